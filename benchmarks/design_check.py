@@ -10,10 +10,10 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.study.design.bench import DesignBench
-from emmc_rig.study.design.candidates import choices
-from emmc_rig.study.design.comparison import shipped_like
+from emmc_rig.study.design.designing import shipped_like
 from emmc_rig.study.design.expected import SIZE, expected
 from emmc_rig.study.design.printed import Print, printed_psi
+from emmc_rig.study.design.search import candidates
 from reconstruction.methods import DEFAULT_METHOD, reconstruct
 
 RANDOM = 8
@@ -23,7 +23,7 @@ RANDOM = 8
 def cameras(seed: int) -> dict[str, Camera]:
     """Return the cameras compared, at equal light and noise."""
     bench = DesignBench()
-    every = list(choices(bench).every(bench))
+    every = candidates(bench)
     drawn = np.random.default_rng(seed).permutation(len(every))[:RANDOM]
     found = {**shipped_like(bench), **{every[i].label: every[i].camera(bench) for i in drawn}}
     noise, total_s = bench.sensor.noise, bench.total_exposure_s

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calibration.whiteboard import Calibration, ideal_boards, lamps_needed, measure_psi
+from calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
@@ -255,7 +255,6 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
                 truth,
                 result,
                 readings,
-                calibration,
                 pictures,
                 maps,
             ),
@@ -300,14 +299,10 @@ def _report(
     truth: Array,
     result: Reconstruction,
     readings: Array,
-    calibration: Calibration,
     pictures: list[tuple[str, Array]],
     maps: Mapping[str, NDArray],
 ) -> ReportContent:
     camera = settings.camera
-    weights, deviation = (
-        array[0].sum(axis=3) for array in (calibration.psi.weights, calibration.deviation)
-    )
     peak = max(float(np.percentile(board, 99.9)) for _, board in pictures)
     return ReportContent(
         title=f"{settings.scene} through {settings.camera_name}",
@@ -320,11 +315,8 @@ def _report(
         frames=readings,
         cfa=camera.sensor.cfa_name,
         whiteboards=[(label, board / peak) for label, board in pictures],
-        psi=weights,
-        psi_std=deviation,
         metrics=metrics,
         stage_s=metrics["seconds"],
-        objective=[value for _, value in result.objective],
         warnings=metrics["warnings"],
         command=metrics["command"],
         maps=maps,

@@ -23,7 +23,7 @@ def cameras(
         Path | None, typer.Option("--out", help="folder for the drawing and its metrics")
     ] = None,
 ) -> None:
-    """List the cameras known, or draw one: masks, weights, sampling, condition."""
+    """List the cameras known, or draw one: masks, weights, sampling."""
     import emmc_rig as emmc
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import write_metrics

@@ -1,4 +1,4 @@
-"""What a capture shows: bar, time left and the frame's histogram on a terminal; words elsewhere.
+"""What a capture shows: bar, time left and the brightest readings on a terminal; words elsewhere.
 
 On a terminal p pauses and resumes, and q stops after the present frame.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -22,7 +21,6 @@ from emmc_rig.acquisition.keyboard import pressed_keys
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.commands.output import columns
 from emmc_rig.files.results import shown_seconds
-from emmc_rig.pages.frame_view import histogram, histogram_text, thinned
 from emmc_rig.session.planned import PlannedFrame
 
 KEY_POLL_S = 0.1
@@ -36,7 +34,6 @@ class CaptureDisplay(CaptureWatcher):
         self._console, self._control = console, control
         self._progress = Progress(*columns(), console=console)
         self._task: TaskID | None = None
-        self._histogram = Text()
         self._line = Text()
         self._live: Live | None = None
         self._asking = False
@@ -98,12 +95,10 @@ class CaptureDisplay(CaptureWatcher):
             self._update()
 
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """Show the frame's histogram."""
+        """Show how bright the frame is."""
         if self._live is None:
             return
         span = max(1.0, frame.white_level_dn - float(frame.black_level_dn.mean()))
-        few = replace(frame, mosaic=thinned(frame.mosaic))
-        self._histogram = histogram_text(histogram(few))
         self._line = Text(
             f"{planned.id}: {frame.exposure_s or 0:g} s, brightest {found.bright_dn / span:.0%} of "
             f"white, saturated {found.saturated:.2%}"
@@ -138,7 +133,7 @@ class CaptureDisplay(CaptureWatcher):
             self._progress.update(self._task, detail=detail)
 
     def _drawn(self) -> Group:
-        return Group(self._histogram, self._line, self._progress)
+        return Group(self._line, self._progress)
 
     def _listen(self, pressed, ended: threading.Event) -> None:
         while not ended.wait(KEY_POLL_S):

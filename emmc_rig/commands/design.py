@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from emmc_rig.commands.options import ScenesOption, SeedOption, SizeOption
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from emmc_rig.study.design.comparison import Simulated
 
 
 def design(
@@ -32,7 +27,7 @@ def design(
     """Choose the mask to order: by theory, confirmed by simulation; a camera and a mask file."""
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.design.bench import load_bench
-    from emmc_rig.study.design.designing import run_design
+    from emmc_rig.study.design.designing import run_design, simulated_table
 
     described = load_bench(bench)
     sides = parse_size(size)
@@ -46,16 +41,9 @@ def design(
         f"expected {best.psnr_db:.2f} dB, {best.light:.0%} of the light, Fresnel number "
         f"{best.fresnel:.2g}: diffraction costs {loss_db:.2f} dB"
     )
-    _show(designed.simulated)
+    show_table(*simulated_table(designed.simulated))
     tell(designed.verdict)
     for line in designed.left_out:
         say("left out", line)
     tell(f"open {designed.page}")
     give_result(place)
-
-
-def _show(found: Sequence[Simulated]) -> None:
-    from emmc_rig.study.design.design_page import simulated_table
-
-    heads, rows = simulated_table(found)
-    show_table(heads, rows)

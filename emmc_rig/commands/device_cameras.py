@@ -135,7 +135,7 @@ def frame_line(frame: RawFrame, figures: FrameFigures) -> str:
     brightest = ", ".join(f"{name} {level:.0%}" for name, level in figures.brightest.items())
     return (
         f"{rows}x{columns} {frame.cfa}{exposed}; brightest {brightest}; "
-        f"saturated {figures.saturated:.2%}; focus {figures.focus:.4f}"
+        f"saturated {figures.saturated:.2%}"
     )
 
 

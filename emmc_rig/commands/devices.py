@@ -7,18 +7,14 @@ Ctrl-C, SIGTERM, a closed terminal or an error during a move stops the stage and
 from __future__ import annotations
 
 import logging
-import signal
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from drivers.cameras import CAMERAS
-from emmc_rig.acquisition.control import ENDING, handled, signals_interrupt
+from emmc_rig.acquisition.control import signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
@@ -168,46 +164,6 @@ def jog(
             at_um = move({axis: distance_um})[axis]
         tell(f"{axis} at {at_um:.3f} um")
         give_result(axis=axis, at_um=at_um)
-
-
-@app.command()
-def serve(
-    protocol: Annotated[str, typer.Argument(help="zaber, grbl or apt")] = "zaber",
-    tcp: Annotated[
-        str | None, typer.Option("--tcp", help="HOST:PORT to listen on, instead of a terminal")
-    ] = None,
-    link: Annotated[
-        Path | None, typer.Option("--link", help="a path that always leads to the terminal")
-    ] = None,
-) -> None:
-    """Serve a simulated stage to other programs, in real time, until Ctrl-C."""
-    from drivers.clock import SYSTEM_CLOCK
-    from emmc_rig.bench.hardware import SIMULATED_SCALES, simulated_firmware
-    from emmc_rig.files.folders import refuse_inside_session
-    from simulators.wire import PtyServer, TcpServer
-
-    if link is not None:
-        refuse_inside_session(link.parent)
-    firmware = simulated_firmware(protocol, SYSTEM_CLOCK)
-    if tcp is None:
-        server = PtyServer(firmware, link)
-    else:
-        host, _, number = tcp.rpartition(":")
-        if not (host and number.isdecimal() and int(number) < 2**16):
-            raise AppError(f"--tcp {tcp}: write HOST:PORT, for instance 127.0.0.1:5000")
-        server = TcpServer(firmware, host, int(number))
-
-    def ended(number: int, frame: FrameType | None) -> None:
-        say("emmc-rig", f"no longer serving ({signal.Signals(number).name})")
-        raise typer.Exit(128 + number)
-
-    try:
-        with handled(ended, ENDING), server:
-            tell(f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}")
-            while True:
-                time.sleep(1.0)
-    except OSError as fault:
-        raise AppError(f"cannot serve on {tcp or 'a terminal'}: {fault}") from fault
 
 
 @app.command("udev-rule")

@@ -105,11 +105,7 @@ def emit(event: str, **facts: Any) -> None:
 
 
 class Quiet:
-    """A `Watcher` that shows no progress, and what a study shows beside it."""
-
-    line = staticmethod(tell)
-    note = staticmethod(say)
-    table = staticmethod(show_table)
+    """A `Watcher` that shows no progress."""
 
     def begin(self, stage: str, steps: int | None = None) -> None:
         """Begin a stage; the one before is done. steps: None where not known."""

@@ -16,7 +16,7 @@ def tables(
         Path | None, typer.Option("--scenes", help="a folder of scenes (default: the built-in)")
     ] = None,
     only: Annotated[
-        str | None, typer.Option("--only", help="table2, table3, table4, figure8; commas between")
+        str | None, typer.Option("--only", help="table2, table3, table4; commas between")
     ] = None,
     fast: Annotated[bool, typer.Option("--fast", help="crops: minutes, not days")] = False,
     dictionary: DictionaryOption = None,

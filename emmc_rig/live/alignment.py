@@ -19,7 +19,7 @@ from calibration.placement import Placement, designed_placement
 from calibration.registration import LEAST_CORRELATION, register
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from drivers.raw import RawFrame
-from emmc_rig.model.camera import Camera, draw_plates, psi_layout
+from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.pages.frame_view import thinned
 
 Array = NDArray[np.floating]
@@ -38,12 +38,9 @@ turn of a degree or a stretch of a per cent stays below a cell."""
 STEPS, ENOUGH = 12, 0.02
 """Gauss-Newton steps in a window, and the step, in standard deviations, that ends them."""
 TUKEY = 4.685
-SPLIT = 2
-"""Parts of a view along each axis, where a mask at the lens shades it unevenly."""
 MODEL_FACTOR = 2.0
 """On deviations by the residuals alone: what the model of the shadow lacks is no noise of single
-pixels. On whiteboards of the shipped cameras, by the ray caster, errors were up to 3 of those, of
-the one with a second mask at the lens 6."""
+pixels. On whiteboards of the shipped cameras, by the ray caster, errors were up to 3 of those."""
 LEVEL_CELLS = 8.0
 """Light varies more slowly than this over the picture, the mask faster."""
 WANTED_DEG, WANTED_SHARE = 0.1, 1e-3
@@ -110,12 +107,10 @@ class MaskGauge:
         self._camera, self._pixels = camera, pixels
         k = camera.sensor.binning
         size = pixels[0] * k, pixels[1] * k
-        single, weights = _with_one_mask(camera, size)
-        self._mask = shadow_mask(single, size)
-        start = designed_placement(single)
-        self._start = replace(
-            start, blur_um=BLUR_CELLS * self._mask.cell_um, aperture=weights or start.aperture
-        )
+        _require_one_mask(camera)
+        self._mask = shadow_mask(camera, size)
+        blur_um = BLUR_CELLS * self._mask.cell_um
+        self._start = replace(designed_placement(camera), blur_um=blur_um)
         self._layout = psi_layout(camera, size)
         self._last: Placement | None = None
 
@@ -210,49 +205,17 @@ class MaskGauge:
         return place, placement
 
 
-def _with_one_mask(
-    camera: Camera, size: tuple[int, int]
-) -> tuple[Camera, tuple[tuple[float, ...], ...] | None]:
-    """Return the camera with only the mask whose shadow is seen, and what those at the lens leave.
-
-    The second: the share of light of every view, None for all alike.
-    """
-    lens_mm = camera.lens.distance_mm
-    near = {name: mask for name, mask in camera.masks.items() if mask.distance_mm < lens_mm}
-    if len(near) != 1:
+def _require_one_mask(camera: Camera) -> None:
+    """Raise CalibrationError unless the design has one mask, and that throws a shadow."""
+    masks = camera.masks.values()
+    if masks and all(mask.distance_mm >= camera.lens.distance_mm for mask in masks):
         raise CalibrationError(
             "this design's masks lie at the lens: they throw no shadow to measure"
-            if camera.masks and not near
-            else f"this design has {len(near)} masks before the sensor: one is needed to measure"
         )
-    (name,) = near
-    shots = tuple(
-        shot.model_copy(
-            update={
-                "masks": (name,),
-                "offset_um": {one: by for one, by in shot.offset_um.items() if one == name},
-            }
+    if len(masks) != 1:
+        raise CalibrationError(
+            f"this design has {len(masks)} masks: the shadow of one alone can be measured"
         )
-        for shot in camera.shots
-    )
-    steps = {one: by for one, by in (camera.more_shots_step_um or {}).items() if one == name}
-    single = camera.model_copy(
-        update={"masks": near, "shots": shots, "more_shots_step_um": steps or None}
-    )
-    weights = None
-    finer = tuple(SPLIT * count for count in camera.views)
-    for other, plate in draw_plates(camera, size).items():
-        if other != name:
-            passed = cv2.resize(
-                plate.cells[0].mean(axis=-1), finer[::-1], interpolation=cv2.INTER_AREA
-            )
-            passed = passed if weights is None else passed * weights
-            weights = passed / passed.mean()
-    if weights is None:
-        return single, None
-    lens = camera.lens.model_copy(update={"aperture_cell_mm": camera.lens.aperture_cell_mm / SPLIT})
-    single = single.model_copy(update={"views": finer, "lens": lens})
-    return single, tuple(tuple(max(1e-3, float(one)) for one in row) for row in weights)
 
 
 def _levelled(

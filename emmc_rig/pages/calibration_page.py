@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,7 @@ from calibration.choice import HeldOut
 from calibration.routes import Outcome
 from calibration.sensor import SensorSheet
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.display import png_of
+from emmc_rig.pages.display import DisplayCurve, finite, heat, montage, png_of, round_up
 from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
 from emmc_rig.pages.page import (
     Card,
@@ -24,10 +25,13 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.pages.psi_panels import psi_panels
 
 Array = NDArray[np.floating]
 RESIDUAL_SCALE = 5.0
+DETAIL_PX = 40
+"""Side of the piece of a slice of Psi that is shown pixel for pixel."""
+THUMBNAIL_PX = 120
+"""Side of a whole slice."""
 WORDS = {
     "offset_x_um": ("Offset x", "um"),
     "offset_y_um": ("Offset y", "um"),
@@ -157,14 +161,55 @@ def _residuals(judged: Sequence[HeldOut]) -> str:
 
 
 def _psi(outcome: Outcome) -> str:
-    calibration = outcome.calibration
-    weights, deviation = calibration.psi.weights, calibration.deviation
-    panels = psi_panels(
-        calibration.psi.light_field_shape[:2],
-        lambda v, u: weights[0, v, u].sum(axis=1),
-        lambda v, u: deviation[0, v, u].sum(axis=1),
+    """Return slices of Psi and of its deviation, (v, u, y, x) of the first shot."""
+    psi, deviation = outcome.calibration.psi, outcome.calibration.deviation
+    views = psi.light_field_shape[:2]
+    slices: list[list[Array]] = [[], [], []]
+    medians = []
+    for v, u in np.ndindex(views):  # one view in memory at a time
+        weights, spread = (finite(of[0, v, u].sum(axis=1)) for of in (psi.weights, deviation))
+        for found, one in zip(
+            slices, (_thumbnail(weights), _centre(weights), _centre(spread)), strict=True
+        ):
+            found.append(one)
+        medians.append(np.median(spread))
+    whole, piece, unsure = (
+        np.reshape(np.array(one, np.float32), (*views, *one[0].shape)) for one in slices
     )
+    layout = f"rows are v 0 to {views[0] - 1} downwards, columns u 0 to {views[1] - 1}"
+    side = f"{piece.shape[-1]} × {piece.shape[-2]}"
+    note = f"same pixels; of the views' medians the median is {np.median(medians):.2g}"
+    panels = [
+        _panel("Whole field", f"one tile per view, averaged down; {layout}", whole, 3),
+        _panel(
+            "Centre, pixel for pixel", f"the middle {side} pixels of each view's weights", piece, 2
+        ),
+        _panel("Its standard deviation", note, unsure, 2, "heat"),
+    ]
     return fragment("calibration_psi.html", panels=panels)
+
+
+def _panel(
+    name: str, note: str, slices: Array, gap_px: int, ramp: str = "grey"
+) -> dict[str, object]:
+    """Return a figure of slices (v, u, y, x) side by side; ramp: its scale of colours."""
+    scale = round_up(float(np.percentile(slices, 99.9)))
+    codes = DisplayCurve(1 / scale, 1.0).encode(slices)
+    picture = png_of(montage(heat(codes) if ramp == "heat" else codes, gap_px))
+    return {"name": name, "note": note, "picture": picture, "scale": scale, "ramp": ramp}
+
+
+def _centre(view: Array) -> Array:
+    height, width = view.shape
+    top, left = max((height - DETAIL_PX) // 2, 0), max((width - DETAIL_PX) // 2, 0)
+    return view[top : top + DETAIL_PX, left : left + DETAIL_PX]
+
+
+def _thumbnail(view: Array) -> Array:
+    height, width = view.shape
+    shrink = min(1.0, THUMBNAIL_PX / max(height, width))
+    size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+    return np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _sensor(sheet_: SensorSheet) -> str:

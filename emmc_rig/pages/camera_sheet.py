@@ -33,7 +33,6 @@ SHEET_SAMPLES = 64
 LISTING_SAMPLES = 24
 WEIGHTS_SHOWN = 20
 HALF_CELLS_SHOWN = 8
-SMALLEST_EIGENVALUE = 1e-10
 INK, FAINT, BLOCKED, RAY, WARNING = "#1b1f27", "#8a919e", "#2b2f38", "#c2410c", "#b45309"
 
 
@@ -87,44 +86,19 @@ def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> dict[str
     sampling_rate: measurements per light-field value (rows over columns of Psi).
     light_efficiency: reading from a white light field, 1 for the open camera behind its filters.
     dark_share: share of the measurements that no light reaches.
-    block_condition_median, block_condition_worst_percent: condition number of the pixels' blocks
-        of Psi Psi^T, its median and what one block in a hundred exceeds; 1 for one shot, None
-        where the block is singular.
-    row_norm_spread: 99th over 1st percentile of the norms of the lit rows of Psi.
     masks: per mask the shift of its shadow from view to view in samples and its magnification on
         the sensor (both None at the lens, where a view sees one value), and the Fresnel number of
         a cell (None in contact with the sensor).
     Raises CameraError when the camera cannot be built at that size.
     """
     psi = build_imaging_matrix(camera, size)
-    norms = psi.row_norms()
-    lit = norms[norms > 0]
-    conditions = _block_conditions(psi)
     return {
         "sampling_rate": psi.shape[0] / psi.shape[1],
         "light_efficiency": psi.light_efficiency(),
-        "dark_share": 1 - lit.size / norms.size,
-        "block_condition_median": _quantile(conditions, 0.5),
-        "block_condition_worst_percent": _quantile(conditions, 0.99),
-        "row_norm_spread": float(np.quantile(lit, 0.99) / np.quantile(lit, 0.01)),
+        "dark_share": float(np.mean(psi.row_norms() == 0)),
         "total_exposure_s": float(camera.exposures_s().sum()),
         "masks": {name: _mask_figures(camera, mask) for name, mask in camera.masks.items()},
     }
-
-
-def _block_conditions(psi: ImagingMatrix) -> NDArray[np.float64]:
-    """Return the condition number of every pixel's block of Psi Psi^T; infinite when singular."""
-    if psi.shots == 1:
-        return np.ones(1)
-    eigenvalues = np.linalg.eigvalsh(np.moveaxis(psi.gram, (0, 1), (2, 3)))
-    smallest, largest = eigenvalues[..., 0].ravel(), eigenvalues[..., -1].ravel()
-    regular = smallest > SMALLEST_EIGENVALUE * largest
-    return np.divide(largest, smallest, out=np.full(smallest.shape, np.inf), where=regular)
-
-
-def _quantile(values: NDArray[np.float64], share: float) -> float | None:
-    found = float(np.quantile(values, share, method="higher"))
-    return found if np.isfinite(found) else None
 
 
 def _mask_figures(camera: Camera, mask: Mask) -> dict[str, float | None]:

@@ -21,7 +21,7 @@ COLOURS = (
 LEGEND = {"fontsize": 8.5, "frameon": False, "labelcolor": INK}
 FONTS: dict[Any, Any] = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "emmc-rig"}
 """Journals want TrueType in a PDF. SVG cannot embed the font, so that its letters are outlines."""
-PNG_DPI, PUBLICATION_DPI, PAGE_DPI = 160, 300, 220
+PUBLICATION_DPI = 300
 
 
 def sheet(
@@ -57,9 +57,9 @@ def titled(axes: Axes, title: str, across: str = "") -> None:
         axes.set_xlabel(across, color=FAINT, fontsize=9)
 
 
-def plain_log_ticks(axes: Axes, which: str) -> None:
-    """Label the ticks of a logarithmic axis, "x" or "y", as 1, 2, 5, 10, ... without powers."""
-    axis = getattr(axes, f"{which}axis")
+def plain_log_ticks(axes: Axes) -> None:
+    """Label the ticks of a logarithmic x axis as 1, 2, 5, 10, ... without powers."""
+    axis = axes.xaxis
     axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
@@ -95,13 +95,7 @@ def save_publication(figure: Figure, path: Path, about: str) -> None:
         figure.savefig(path, metadata=metadata[path.suffix], dpi=PUBLICATION_DPI)
 
 
-def save_svg(figure: Figure, path: Path) -> Path:
+def save_drawing(figure: Figure, path: Path) -> Path:
     """Write a figure as SVG without date and random names; return its path."""
     path.write_bytes(svg_of(figure))
     return path
-
-
-def save_drawing(figure: Figure, path: Path) -> Path:
-    """Write a figure as SVG, and as PNG beside it; return the path of the SVG."""
-    figure.savefig(path.with_suffix(".png"), dpi=PNG_DPI)
-    return save_svg(figure, path)

@@ -1,4 +1,4 @@
-"""Views of a frame: figures, a preview, and a histogram for the terminal."""
+"""Views of a frame: figures, a histogram, and a preview."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.text import Text
 
 from drivers.raw import RawFrame
 from emmc_rig.model.srgb import codes_of, srgb_of
 
 BAYER = ("rggb", "bggr", "grbg", "gbrg")
 LETTERS = {"r": "red", "g": "green", "b": "blue"}
-STYLES = {"red": "red", "green": "green", "blue": "blue", "grey": "white"}
-BLOCKS = " ▁▂▃▄▅▆▇█"
 BINS = 64
 LONGEST_PREVIEW_PX = 1600
 SAMPLED_PIXELS = 1 << 16
@@ -42,13 +39,11 @@ def colour_planes(frame: RawFrame) -> dict[str, list[NDArray[np.uint16]]]:
 class FrameFigures:
     """Of one frame: per colour the level of its 99.9th percentile, 1 at white; and the whole's.
 
-    saturated: share of pixels at the white level. focus: energy of the differences between
-    neighbours of one colour over that of the picture; the larger, the sharper, for one scene.
+    saturated: share of pixels at the white level.
     """
 
     brightest: dict[str, float]
     saturated: float
-    focus: float
 
 
 def frame_figures(frame: RawFrame) -> FrameFigures:
@@ -60,11 +55,8 @@ def frame_figures(frame: RawFrame) -> FrameFigures:
         name: max((float(np.percentile(plane, 99.9)) - black) / span for plane in parts)
         for name, parts in planes.items()
     }
-    sharpest = planes.get("green", planes.get("grey", []))[0].astype(np.float32) - np.float32(black)
-    energy = float(np.mean(sharpest**2))
-    changes = float(np.mean(np.diff(sharpest, axis=0) ** 2) + np.mean(np.diff(sharpest) ** 2))
     saturated = float(np.mean(frame.mosaic >= frame.white_level_dn))
-    return FrameFigures(brightest, saturated, changes / energy if energy else 0.0)
+    return FrameFigures(brightest, saturated)
 
 
 def histogram(frame: RawFrame, bins: int = BINS) -> dict[str, NDArray[np.int64]]:
@@ -75,17 +67,6 @@ def histogram(frame: RawFrame, bins: int = BINS) -> dict[str, NDArray[np.int64]]
         name: np.sum([np.histogram(part, bins, limits)[0] for part in parts], axis=0)
         for name, parts in colour_planes(frame).items()
     }
-
-
-def histogram_text(counts: dict[str, NDArray[np.int64]]) -> Text:
-    """Return a line of blocks for each colour, on a logarithmic scale: one pixel still shows."""
-    text = Text()
-    for name, row in counts.items():
-        heights = np.log1p(row) / max(1e-9, float(np.log1p(row.max())))
-        steps = np.ceil(heights * (len(BLOCKS) - 1)).astype(int)
-        line = "".join(BLOCKS[step] for step in steps)
-        text.append(f"{name:>6} ", "dim").append(line, STYLES[name]).append("|\n", "dim")
-    return text
 
 
 Balance = tuple[float, float, float]

@@ -9,7 +9,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -20,10 +19,8 @@ KINDS = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
     ".svg": "image/svg+xml",
-    ".webp": "image/webp",
 }
 TEMPLATES = PackageLoader("emmc_rig.pages")
-SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 
 @dataclass(frozen=True)
@@ -161,21 +158,18 @@ def framed(
     caveats: Sequence[str],
     sections: Sequence[Section],
     styles: Sequence[str] = (),
-    scripts: Sequence[str] = (),
-    data: Mapping[str, object] | None = None,
     lead: str = "",
     *,
     head: Head,
 ) -> str:
     """Return a page of sections.
 
-    about: sentences under the title. caveats: how to read it. styles, scripts: files beside the
-    templates that only this page needs; data: what the scripts read, by the name of its element.
-    head: comes first. lead: HTML before the sections.
+    about: sentences under the title. caveats: how to read it. styles: files beside the templates
+    that only this page needs. head: comes first. lead: HTML before the sections.
     """
     return fragment(
         "page.html", title=title, about=about, caveats=caveats, sections=sections, styles=styles,
-        scripts=scripts, data=data or {}, lead=lead, summary=head,
+        scripts=(), data={}, lead=lead, summary=head,
     )  # fmt: skip
 
 
@@ -193,25 +187,3 @@ def data_address(data: bytes, kind: str) -> str:
 def embedded(path: Path) -> str:
     """Return a picture as a data address."""
     return data_address(path.read_bytes(), path.suffix)
-
-
-def inline_svg(path: Path, key: str) -> Markup:
-    """Return a drawing as part of a page, where a script can reach its marks.
-
-    Names are put behind the key: on one page no drawing may refer to what is in another. Those of
-    marks, which begin with "mark-", stay as they are.
-    """
-    ElementTree.register_namespace("", SVG)
-    ElementTree.register_namespace("xlink", XLINK)
-    drawing = ElementTree.parse(path).getroot()
-    for element in drawing.iter():
-        for name, value in element.items():
-            if name == "id" and not value.startswith("mark-"):
-                element.set(name, f"{key}-{value}")
-            elif name in ("href", f"{{{XLINK}}}href") and value.startswith("#"):
-                element.set(name, f"#{key}-{value[1:]}")
-            elif "url(#" in value:
-                element.set(name, value.replace("url(#", f"url(#{key}-"))
-    for metadata in drawing.findall(f"{{{SVG}}}metadata"):
-        drawing.remove(metadata)
-    return Markup(ElementTree.tostring(drawing, encoding="unicode"))

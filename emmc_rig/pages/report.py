@@ -22,8 +22,7 @@ from emmc_rig.pages.display import (
     reduced,
     round_up,
 )
-from emmc_rig.pages.page import Card, data_address, fragment, light_field_head
-from emmc_rig.pages.psi_panels import psi_panels
+from emmc_rig.pages.page import Card, fragment, light_field_head
 from emmc_rig.pages.viewer import poster, viewer_data
 
 Array = NDArray[np.floating]
@@ -35,9 +34,9 @@ FRAME_PIXELS = 1_500_000
 class ReportContent:
     """What the report shows. Pictures are linear, float, nominally in [0, 1].
 
-    Shapes: light fields (v, u, y, x, c) with c 1 or 3; frames (shot, y, x); whiteboards (y, x);
-    psi and psi_std (v, u, y, x), the weights of shot 0. maps: what is laid over the picture in the
-    viewer, by name, see `Export`. source: the result's folder, as typed.
+    Shapes: light fields (v, u, y, x, c) with c 1 or 3; frames (shot, y, x); whiteboards (y, x).
+    maps: what is laid over the picture in the viewer, by name, see `Export`. source: the result's
+    folder, as typed.
     """
 
     title: str
@@ -51,10 +50,7 @@ class ReportContent:
     metrics: Mapping[str, object]
     truth: Array | None = None
     whiteboards: Sequence[tuple[str, Array]] = ()
-    psi: Array | None = None
-    psi_std: Array | None = None
     stage_s: Mapping[str, float] = field(default_factory=dict)
-    objective: Sequence[float] = ()
     warnings: Sequence[str] = ()
     command: str = ""
     source: str = ""
@@ -74,7 +70,6 @@ def render(content: ReportContent) -> str:
     rows, columns, height, width, _ = content.estimate.shape
     disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
     export = Export(content.title, "", content.estimate, content.truth, disparity, sigma, misfit)
-    psi, psi_std = content.psi, content.psi_std
     return fragment(
         "report.html",
         title=content.title,
@@ -91,14 +86,6 @@ def render(content: ReportContent) -> str:
         ],
         views={"rows": rows, "columns": columns, "height": height, "width": width},
         error=None if content.truth is None else _error(content.estimate, content.truth),
-        psi=None
-        if psi is None
-        else psi_panels(
-            (rows, columns),
-            lambda v, u: psi[v, u],
-            None if psi_std is None else lambda v, u: psi_std[v, u],
-        ),
-        convergence=_convergence(content.objective),
         timings=_timings(content.stage_s),
         figures=_figures(content.metrics),
         provenance=_provenance(content),
@@ -123,15 +110,13 @@ def _frames(frames: Array) -> dict[str, Any]:
 
 
 def _error(estimate: Array, truth: Array) -> dict[str, object]:
-    """Return the error averaged over views as a picture, and the PSNR of each view."""
-    difference = finite(estimate) - finite(truth)
-    absolute, squared = np.abs(difference).mean(axis=-1), np.square(difference).mean(axis=-1)
-    mean = reduced(absolute.mean(axis=(0, 1))[None, None, ..., None], FRAME_PIXELS)[0, 0, ..., 0]
+    """Return the error averaged over views and colours as a picture, and its scale."""
+    absolute = np.abs(finite(estimate) - finite(truth)).mean(axis=(0, 1, -1))
+    mean = reduced(absolute[None, None, ..., None], FRAME_PIXELS)[0, 0, ..., 0]
     scale = round_up(float(np.percentile(mean, 99.5)))
     return {
         "scale": scale,
         "picture": png_of(heat(DisplayCurve(1 / scale, 1.0).encode(mean))),
-        "views": _view_psnr(squared),
     }
 
 
@@ -238,41 +223,6 @@ def _warnings(content: ReportContent) -> list[str]:
     broken = int(content.estimate.size - np.count_nonzero(np.isfinite(content.estimate)))
     more = f"The estimate holds {broken} values that are not finite; drawn black."
     return [*content.warnings, *([more] if broken else [])]
-
-
-def _view_psnr(squared: Array) -> list[list[dict[str, str]]]:
-    """Return the PSNR of each view in words, and how light its cell is, row by row."""
-    with np.errstate(divide="ignore"):
-        psnr_db = -10 * np.log10(squared.mean(axis=(2, 3)))
-    known = psnr_db[np.isfinite(psnr_db)]
-    low, span = (float(known.min()), float(np.ptp(known))) if known.size else (0.0, 0.0)
-
-    def cell(value: float) -> dict[str, str]:
-        share = 1.0 if not math.isfinite(value) else (value - low) / span if span > 0 else 0.5
-        words = f"{value:.1f}" if math.isfinite(value) else "exact"
-        return {"words": words, "lightness": f"{96 - 26 * share:.0f}"}
-
-    return [[cell(value) for value in row] for row in psnr_db]
-
-
-def _convergence(objective: Sequence[float]) -> dict[str, str] | None:
-    """Return the objective over the solver's steps as a chart; None where few can be drawn."""
-    finite_values = [float(value) for value in objective if math.isfinite(value)]
-    if len(finite_values) < 2:
-        return None
-    # matplotlib loads for half a second: here only.
-    from matplotlib.ticker import MaxNLocator
-
-    from emmc_rig.pages.drawing import ACCENT, sheet, svg_of, titled
-
-    figure, (axes,) = sheet(1, 6.2, 2.7, "")
-    axes.plot(np.arange(1, len(objective) + 1), objective, color=ACCENT, linewidth=2)
-    if min(finite_values) > 0 and max(finite_values) / min(finite_values) > 20:
-        axes.set_yscale("log")
-    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    titled(axes, "", "recorded step")
-    ends = f"{objective[0]:.4g} to {objective[-1]:.4g} over {len(objective)} values"
-    return {"ends": ends, "picture": data_address(svg_of(figure), ".svg")}
 
 
 def _timings(stage_s: Mapping[str, float]) -> list[tuple[str, str, str]]:

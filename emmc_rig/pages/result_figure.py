@@ -1,37 +1,44 @@
 """Figure of results for a paper: views, close-ups, epipolar images and maps, side by side.
 
-Every picture is embedded at its own pixels; text and lines stay vectors. Results are columns under
-each other's scale; of a single result the maps stand to the right of the view.
+Every picture is embedded at its own pixels; text and lines stay vectors. Results are columns, maps
+rows under each other's scale; of a single result the maps stand to the right of the view.
 """
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.formats import Export
 from emmc_rig.model.lightfield import epi_horizontal, psnr_db, ssim
 from emmc_rig.pages.display import DisplayCurve, finite, round_up, three_colours
-from emmc_rig.pages.paper_figure import (
-    FRAMES,
-    WIDTH_IN,
-    CloseUp,
-    PaperFigure,
-    Row,
-    Scale,
-    Strip,
-    Tile,
-    caption_of,
-    draw_tiles,
-)
+from emmc_rig.pages.drawing import FAINT, INK, save_publication
 from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
+from emmc_rig.version import __version__
 
 Array = NDArray[np.floating]
+WIDTH_IN = 7.16
+"""Of a figure across both columns of an IEEE page."""
+EDGE_IN, GAP_IN, LABEL_IN, BAR_IN, STRIP_IN = 0.01, 0.06, 0.2, 0.45, 0.3
+TICK_IN = 0.05
+"""Half a figure at the lower end of a scale, which stands at the edge."""
+TEXT_PT, LINE_IN = 7.5, 0.13
+LETTER_PT = 0.55 * TEXT_PT
+"""Mean width of a letter of a title."""
+FRAMES = ("#ffb000", "#00beff", "#ff5d8f", "#7ed957")
+"""Colours of the close-ups' frames, in order."""
 CLOSE_UP_SHARE = 0.16
 LEAST_RANGE_PX = 0.1
 """Of a scale of disparities, where a result is one plane."""
@@ -49,6 +56,33 @@ class FigureSettings:
     at: Sequence[tuple[int, int]] = ()
     side_px: int | None = None
     width_in: float = WIDTH_IN
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """The figure, its caption with where everything came from, and PSNR and SSIM by column."""
+
+    figure: Figure
+    caption: str
+    measured: Mapping[str, Mapping[str, float]]
+
+    def save(self, folder: Path) -> None:
+        """Write figure.pdf, .svg, .png, and the caption as figure.txt, into a folder."""
+        for ending in ("pdf", "svg", "png"):
+            save_publication(self.figure, folder / f"figure.{ending}", self.caption)
+        text = "\n".join(textwrap.wrap(self.caption, 100, break_on_hyphens=False))
+        (folder / "figure.txt").write_text(text + "\n", encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """One map (y, x) of every result, None where it has none, and their common scale."""
+
+    label: str
+    values: Sequence[Array | None]
+    low: float
+    high: float
+    colours: str
 
 
 def draw_results(
@@ -86,42 +120,146 @@ def draw_results(
         for name in names
     ]
     line, _ = epipolar_lines(reference)
-    height, width = reference.shape[2:4]
-
-    def tile(title: str, light_field: Array) -> Tile:
-        codes = three_colours(curve.encode(light_field[view]))
-        strip = three_colours(curve.encode(epi_horizontal(light_field, view[0], line)))
-        return Tile(
-            title,
-            codes,
-            [CloseUp(one.of(codes), FRAMES[k % len(FRAMES)], one) for k, one in enumerate(pieces)],
-            [Strip(strip, ((line, 0), (line, width - 1)))],
-        )
-
-    shown = [tile(title, one.light_field) for title, one in zip(titles, columns, strict=True)]
     maps = _maps(results, view, truth)
-    if len(columns) == 1:
-        beside = [replace(row.tiles[0], title=row.label, bar=True) for row in maps if row.tiles[0]]
-        rows = [Row([*shown, *beside])]
-    else:
-        before = [None] * (len(columns) - len(results))
-        rows = [Row(shown), *(Row([*before, *row.tiles], row.label) for row in maps)]
-    sentences = [
-        f"View {view} of {reference.shape[0]}x{reference.shape[1]}, {height}x{width} pixels.",
-        f"Epipolar plane image of row {line} (dotted), all views of a row downwards.",
-    ]
-    if measured:
-        sentences.append(
-            "Error: root mean square over colours, of this view. PSNR and SSIM are of all views, "
-            "peak 1."
+    beside = maps if len(columns) == 1 else []
+    titles += [one.label for one in beside]
+    rows, bars = (0, len(maps)) if beside else (len(maps), min(len(maps), 1))
+    sheet = _Sheet(
+        figure or Figure(), settings.width_in, titles, len(pieces), rows, bars, reference.shape
+    )
+    for at, one in enumerate(columns):
+        codes, strip = (
+            three_colours(curve.encode(picture))
+            for picture in (one.light_field[view], epi_horizontal(one.light_field, view[0], line))
         )
+        sheet.picture(at, codes, pieces, strip, line)
+    for at, one in enumerate(beside, 1):
+        sheet.map(at, 0, one.values[0], one, bar=True)
+    for row, one in enumerate(maps if not beside else [], 1):
+        sheet.label(row, one.label)
+        first = len(columns) - len(results)
+        for at, values in enumerate(one.values, first):
+            sheet.map(at, row, values, one, bar=at == len(columns) - 1)
     sources = [
-        f"{name}: {_source(one)}"
+        f"{name}: {_source(one)}."
         for name, one in zip(names, columns, strict=True)
         if one.title != "true"
     ]
-    caption = caption_of(sentences, curve, pieces, sources)
-    return PaperFigure(draw_tiles(rows, settings.width_in, figure), caption, measured)
+    caption = " ".join([
+        f"View {view} of {reference.shape[0]}x{reference.shape[1]}, "
+        f"{reference.shape[2]}x{reference.shape[3]} pixels.",
+        f"Epipolar plane image of row {line} (dotted), all views of a row downwards.",
+        *(["Error: root mean square over colours, of this view. PSNR and SSIM are of all views, "
+           "peak 1."] if measured else []),
+        f"Close-ups of {pieces[0].side}x{pieces[0].side} pixels around (y, x) = "
+        + ", ".join(f"({one.y + one.side // 2}, {one.x + one.side // 2})" for one in pieces) + ".",
+        f"Linear values x are shown as {_shown_as(curve)}, cut at 1.",
+        *sources,
+        f"Drawn by emmc-rig {__version__}.",
+    ])  # fmt: skip
+    return PaperFigure(sheet.figure, caption, measured)
+
+
+class _Sheet:
+    """Axes in columns of one width, placed by the inch from the top left.
+
+    titles: of all columns. close_ups: below each picture. rows: of maps below; 0: they stand beside
+    the picture. bars: columns with a scale to their right, the last ones. shape: of light fields.
+    """
+
+    def __init__(
+        self,
+        figure: Figure,
+        width_in: float,
+        titles: Sequence[str],
+        close_ups: int,
+        rows: int,
+        bars: int,
+        shape: Sequence[int],
+    ) -> None:
+        self.left = LABEL_IN if rows else EDGE_IN
+        self.bars = bars
+        gaps_in = (len(titles) - 1) * GAP_IN + bars * BAR_IN
+        self.wide = (width_in - EDGE_IN - self.left - gaps_in) / len(titles)
+        self.tall = self.wide * shape[2] / shape[3]
+        self.side = (self.wide - GAP_IN * (close_ups - 1)) / close_ups
+        letters = max(8, int(self.wide * 72 / LETTER_PT))
+        wrapped = [
+            "\n".join(line for one in title.split("\n") for line in textwrap.wrap(one, letters))
+            for title in titles
+        ]
+        self.top = GAP_IN + LINE_IN * (1 + max(title.count("\n") for title in wrapped))
+        self.below = self.tall + self.side + STRIP_IN + 4 * GAP_IN
+        height = self.top + self.below + rows * (self.tall + 2 * GAP_IN) + EDGE_IN
+        self.width, self.height = width_in, height + (TICK_IN if bars else 0)
+        self.figure = figure
+        figure.set_size_inches(self.width, self.height)
+        for at, title in enumerate(wrapped):
+            x = self._x(at) + self.wide / 2
+            self._text(x, self.top - GAP_IN / 2, title, va="bottom")
+
+    def picture(
+        self, at: int, codes: NDArray, pieces: Sequence[Piece], strip: NDArray, line: int
+    ) -> None:
+        """Draw screen codes (y, x, 3) into a column; below, pieces and the strip of a line."""
+        x, y = self._x(at), self.top
+        axes = self._axes(x, y, self.wide, self.tall)
+        axes.imshow(codes, interpolation="none", aspect="auto")
+        y += self.tall + GAP_IN
+        for k, piece in enumerate(pieces):
+            colour = FRAMES[k % len(FRAMES)]
+            axes.add_patch(
+                Rectangle(
+                    (piece.x - 0.5, piece.y - 0.5), piece.side, piece.side,
+                    fill=False, edgecolor=colour, linewidth=0.8,
+                )
+            )  # fmt: skip
+            close = self._axes(x + k * (self.side + GAP_IN), y, self.side, self.side)
+            close.imshow(piece.of(codes), interpolation="none")
+            close.spines[:].set(visible=True, color=colour, linewidth=1.2)
+        axes.axhline(line, color="white", linewidth=0.8, linestyle=":")
+        drawn = self._axes(x, y + self.side + GAP_IN, self.wide, STRIP_IN)
+        drawn.imshow(strip, interpolation="none", aspect="auto")
+
+    def map(self, at: int, row: int, values: Array | None, of: _Maps, bar: bool) -> None:
+        """Draw a map into a column; row: below the pictures, 0 beside them. bar: its scale too."""
+        x, y = self._x(at), self._y(row)
+        if values is None:
+            self._text(x + self.wide / 2, y + self.tall / 2, "none", color=FAINT)
+        else:
+            look: dict[str, Any] = {"cmap": of.colours, "vmin": of.low, "vmax": of.high}
+            axes = self._axes(x, y, self.wide, self.tall)
+            axes.imshow(values, interpolation="none", aspect="auto", **look)
+        if bar:
+            axes = self._axes(x + self.wide + GAP_IN, y, 0.08, self.tall)
+            colours = ScalarMappable(Normalize(of.low, of.high), of.colours)
+            self.figure.colorbar(colours, cax=axes).outline.set_linewidth(0.4)
+            axes.tick_params(labelsize=6, width=0.4, length=2, pad=1)
+
+    def label(self, row: int, text: str) -> None:
+        """Write what a row of maps shows to its left."""
+        self._text(LABEL_IN / 2, self._y(row) + self.tall / 2, text, rotation=90)
+
+    def _x(self, at: int) -> float:
+        bars_before = max(at - 1, 0) if self.bars > 1 else 0
+        return self.left + at * (self.wide + GAP_IN) + bars_before * BAR_IN
+
+    def _y(self, row: int) -> float:
+        return self.top + (row and self.below + (row - 1) * (self.tall + 2 * GAP_IN))
+
+    def _axes(self, x: float, y: float, wide: float, tall: float) -> Axes:
+        axes = self.figure.add_axes((
+            x / self.width, 1 - (y + tall) / self.height, wide / self.width, tall / self.height,
+        ))  # fmt: skip
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
+        return axes
+
+    def _text(self, x: float, y: float, text: str, **more: Any) -> None:
+        self.figure.text(
+            x / self.width, 1 - y / self.height, text,
+            **{"fontsize": TEXT_PT, "color": INK, "ha": "center", "va": "center", **more},
+        )  # fmt: skip
 
 
 def _view(light_field: Array, chosen: tuple[int, int] | None) -> tuple[int, int]:
@@ -148,8 +286,8 @@ def _pieces(picture: Array, settings: FigureSettings) -> list[Piece]:
     return [Piece(y, x, side) for y, x in corners] or detailed_pieces(picture, side, 2)
 
 
-def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None) -> list[Row]:
-    """Return a row for every map that any result has; error and deviation share one scale."""
+def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None) -> list[_Maps]:
+    """Return every map that any result has; error and deviation share one scale."""
     errors = [
         None if truth is None
         else np.sqrt(np.mean((finite(one.light_field[view]) - truth[view]) ** 2, axis=-1))
@@ -161,16 +299,12 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
     low, high = _ends(disparities)
     if high - low < LEAST_RANGE_PX:
         low, high = low - LEAST_RANGE_PX / 2, high + LEAST_RANGE_PX / 2
-    rows = []
-    for label, maps, scale in (
-        ("error", errors, Scale(0, top, "magma")),
-        ("stated standard deviation", deviations, Scale(0, top, "magma")),
-        ("disparity, px per view", disparities, Scale(low, high, "viridis")),
-    ):
-        if any(values is not None for values in maps):
-            tiles = [Tile("", values, scale=scale) for values in maps]
-            rows.append(Row([*tiles[:-1], replace(tiles[-1], bar=True)], label))
-    return rows
+    every = [
+        _Maps("error", errors, 0, top, "magma"),
+        _Maps("stated standard deviation", deviations, 0, top, "magma"),
+        _Maps("disparity, px per view", disparities, low, high, "viridis"),
+    ]
+    return [one for one in every if any(values is not None for values in one.values)]
 
 
 def _ends(maps: Sequence[Array | None]) -> tuple[float, float]:
@@ -203,3 +337,9 @@ def _source(one: Export) -> str:
     if known.get("command"):
         said.append(f"by: {known['command']}")
     return "; ".join(said) or one.caption or one.title
+
+
+def _shown_as(curve: DisplayCurve) -> str:
+    """Return the screen's curve as a formula of x."""
+    shown = f"{curve.gain:.3g} x"
+    return shown if abs(curve.gamma - 1) < 0.005 else f"({shown})^(1/{curve.gamma:.3g})"

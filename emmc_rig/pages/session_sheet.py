@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -30,10 +30,9 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.pages.timeline import overlap, run_entries, session_metrics
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.journal import DecidedEntry, RetryEntry, ended, of_kind
+from emmc_rig.session.journal import DecidedEntry, FrameEntry, RetryEntry, ended, of_kind
 from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
@@ -148,15 +147,58 @@ def _cards(session: Session) -> list[Card]:
         *_light_field_cards(session),
         Card("Retries", str(retries), f"in {session.runs} run(s)", "watch" if retries else ""),
     ]
-    runs = run_entries(session.journal.entries)
+    runs = run_times(session)
     if runs:
-        last = overlap(runs[-1])
+        last = runs[-1]
         note = (
-            f"in the last run: {last.moving_s:.1f} s moving, {last.exposing_s:.1f} s exposing, "
-            f"{last.writing_s:.1f} s writing, {last.hidden_share:.0%} of it while the bench worked"
+            f"in the last run: {last['moving_s']:.1f} s moving, {last['exposing_s']:.1f} s "
+            f"exposing, {last['writing_s']:.1f} s writing meanwhile"
         )
-        cards.append(Card("Time", f"{last.seconds:.1f} s", note))
+        cards.append(Card("Time", f"{last['seconds']:.1f} s", note))
     return cards
+
+
+def run_times(session: Session) -> list[dict[str, float]]:
+    """Return the frames of each run, and its seconds in all, moving, exposing and writing."""
+    runs: dict[int, list[FrameEntry]] = {}
+    for entry in of_kind(session.journal.entries, FrameEntry):
+        if entry.spans_s:
+            runs.setdefault(entry.run, []).append(entry)
+
+    def times(entries: list[FrameEntry]) -> dict[str, float]:
+        spans = [(name, *span) for entry in entries for name, span in entry.spans_s.items()]
+
+        def spent(*names: str) -> float:
+            return sum(end - start for name, start, end in spans if name in names)
+
+        return {
+            "frames": len(entries),
+            "seconds": max(end for _, _, end in spans) - min(start for _, start, _ in spans),
+            "moving_s": spent("move", "settle"),
+            "exposing_s": spent("expose"),
+            "writing_s": spent("write"),
+        }
+
+    return [times(entries) for entries in runs.values()]
+
+
+def session_metrics(session: Session) -> dict[str, object]:
+    """Return the figures of a session: frames, bytes, retries, and how its runs spent time."""
+    entries, needed = session.journal.entries, session.needed
+    return {
+        "title": session.header["title"],
+        "frames": len(needed),
+        "spared": len(session.frames) - len(needed),
+        "decided": [one.model_dump(mode="json") for one in of_kind(entries, DecidedEntry)],
+        "stored": len(session.stored),
+        "complete": session.is_complete,
+        "bytes": sum(entry.bytes for entry in session.stored.values()),
+        "exposures": [asdict(one) for one in shot_exposures(session)],
+        "retries": len(of_kind(entries, RetryEntry)),
+        "runs": run_times(session),
+        "command": session.header["command"],
+        "versions": session.header["versions"],
+    }
 
 
 def _exposure_cards(session: Session) -> list[Card]:

@@ -1,1 +1,1 @@
-"""Measurements of the methods and of the machine: sweeps, their tables, charts and checks."""
+"""Charts, tables, stability and designs, on one engine of points."""

@@ -153,10 +153,6 @@ class Study(Generic[P]):
         """Return what points that are measured together have in common."""
         return point
 
-    def is_whole(self, point: P, result: dict) -> bool:
-        """Return whether all that belongs to a kept result, such as a picture, is there."""
-        return True
-
     def label(self, point: P) -> str:
         """Return a point in words."""
         return getattr(point, "label", str(point))
@@ -196,7 +192,7 @@ class Study(Generic[P]):
         """
         points = list(dict.fromkeys(points))
         self.results, self.left_out = {}, {}
-        digests = self._digests(points)
+        digests, unfit = self._digests(points)
         known: dict[str, dict] = {}
         with _stopped_with_words(
             self.folder, lambda: f"{len(known)} of {len(set(digests.values()))} {self.noun} are"
@@ -205,7 +201,7 @@ class Study(Generic[P]):
             missing: dict[str, P] = {}
             for point, digest in digests.items():
                 result = journal.get(digest)
-                if result is not None and self.is_whole(point, result):
+                if result is not None:
                     known[digest] = result
                 else:
                     missing.setdefault(digest, point)
@@ -221,19 +217,19 @@ class Study(Generic[P]):
                 watcher.step(self.words(point, result))
         self.results = {p: known[d] for p, d in digests.items() if d in known}
         why = {digests[point]: reason for point, reason in self.left_out.items()}
-        self.left_out = {p: why[d] for p, d in digests.items() if d in why} | self._unfit
+        self.left_out = {p: why[d] for p, d in digests.items() if d in why} | unfit
         return self.results
 
-    def _digests(self, points: Iterable[P]) -> dict[P, str]:
-        """Return the digests of the points that can be measured; the others are unfit."""
-        found: dict[P, str] = {}
-        self._unfit: dict[P, str] = {}
+    def _digests(self, points: Iterable[P]) -> tuple[dict[P, str], dict[P, str]]:
+        """Return the digests of the points that can be measured, and why the others cannot be."""
+        digests: dict[P, str] = {}
+        unfit: dict[P, str] = {}
         for point in points:
             try:
-                found[point] = self.digest(point)
+                digests[point] = self.digest(point)
             except NotApplicableError as why:
-                self._unfit[point] = str(why)
-        return found
+                unfit[point] = str(why)
+        return digests, unfit
 
     def _all_measured(
         self, groups: list[list[P]], watcher: Watcher, pool: Pool | None

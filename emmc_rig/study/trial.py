@@ -24,6 +24,7 @@ from emmc_rig.model.errors import CameraError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.points import NotApplicableError
+from emmc_rig.study.rows import dictionary_identity, machine
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import METHODS, MethodSettings, reconstruct
 from reconstruction.result import Reconstruction
@@ -118,6 +119,21 @@ class Capture:
         """Return the capture with some fields of the camera replaced."""
         camera = self.described.model_copy(update=changed)
         return dataclasses.replace(self, camera=camera, shots=None, views=None)
+
+
+def method_inputs(name: str, dictionary: str | None) -> dict[str, object]:
+    """Return what any method's figures depend on: machine, method, dictionary.
+
+    Raises NotApplicableError for a method that is not installed.
+    """
+    method = METHODS[name]
+    if not method.installed:
+        raise NotApplicableError(f"{method.name} needs {method.package}: not installed")
+    return {
+        "machine": machine(),
+        "method": method.name,
+        "dictionary": dictionary_identity(dictionary) if method.needs_dictionary else None,
+    }
 
 
 def with_shots(camera: Camera, count: int) -> Camera:

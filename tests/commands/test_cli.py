@@ -59,23 +59,6 @@ def test_the_demo_writes_a_whole_result(run, tmp_path):
     assert not leftovers(tmp_path)
 
 
-@pytest.mark.slow
-def test_a_second_run_replaces_the_first(run, tmp_path):
-    for seed in (1, 2):
-        assert run("simulate", *SMALL, "--seed", seed, "--out", "result")[0] == 0
-    assert json.loads((tmp_path / "result/metrics.json").read_text())["seed"] == 2
-    assert not leftovers(tmp_path)
-
-
-def test_a_folder_that_holds_something_else_is_not_touched(run, tmp_path):
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos/cat.jpg").write_text("meow")
-    code, _, err = run("simulate", *SMALL, "--out", "photos")
-    assert code == 1
-    assert "choose another folder" in one_line(err)
-    assert (tmp_path / "photos/cat.jpg").read_text() == "meow"
-
-
 def test_an_output_that_cannot_be_written_is_one_line(run, tmp_path):
     (tmp_path / "file").write_text("")
     for out in ("file", "file/inside", "/proc/emmc"):

@@ -201,8 +201,6 @@ def test_the_udev_rule_is_printed(run):
         (["jog", "--rig", "simulated", "--home", "mask_x", "1e9"], "choose 10 to"),
         (["jog", "--rig", "simulated", "mask_x", "5", "--speed", "0"], "cannot move at 0"),
         (["probe", "/dev/no-such-port"], "does not exist"),
-        (["serve", "zaber", "--tcp", "here"], "write HOST:PORT"),
-        (["serve", "teapot"], "no simulated stage"),
     ],
 )
 def test_faults_are_one_line_that_says_what_to_do(run, arguments, reported):
@@ -310,34 +308,6 @@ def test_a_stage_that_vanishes_in_a_move_is_an_error_that_says_it_could_not_be_s
     assert "could not be stopped" in one_line(err)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("wire", [[], ["--tcp", "127.0.0.1:0"]])
-def test_a_simulated_stage_is_served_to_other_programs(wire, tmp_path):
-    command = [*PROGRAM, "serve", "zaber", *wire]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        try:
-            stage = process.stdout.readline().strip()
-            with open_stage(stage) as opened:
-                opened.home(["mask_y"])
-                assert opened.is_homed("mask_y")
-        finally:
-            process.send_signal(signal.SIGINT)
-            _, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 130
-    assert "Traceback" not in err
-
-
-def test_a_link_does_not_replace_a_file(run, tmp_path):
-    (tmp_path / "notes").write_text("mine")
-    code, _, err = run("serve", "zaber", "--link", "notes")
-    assert (code, "cannot serve" in one_line(err)) == (1, True)
-    assert (tmp_path / "notes").read_text() == "mine"
-
-
 def test_every_test_that_the_page_about_devices_names_exists():
     root = Path(__file__).parents[2]
     named = set(re.findall(r"`(test_\w+)`", (root / "docs/devices.md").read_text()))
@@ -366,19 +336,3 @@ def test_a_simulated_rig_has_a_camera_too(run, tmp_path):
     assert code == 0
     assert "frame-0001.dng: 240x320 rggb" in reported.replace("\n", "")
     assert (tmp_path / "snaps" / "frame-0001.dng").stat().st_size > 240 * 320
-
-
-@pytest.mark.slow
-def test_a_request_to_end_serving_is_not_called_ctrl_c():
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
-    command = [*PROGRAM, "serve", "zaber"]
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("zaber:")
-        process.send_signal(signal.SIGTERM)
-        _, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 128 + signal.SIGTERM
-    assert "no longer serving (SIGTERM)" in err
-    assert "Ctrl-C" not in err

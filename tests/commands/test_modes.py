@@ -35,16 +35,6 @@ def test_every_mode_and_what_it_takes_is_a_parameter_of_its_command():
         assert names.issuperset(set().union(*modes.values()))
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_option_that_measures_something_instead_is_a_mode(command):
-    instead = {
-        parameter.name
-        for parameter in COMMANDS[command].params
-        if (getattr(parameter, "help", None) or "").startswith("instead:")
-    }
-    assert instead <= set(MODES.get(command, {}))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("command", MODES)
 def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):

@@ -25,7 +25,6 @@ RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
 ONE_FILE = {
     "capture --new",
     "session export",
-    "devices serve",
 }
 WRITERS = {
     "cameras": ("rgbw-mono",),
@@ -37,7 +36,6 @@ WRITERS = {
     "chart": ("--fast",),
     "demo": (*SIZE,),
     "design": (),
-    "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
     "figure": ("scene.h5",),
@@ -161,8 +159,7 @@ def test_nothing_is_lost_wherever_out_leads(world, monkeypatch, typed):
     for situation in SITUATIONS:
         out = place(world, situation, typed)
         before, ours = files_of(world), listed(world)
-        option = "--link" if typed == "devices serve" else "--out"
-        code, err = called(typed, option, out)
+        code, err = called(typed, "--out", out)
         after = files_of(world)
         lost = [path for path in before if after.get(path) != before[path]]
         assert all(ours.get(path) == before[path] for path in lost), (situation, lost)
@@ -210,12 +207,8 @@ def test_a_rerun_replaces_its_own_files_and_keeps_all_others(tmp_path, monkeypat
     assert not list(tmp_path.rglob(".*"))
 
 
-AT_ONCE = {"capture --new", "devices serve"}
-"""Done at once, shown by what they print."""
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("typed", [typed for typed in WRITERS if typed not in AT_ONCE])
+@pytest.mark.parametrize("typed", [typed for typed in WRITERS if typed != "capture --new"])
 def test_every_command_states_its_stage_before_its_work_begins(world, tmp_path, monkeypatch, typed):
     """The first event of --json is a stage; there the test stops it."""
     monkeypatch.chdir(world)

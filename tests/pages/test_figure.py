@@ -11,8 +11,7 @@ from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.pages.paper_figure import FRAMES, CloseUp, Row, Tile, draw_tiles
-from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
+from emmc_rig.pages.pictures import detailed_pieces, epipolar_lines
 from emmc_rig.pages.result_figure import FigureSettings, draw_results
 
 SIZE = (36, 48)
@@ -79,20 +78,11 @@ def test_a_close_up_shows_the_pixels_around_its_point_of_the_view_asked_for(resu
     )
     np.testing.assert_array_equal(first, whole[16:24, 26:34])
     np.testing.assert_array_equal(corner, whole[:8, :8])
-
-
-def test_a_tile_frames_its_piece_and_shows_it_enlarged():
-    whole = np.zeros((30, 40, 3), np.uint8)
-    whole[10:20, 10:20] = 200
-    piece = Piece(10, 10, 10)
-    figure = draw_tiles([Row([Tile("", whole, [CloseUp(piece.of(whole), FRAMES[0], piece)])])], 4)
-    picture, close_up = figure.axes
-    np.testing.assert_array_equal(close_up.images[0].get_array(), np.full((10, 10, 3), 200))
-    assert close_up.get_position().width == picture.get_position().width  # four times enlarged
-    (frame,) = picture.patches
+    picture, first_axes = drawn.figure.axes[:2]
+    frame = picture.patches[0]
     assert isinstance(frame, Rectangle)
-    assert (frame.get_xy(), frame.get_width(), frame.get_height()) == ((9.5, 9.5), 10, 10)
-    assert frame.get_edgecolor() == close_up.spines["left"].get_edgecolor()
+    assert (frame.get_xy(), frame.get_width(), frame.get_height()) == ((25.5, 15.5), 8, 8)
+    assert frame.get_edgecolor() == first_axes.spines["left"].get_edgecolor()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from emmc_rig.files.formats import Export
 from emmc_rig.pages.page import light_field_head, typed
 from emmc_rig.pages.viewer import render_viewer
 from emmc_rig.study.chart.charting import chart_page
-from emmc_rig.study.stability.stability_page import stability_page
+from emmc_rig.study.stability.stability_run import stability_page
 from emmc_rig.study.tables.tables_page import tables_page
 
 NOT_ASKED: Any = None
@@ -29,7 +29,7 @@ def head_of(page):
     [
         lambda: tables_page([], {}, [], {}),
         lambda: chart_page(NOT_ASKED, [], {}, {}),
-        lambda: stability_page([], [], NOT_ASKED, []),
+        lambda: stability_page([], [], []),
     ],
     ids=["tables", "chart", "stability"],
 )

@@ -33,9 +33,7 @@ def content() -> ReportContent:
         frames=rng.random((2, HEIGHT, WIDTH)).astype(np.float32),
         cfa="rggb",
         whiteboards=[("View v 0, u 0", psi[0, 0])],
-        psi=psi,
         metrics={"psnr_db": 30.0},
-        objective=[3.0, 2.0, 1.0],
         stage_s={"reconstruction": 1.0},
     )
 

@@ -18,8 +18,14 @@ from emmc_rig.model.camera import build_imaging_matrix, load_camera
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.masks import FILTERS
 from emmc_rig.study.design.bench import DesignBench
-from emmc_rig.study.design.candidates import MASK, Candidate, choices
-from emmc_rig.study.design.expected import SIZE, Expected, bounds, expected
+from emmc_rig.study.design.expected import (
+    SIZE,
+    Block,
+    SceneTexture,
+    _shift,
+    expected,
+    prior_covariance,
+)
 from emmc_rig.study.design.mask_file import (
     LAYERS,
     PICTURE,
@@ -28,10 +34,8 @@ from emmc_rig.study.design.mask_file import (
     write_gdsii,
     write_picture,
 )
-from emmc_rig.study.design.periodic import Block, SceneTexture, _shift, prior_covariance
 from emmc_rig.study.design.printed import Print, printed_psi
-from emmc_rig.study.design.search import pareto
-from emmc_rig.study.design.ziv_zakai import ziv_zakai
+from emmc_rig.study.design.search import MASK, Candidate, candidates
 
 RGBW = Candidate("random_rgbw", 0.5, 36.0, 0.12)
 SMALL = DesignBench(size=(48, 64), stage_travel_um=(200.0, 200.0))
@@ -116,26 +120,9 @@ def test_less_light_and_more_noise_is_a_larger_expected_error():
     assert expect(0.5, 0.05) > expect(0.1, 0.05)
 
 
-def test_a_mask_shows_the_disparity_that_an_open_camera_cannot():
-    def bound_px(share):
-        camera = Candidate("random_binary", share, 36.0, 0.12).camera(SMALL)
-        return bounds(camera, printed_psi(camera, SIZE, PLAIN), (-1, 1)).disparity_px
-
-    # Blur grows to both sides of focus alike: its sign does not show.
-    assert bound_px(1.0) > 4 * bound_px(0.5)
-
-
-def test_the_pareto_front_holds_what_nothing_else_beats_in_both():
-    def one(name, light, psnr_db):
-        return replace(RGBW, cell_um=name), Expected(psnr_db, light, 1.0)
-
-    tried = [one(1, 0.2, 30.0), one(2, 0.5, 31.0), one(3, 0.4, 30.5), one(4, 0.7, 29.0)]
-    assert [candidate.cell_um for candidate, _ in pareto(tried)] == [2, 4]
-
-
 def test_shots_stay_within_the_stage_s_travel():
     bench = DesignBench(shots=3, stage_travel_um=(150.0, 80.0))
-    for candidate in choices(bench).every(bench):
+    for candidate in candidates(bench):
         places = [shot.offset_um.get(MASK, (0, 0)) for shot in candidate.camera(bench).shots]
         assert len(set(places)) == 3
         assert (np.ptp(places, axis=0) <= (150, 80)).all()
@@ -284,12 +271,3 @@ def test_a_bench_that_cannot_be_is_one_line(run, tmp_path, change, says):
     assert says in err
     assert len(err.strip().splitlines()) == 1
     assert not (tmp_path / "emmc-design").exists()
-
-
-def test_without_readings_the_disparity_is_as_uncertain_as_its_prior():
-    grid = np.linspace(-2, 2, 401)
-    uniform = (grid[-1] - grid[0]) ** 2 / 12
-    bound = ziv_zakai(grid, np.zeros((401, 401)))
-    assert bound <= uniform
-    assert bound == pytest.approx(uniform, rel=0.02)
-    assert ziv_zakai(grid, np.full((401, 401), 50.0)) < 1e-12

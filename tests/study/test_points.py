@@ -2,15 +2,13 @@
 
 import csv
 import io
-import json
 import math
-import re
 from dataclasses import dataclass
 
 import pytest
 
 from emmc_rig.errors import AppError
-from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
+from emmc_rig.pages.page import Head, Section, fragment, framed, number
 from emmc_rig.progress import Silent
 from emmc_rig.study.points import Journal, NotApplicableError, Study, StudyStopped, study_folder
 from emmc_rig.study.rows import csv_text, plain
@@ -184,31 +182,14 @@ def test_a_result_is_kept_as_json_gives_it_back():
     assert plain({"a": (1, math.nan), "b": {2: -math.inf}}) == {"a": [1, None], "b": {"2": None}}
 
 
-def test_text_on_a_page_is_escaped_and_data_cannot_end_its_script():
+def test_text_on_a_page_is_escaped():
     body = fragment("figures.html", heads=["<b>"], rows=[["</td>", "&"]], pictures={})
     head = Head("<trust>", "<u>", ["look at `<s>`"])
     sections = [Section("one", "One", body)]
-    page = framed("<i>", ["&"], ["'"], sections, data={"d": ["</script>"]}, head=head)
+    page = framed("<i>", ["&"], ["'"], sections, head=head)
     for mark in ("<b>", "<i>", "<trust>", "<u>", "<s>"):
         assert mark not in page
     assert "&lt;/td&gt;" in page
-    assert page.count("</script>") == 1
-    (data,) = re.findall(r'id="d">(.*?)</script>', page)
-    assert json.loads(data) == ["</script>"]
-
-
-def test_a_drawing_in_a_page_refers_only_to_itself(tmp_path):
-    path = tmp_path / "drawing.svg"
-    path.write_text(
-        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">'
-        '<metadata/><g id="mark-a"/><path id="p"/><use xlink:href="#p" clip-path="url(#c)"/></svg>'
-    )
-    drawn = inline_svg(path, "k")
-    assert 'id="mark-a"' in drawn
-    assert 'id="k-p"' in drawn
-    assert 'href="#k-p"' in drawn
-    assert "url(#k-c)" in drawn
-    assert "metadata" not in drawn
 
 
 def test_a_figure_that_is_not_known_is_a_dash():

@@ -14,7 +14,7 @@ from emmc_rig.model.lightfield import psnr_db, save_hdf5
 from emmc_rig.progress import Silent
 from emmc_rig.study.rows import digest_of
 from emmc_rig.study.tables import paper, tables_page, tables_study
-from emmc_rig.study.tables.cells import MASKS, PARTS, Cell, Setup, cells_of, chosen_parts, scenes_of
+from emmc_rig.study.tables.cells import PARTS, Cell, Setup, cells_of, chosen_parts, scenes_of
 from emmc_rig.study.tables.tables_page import COLUMNS, run_tables
 from emmc_rig.study.tables.tables_study import (
     FAST,
@@ -44,7 +44,7 @@ QUICK = TablesSettings(
     ),
     binned_stride=8,
 )
-TABLE_2, NOISY, TABLE_3, *TABLE_4, FIGURE_8 = PARTS
+TABLE_2, NOISY, TABLE_3, *TABLE_4 = PARTS
 
 
 @pytest.mark.parametrize(
@@ -53,9 +53,7 @@ TABLE_2, NOISY, TABLE_3, *TABLE_4, FIGURE_8 = PARTS
         ([TABLE_2], 4 * 3 * 3),
         ([TABLE_3], 5 * 7 * 3),
         (TABLE_4, 5 * 12 * 3),
-        ([FIGURE_8], 4 * 4 * 3),
-        # Figure 8 shares RGBW with Table II.
-        (PARTS, 72 + 105 + 180 + 48 - 12),
+        (PARTS, 72 + 105 + 180),
     ],
 )
 def test_a_part_has_a_cell_for_every_scene_setup_and_method(parts, count):
@@ -73,7 +71,7 @@ def test_table_2_is_about_the_four_synthetic_scenes_and_the_others_about_the_res
 
 
 def test_parts_are_chosen_by_name_in_the_papers_order():
-    assert chosen_parts("figure8, table2") == (TABLE_2, NOISY, FIGURE_8)
+    assert chosen_parts("table3, table2") == (TABLE_2, NOISY, TABLE_3)
     assert chosen_parts(None) == PARTS
 
 
@@ -95,19 +93,6 @@ def test_every_setup_has_the_same_total_exposure_and_its_shots(setup):
     assert camera.sensor.binning == setup.binning
 
 
-def test_a_setup_changes_the_pattern_of_the_mask_only():
-    plain, binary = (Setup("ii", 1, mask=mask).camera() for mask in ("rgbw", "binary"))
-    pattern = {"pattern": plain.masks["mask"].pattern}
-    assert binary.masks["mask"].model_copy(update=pattern) == plain.masks["mask"]
-    assert binary.masks["mask"].pattern.kind == "random_binary"
-    assert plain == Setup("ii", 1).camera()
-
-
-def test_all_mask_patterns_let_about_half_of_the_light_through():
-    for _, pattern in MASKS.values():
-        assert pattern.draw(1, 90, 90, 1.0).mean() == pytest.approx(0.5, abs=0.02)
-
-
 @pytest.mark.parametrize(
     ("scene", "setup", "method", "printed"),
     [
@@ -123,7 +108,6 @@ def test_all_mask_patterns_let_about_half_of_the_light_through():
         ("seahorse", Setup("iii", 4, 2), "dict-admm", None),
         ("dragons", Setup("i", 3), "tv", None),
         ("attic", Setup("i", 3), "tv-dict", None),
-        ("dragons", Setup("ii", 1, noisy=True, mask="binary"), "tv-dict", None),
     ],
 )
 def test_numbers_stand_where_the_paper_prints_them(scene, setup, method, printed):
@@ -210,10 +194,8 @@ def test_every_cell_is_one_row_of_the_csv(whole):
     with open(folder / "tables.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     cells = {cell for part in PARTS for cell in cells_of(part, list(NAMES))}
-    assert len(rows) == len(cells) == 18 + 21 + 36 + (12 - 3)
+    assert len(rows) == len(cells) == 18 + 21 + 36
     assert tuple(rows[0]) == COLUMNS
-    shared = [row for row in rows if "figure8" in row["tables"] and "table2" in row["tables"]]
-    assert [row["mask"] for row in shared] == ["rgbw"] * 3
     printed = [row for row in rows if row["paper_psnr_db"]]
     assert {row["scene"] for row in printed} == {"dragons"}
     row = next(r for r in printed if (r["scenario"], r["method"]) == ("i", "tv-dict"))
@@ -240,7 +222,7 @@ def test_the_page_is_whole_and_asks_for_nothing(whole):
 
 def test_grids_hold_means_and_the_papers_numbers(whole):
     _, outcome = whole
-    table_2, _, table_3, table_4, *_, figure_8 = outcome.grids
+    table_2, _, table_3, table_4, *_ = outcome.grids
     ours = {name: cells for name, *cells in table_2.rows}
     assert [cell.split(" | ")[1] for cell in ours["dragons, TV-Dict"]] == [
         "30.22",
@@ -254,7 +236,6 @@ def test_grids_hold_means_and_the_papers_numbers(whole):
     assert theirs["mean, TV-Dict"][0].endswith(" | 35.62")
     assert theirs["mean, TV alone"][0] == theirs["attic, TV alone"][0]
     assert len(table_4.rows[0]) == 5
-    assert figure_8.heads[1:] == ("RGBW", "random binary", "uniform colour", "Gaussian colour")
 
 
 def test_a_mean_is_over_the_scenes_that_were_measured():
@@ -376,7 +357,7 @@ def test_the_middle_is_cut_to_whole_pixels():
 
 @pytest.mark.slow
 def test_a_part_alone_is_done_from_the_command_line(run, scenes):
-    code, out, _ = run("--scenes", scenes, "--only", "figure8", "--fast", "--out", "r")
+    code, out, _ = run("--scenes", scenes, "--only", "table2", "--fast", "--out", "r")
     assert code == 0
     assert "open r/tables.html" in out
     assert "…" not in out
@@ -385,7 +366,7 @@ def test_a_part_alone_is_done_from_the_command_line(run, scenes):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (["--only", "figure7"], "did you mean 'figure"),
+        (["--only", "table7"], "did you mean 'table"),
         (["--scenes", "nowhere"], "no such folder"),
         (["--scenes", "taken"], "no scenes"),
         (["--scenes", "scene"], "is itself a scene"),
@@ -420,5 +401,5 @@ def test_a_stop_or_a_full_disk_while_writing_is_one_line(
         raise fault
 
     monkeypatch.setattr(tables_page, "grid_of", failing)
-    stopped, _, err = run("--scenes", scenes, "--only", "figure8", "--fast")
+    stopped, _, err = run("--scenes", scenes, "--only", "table2", "--fast")
     assert (stopped, reported in one_line(err)) == (code, True)

@@ -22,7 +22,7 @@ from simulators.scenes import SCENES
 FAST_SCENES = ("near-planar", "deep-occlusions")
 FAST_CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
 CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-2shots", "rgbw-bayer-3shots", "rgbw-mono")
-FAST = {"size": (64, 80), "zoom": 3, "repeats": 3, "enough_s": 1.0, "limit_s": 300.0}
+FAST = {"size": (64, 80), "zoom": 3, "repeats": 3, "enough_s": 1.0}
 DEFAULT = "default"
 _QUICK_PATCHES = {"stride": 9, "solver": {"rtol": 1e-2, "max_steps": 200}}
 VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
@@ -98,7 +98,6 @@ class ChartSettings(Settings):
     dictionary: str | None = None
     repeats: int = Field(default=5, ge=1)
     enough_s: float = Field(default=120.0, gt=0)
-    limit_s: float = Field(default=3600.0, gt=0, description="after which a point is given up")
     seed: int = Field(default=0, ge=0)
 
 

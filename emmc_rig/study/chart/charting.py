@@ -28,17 +28,16 @@ from emmc_rig.pages.drawing import (
 from emmc_rig.pages.page import (
     Head,
     Section,
+    embedded,
     fragment,
     framed,
-    inline_svg,
     number,
     provenance_section,
 )
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.chart_points import ChartSettings, Point, charted_points
-from emmc_rig.study.chart.chart_study import ChartStudy
 from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts
-from emmc_rig.study.pictured import ShownMark, marks_data
+from emmc_rig.study.chart.measure import ChartStudy
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import (
     available_cores,
@@ -54,7 +53,7 @@ LINE_POINTS, LETTER_POINTS = 10.0, 4.6
 
 
 def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
-    """Write one chart; return the SVG. Every mark has the name of `Chart.mark_name`."""
+    """Write one chart; return the SVG."""
     figure, (axes,) = sheet(1, 7.6, 4.6)
     axes.set_xscale("log")
     axes.grid(axis="x", color=LINE, linewidth=0.7)
@@ -68,7 +67,6 @@ def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
             markeredgewidth=1.6, alpha=1 if mark in front else 0.55,
             zorder=3,
         )  # fmt: skip
-        dot.set_gid(chart.mark_name(mark))
         shown.setdefault(method, dot)
     axes.step(
         [mark.seconds for mark in front], [mark.psnr_db for mark in front],
@@ -80,7 +78,7 @@ def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
         ha="right", va="bottom", transform=axes.get_yaxis_transform(),
     )  # fmt: skip
     axes.margins(x=0.14, y=0.16)
-    plain_log_ticks(axes, "x")
+    plain_log_ticks(axes)
     titled(axes, chart.title, "seconds")
     axes.legend(
         list(shown.values()), list(shown), loc="center left", bbox_to_anchor=(1.0, 0.5), **LEGEND
@@ -114,8 +112,8 @@ CAVEATS = (
     "Frames are made with the very Psi that reconstructs them; all methods have this advantage.",
     "Angular: 0 dB is what one picture copied to every view scores; below, parallax is worse than "
     "none. Disparity: mean error of one plane sweep on the estimate; in brackets on the truth.",
-    "Seconds are the median of repeats after a warm-up, one point at a time in a process of their "
-    "own; the dictionary is made beforehand. Memory is what a run takes beyond Psi, frames and "
+    "Seconds are the median of repeats after a warm-up, one point at a time; "
+    "the dictionary is made beforehand. Memory is what a run takes beyond Psi, frames and "
     "dictionary.",
 )
 MEANS = {
@@ -134,11 +132,8 @@ def chart_page(
     """Return the page. about: sentences under the title. charts: their SVG files."""
     sections = [_chart_section(study, chart, path) for chart, path in charts.items()]
     sections.append(provenance_section(provenance))
-    marks = {chart.mark_name(mark): _shown(study, mark) for chart in charts for mark in chart.marks}
-    return framed(
-        "Speed against accuracy", about, CAVEATS, sections, ["chart.css"], ["chart.js"],
-        marks_data(marks), head=_head(next(iter(charts), None)),
-    )  # fmt: skip
+    head = _head(next(iter(charts), None))
+    return framed("Speed against accuracy", about, CAVEATS, sections, ["chart.css"], head=head)
 
 
 def _head(chart: Chart | None) -> Head:
@@ -164,16 +159,13 @@ def _chart_section(study: ChartStudy, chart: Chart, path: Path) -> Section:
     front = chart.front()
     rows = [
         {
-            "name": chart.mark_name(mark),
             "mark": mark,
             "in_front": mark in front,
             **_means([study.results[point] for point in mark.points]),
         }
         for mark in sorted(chart.marks, key=lambda mark: mark.seconds)
     ]
-    first = chart.mark_name(front[-1]) if front else None
-    drawing = inline_svg(path, chart.key)
-    body = fragment("chart_front.html", drawing=drawing, first=first, rows=rows)
+    body = fragment("chart_front.html", drawing=embedded(path), title=chart.title, rows=rows)
     return Section(chart.key, chart.title, body)
 
 
@@ -184,19 +176,6 @@ def _means(results: Sequence[dict]) -> dict[str, str]:
         known = [result[key] for result in results if result[key] is not None]
         means[key] = number(mean(known) if known else None, form)
     return means
-
-
-def _shown(study: ChartStudy, mark: Mark) -> ShownMark:
-    pairs = [
-        (
-            f"{point.capture.scene_name}: {study.results[point]['psnr_db']:.2f} dB",
-            study.picture(point),
-            study.truth_picture(point),
-        )
-        for point in mark.points
-    ]
-    words = f"{mark.psnr_db:.2f} dB, {mark.seconds:.3g} s"
-    return ShownMark(mark.configuration.label, words, pairs)
 
 
 CSV, PAGE, DRAWN = "chart.csv", "chart.html", "charts"

@@ -22,11 +22,6 @@ class Mark:
     psnr_db: float
     points: tuple[Point, ...]
 
-    @property
-    def key(self) -> str:
-        """A name that is fit for an anchor, the same in every chart for one configuration."""
-        return "".join(c if c.isalnum() else "-" for c in self.configuration.label)
-
 
 @dataclass(frozen=True)
 class Chart:
@@ -49,10 +44,6 @@ class Chart:
     def title(self) -> str:
         """In words."""
         return f"{self.scene}, {self.camera}"
-
-    def mark_name(self, mark: Mark) -> str:
-        """Return the name of a mark in the drawing, unique on the page."""
-        return f"mark-{self.key}-{mark.key}"
 
     def front(self) -> list[Mark]:
         """Return the marks that none beats, from quick to accurate."""

@@ -1,24 +1,21 @@
-"""The page of a design: the mask, light against error, what was tried."""
+"""The page of a design: the mask, what was tried, what the maker may miss, the comparison."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from emmc_rig.pages.drawing import ACCENT, FAINT, INK, save_drawing, sheet, titled
 from emmc_rig.pages.page import (
     Card,
     Head,
     Section,
-    embedded,
     fragment,
     framed,
     number,
     provenance_section,
     typed,
 )
-from emmc_rig.study.design.comparison import Simulated
-from emmc_rig.study.design.search import Search, pareto
+from emmc_rig.study.design.search import Search
 
 CAVEATS = (
     "Theory knows textures on two planes half a sample of disparity apart, and noise; it knows no "
@@ -28,36 +25,21 @@ CAVEATS = (
 )
 SHOWN = 20
 """Masks in the table."""
-
-
-def draw_pareto(found: Search, path: Path) -> Path:
-    """Write light against expected PSNR as SVG and PNG; return the SVG's path."""
-    figure, (axes,) = sheet(1, 6.4, 3.8, "PSNR expected, dB")
-    light = [100 * one.light for _, one in found.tried]
-    axes.plot(light, [one.psnr_db for _, one in found.tried], "o", color=FAINT, markersize=4)
-    front = pareto(found.tried)
-    axes.plot(
-        [100 * one.light for _, one in front], [one.psnr_db for _, one in front],
-        "-o", color=ACCENT, markersize=6,
-    )  # fmt: skip
-    best = found.expected
-    axes.plot([100 * best.light], [best.psnr_db], "o", color=INK, markersize=9, fillstyle="none")
-    titled(axes, "Light against error: none beats the line in both", "light that passes, %")
-    return save_drawing(figure, path)
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Heads of the columns, and rows."""
 
 
 def design_page(
     about: Sequence[str],
     found: Search,
-    simulated: Sequence[Simulated],
+    simulated: Table,
     verdict: str,
-    picture: Path,
     camera: Path,
     provenance: Mapping[str, str],
 ) -> str:
     """Return the page of a design.
 
-    simulated: the chosen mask first, then the shipped cameras. camera: its file, as it will lie.
+    simulated: theory and simulation, a row a camera. camera: its file, as it will lie.
     """
     best = found.expected
     loss_db = found.ideal_db - best.psnr_db
@@ -65,17 +47,15 @@ def design_page(
         Card(
             "PSNR expected",
             f"{best.psnr_db:.2f} dB",
-            f"{found.held[0].worst_db:.2f} at worst; {found.bounds.known_db:.2f} were depth known",
+            f"{found.held[0].worst_db:.2f} where the maker misses most",
         ),
         Card("Light", f"{best.light:.0%}", "of the open camera's"),
         Card("Fresnel number", f"{best.fresnel:.2g}", f"diffraction costs {loss_db:.2f} dB"),
-        Card("Disparity", f"{found.bounds.disparity_px:.3f} px", "Ziv-Zakai bound"),
     )
     names = list(found.held[0].psnr_db)
     body = fragment(
         "design.html",
         cards=cards,
-        picture=embedded(picture),
         tried=_tried(found),
         held=(
             ["Mask", *names],
@@ -84,7 +64,7 @@ def design_page(
                 for one in found.held
             ],
         ),
-        simulated=simulated_table(simulated),
+        simulated=simulated,
     )
     sections = [Section("design", found.winner.label, body, "Design")]
     sections.append(provenance_section(provenance))
@@ -100,10 +80,6 @@ def design_page(
     return framed("Which mask to order", about, CAVEATS, sections, head=head)
 
 
-Table = tuple[Sequence[str], Sequence[Sequence[str]]]
-"""Heads of the columns, and rows."""
-
-
 def _tried(found: Search) -> Table:
     heads = ("Mask", "PSNR expected, dB", "Light", "Fresnel number")
     rows = [
@@ -111,13 +87,3 @@ def _tried(found: Search) -> Table:
         for one, what in found.tried[:SHOWN]
     ]
     return heads, rows
-
-
-def simulated_table(found: Sequence[Simulated]) -> Table:
-    """Return theory and simulation, a row a camera."""
-    scenes = list(found[0].psnr_db)
-    rows = [
-        [one.name, *(f"{db:.2f}" for db in (one.expected_db, one.mean_db, *one.psnr_db.values()))]
-        for one in found
-    ]
-    return ("Camera", "Theory", "Simulated, mean", *scenes), rows

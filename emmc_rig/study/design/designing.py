@@ -7,23 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
-from emmc_rig.model.camera import Camera
+from emmc_rig.model.camera import Camera, shipped_cameras
+from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.progress import Watcher
 from emmc_rig.study.design.bench import DesignBench, bench_text
-from emmc_rig.study.design.candidates import MASK
-from emmc_rig.study.design.comparison import (
-    SCENES,
-    SIZE_PX,
-    Simulated,
-    buildable,
-    shipped_like,
-    simulated,
-)
-from emmc_rig.study.design.design_page import design_page, draw_pareto
+from emmc_rig.study.design.design_page import Table, design_page
+from emmc_rig.study.design.expected import SIZE, expected
 from emmc_rig.study.design.mask_file import (
     GDSII,
     PICTURE,
@@ -33,15 +27,129 @@ from emmc_rig.study.design.mask_file import (
     write_gdsii,
     write_picture,
 )
-from emmc_rig.study.design.search import Search, search
-from emmc_rig.study.points import study_folder
+from emmc_rig.study.design.printed import printed_psi
+from emmc_rig.study.design.search import AS_DESIGNED, MASK, Search, search
+from emmc_rig.study.points import Results, Study, study_folder
 from emmc_rig.study.rows import check_scene_names, provenance
+from emmc_rig.study.trial import Capture
+from reconstruction.methods import DEFAULT_METHOD, reconstruct
 
 JOURNAL, PAGE, CAMERA = "simulations.jsonl", "report.html", "camera.yaml"
 COMMAND = "design"
 DESIGNED = "this design"
 GOAL_DB = 1.5
 """Over the best shipped camera, from which a mask of one's own is worth its price."""
+SCENES = ("deep-occlusions", "near-planar", "non-lambertian")
+SIZE_PX = (96, 96)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A camera: what theory expects, and the default method's PSNR by scene, dB."""
+
+    name: str
+    expected_db: float
+    psnr_db: Mapping[str, float]
+
+    @property
+    def mean_db(self) -> float:
+        """Over the scenes."""
+        return float(np.mean(list(self.psnr_db.values())))
+
+
+def shipped_like(bench: DesignBench) -> dict[str, Camera]:
+    """Return the shipped cameras of a bench's views, colour filters and sample pitch."""
+    sensor = bench.sensor
+    return {
+        name: camera
+        for name, camera in shipped_cameras().items()
+        if camera.views == bench.views
+        and camera.sensor.cfa == sensor.cfa
+        and camera.sensor.sample_pitch_um == sensor.sample_pitch_um
+    }
+
+
+def buildable(camera: Camera, bench: DesignBench) -> bool:
+    """Return whether a camera is no sampled model, and its maker can print its masks."""
+    return camera.lens.aperture_fill > 0 and all(
+        mask.cell_um >= bench.maker.smallest_cell_um for mask in camera.masks.values()
+    )
+
+
+@dataclass
+class Simulations(Study[tuple[str, str]]):
+    """Points of camera and scene; settings: DesignBench."""
+
+    cameras: Mapping[str, Camera]
+    size: tuple[int, int]
+    seed: int
+    journal = JOURNAL
+    noun = "simulations"
+    stage = "simulate the default method"
+    revision = 1
+
+    def inputs(self, point: tuple[str, str]) -> dict[str, object]:
+        """Return everything that a point's figures depend on, as plain data."""
+        name, scene = point
+        return {
+            "camera": self.cameras[name].model_dump(mode="json"),
+            "scene": scene,
+            "size": self.size,
+            "seed": self.seed,
+            "method": DEFAULT_METHOD,
+        }
+
+    def measured(self, points: Sequence[tuple[str, str]], watcher: Watcher) -> Results:
+        """Yield the PSNR of each point: frames by the printed mask's Psi, which is calibrated."""
+        for name, scene in points:
+            camera = self.cameras[name]
+            truth = Capture(scene, camera, self.size, self.seed).scene_seen().light_field
+            psi = printed_psi(camera, (truth.shape[2], truth.shape[3]), AS_DESIGNED)
+            shots = camera.expose(truth, self.seed, psi)
+            result = reconstruct(
+                DEFAULT_METHOD, psi, shots.readings, shots.noise_sigma, usable=shots.usable
+            )
+            yield {"psnr_db": psnr_db(result.light_field, truth)}
+
+    def label(self, point: tuple[str, str]) -> str:
+        """Return a point in words."""
+        return f"{point[0]}, {Path(point[1]).stem}"
+
+
+def simulated(
+    bench: DesignBench,
+    cameras: Mapping[str, Camera],
+    scenes: Sequence[str],
+    size: tuple[int, int],
+    seed: int,
+    folder: Path,
+    watcher: Watcher,
+) -> list[Simulated]:
+    """Return theory and simulation of cameras; what the folder holds is not simulated again.
+
+    Raises what scenes and methods do for wrong input.
+    """
+    points = [(name, scene) for name in cameras for scene in scenes]
+    results = Simulations(bench, folder, cameras, size, seed).run(points, watcher)
+    watcher.begin("expected error of each camera, by theory", len(cameras))
+    found = []
+    for name, camera in cameras.items():
+        psi = printed_psi(camera, SIZE, AS_DESIGNED)
+        expected_db = expected(camera, psi, bench.disparities_px).psnr_db
+        by_scene = {Path(scene).stem: results[name, scene]["psnr_db"] for scene in scenes}
+        found.append(Simulated(name, expected_db, by_scene))
+        watcher.step(name)
+    return found
+
+
+def simulated_table(found: Sequence[Simulated]) -> Table:
+    """Return the heads and rows of theory and simulation, a row a camera."""
+    scenes = list(found[0].psnr_db)
+    rows = [
+        [one.name, *(f"{db:.2f}" for db in (one.expected_db, one.mean_db, *one.psnr_db.values()))]
+        for one in found
+    ]
+    return ("Camera", "Theory", "Simulated, mean", *scenes), rows
 
 
 @dataclass(frozen=True)
@@ -83,12 +191,12 @@ def run_design(
         with result_folder(folder, COMMAND, adds=True) as new:
             left_out = _write_mask(winner, bench, new)
             (new / "bench.yaml").write_text(bench_text(bench), encoding="utf-8")
-            picture = draw_pareto(searched, new / "light.svg")
             origin = provenance(bench, time.monotonic() - started, Scenes=", ".join(scenes))
             about = [
                 f"{len(searched.tried)} masks tried for {bench.shots} shot(s) by theory; {verdict}"
             ]
-            page = design_page(about, searched, compared, verdict, picture, folder / CAMERA, origin)
+            shown = simulated_table(compared)
+            page = design_page(about, searched, shown, verdict, folder / CAMERA, origin)
             (new / PAGE).write_text(page, encoding="utf-8")
             write_metrics(new, _metrics(bench, searched, compared))
     return Designed(searched, tuple(compared), verdict, folder / PAGE, tuple(left_out))
@@ -131,7 +239,7 @@ def _metrics(
 ) -> Mapping[str, object]:
     return {
         "winner": asdict(found.winner),
-        "expected": {**asdict(found.expected), **asdict(found.bounds)},
+        "expected": asdict(found.expected),
         "expected_without_diffraction_db": found.ideal_db,
         "manufacturing_db": {one.candidate.label: dict(one.psnr_db) for one in found.held},
         "tried": [{**asdict(one), **asdict(what)} for one, what in found.tried],

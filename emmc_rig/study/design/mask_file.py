@@ -20,7 +20,7 @@ from calibration.shadow import SPARE_UM
 from emmc_rig.model.camera import Camera, draw_plates
 from emmc_rig.model.masks import FILTERS, Picture
 from emmc_rig.study.design.bench import DesignBench
-from emmc_rig.study.design.candidates import MASK
+from emmc_rig.study.design.search import MASK
 
 LAYERS = {"W": 1, "R": 2, "G": 3, "B": 4}
 CROSS = 9

@@ -1,24 +1,119 @@
-"""The search: coordinate descent over what can be mounted and printed, then what the maker misses.
+"""The search: masks that a bench can mount and a maker can print, ordered by theory.
 
-Theory takes a second a candidate, so the descent goes through every value of one property at a
-time until none is better; all that were tried make the chart of light against error.
+Theory takes a second a candidate, so coordinate descent goes through every value of one property at
+a time until none is better. The best are then swept through what the maker misses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 
+from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera
 from emmc_rig.progress import Watcher
-from emmc_rig.study.design.bench import DesignBench, Maker
-from emmc_rig.study.design.candidates import Candidate, Choices, choices
-from emmc_rig.study.design.expected import SIZE, Bounds, Expected, bounds, expected
+from emmc_rig.study.design.bench import DesignBench, Family, Maker
+from emmc_rig.study.design.expected import SIZE, Expected, expected
 from emmc_rig.study.design.printed import Print, printed_psi
 
+MASK = "mask"
+STEPS_CELLS = ((1.5, 0.0), (0.0, 1.5), (1.5, 0.5), (3.5, 2.5), (7.5, 4.5))
+"""From shot to shot (x, y): by odd halves, so that a pixel's edges fall elsewhere in the cells."""
+FURTHER_CELLS = (7.5, 4.5)
+"""To a further shot of a camera with one, as of the shipped ones."""
+RGBW_SHARE = 0.5
+"""Of each colour that an RGBW mask lets through."""
+SEED = 1
+
+
+PROPERTIES = (("cell_um", "distance_mm"), ("family", "open_share"), ("step_cells",))
+"""What the descent changes together: the shadow's shift from view to view, in cells, is of cell and
+distance both."""
 FINALISTS = 3
 """Candidates whose manufacturing errors are swept."""
 AS_DESIGNED = Print()
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One mask. step_cells: (x, y) by which it moves from shot to shot, (0, 0) for one shot."""
+
+    family: Family
+    open_share: float
+    cell_um: float
+    distance_mm: float
+    step_cells: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        step = f", moved by {self.step_cells[0]:g} x {self.step_cells[1]:g} cells"
+        return (
+            f"{self.family}, {self.open_share:.0%} open, cells of {self.cell_um:g} um at "
+            f"{self.distance_mm:g} mm{step if any(self.step_cells) else ''}"
+        )
+
+    def camera(self, bench: DesignBench) -> Camera:
+        """Return the bench's camera with this mask."""
+        pattern: dict[str, object] = {"kind": self.family, "seed": SEED}
+        if self.family == "random_binary":
+            pattern["open_probability"] = self.open_share
+        mask = {"distance_mm": self.distance_mm, "cell_um": self.cell_um, "pattern": pattern}
+        x, y = (step * self.cell_um for step in self.step_cells)
+        middle = (bench.shots - 1) / 2
+        shots = [
+            {"offset_um": {MASK: ((shot - middle) * x, (shot - middle) * y)} if x or y else {}}
+            for shot in range(bench.shots)
+        ]
+        more = (bench.shots * x, bench.shots * y)
+        if bench.shots == 1:
+            more = tuple(step * self.cell_um for step in FURTHER_CELLS)
+        return Camera.model_validate(
+            {
+                "title": self.label,
+                "reference": "emmc-rig design",
+                "views": bench.views,
+                "lens": bench.lens.model_dump(),
+                "sensor": bench.sensor.model_dump(),
+                "masks": {MASK: mask},
+                "shots": shots,
+                "more_shots_step_um": {MASK: more},
+                "total_exposure_s": bench.total_exposure_s,
+            }
+        )
+
+    def is_within(self, bench: DesignBench) -> bool:
+        """Return whether the stage reaches all its shots."""
+        return all(
+            (bench.shots - 1) * step * self.cell_um <= travel_um
+            for step, travel_um in zip(self.step_cells, bench.stage_travel_um, strict=True)
+        )
+
+
+def candidates(bench: DesignBench) -> list[Candidate]:
+    """Return every mask there is to choose from; raises AppError where there is none."""
+    shares: dict[Family, tuple[float, ...]] = {
+        "random_rgbw": (RGBW_SHARE,),
+        "random_binary": bench.open_shares,
+    }
+    patterns: list[tuple[Family, float]] = [
+        (family, share) for family in bench.printed_families for share in shares[family]
+    ]
+    steps = STEPS_CELLS if bench.shots > 1 else ((0.0, 0.0),)
+    every = [
+        Candidate(family, share, cell_um, distance_mm, step)
+        for (family, share), cell_um, distance_mm, step in product(
+            patterns, bench.tried_cells_um, bench.distances_mm, steps
+        )
+    ]
+    within = [one for one in every if one.is_within(bench)]
+    if not within:
+        raise AppError(
+            "no mask is left to choose from: let the maker print a family, smaller cells, or give "
+            "the stage more travel"
+        )
+    return within
 
 
 @dataclass(frozen=True)
@@ -38,12 +133,11 @@ class Held:
 class Search:
     """tried: every candidate with what theory expects; best first. held: the finalists, best first.
 
-    bounds: of the winner. ideal_db: PSNR expected of it if light did not diffract.
+    ideal_db: PSNR expected of the winner if light did not diffract.
     """
 
     tried: tuple[tuple[Candidate, Expected], ...]
     held: tuple[Held, ...]
-    bounds: Bounds
     ideal_db: float
 
     @property
@@ -59,58 +153,45 @@ class Search:
 
 def search(bench: DesignBench, watcher: Watcher) -> Search:
     """Return what was tried and what holds; raises AppError where nothing can be chosen."""
-    offered = choices(bench)
+    every = candidates(bench)
     watcher.begin("expected error of each mask, by theory", None)
     tried: dict[Candidate, Expected] = {}
 
     def score(candidate: Candidate) -> float:
         if candidate not in tried:
-            camera = candidate.camera(bench)
-            psi = printed_psi(camera, SIZE, AS_DESIGNED)
-            tried[candidate] = expected(camera, psi, bench.disparities_px)
+            tried[candidate] = _expected(bench, candidate, AS_DESIGNED)
             watcher.step(candidate.label)
         return tried[candidate].psnr_db
 
-    every = list(offered.every(bench))
     best = every[len(every) // 2]
     while True:
         before = score(best)
-        for beside in _beside(offered, bench):
-            best = max((best, *beside(best)), key=score)
+        for changed in PROPERTIES:
+            best = max((best, *_beside(best, every, changed)), key=score)
         if score(best) <= before:
             break
     ordered = sorted(tried.items(), key=lambda item: -item[1].psnr_db)
     watcher.begin("manufacturing errors", FINALISTS)
     held = []
     for candidate, _ in ordered[:FINALISTS]:
-        held.append(_held(bench, candidate))
+        errors = prints(bench.maker).items()
+        figures = {name: _expected(bench, candidate, how).psnr_db for name, how in errors}
+        held.append(Held(candidate, figures))
         watcher.step(candidate.label)
     held.sort(key=lambda one: -one.worst_db)
-    winner = held[0].candidate.camera(bench)
-    found = bounds(winner, printed_psi(winner, SIZE, AS_DESIGNED), bench.disparities_px)
-    ideal_db = _psnr_db(bench, held[0].candidate, Print(diffraction=False))
-    return Search(tuple(ordered), tuple(held), found, ideal_db)
+    ideal = _expected(bench, held[0].candidate, Print(diffraction=False))
+    return Search(tuple(ordered), tuple(held), ideal.psnr_db)
 
 
-def _beside(
-    offered: Choices, bench: DesignBench
-) -> Iterator[Callable[[Candidate], Sequence[Candidate]]]:
-    """Yield, for each property, what returns the candidates that differ by it alone.
+def _beside(at: Candidate, every: Sequence[Candidate], changed: Sequence[str]) -> list[Candidate]:
+    """Return the candidates that differ from one by these properties alone."""
+    same = [name for name in at.__dataclass_fields__ if name not in changed]
+    return [one for one in every if all(getattr(one, n) == getattr(at, n) for n in same)]
 
-    Cell and distance are one: the shadow's shift from view to view, in cells, is of both.
-    """
 
-    def fitting(some: Iterator[Candidate]) -> Sequence[Candidate]:
-        return [one for one in some if offered.fits(bench, one)]
-
-    yield lambda at: fitting(
-        replace(at, cell_um=cell_um, distance_mm=distance_mm)
-        for cell_um, distance_mm in product(offered.cells_um, offered.distances_mm)
-    )
-    yield lambda at: fitting(
-        replace(at, family=family, open_share=share) for family, share in offered.patterns
-    )
-    yield lambda at: fitting(replace(at, step_cells=step) for step in offered.steps_cells)
+def _expected(bench: DesignBench, candidate: Candidate, how: Print) -> Expected:
+    camera = candidate.camera(bench)
+    return expected(camera, printed_psi(camera, SIZE, how), bench.disparities_px)
 
 
 def prints(maker: Maker) -> dict[str, Print]:
@@ -125,22 +206,3 @@ def prints(maker: Maker) -> dict[str, Print]:
         "all, over-etched": Print(maker.edge_um, off, maker.thickness_um),
         "all, under-etched": Print(maker.edge_um, -off, maker.thickness_um),
     }
-
-
-def _held(bench: DesignBench, candidate: Candidate) -> Held:
-    figures = {name: _psnr_db(bench, candidate, how) for name, how in prints(bench.maker).items()}
-    return Held(candidate, figures)
-
-
-def _psnr_db(bench: DesignBench, candidate: Candidate, how: Print) -> float:
-    camera = candidate.camera(bench)
-    return expected(camera, printed_psi(camera, SIZE, how), bench.disparities_px).psnr_db
-
-
-def pareto(tried: Sequence[tuple[Candidate, Expected]]) -> list[tuple[Candidate, Expected]]:
-    """Return those that no other beats in both light and PSNR, the darkest first."""
-    front: list[tuple[Candidate, Expected]] = []
-    for one in sorted(tried, key=lambda item: (-item[1].light, -item[1].psnr_db)):
-        if not front or one[1].psnr_db > front[-1][1].psnr_db:
-            front.append(one)
-    return front[::-1]

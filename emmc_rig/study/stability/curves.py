@@ -87,8 +87,7 @@ def place_words(place: float | None, strengths: Sequence[float]) -> str:
 class Curve:
     """PSNR by strength. scene: a scene's name, or POOLED: the mean over those with the fault.
 
-    views: the copied centre view of the truth; None where it is exact. points: those of each
-    strength, one a scene.
+    views: the copied centre view of the truth; None where it is exact.
     """
 
     scene: str
@@ -97,11 +96,6 @@ class Curve:
     strengths: tuple[float, ...]
     levels: tuple[float | None, ...]
     views: tuple[float | None, ...]
-    points: tuple[tuple[Point, ...], ...]
-
-    def mark_name(self, index: int) -> str:
-        """Return the name of a measured point in the drawing, unique on the page."""
-        return f"mark-{self.scene.replace(' ', '-')}-{self.fault.name}-{self.method}-{index}"
 
     def below_best(self) -> float | None:
         """Return where it breaks by the first measure: 3 dB below its best."""
@@ -148,9 +142,7 @@ def _curve(
             means.append(float(np.mean(known)) if len(known) == len(some) else None)
         return tuple(means)
 
-    return Curve(
-        name, FAULTS[fault], method, tuple(whole[0]), mean("psnr_db"), mean("view_db"), points
-    )
+    return Curve(name, FAULTS[fault], method, tuple(whole[0]), mean("psnr_db"), mean("view_db"))
 
 
 def breaking_rows(curves: Sequence[Curve], scene: str) -> tuple[list[BreakingRow], tuple[str, ...]]:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
@@ -14,20 +21,22 @@ from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.drawing import colours_of
-from emmc_rig.pages.page import Section, provenance_section
+from emmc_rig.pages.drawing import (
+    FAINT,
+    INK,
+    colours_of,
+    legend_below,
+    save_drawing,
+    sheet,
+    titled,
+)
+from emmc_rig.pages.page import Head, Section, embedded, fragment, framed, provenance_section
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, machine, provenance
-from emmc_rig.study.stability.curves import Curve, break_row, curves
+from emmc_rig.study.stability.curves import LOST_DB, Curve, Levels, break_row, breaking_rows, curves
 from emmc_rig.study.stability.faults import FAULTS, Point
-from emmc_rig.study.stability.stability_page import (
-    breaking_section,
-    curves_section,
-    draw_curves,
-    stability_page,
-)
 from emmc_rig.study.stability.stability_study import StabilitySettings, StabilityStudy, planned
 from reconstruction.methods import METHODS
 
@@ -43,6 +52,18 @@ BREAK_COLUMNS = (
     "below_view_to", "below_view",
 )  # fmt: skip
 """`..._to`: the strength from which on it is broken; empty: not within the sweep. Then in words."""
+PANEL_INCHES, COLUMNS = (3.9, 2.75), 3
+FLOOR_DB = 6.0
+"""Below the least of the copied centre view: further down, a curve says nothing more."""
+CAVEATS = (
+    "A method breaks where it falls 3 dB below its best on that curve, and where it falls below "
+    "the true centre view copied to every view. Between measured strengths the curve is taken as "
+    "straight.",
+    "The readings are made by the real Psi with the sensor's noise on the grid of the "
+    "reconstruction; where mask, lens or shots are at fault, the methods are given the design's.",
+    "Turning and scaling a mask moves its rim most: the larger the picture, the sooner it breaks.",
+    "Contrast: the PSNR is that of the picture stretched back to full contrast.",
+)
 
 
 @dataclass(frozen=True)
@@ -99,7 +120,7 @@ def _write(study: StabilityStudy, folder: Path, outcome: StabilityOutcome) -> No
     sources = provenance(settings, outcome.seconds, Machine=machine())
     sections = [*_sections(found, folder / DRAWN), provenance_section(sources)]
     breaks = [break_row(curve) for curve in found]
-    text = stability_page(_about(study, outcome.left_out), sections, study, found)
+    text = stability_page(_about(study, outcome.left_out), sections, found)
     rows = [_row(*pair) for pair in study.results.items()]
     write_text(folder / POINTS_CSV, csv_text(rows, POINT_COLUMNS))
     write_text(folder / BREAKS_CSV, csv_text(breaks, BREAK_COLUMNS))
@@ -127,13 +148,12 @@ def _sections(found: Sequence[Curve], drawn: Path) -> list[Section]:
         of_scene = [curve for curve in found if curve.scene == scene]
         slug = scene.replace(" ", "-")
         tables.append(breaking_section(scene, of_scene))
-        draw_curves(of_scene, colours, drawn / f"{slug}.svg", columns=5)
         for kind in dict.fromkeys(fault.kind for fault in FAULTS.values()):
             some = [curve for curve in of_scene if curve.fault.kind == kind]
             if some:
                 name = f"{slug}-{kind.lower().replace(' ', '-')}.svg"
                 svg = draw_curves(some, colours, drawn / name)
-                charts.append(curves_section(scene, kind, some, svg))
+                charts.append(curves_section(scene, kind, svg))
     return [*tables, *charts]
 
 
@@ -157,3 +177,116 @@ def _about(study: StabilityStudy, left_out: Sequence[str]) -> list[str]:
         f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
     ]
     return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]
+
+
+def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) -> Path:
+    """Write a panel for each fault of some curves as SVG; return its path."""
+    faults = list(dict.fromkeys(curve.fault.name for curve in curves))
+    panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
+    figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(COLUMNS, len(panels)))
+    for one, some in zip(axes, panels, strict=True):
+        _panel(one, some, colours)
+    _legend(figure, curves, colours)
+    return save_drawing(figure, path)
+
+
+def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None:
+    fault, strengths = curves[0].fault, curves[0].strengths
+    views = next((c.views for c in curves if None not in c.views), curves[0].views)
+    axes.plot(*_known(views), ":", color=FAINT, linewidth=1.2, zorder=1)
+    floor = _limit(axes, curves)
+    for curve in curves:
+        colour = colours[curve.method]
+        places, levels = _known(curve.levels)
+        axes.plot(places, levels, "-o", color=colour, linewidth=1.5, markersize=3.6, zorder=2)
+        place = curve.below_best()
+        if place is not None and levels:
+            level = max(float(np.interp(place, places, levels)), floor)
+            axes.plot(
+                place, level, "x", color=colour, markersize=9, markeredgewidth=1.4, zorder=4,
+                clip_on=False,
+            )  # fmt: skip
+    axes.set_xticks(range(len(strengths)), [shown(strength) for strength in strengths])
+    axes.set_xlim(-0.25, len(strengths) - 0.75)
+    axes.tick_params(labelsize=7.5)
+    titled(axes, fault.title, fault.unit)
+
+
+def _known(levels: Levels) -> tuple[list[int], list[float]]:
+    """Return places and levels where there are such."""
+    pairs = [(i, level) for i, level in enumerate(levels) if level is not None]
+    return [i for i, _ in pairs], [level for _, level in pairs]
+
+
+def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
+    """End the axis a little below the copied view, where lower values add nothing; return where."""
+    views = [view for curve in curves for view in curve.views if view is not None]
+    levels = [level for curve in curves for level in curve.levels if level is not None]
+    if not levels:
+        return -math.inf
+    views = views or levels
+    low = max(min(levels), min(min(views), max(levels) - LOST_DB) - FLOOR_DB)
+    high = max(*levels, *views)
+    bottom = low - 0.06 * (high - low)
+    axes.set_ylim(bottom, high + 0.08 * (high - low))
+    return bottom
+
+
+def shown(strength: float) -> str:
+    """Return a strength for a tick: short."""
+    if strength >= 1000:
+        return f"{strength / 1000:g}k"
+    return f"{strength:.3g}"
+
+
+def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) -> None:
+    methods = dict.fromkeys(curve.method for curve in curves)
+    lines = [Line2D([], [], color=colours[name], marker="o", markersize=4) for name in methods]
+    names = list(methods)
+    lines.append(Line2D([], [], color=INK, linestyle="", marker="x"))
+    names.append(f"{LOST_DB:g} dB below its best")
+    lines.append(Line2D([], [], color=FAINT, linestyle=":"))
+    names.append("copied true centre view")
+    legend_below(figure, lines, names, 5)
+
+
+def stability_page(
+    about: Sequence[str], sections: Sequence[Section], curves: Sequence[Curve]
+) -> str:
+    """Return the page. about: sentences under the title."""
+    head = _head(curves)
+    return framed("Where methods fail", about, CAVEATS, sections, ["stability.css"], head=head)
+
+
+def _head(curves: Sequence[Curve]) -> Head:
+    """Return the method that breaks under the fewest faults; curves: pooled first."""
+    first = [curve for curve in curves if curve.scene == curves[0].scene]
+    faults = len({curve.fault.name for curve in first})
+    broken = Counter({curve.method: 0 for curve in first})
+    broken.update(curve.method for curve in first if curve.below_best() is not None)
+    if not broken:
+        why = "no method ran under any of the faults"
+        return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
+    (best, least), *others = reversed(broken.most_common())
+    return Head(
+        best,
+        f"falls {LOST_DB:g} dB below its best under {least} of {faults} faults, the fewest",
+        [
+            "keep your bench below the strengths of the breaking points",
+            *(f"compare {name}: under {count} of {faults} faults" for name, count in others),
+        ],
+    )
+
+
+def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
+    """Return the table of one scene, or of all: method x fault -> breaking point."""
+    rows, methods = breaking_rows(curves, scene)
+    body = fragment("stability_breaking.html", rows=rows, methods=methods)
+    return Section("breaking-" + scene.replace(" ", "-"), f"Breaking points, {scene}", body)
+
+
+def curves_section(scene: str, kind: str, svg: Path) -> Section:
+    """Return the small multiples of one kind of fault."""
+    title = f"{kind}, {scene}"
+    body = fragment("drawing.html", drawing=embedded(svg), title=title)
+    return Section(title.lower().replace(", ", "-").replace(" ", "-"), title, body)

@@ -14,12 +14,11 @@ from pydantic import Field
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
-from emmc_rig.study.pictured import PicturedStudy, save_pair
-from emmc_rig.study.points import Results
+from emmc_rig.study.points import Results, Study
 from emmc_rig.study.rows import check_scene_names, check_size, described
 from emmc_rig.study.scores import angular_snr_db
 from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
-from emmc_rig.study.trial import Capture, Trial
+from emmc_rig.study.trial import Capture, Trial, method_inputs
 from reconstruction.methods import METHODS, MethodSettings, find_method
 from reconstruction.sparse import SparseSettings
 
@@ -94,14 +93,10 @@ def planned(settings: StabilitySettings) -> list[Point]:
 
 
 @dataclass
-class StabilityStudy(PicturedStudy[Point]):
+class StabilityStudy(Study[Point]):
     """The points; settings: StabilitySettings."""
 
     revision = 2
-
-    def trial_inputs(self, point: Point) -> dict[str, object]:
-        """Return what a point's trial depends on, as plain data."""
-        return described(point.same_trial)
 
     def unmeasured(self) -> list[str]:
         """Return a line for what could not be measured, and why."""
@@ -122,8 +117,8 @@ class StabilityStudy(PicturedStudy[Point]):
     def inputs(self, point: Point) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
         return {
-            **self.trial_inputs(point),
-            **self.method_inputs(point.method),
+            **described(point.same_trial),
+            **method_inputs(point.method, self.settings.dictionary),
             "settings": _settings().model_dump(mode="json"),
         }
 
@@ -152,7 +147,6 @@ class StabilityStudy(PicturedStudy[Point]):
         estimate = result.light_field
         if not np.isfinite(estimate).all():
             return {"failed": "the estimate is not finite", "view_db": view_db}
-        save_pair(self.picture(point), self.truth_picture(point), estimate, made.truth)
         return {
             "psnr_db": made.psnr_db(estimate),
             "view_db": view_db,

@@ -9,21 +9,12 @@ from functools import cache
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, shipped_cameras
 from emmc_rig.model.errors import nearest_of
-from emmc_rig.model.masks import AnyPattern, GaussianColour, RandomBinary, RandomRGBW, UniformColour
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.paper import Scenario
 
 METHODS = {"dict-admm": "Dict-ADMM", "tv-dict": "TV-Dict", "tv": "TV alone"}
 SCENARIOS: dict[Scenario, str] = {"i": "RGB", "ii": "CFA", "iii": "mono"}
 CAMERAS = {"i": "scenario-i-rgb", "ii": "scenario-ii-cfa", "iii": "scenario-iii-mono"}
-_MASK_SEED = 1
-MASKS: dict[str, tuple[str, AnyPattern]] = {
-    "rgbw": ("RGBW", RandomRGBW(kind="random_rgbw", seed=_MASK_SEED)),
-    "binary": ("random binary", RandomBinary(kind="random_binary", seed=_MASK_SEED)),
-    "uniform": ("uniform colour", UniformColour(kind="uniform_colour", seed=_MASK_SEED)),
-    "gaussian": ("Gaussian colour", GaussianColour(kind="gaussian_colour", seed=_MASK_SEED)),
-}
-"""Title and pattern by name."""
 
 _shipped = cache(shipped_cameras)
 
@@ -39,28 +30,21 @@ class Setup:
     shots: int
     binning: int = 1
     noisy: bool = False
-    mask: str = "rgbw"
 
     @property
     def label(self) -> str:
         """In words, such as "(ii) CFA × 2, r = 1/4, noisy"."""
         parts = [f"({self.scenario}) {SCENARIOS[self.scenario]} × {self.shots}"]
-        if self.mask != "rgbw":
-            parts.append(f"{MASKS[self.mask][0]} mask")
         if self.binning > 1:
             parts.append(f"r = 1/{self.binning**2}")
         parts.append("noisy" if self.noisy else "noise-free")
         return ", ".join(parts)
 
     def camera(self) -> Camera:
-        """Return the shipped camera of the scenario with these shots, pixels and mask."""
+        """Return the shipped camera of the scenario with these shots and pixels."""
         camera = _shipped()[CAMERAS[self.scenario]].with_shots(self.shots)
         sensor = camera.sensor.model_copy(update={"binning": self.binning})
-        masks = {
-            name: mask.model_copy(update={"pattern": MASKS[self.mask][1]})
-            for name, mask in camera.masks.items()
-        }
-        return camera.model_copy(update={"sensor": sensor, "masks": masks})
+        return camera.model_copy(update={"sensor": sensor})
 
 
 @dataclass(frozen=True)
@@ -80,7 +64,7 @@ class Cell:
     def paper_psnr_db(self) -> float | None:
         """What the paper prints for this scene, setup and method; None where it does not."""
         setup, scene = self.setup, paper.known_as(self.scene)
-        if scene is None or setup.mask != "rgbw":
+        if scene is None:
             return None
         place = (scene, setup.scenario, setup.shots, setup.binning, setup.noisy, self.method)
         return paper.PSNR_DB.get(paper.Printed(*place))
@@ -101,8 +85,6 @@ class Part:
     @property
     def columns(self) -> list[str]:
         """What heads the columns: in what the setups differ."""
-        if self.name == "figure8":
-            return [MASKS[setup.mask][0] for setup in self.setups]
         return [setup.label.partition(",")[0] for setup in self.setups]
 
 
@@ -135,12 +117,6 @@ PARTS = (
         for (scenario, title), numbers in zip(
             SCENARIOS.items(), ((3, 6, 9, 12), (1, 2, 3, 4), (1, 2, 3, 4)), strict=True
         )
-    ),
-    Part(
-        "figure8",
-        "Figure 8: mask patterns before a CFA sensor, with noise",
-        True,
-        tuple(Setup("ii", 1, noisy=True, mask=mask) for mask in MASKS),
     ),
 )
 

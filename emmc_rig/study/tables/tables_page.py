@@ -36,7 +36,7 @@ CAVEATS = (
 )
 CSV, PAGE = "tables.csv", "tables.html"
 COLUMNS = (
-    "tables", "scene", "scenario", "shots", "r", "mask", "noise", "method", "psnr_db",
+    "tables", "scene", "scenario", "shots", "r", "noise", "method", "psnr_db",
     "paper_psnr_db", "ssim", "angular_db", "replicate_psnr_db", "noise_sigma", "rows", "columns",
     "seconds", "steps", "status", "advice", "dictionary", "settings",
 )  # fmt: skip
@@ -193,7 +193,6 @@ def cells_csv(study: TablesStudy) -> str:
             "scenario": cell.setup.scenario,
             "shots": cell.setup.shots,
             "r": f"1/{cell.setup.binning**2}" if cell.setup.binning > 1 else "1",
-            "mask": cell.setup.mask,
             "noise": "yes" if cell.setup.noisy else "no",
             "scene": cell.scene,
             "method": cell.method,
