@@ -20,11 +20,29 @@ class Control:
 
     The sequencer looks between frames. Plain flags: a lock could be held by the very code that a
     signal interrupts.
+
+    stays: at the end the capture waits until it is stopped, so that frames may be taken again.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stays: bool = False) -> None:
         self.paused = False
         self.stopping = False
+        self.stays = stays
+        self._again: list[str] = []
+
+    def take_again(self, ids: Iterable[str]) -> None:
+        """Take these frames once more."""
+        self._again += ids
+
+    @property
+    def again(self) -> bool:
+        """Whether frames are to be taken once more."""
+        return bool(self._again)
+
+    def pop_again(self) -> list[str]:
+        """Return the frames to take once more, and forget them."""
+        ids, self._again = self._again, []
+        return list(dict.fromkeys(ids))
 
     def pause(self) -> None:
         """Begin no further frame until `resume`."""

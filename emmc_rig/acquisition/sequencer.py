@@ -55,6 +55,7 @@ REPORTED_BYTES = 1_000_000_000
 """Hashing more takes long enough to be reported."""
 REMAINING_TIME_INTERVAL_S = 1.0
 """Least time between two reports of the remaining time."""
+ALL_TAKEN = "all frames are taken: finish, or take some once more"
 Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 """What to take next, asked again once that is on the disk; it gets the seconds of the run."""
 
@@ -96,7 +97,7 @@ class Sequencer:
         self._metered: dict[str, FrameEntry] = {}
         self._left_of_shot: dict[int, set[str]] = {}
         self._began_s = 0.0
-        self._taken = self._run = 0
+        self._taken = self._run = self._more = 0
         # How long the frame before took to hand over: its own line is written by then.
         self._handed: dict[str, tuple[float, float]] = {}
         self._may_saturate = _may_saturate(session.frames)
@@ -188,8 +189,34 @@ class Sequencer:
     # What comes next.
 
     def _next(self) -> tuple[PlannedFrame, ...]:
-        """Return what to take next; none where the run is to end."""
-        return self._choose(self._now_s) if self._may_go_on() else ()
+        """Return what to take next; none where the run is to end.
+
+        Where it stays when all is taken, the lamp is off until frames are wanted once more.
+        """
+        if not self._may_go_on():
+            return ()
+        self._discard_retakes()
+        frames = self._choose(self._now_s)
+        if frames or not self._control.stays or self._session.missing():
+            return frames
+        if self._devices.sent.lamp is not None:
+            self._devices.set_lamp("off")
+        return self._next() if self._may_go_on(ALL_TAKEN) else ()
+
+    def _discard_retakes(self) -> None:
+        """Count the frames that are wanted once more as not taken."""
+        ids = [name for name in self._control.pop_again() if name in self._session.stored]
+        if not ids:
+            return
+        self._writer.flush()
+        for name in ids:
+            self._session.discard(name, "wanted once more")
+        self._left_of_shot = self._missing_of_shots()
+        # A simulated frame may come out as it was before.
+        self._before = None
+        self._more += len(ids)
+        self._watcher.more(len(self._session.needed) + self._more)
+        self._watcher.tell(f"taken once more: {', '.join(ids)}")
 
     def _missing_of_shots(self) -> dict[int, set[str]]:
         """Return by shot which frames of it are still to be taken."""
@@ -199,12 +226,17 @@ class Sequencer:
                 found.setdefault(frame.bench.shot, set()).add(frame.id)
         return found
 
-    def _may_go_on(self) -> bool:
-        """Wait while somebody or a condition wants it; returns False when the run is to end."""
+    def _may_go_on(self, otherwise: str = "") -> bool:
+        """Wait while somebody or a condition wants it; returns False when the run is to end.
+
+        otherwise: why to wait while nothing is wanted; "": there is no need to.
+        """
         control = self._control
 
         def reason() -> str:
-            return "somebody asked for it" if control.paused else self._suspended()
+            wanted = control.stopping or control.again
+            asked = "somebody asked for it" if control.paused else self._suspended()
+            return asked or ("" if wanted else otherwise)
 
         why = reason()
         if why and not control.stopping:
@@ -229,6 +261,8 @@ class Sequencer:
         for frame in frames:
             if not self._may_go_on():
                 return False
+            if self._control.again:
+                return True
             if frame.is_exposed_as_shots and self._decide_exposures():
                 return True
             self._take(frame)
@@ -305,7 +339,7 @@ class Sequencer:
         if not asked.asked:
             return False
         self._left_of_shot = self._missing_of_shots()
-        self._watcher.more(len(session.needed))
+        self._watcher.more(len(session.needed) + self._more)
         return True
 
     def _report_remaining(self, taken: PlannedFrame) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -19,6 +19,7 @@ from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import ERRORS, AppError
 
 if TYPE_CHECKING:
+    from emmc_rig.acquisition.control import Control
     from emmc_rig.acquisition.events import Event
     from emmc_rig.acquisition.watcher import CaptureWatcher
 
@@ -65,6 +66,10 @@ def capture(
     page: Annotated[
         bool, typer.Option("--page", help="show the running capture on a local page")
     ] = False,
+    steer: Annotated[
+        bool,
+        typer.Option("--steer", help="and let the page pause and take frames again; it ends there"),
+    ] = False,
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
     ] = None,
@@ -94,9 +99,10 @@ def capture(
     if chosen is None or chosen["kind"] != SIMULATED:
         where = "on a session's own rig" if chosen is None else "on a rig of real devices"
         refuse(context, given_names(context) & set(SIMULATED_ONLY), where)
-    if dry_run and page:
-        refuse(context, ("page",), "with --dry-run")
-    _run(plan, chosen, until_db, dry_run, out, page)
+    if dry_run and (page or steer):
+        refuse(context, given_names(context) & {"page", "steer"}, "with --dry-run")
+    shown = None if not (page or steer) else "steers" if steer else "shows"
+    _run(plan, chosen, until_db, dry_run, out, shown)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -114,7 +120,7 @@ def _run(
     until_db: float | None,
     dry_run: bool,
     out: Path | None,
-    page: bool,
+    page: Literal["shows", "steers"] | None,
 ) -> None:
     from emmc_rig.acquisition.command import FrontEnd, asked_folder, capture_session
     from emmc_rig.acquisition.control import Control
@@ -126,7 +132,7 @@ def _run(
     from emmc_rig.session.journal import ended
     from emmc_rig.session.session import REPORT
 
-    control = Control()
+    control = Control(stays=page == "steers")
     display = CaptureDisplay(Console(stderr=True, quiet=json_wanted.get()), control)
     watcher: CaptureWatcher = EventWatcher(_print_line) if json_wanted.get() else display
 
@@ -156,9 +162,9 @@ def _run(
         return not dry_run
 
     with ExitStack() as open_things:
-        if page:
+        if page is not None:
             folder = asked_folder(plan, out)
-            watcher = open_things.enter_context(_page(folder, watcher, until_db))
+            watcher = open_things.enter_context(_page(folder, control, watcher, page, until_db))
         open_things.enter_context(display.shown())
         if json_wanted.get():
             emit("stage", stage="open the rig", steps=None)
@@ -182,7 +188,13 @@ def _run(
 
 
 @contextmanager
-def _page(folder: Path, other: CaptureWatcher, until_db: float | None) -> Iterator[CaptureWatcher]:
+def _page(
+    folder: Path,
+    control: Control,
+    other: CaptureWatcher,
+    does: Literal["shows", "steers"],
+    until_db: float | None,
+) -> Iterator[CaptureWatcher]:
     """Serve the page of a capture, and say where, until the block ends; yield what it watches by.
 
     other: called too.
@@ -190,8 +202,9 @@ def _page(folder: Path, other: CaptureWatcher, until_db: float | None) -> Iterat
     from emmc_rig.live.server import application, new_token, served
     from emmc_rig.live.session_page import SessionPage
 
-    page, token = SessionPage(folder, other, until_db is None), new_token()
-    with served(application(page, token, read_only=True)) as port:
+    page, token = SessionPage(folder, control, other, until_db is None), new_token()
+    to_act = "start `emmc-rig capture` with --steer"
+    with served(application(page, token, does == "shows", to_act=to_act)) as port:
         say("page", f"http://127.0.0.1:{port}/{token}/", "cyan")
         page.start()
         why = ""

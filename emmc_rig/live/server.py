@@ -115,8 +115,12 @@ def application(
     token: str,
     read_only: bool = False,
     hosts: tuple[str, ...] = LOCAL_HOSTS,
+    to_act: str = "start `emmc-rig live` without --read-only",
 ) -> Starlette:
-    """Return the ASGI application; hosts: names under which it may be asked for ("*": any)."""
+    """Return the ASGI application; hosts: names under which it may be asked for ("*": any).
+
+    to_act: what somebody has to do who wants to act on a page that is read-only.
+    """
     ending, known = asyncio.Event(), (-1, b"")
     made: dict[Hashable, tuple[int, bytes]] = {}
     one_picture = ThreadPoolExecutor(1, thread_name_prefix="live pictures")
@@ -204,7 +208,7 @@ def application(
         if request.method != "POST":
             raise HTTPException(405, "nothing is done by GET: send POST")
         if read_only:
-            raise HTTPException(403, "read-only: this page only shows")
+            raise HTTPException(403, f"read-only: {to_act} to act")
         origin = request.headers.get("origin")
         page_origin = f"{request.url.scheme}://{request.headers.get('host')}"
         if origin not in (None, page_origin):

@@ -1,6 +1,7 @@
 "use strict";
-// The page of a capture: frames as they come, and the light field so far.
+// The page of a capture: frames as they come, the light field so far, and where allowed steering.
 const rows = new Map();
+let chosen = new Set();
 
 function draw(before) {
   write("title", state.title);
@@ -11,8 +12,14 @@ function draw(before) {
   write("left", state.left && !state.ended && state.done < state.planned ? `about ${duration(state.left.seconds)} left`
     + (state.left.guessed ? `, and the exposures of ${state.left.guessed} not metered yet` : "") : "");
   write("step", state.step);
-  $("waiting").hidden = !state.paused;
-  write("waiting", state.paused ? `Waiting: ${state.paused.reason}` : "");
+  // Whoever may press "go on" reads of a pause beside it: nothing moves under the hand.
+  const here = state.paused && state.held && !state.read_only;
+  write("wish", here ? "Paused by hand: \u201cgo on\u201d takes the next frame." : state.wish);
+  $("waiting").hidden = !state.paused || here;
+  write("waiting", !state.paused ? "" : state.held ? "Paused by hand." : `Waiting: ${state.paused.reason}`);
+  for (const one of document.querySelectorAll(".steers")) one.hidden = state.read_only || state.ended;
+  write("pause", state.held ? "go on" : "pause");
+  $("pause").hidden = state.paused !== null && !state.held;
   drawMessages();
   drawEnd();
   drawFrames();
@@ -55,11 +62,13 @@ function drawFrames() {
   for (const one of state.frames) {
     let tile = rows.get(one.id);
     if (!tile) {
-      tile = document.createElement("div");
+      tile = document.createElement("button");
       tile.className = "tile";
       tile.append(document.createElement("img"), cell("span", one.id), cell("span", "", "figure"));
       tile.firstChild.alt = "";
       tile.firstChild.loading = "lazy";
+      tile.addEventListener("click", () => choose_frame(one.id));
+      tile.setAttribute("aria-pressed", "false");
       rows.set(one.id, tile);
       parent.prepend(tile);
     }
@@ -70,9 +79,18 @@ function drawFrames() {
     if (tile.lastChild.textContent !== words) tile.lastChild.textContent = words;
     tile.lastChild.classList.toggle("bad", one.saturated > 0.001);
     tile.classList.toggle("due", !one.stored);
+    tile.disabled = state.read_only || state.ended;
   }
   const hidden = state.taken - state.frames.length;
-  write("chosen", state.frames.length === 0 ? "none yet" : hidden > 0 ? `the last ${state.frames.length} of ${state.taken}` : "");
+  write("chosen", chosen.size ? `${chosen.size} chosen` : state.frames.length === 0 ? "none yet" : hidden > 0 ? `the last ${state.frames.length} of ${state.taken}` : "");
+  $("retake").disabled = chosen.size === 0;
+  write("retake", chosen.size ? `take ${chosen.size} again` : "take again");
+}
+
+function choose_frame(id) {
+  if (!chosen.delete(id)) chosen.add(id);
+  rows.get(id).setAttribute("aria-pressed", chosen.has(id));
+  drawFrames();
 }
 
 let loading = false, wanted = false;
@@ -92,4 +110,12 @@ async function show() {
   if (wanted) { wanted = false; show(); }
 }
 
+$("pause").addEventListener("click", () => act(state.held ? "resume" : "pause"));
+$("finish").addEventListener("click", () => act("stop"));
+$("retake").addEventListener("click", async () => {
+  const ids = [...chosen];
+  chosen = new Set();
+  for (const id of ids) rows.get(id)?.setAttribute("aria-pressed", "false");
+  await act("retake", { ids });
+});
 follow(draw);

@@ -1,9 +1,9 @@
-"""The page of a running capture, to look at: frames, time left, pauses, the light field so far."""
+"""The page of a running capture: its frames, time left, pauses, the light field so far."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.assessment import METHOD, stated_psnr_db
 from emmc_rig.acquisition.checks import Figures
+from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.events import Event, EventWatcher
 from emmc_rig.acquisition.until import light_field_so_far
 from emmc_rig.acquisition.watcher import CaptureWatcher
@@ -42,24 +43,24 @@ class SessionPage(EventWatcher):
     """
 
     files: tuple[str, ...] = ("session.html", "session.js", *COMMON_FILES)
-    actions: Mapping[str, Action] = {}
-    urgent: frozenset[str] = frozenset()
+    urgent: frozenset[str] = frozenset({"pause", "stop"})
 
     def __init__(
         self,
         folder: Path,
+        control: Control,
         other: CaptureWatcher | None = None,
         computes: bool = True,
     ) -> None:
         super().__init__(self._heard, other)
-        self._folder, self._computes = folder, computes
+        self._folder, self._control, self._computes = folder, control, computes
         self._changed = threading.Condition()
         self._frames: dict[str, dict[str, Any]] = {}
         self._small: dict[str, bytes] = {}
         self._newest: tuple[int, RawFrame] | None = None
         self._shots: set[int] = set()
         self._scale: Scale | None = None
-        self._wanted = False
+        self._wanted, self._retaken = False, 0
         self._pictures: Pictures | None = None
         self._ending = threading.Event()
         self._thread = threading.Thread(
@@ -70,6 +71,8 @@ class SessionPage(EventWatcher):
             "title": folder.name,
             "step": "",
             "paused": None,
+            "held": False,
+            "wish": "",
             "done": 0,
             "planned": 0,
             "left": None,
@@ -89,6 +92,12 @@ class SessionPage(EventWatcher):
             "frame.jpg": self._small_picture,
             **field_pictures(lambda: self._pictures),
         }
+        self.actions: Mapping[str, Action] = {
+            "pause": lambda: self._wish("pausing after this frame", control.pause),
+            "resume": lambda: self._wish("", control.resume),
+            "stop": lambda: self._wish("stopping after this frame", control.stop),
+            "retake": self._retake,
+        }
 
     def start(self) -> None:
         """Begin to reconstruct."""
@@ -97,7 +106,7 @@ class SessionPage(EventWatcher):
     def close(self, why: str = "") -> None:
         """Let those who look know that the capture is over; why: what ended it early."""
         self._ending.set()
-        self._publish(ended=True, why=why, step="")
+        self._publish(ended=True, why=why, step="", wish="")
         with self._changed:
             self._changed.notify_all()
         self._thread.join(PATIENCE_S)
@@ -158,13 +167,13 @@ class SessionPage(EventWatcher):
             self._frames[facts["id"]]["stored"] = True
             if facts["kind"] != "shot":
                 self._scale = None
-            self._publish_frames(planned=facts["planned"])
+            self._publish_frames(planned=facts["planned"] - self._retaken)
         elif event.name == "shot.done":
             self._shots.add(facts["shot"])
             self._wanted = self._computes
             self._changed.notify_all()
         elif event.name in ("pause", "resume"):
-            self._publish(paused=facts if event.name == "pause" else None, step="")
+            self._publish(paused=facts if event.name == "pause" else None, wish="", step="")
         elif event.name in ("left", "verdict", "end"):
             self._publish(**{event.name: facts})
         elif event.name == "message":
@@ -192,6 +201,7 @@ class SessionPage(EventWatcher):
         self._shots |= taken
         self._wanted = bool(taken) and self._computes
         self._changed.notify_all()
+        self._retaken = 0
         self._publish_frames(title=session.header["title"], planned=facts["planned"])
 
     def _publish_frames(self, **more: Any) -> None:
@@ -202,6 +212,28 @@ class SessionPage(EventWatcher):
             done=sum(one["stored"] for one in known),
             **more,
         )
+
+    def _wish(self, words: str, ask: Callable[[], None]) -> None:
+        ask()
+        self._publish(wish=words, held=self._control.paused)
+
+    def _retake(self, ids: list[str]) -> None:
+        for name in ids:
+            known = self._frames.get(name)
+            if known is None or not known["stored"]:
+                raise AppError(f"frame {name!r} is not on the disk, so it cannot be taken again")
+            if known["kind"] == "metering":
+                raise AppError(f"frame {name}: others were exposed by it; begin another session")
+        if not ids:
+            raise AppError("choose the frames to take once more")
+        with self._changed:
+            for name in ids:
+                self._frames[name]["stored"] = False
+                if self._frames[name]["kind"] == "shot":
+                    self._shots.discard(self._frames[name]["shot"])
+            self._retaken += len(ids)
+            self._control.take_again(ids)
+            self._publish_frames()
 
     def _newest_picture(self, query: Query) -> Picture | None:
         newest = self._newest

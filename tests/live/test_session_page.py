@@ -1,4 +1,4 @@
-"""The page of a running capture: what it shows, and to whom the end is told."""
+"""The page of a running capture, and what it does to it: pause, retake, finish."""
 
 import http.client
 import json
@@ -12,6 +12,8 @@ import yaml
 
 import emmc_rig as emmc
 from emmc_rig.acquisition.command import FrontEnd, capture_session
+from emmc_rig.acquisition.control import Control
+from emmc_rig.acquisition.sequencer import ALL_TAKEN
 from emmc_rig.errors import AppError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served
@@ -40,16 +42,47 @@ def rig(size=(24, 32)):
     return emmc.rig("simulated", scene="near-planar", size=size, rays=16).description
 
 
-def run(page, plan):
-    """Capture before a page that watches; return the session."""
-    done = capture_session(plan, rig(), None, None, FrontEnd(page, nobody))
-    assert done is not None
-    return done[0]
+class Acting(SessionPage):
+    """A page on which somebody acts whenever the capture waits; each action once, then finish."""
+
+    def __init__(self, folder, *actions):
+        self.control = Control(stays=True)
+        super().__init__(folder, self.control, computes=False)
+        self.todo = list(actions)
+        self.reasons = []
+
+    def paused(self, reason):
+        super().paused(reason)
+        self.reasons.append(reason)
+        if self.todo:
+            self.todo.pop(0)(self)
+        else:
+            self.actions["stop"]()
+
+    def run(self, plan):
+        front = FrontEnd(self, nobody, control=self.control)
+        done = capture_session(plan, rig(), None, None, front)
+        assert done is not None
+        return done
+
+
+def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_whole(plan):
+    page = Acting(
+        plan.with_name("plan-session"), lambda page: page.actions["retake"](["shot-1-e0-r0"])
+    )
+    session, outcome = page.run(plan)
+    assert outcome.complete
+    lines = [e for e in session.journal.entries if getattr(e, "id", "") == "shot-1-e0-r0"]
+    assert [one.kind for one in lines] == ["frame", "discarded", "frame"]
+    assert page.reasons == [ALL_TAKEN, ALL_TAKEN]
+    state = page.state()
+    assert state["done"] == state["planned"] == len(session.needed)
+    assert Session(session.folder).is_complete
 
 
 def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan):
-    page = SessionPage(plan.with_name("plan-session"), computes=False)
-    session = run(page, plan)
+    page = Acting(plan.with_name("plan-session"))
+    session, _ = page.run(plan)
     state = page.state()
     json.dumps(state, allow_nan=False)
     shown = {one["id"]: one for one in state["frames"]}
@@ -67,13 +100,20 @@ def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan
         assert small is not None
     with pytest.raises(AppError, match="no frame"):
         page.pictures["frame.jpg"]({"id": "../plan.yaml"})
+    for ids, why in (
+        (["shot-9"], "not on the disk"),
+        (["meter-shot-0"], "exposed by it"),
+        ([], "choose"),
+    ):
+        with pytest.raises(AppError, match=why):
+            page.actions["retake"](ids)
 
 
 def test_the_page_of_a_resumed_session_shows_what_was_taken_before(plan):
     folder = plan.with_name("plan-session")
-    run(SessionPage(folder, computes=False), plan)
-    page = SessionPage(folder, computes=False)
-    session = run(page, folder)
+    Acting(folder).run(plan)
+    page = Acting(folder)
+    session, _ = page.run(folder)
     assert {one["id"] for one in page.state()["frames"]} == set(session.stored)
     wanted = page.pictures["frame.jpg"]({"id": "shot-0-e0-r0"})
     assert wanted is not None
@@ -86,17 +126,18 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
     path.write_text(yaml.safe_dump({**PLAN, "whiteboards": {"repeats": 1, "references": 2}}))
     shown = threading.Event()
 
-    class Waiting(SessionPage):
+    class Waiting(Acting):
         def light_field(self, shots, result):
             super().light_field(shots, result)
             if len(shots) == 2:
                 shown.set()
 
-    page = Waiting(tmp_path / "plan-session")
+    page = Waiting(tmp_path / "plan-session", lambda page: shown.wait(60) and page.control.stop())
+    page._computes = True
     page.start()
     try:
-        capture_session(path, rig((32, 40)), None, None, FrontEnd(page, nobody))
-        assert shown.wait(60)
+        front = FrontEnd(page, nobody, control=page.control)
+        capture_session(path, rig((32, 40)), None, None, front)
     finally:
         page.close()
     reported = page.state()["light_field"]
@@ -113,7 +154,7 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
 
 def test_the_last_state_reaches_who_looks_though_the_program_ends_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(server, "PAUSE_S", 3600)  # the end comes before the next round of states
-    page = SessionPage(tmp_path / "session", computes=False)
+    page = SessionPage(tmp_path / "session", Control(), computes=False)
     page.start()
     page.tell("the lamp is warm")
     with served(application(page, "a-secret")) as port:
@@ -130,7 +171,7 @@ def test_the_last_state_reaches_who_looks_though_the_program_ends_at_once(tmp_pa
 
 
 def test_the_first_state_is_not_pushed_again_and_again(tmp_path):
-    page = SessionPage(tmp_path / "session", computes=False)
+    page = SessionPage(tmp_path / "session", Control(), computes=False)
     page.start()
     with served(application(page, "a-secret")) as port:
         link = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
