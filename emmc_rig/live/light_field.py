@@ -61,6 +61,9 @@ COMPILING_S = 5.0
 """Without a step, from when on the page says why."""
 
 Solve = Callable[..., tuple[Reconstruction, Verdict]]
+SURE_PX = 0.15
+"""Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
+WINDOW_PX = 7
 CALIBRATION = "calibration.h5"
 MANY = 1_000_000
 """Frames that an average stands for whose own noise is not known, and is left out."""
@@ -205,7 +208,7 @@ class LiveLightField:
         self.preview.follow(readings, STEPS)
         coarse = self.preview.light_field
         block = max(1, self.psi.size[1] // coarse.shape[3])
-        self._draw(export_of(coarse, {}), block)
+        self._draw(export_of(coarse, {"disparity": disparity_of(coarse)}), block)
 
     _shots = 0
 
@@ -352,6 +355,35 @@ def field_pictures(
         return shown and Picture("light field", shown.number, shown.encoded, "application/json")
 
     return {"light-field.json": light_field}
+
+
+def disparity_of(light_field: Array) -> NDArray[np.float32]:
+    """Return the disparity of small views, (y, x), pixels per view step; NaN where not decided.
+
+    light_field: (v, u, y, x, c). Where views are shifted by less than a pixel, brightness stays
+    along lines of slope d: L_u = -d L_x and L_v = -d L_y, solved by least squares over a window
+    and all views (Bolles, Baker and Marimont 1987; as Lucas and Kanade 1981 for flow).
+    """
+    grey = light_field @ np.full(light_field.shape[-1], 1 / light_field.shape[-1], np.float32)
+    by_v, by_u, by_y, by_x = (
+        np.gradient(grey, axis=axis) if grey.shape[axis] > 1 else np.zeros_like(grey)
+        for axis in range(4)
+    )
+
+    def gathered(*products: tuple[Array, Array]) -> Array:
+        summed = sum(np.einsum("vuyx,vuyx->yx", one, other) for one, other in products)
+        return np.asarray(cv2.blur(np.asarray(summed), (WINDOW_PX, WINDOW_PX)), np.float32)
+
+    power = gathered((by_x, by_x), (by_y, by_y))
+    product = gathered((by_u, by_x), (by_v, by_y))
+    change = gathered((by_u, by_u), (by_v, by_v))
+    safe = np.maximum(power, 1e-12)
+    found = -product / safe
+    left = np.maximum(change - product**2 / safe, 0)
+    # Views that differ by interpolation are no independent witnesses: one window of pixels counts.
+    deviation = np.sqrt(left / safe / WINDOW_PX)
+    sure = (deviation < SURE_PX) & (power > 1e-4 * float(power.max() + 1e-12))
+    return np.where(sure, found, np.nan).astype(np.float32)
 
 
 def open_scale(place: Path) -> Scale:

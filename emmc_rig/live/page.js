@@ -58,6 +58,10 @@ function draw() {
   write("focus", !focus ? (figures.dark ? "nothing to see" : "no edge above the noise")
     : focus.share >= 1 ? "the sharpest of the last minute"
     : `${percent(focus.share, focus.deviation)} of the sharpest of the last minute`);
+  const shift = figures.shift;
+  write("shift", shift ? `x ${shift.x_px.toFixed(2)}, y ${shift.y_px.toFixed(2)} px, likeness ${Math.round(100 * shift.likeness)} %`
+    : state.reference ? "the frame is not like the reference" : "no reference");
+  write("take", state.reference ? "forget the reference" : "measure shifts from here");
 }
 
 function drawMask() {
@@ -80,7 +84,7 @@ function drawHint() {
 }
 
 // Steps are made once and then written to: a button that has the focus keeps it.
-const LABELS = { autoexpose: "expose", centre: "centre", preview: "show the changes" };
+const LABELS = { autoexpose: "expose", centre: "centre", autofocus: "focus", preview: "show the changes" };
 function drawSteps() {
   const parent = $("steps");
   if (parent.children.length !== state.steps.length)
@@ -104,6 +108,7 @@ function drawSteps() {
 function doStep(i) {
   const step = state.steps[i];
   if (step.action === "preview") openSave();
+  else if (step.action === "autofocus") act("autofocus", { span_um: 1000 });
   else if (step.action) act(step.action, step.values);
   else if (step.look) act("look", { target: step.look });
 }
@@ -280,6 +285,7 @@ for (const [id, send] of [
     one.blur();
   });
 }
+$("take").addEventListener("click", () => act("reference", { taken: !state.reference }));
 $("hint-do").addEventListener("click", () => act(state.hint.action, state.hint.values));
 for (const name of ["home", "centre", "stop", "autoexpose", "refocus", "cancel"])
   $(name).addEventListener("click", () => act(name));

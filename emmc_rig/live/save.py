@@ -8,26 +8,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.acquisition.plan import Plan, load_plan
-from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.bench.rig_config import SIMULATED, FocusedRig, RealRig
 from emmc_rig.errors import AppError
 from emmc_rig.files.yaml_edit import Key, replace_text, with_values
 from emmc_rig.live.alignment import MaskPlace
+from emmc_rig.live.focus import FocusFound
 from emmc_rig.model.reading import parse_yaml, read_yaml
 from emmc_rig.model.settings import validated
 
 
 @dataclass(frozen=True)
 class Found:
-    """What was found; None: not yet. zero_um: by axis, where the mask is centred.
-
-    focus_um: where the focus axis stands.
-    """
+    """What was found; None: not yet. zero_um: by axis, where the mask is centred."""
 
     exposure_s: float | None = None
     mask: MaskPlace | None = None
     zero_um: Mapping[str, float] | None = None
-    focus_um: float | None = None
+    focus: FocusFound | None = None
 
 
 class Files:
@@ -101,6 +98,6 @@ def _rig_values(found: Found, what: Sequence[str]) -> dict[Key, float]:
         place = found.mask
         names = "rotation_deg", "rotation_deviation_deg", "scale", "scale_deviation"
         values |= {("mask", name): getattr(place, name) for name in names}
-    if "focus" in what and found.focus_um is not None:
-        values["stands_um", FOCUS] = found.focus_um
+    if "focus" in what and found.focus is not None:
+        values["stands_um", found.focus.axis] = found.focus.place_um
     return values

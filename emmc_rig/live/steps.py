@@ -17,6 +17,10 @@ LONGEST_UNASKED_S = 4.0
 AWAY_UM = 5.0
 """From where an axis centres the mask or opens the aperture, it is not there."""
 ALIGNED_DEG = 0.1
+NO_FOCUS = (
+    "this stage has no axis named focus, and the camera's driver moves no lens: turn the lens by "
+    "hand until the sharpness no longer grows"
+)
 
 
 def steps(
@@ -24,7 +28,6 @@ def steps(
     mask: Mapping[str, Any] | None,
     off_um: Mapping[str, float | None],
     has_focus: bool,
-    focus_um: float | None,
     found: Found,
     takes: Sequence[str],
     hint: Mapping[str, Any] | None,
@@ -32,14 +35,13 @@ def steps(
     """Return for every step its name, whether it is done, what to say, and the action that does it.
 
     figures, mask: of the page's state. off_um: by axis, how far it stands from where it centres the
-    mask or opens the aperture; None: not homed. focus_um: where the focus axis stands. takes: what
-    can be saved. hint: what to do next.
+    mask or opens the aperture; None: not homed. takes: what can be saved. hint: what to do next.
     """
     return [
         _centre(off_um),
         _exposure(figures, hint),
         _align(mask, found),
-        _focus(has_focus, focus_um),
+        _focus(has_focus, found),
         {
             "name": "save",
             "done": False,
@@ -121,9 +123,13 @@ def _align(mask: Mapping[str, Any] | None, found: Found) -> dict[str, Any]:
     return {"name": "align", "done": done, "text": text, "action": ""}
 
 
-def _focus(has_focus: bool, focus_um: float | None) -> dict[str, Any]:
-    text = "show it the scene, and turn the lens by hand until the sharpness no longer grows"
+def _focus(has_focus: bool, found: Found) -> dict[str, Any]:
+    if found.focus is not None:
+        text = (
+            f"sharpest at {found.focus.place_um:.0f} \u00b1 {found.focus.deviation_um:.0f} \u00b5m"
+        )
+        return {"name": "focus", "done": True, "text": text, "action": "autofocus"}
     if has_focus:
-        where = "not homed" if focus_um is None else f"at {focus_um:.0f} µm"
-        text = f"show it the scene, and jog focus ({where}) until the sharpness no longer grows"
-    return {"name": "focus", "done": False, "text": text, "action": ""}
+        text = "show it the scene: a white board has nothing to focus on"
+        return {"name": "focus", "done": False, "text": text, "action": "autofocus"}
+    return {"name": "focus", "done": False, "text": NO_FOCUS, "action": ""}

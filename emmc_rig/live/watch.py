@@ -23,16 +23,18 @@ from drivers.errors import DriverError, ExposureStoppedError
 from drivers.raw import RawFrame
 from drivers.stage import Stage
 from emmc_rig.bench.hardware import FOCUS
+from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.live.alignment import MaskGauge, is_dark
 from emmc_rig.live.driving import Driving
-from emmc_rig.live.focus import FocusMeter
+from emmc_rig.live.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.save import Files, Found
 from emmc_rig.live.steps import (
     AWAY_UM,
     LONGEST_UNASKED_S,
     LOW_LEVEL,
+    NO_FOCUS,
     WANTED_LEVEL,
     WANTED_LEVELS,
     exposure_hint,
@@ -52,6 +54,9 @@ PATIENCE_S = 10.0
 """For the threads to end. A move under way is stopped first."""
 LEVEL_PIXELS = 1 << 18
 """Of a frame, evenly spread, for its histogram; saturated ones are counted in all."""
+SHIFT_PX = 1024
+LEAST_LIKENESS = 0.3
+"""Of a frame and the reference, below which their shift is not shown."""
 SEEK_S = 10.0
 """Between two searches for a mask that is not seen while nothing changes: each takes seconds."""
 DARK = "the picture is dark"
@@ -106,6 +111,7 @@ class Watch:
         self._found = Found()
         self._news = threading.Condition()
         self._shown: Shown | None = None
+        self._reference: RawFrame | None = None
         self._focus = FocusMeter()
         self._exposing, self._dimmest_s, self._longest_s = 0, 0.0, LONGEST_UNASKED_S
         self._unexposed = ""
@@ -124,6 +130,7 @@ class Watch:
             "stopped": False,
             "trouble": {"camera": "", "setting": "", "stage": "", "light field": ""},
             "exposing": None,
+            "reference": False,
             "targets": list(targets),
             "centre_um": self._centre_um,
             "light_field": None,
@@ -270,6 +277,12 @@ class Watch:
         """Compare the sharpness with nothing seen so far."""
         self._focus.forget()
 
+    def take_reference(self, taken: bool = True) -> None:
+        """Measure shifts from the present frame on; or no more."""
+        with self._news:
+            self._reference = self._shown.frame if taken and self._shown is not None else None
+        self._publish(reference=self._reference is not None)
+
     def home(self, axes: list[str] | None = None) -> None:
         """Home axes, all by default; raises AppError as `jog`."""
         self._move("homing", lambda stage: stage.home(axes))
@@ -280,6 +293,13 @@ class Watch:
         self._move(
             f"moving {axis} by {distance_um:g} um",
             lambda stage: stage.move_by_um({axis: distance_um}),
+        )
+
+    def go(self, axis: str, place_um: float) -> None:
+        """Move an axis to a place; raises AppError as `jog`."""
+        self._require_axis(axis)
+        self._move(
+            f"moving {axis} to {place_um:g} um", lambda stage: stage.move_to_um({axis: place_um})
         )
 
     def centre(self) -> None:
@@ -294,6 +314,38 @@ class Watch:
 
         self._move("centring", home, lambda stage: stage.move_to_um(self._centre_um))
 
+    def autofocus(self, span_um: float) -> None:
+        """Bring the focus axis to where the picture is sharpest, within so far from here.
+
+        Raises AppError where there is no such axis.
+        """
+        if self._driving is None or FOCUS not in self._driving.stage.axes:
+            raise AppError(NO_FOCUS)
+        driving = self._driving
+
+        def focus(stage: Stage) -> None:
+            if not stage.is_homed(FOCUS):
+                stage.home([FOCUS])
+            found = focused(stage, FOCUS, span_um, self._sharpness, lambda: driving.stopped)
+            if found is not None:
+                self._found = replace(self._found, focus=found)
+
+        self._move("focusing", focus)
+
+    def _sharpness(self) -> Sharpness | None:
+        """Return the sharpness of two frames that are exposed from now on."""
+        newest = self.newest()
+        number = 0 if newest is None else newest.number
+        frames = []
+        # The next one may have been exposed while the axis moved.
+        for skipped in (1, 0):
+            shown = self._after(number + skipped)
+            if shown is None:
+                return None
+            frames.append(shown.frame)
+            number = shown.number
+        return sharpness(frames[1], frames[0])
+
     def preview(self, what: list[str]) -> dict[str, str]:
         """Return what saving some of exposure, centre, mask and focus would change, as a diff."""
         exposure_s = self._exposure_s
@@ -302,10 +354,7 @@ class Watch:
         if place is not None and place.offset_um is not None and not place.ambiguity:
             axes = zip(("mask_x", "mask_y"), place.offset_um, strict=True)
             zero_um = {a: self._centre_um[a] - um for a, um in axes if a in self._centre_um}
-        focus_um = None if self._driving is None else self._driving.position_um(FOCUS)
-        self._found = replace(
-            self._found, exposure_s=exposure_s, zero_um=zero_um, focus_um=focus_um
-        )
+        self._found = replace(self._found, exposure_s=exposure_s, zero_um=zero_um)
         return {"diff": self._files.preview(self._found, what)}
 
     def save(self) -> dict[str, list[str]]:
@@ -400,16 +449,7 @@ class Watch:
             for axis, at in places.items()
             if axis in self._centre_um
         }
-        return steps(
-            figures,
-            mask,
-            off_um,
-            FOCUS in places,
-            places.get(FOCUS),
-            self._found,
-            self._files.takes,
-            hint,
-        )
+        return steps(figures, mask, off_um, FOCUS in places, self._found, self._files.takes, hint)
 
     def _read_settings(self) -> dict[str, Any]:
         camera = self._camera
@@ -513,6 +553,8 @@ class Watch:
         some = replace(frame, mosaic=thinned(frame.mosaic, LEVEL_PIXELS))
         figures = frame_figures(some)
         saturated = np.count_nonzero(frame.mosaic >= frame.white_level_dn) / frame.mosaic.size
+        with self._news:
+            reference = self._reference
         self._publish(
             figures={
                 "frame": newest.number,
@@ -522,6 +564,7 @@ class Watch:
                 "moves": newest.moves,
                 "histogram": {name: row.tolist() for name, row in histogram(some).items()},
                 "focus": self._focus.add(frame, time.monotonic()),
+                "shift": _shift(frame, reference),
                 "exposure_s": frame.exposure_s,
             }
         )
@@ -631,3 +674,14 @@ class Watch:
             if np.hypot(x_um - there_x, y_um - there_y) < AT_SHOT_UM:
                 return number
         return None
+
+
+def _shift(frame: RawFrame, reference: RawFrame | None) -> dict[str, float] | None:
+    """Return how a frame lies over the reference, in sensor pixels; None where they differ."""
+    if reference is None or (reference.mosaic.shape, reference.cfa) != (
+        frame.mosaic.shape,
+        frame.cfa,
+    ):
+        return None
+    shift = registered(frame, reference, SHIFT_PX)
+    return asdict(shift) if shift.likeness >= LEAST_LIKENESS else None

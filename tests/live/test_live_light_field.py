@@ -10,8 +10,8 @@ from test_live_alignment import frame_of
 import emmc_rig as emmc
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
-from emmc_rig.live.light_field import LiveLightField, designed_scale, open_scale
-from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.live.light_field import LiveLightField, designed_scale, disparity_of, open_scale
+from emmc_rig.model.lightfield import psnr_db, shifted
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
 from reconstruction.preview import Preview, coarser
@@ -97,6 +97,28 @@ def test_frames_of_a_changed_scene_take_the_preview_along():
     after = psnr_db(preview.light_field, small_views(second, 4))
     assert after > before + 3
     assert after == pytest.approx(psnr_db(afresh.light_field, small_views(second, 4)), abs=1)
+
+
+def test_the_disparity_of_small_views_is_that_of_the_scene_and_unknown_where_it_is_plain():
+    rng = np.random.default_rng(0)
+    base = rng.random((40, 60, 3)).astype(np.float32)
+    base[:, 30:] = 0.5
+    views = np.stack(
+        [
+            np.stack([shifted(base, -0.3 * (v - 1), -0.3 * (u - 1)) for u in range(3)])
+            for v in range(3)
+        ]
+    )
+    views = np.stack([np.stack([_softened(one) for one in row]) for row in views])
+    found = disparity_of(views)
+    assert np.nanmedian(found[8:-8, 8:22]) == pytest.approx(0.3, abs=0.05)
+    assert np.isnan(found[:, 40:]).all()
+
+
+def _softened(view):
+    import cv2
+
+    return cv2.GaussianBlur(view, (0, 0), 1.5)
 
 
 def live_frames(camera, psi, scene, seed=0):

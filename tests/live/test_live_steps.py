@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import yaml
 from test_live import until, watching
@@ -13,6 +14,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.files.yaml_edit import replace_text, with_values
 from emmc_rig.live.alignment import MaskPlace
+from emmc_rig.live.focus import FocusFound, peak
 from emmc_rig.live.save import Files, Found
 from simulators.bench import MountingErrors
 
@@ -41,28 +43,50 @@ def lit_rig(focus_um=None, errors=None):
     return camera, rig, centre_um
 
 
-def test_the_focus_axis_is_saved_where_it_stands_and_without_one_the_lens_is_turned_by_hand(
-    tmp_path,
-):
-    path = tmp_path / "rig.yaml"
-    path.write_text(RIG_YAML)
+def test_autofocus_finds_where_the_simulated_lens_has_the_scene_sharp():
     _, rig, centre_um = lit_rig(focus_um=9000.0)
-    files = Files(None, path)
-    with watching(rig.camera, rig.stage, None, (), centre_um, None, None, files) as watch:
-        watch.home()
+    with watching(rig.camera, rig.stage, None, (), centre_um) as watch:
+        watch.centre()
         until(watch, lambda state: not state["busy"] and state["axes"])
-        watch.jog("focus", 8700.0)
-        until(watch, lambda state: not state["busy"] and "at 8700" in focus_text(state))
-        watch.preview(["focus"])
-        watch.save()
-    assert yaml.safe_load(path.read_text())["stands_um"] == {"focus": pytest.approx(8700.0, abs=1)}
-    _, plain, centre_um = lit_rig()
-    with watching(plain.camera, plain.stage, None, (), centre_um) as watch:
-        assert "by hand" in focus_text(until(watch, lambda state: state["steps"]))
+        rig.stage.home(["focus"])
+        rig.stage.move_to_um({"focus": 8700.0})
+        watch.autofocus(400.0)
+        ended = until(watch, lambda state: not state["busy"] and state["figures"])
+        assert ended["trouble"]["stage"] == ""
+        found = watch._found.focus
+        assert found is not None
+        assert found.place_um == pytest.approx(9000.0, abs=max(10.0, 4 * found.deviation_um))
+        assert rig.stage.position_um("focus") == pytest.approx(found.place_um, abs=1)
+        step = next(one for one in ended["steps"] if one["name"] == "focus")
+        assert step["done"]
 
 
-def focus_text(state):
-    return next(one["text"] for one in state["steps"] if one["name"] == "focus")
+def test_a_peak_and_its_deviation_are_those_of_the_parabola():
+    rng = np.random.default_rng(0)
+    places = np.linspace(90, 110, 7)
+    errors = np.full(7, 0.02)
+    found = [
+        peak(places, 3 - ((places - 101.3) / 8) ** 2 + rng.normal(0, errors), errors)
+        for _ in range(300)
+    ]
+    off = np.array([place - 101.3 for place, _ in found])
+    stated = np.array([deviation for _, deviation in found])
+    assert abs(off.mean()) < 4 * off.std() / np.sqrt(300)
+    # Stated by the larger of errors and scatter, it is a little too large on average.
+    assert 0.9 < np.median(stated) / off.std() < 1.5
+    with pytest.raises(AppError, match="no sharpest place"):
+        peak(places, places / 10, errors)
+
+
+def test_without_a_focus_axis_it_is_said_why_and_what_to_do():
+    _, rig, centre_um = lit_rig()
+    with watching(rig.camera, rig.stage, None, (), centre_um) as watch:
+        state = until(watch, lambda state: state["steps"])
+        with pytest.raises(AppError, match="no axis named focus"):
+            watch.autofocus(100.0)
+        step = next(one for one in state["steps"] if one["name"] == "focus")
+        assert "by hand" in step["text"]
+        assert step["action"] == ""
 
 
 def test_the_mask_is_centred_by_what_was_measured_and_written(tmp_path):
@@ -105,7 +129,7 @@ def test_the_place_of_a_mask_that_repeats_is_not_written(tmp_path):
 def found():
     place = MaskPlace(-0.5, 0.01, 1.002, 1e-4, (1.0, 2.0), 0.5, 0.9)
     zero_um = {"mask_x": 12699.0, "mask_y": 12698.0}
-    return Found(0.0125, place, zero_um, 8000.0)
+    return Found(0.0125, place, zero_um, FocusFound("focus", 8000.0, 3.0))
 
 
 def test_only_what_was_chosen_and_previewed_is_written_and_nothing_when_the_file_changed(tmp_path):
