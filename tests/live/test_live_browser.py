@@ -6,6 +6,7 @@ import pytest
 from browsers import MARKS, complaints, open_browser
 from test_live import PatientCamera
 
+from emmc_rig.acquisition.control import Control
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
@@ -280,7 +281,7 @@ def test_a_refusal_floats_over_the_page_and_can_be_hidden(page):
 
 
 def test_a_lost_connection_says_so_and_what_to_do(browser, tmp_path):
-    shown = SessionPage(tmp_path / "session", computes=False)
+    shown = SessionPage(tmp_path / "session", Control(), computes=False)
     with served(application(shown, TOKEN)) as port:
         browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
         wait(browser, lambda: text(browser, "count") == "no frame yet")

@@ -18,6 +18,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
+from emmc_rig.session.session import Session
 
 PLAN = {
     "camera": "rgbw-bayer-2shots",

@@ -5,6 +5,7 @@ Every frame is even: 100 in the dark and 1000 under the lamp, plus its place in 
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,8 @@ def names(session, boards):
 
 def whiteboards_of(session, routes):
     """Return the routes, and how many whiteboards judge, fit and measure by the pinhole."""
-    routes, *boards = measured_psi.session_outcome(session, routes)
+    found: Any = measured_psi.session_outcome(session, routes)
+    routes, *boards = found
     return (routes, *(len(some.frames) if some else 0 for some in boards))
 
 
