@@ -9,7 +9,7 @@ const view = { x: 0.5, y: 0.5, level: 0, marked: true, bright: false };
 let loading = false, wanted = false, times = [];
 
 async function show() {
-  if (onField()) return;
+  if (onField() || !state.frame) return; // none before the first frame
   if (loading) { wanted = true; return; }
   loading = true;
   const box = $("stage").getBoundingClientRect();
