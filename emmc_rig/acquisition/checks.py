@@ -6,6 +6,7 @@ The checks look at some ten thousand pixels, and so take less than a millisecond
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,14 @@ from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Checks
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.errors import AppError
-from emmc_rig.pages.frame_view import thinned
+from emmc_rig.pages.frame_view import thinned, thinning_step
 from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
 
 BRIGHT_PERCENTILE = 99.9
+HOT_RATIO = 2.0
+"""Of a pixel over all eight of its colour around it. Where light is brighter than half of white, a
+hot pixel is not found by it: metering then exposes less and looks again."""
 LEAST_LIKENESS = 0.3
 ROUNDING = 1e-9
 """Limits that went through a device's own units come back rounded."""
@@ -41,13 +45,35 @@ class SaturatedError(FrameRefusedError):
 def figures(frame: RawFrame) -> Figures:
     """Return a frame's figures, from `thinned` pixels."""
     black = float(frame.black_level_dn.mean())
-    counts = np.bincount(thinned(frame.mosaic).ravel())
-    levels, total = np.arange(counts.size), counts.sum()
-    shares = np.array([0.5, BRIGHT_PERCENTILE / 100])
-    median, bright = np.searchsorted(np.cumsum(counts), shares * total)
-    saturated = counts[frame.white_level_dn :].sum() / total
-    mean = float(counts @ levels / total)
+    few = thinned(frame.mosaic)
+    counts = np.bincount(few.ravel())
+    total = counts.sum()
+    mean = float(counts @ np.arange(counts.size) / total)
+    median, likely_bright = np.searchsorted(np.cumsum(counts), np.array([0.5, 0.99]) * total)
+    lit = counts - np.bincount(_hot(frame.mosaic, few, likely_bright, black), minlength=counts.size)
+    bright = np.searchsorted(np.cumsum(lit), BRIGHT_PERCENTILE / 100 * lit.sum())
+    saturated = lit[frame.white_level_dn :].sum() / lit.sum()
     return Figures(float(saturated), mean - black, float(bright) - black, float(median) - black)
+
+
+def _hot(
+    mosaic: NDArray[np.uint16], few: NDArray[np.uint16], least_dn: int, black: float
+) -> NDArray[np.uint16]:
+    """Return the values of hot pixels among a few: far brighter than all their neighbours.
+
+    few: see `thinned`. Neighbours are two pixels away, where most mosaics have the same colour, on
+    the diagonals all. Pixels below least_dn are not looked at.
+    """
+    step = thinning_step(mosaic)
+    places = np.argwhere(few >= least_dn)
+    values = few[tuple(places.T)]
+    around = []
+    for shift in product((-2, 0, 2), repeat=2):
+        if any(shift):
+            at = np.abs(places // 2 * 2 * step + places % 2 + shift)
+            at = np.minimum(at, 2 * (np.array(mosaic.shape) - 1) - at)  # mirrored at the edges
+            around.append(mosaic[tuple(at.T)])
+    return values[values - black > HOT_RATIO * np.maximum(np.max(around, axis=0) - black, 1.0)]
 
 
 def check(

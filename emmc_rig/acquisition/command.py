@@ -17,13 +17,7 @@ from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.amend import amendment
 from emmc_rig.acquisition.checks import refuse_impossible
 from emmc_rig.acquisition.control import Control, interruptible
-from emmc_rig.acquisition.estimate import (
-    Estimate,
-    Exposures,
-    known_exposures,
-    last_session,
-    pace_of,
-)
+from emmc_rig.acquisition.estimate import Estimate, known_exposures, pace_of
 from emmc_rig.acquisition.events import EventWatcher, OnEvent
 from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.metering import first_meterings
@@ -32,7 +26,6 @@ from emmc_rig.acquisition.plan import Plan, load_plan, planned_camera
 from emmc_rig.acquisition.replay import missing_words, replaying, there
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.suspend import Suspend, suspended_by
 from emmc_rig.acquisition.until import Until, refuse_without_choice
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.bench.hardware import Rig
@@ -87,15 +80,13 @@ class FrontEnd:
     """Who asks for a capture and follows it: the command line, a page, a program.
 
     ask: does what no axis of the rig does: lamp, board, masks. agreed: gets what the capture will
-    take, once nothing speaks against it; where it says no, nothing is made or moved. suspend: says
-    before each frame why the capture has to wait, "" to go on.
+    take, once nothing speaks against it; where it says no, nothing is made or moved.
     """
 
     watcher: CaptureWatcher = field(default_factory=CaptureWatcher)
     ask: Ask = ask_at_prompt
     agreed: Callable[[Estimate], bool] = lambda expected: True
     control: Control = field(default_factory=Control)
-    suspend: Suspend | None = None
 
 
 def session_folder(plan_path: Path) -> Path:
@@ -192,12 +183,11 @@ def estimated(
     plan: Plan,
     rig: Rig,
     session: Session | None = None,
-    earlier: Session | None = None,
 ) -> Estimate:
-    """Return what frames will take; earlier: another session of the same stage and camera."""
+    """Return what frames will take."""
     meterings = {} if session is None else first_meterings(session)
     decided = None if session is None else metered(session.journal.entries)
-    known = known_exposures(Exposures(plan, earlier), meterings, decided)
+    known = known_exposures(plan, meterings, decided)
     return pace_of(rig, plan).estimate(frames, known)
 
 
@@ -303,12 +293,9 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
             if words := missing_words(folder, frames, recording):
                 watcher.tell(words)
         refuse_impossible(rig, frames)
-        details = getattr(rig.camera, "details", dict)
-        suspended = suspended_by(plan.suspend, details, front.suspend)
         if session is not None:
             refuse_other_camera(session, rig)
-        earlier = last_session(request.out, request.rig)
-        expected = estimated(frames, plan, rig, session, earlier)
+        expected = estimated(frames, plan, rig, session)
         refuse_small_disk(request.out, expected)
         if not front.agreed(expected):
             return None
@@ -331,8 +318,6 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                     watcher,
                     front.control,
                     choose,
-                    exposures=Exposures(plan, earlier),
-                    suspended=suspended,
                 )
                 return session, sequencer.run()
 
@@ -402,7 +387,6 @@ def capture(
     until_db: float | None = None,
     watcher: CaptureWatcher | None = None,
     on_event: OnEvent | None = None,
-    suspend: Suspend | None = None,
     ask: Ask = ask_at_prompt,
 ) -> Session:
     """Run a plan on a rig and return its session; run again, it goes on where it stopped.
@@ -415,7 +399,6 @@ def capture(
         watcher: gets what is captured.
         on_event: is called with each `emmc_rig.acquisition.events.Event`, as `frame.written` or
             `shot.done`; one that raises is not called again.
-        suspend: is asked before each frame, returns why the capture has to wait, "" to go on.
         ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
 
     Raises:
@@ -434,7 +417,7 @@ def capture(
     watching = watcher or CaptureWatcher()
     if on_event is not None:
         watching = EventWatcher(on_event, watching)
-    front = FrontEnd(watching, ask, suspend=suspend)
+    front = FrontEnd(watching, ask)
     captured = capture_session(plan, description, folder, until_db, front)
     assert captured is not None  # nobody is asked whether to agree
     return captured[0]

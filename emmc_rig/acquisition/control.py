@@ -12,7 +12,7 @@ from typing import Any
 
 PAUSE_POLL_S = 0.05
 ENDING = ("SIGTERM", "SIGHUP")
-"""A request to end, and a terminal that closed; not every system has both."""
+"""A request to end, and a terminal that closed."""
 
 
 class Control:
@@ -94,9 +94,8 @@ def uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def handled(handler: Any, names: Iterable[str]) -> Iterator[None]:
-    """Let `handler` take the signals named, as far as there are such; main thread only."""
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    before = {number: signal.signal(number, handler) for number in numbers}
+    """Let `handler` take the signals named; main thread only."""
+    before = {signal.Signals[name]: signal.signal(signal.Signals[name], handler) for name in names}
     try:
         yield
     finally:

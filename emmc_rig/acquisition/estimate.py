@@ -1,7 +1,7 @@
 """How long a capture takes and how much it writes: before it begins, and while it runs.
 
-Exposures that are metered are known once their metering frame is taken; until then they are those
-of the last session of the same stage and camera, or a guess, and it is said how many.
+Exposures that are metered are known once their metering frame is taken; until then they are a
+guess, and it is said how many.
 """
 
 from __future__ import annotations
@@ -9,20 +9,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
-from typing import Any
 
 from drivers.stage import needs_approach
 from emmc_rig.acquisition.metering import metered_exposure_s
 from emmc_rig.acquisition.order import APPROACH_UM
 from emmc_rig.acquisition.plan import METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.errors import AppError
-from emmc_rig.files.folders import is_session
 from emmc_rig.session.journal import FrameEntry, MeteredEntry
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.session import JOURNAL, Session
 
 USUAL_SPEED_UM_S = 2000.0
 DOWNLOAD_BYTES_PER_S = 40e6
@@ -57,63 +52,6 @@ class Estimate:
     def seconds(self) -> float:
         """Total, without what is done by hand."""
         return self.moving_s + self.exposing_s + self.downloading_s
-
-
-class Exposures:
-    """By what frames will be exposed, as far as it is known.
-
-    earlier: a session of the same devices, whose exposures hold until these are metered.
-    """
-
-    def __init__(self, plan: Plan, earlier: Session | None = None) -> None:
-        self._level = (plan.whiteboards or Boards()).level
-        self._earlier: dict[tuple[str, str], float] = {}
-        for frame in () if earlier is None else earlier.frames:
-            entry = earlier.stored.get(frame.id) if earlier is not None else None
-            if entry is not None and frame.kind in ("reference", "shot"):
-                key = (frame.kind, frame.bench.lamp)
-                self._earlier.setdefault(key, entry.exposure_s)
-
-    def seconds(
-        self, frame: PlannedFrame, meterings: Mapping[str, FrameEntry], decided: MeteredEntry | None
-    ) -> float | None:
-        """Return a frame's exposure; None where nothing determines it.
-
-        meterings: journal lines of metering frames. decided: what metering of the scene asks for.
-        """
-        if frame.exposure_s is not None:
-            return frame.exposure_s
-        shot = frame.bench.shot
-        if frame.is_exposed_as_shots:
-            if decided is not None and shot in decided.exposures_s:
-                return decided.exposures_s[shot] * frame.light
-            earlier_s = self._earlier.get(
-                ("shot", "white" if frame.kind == "dark" else frame.bench.lamp)
-            )
-        else:
-            entry = meterings.get(frame.metered_by or "")
-            if entry is not None and entry.figures.bright_dn >= 1:
-                return metered_exposure_s(entry, self._level, frame.light, ANY_LIMITS)
-            earlier_s = self._earlier.get(("reference", frame.bench.lamp))
-        return None if earlier_s is None else earlier_s * frame.light
-
-
-def last_session(out: Path, rig: Mapping[str, Any]) -> Session | None:
-    """Return the latest session beside `out` that the same stage and camera took, if any."""
-    beside = out.absolute().parent
-    found: list[tuple[float, Session]] = []
-    for folder in sorted(beside.iterdir()) if beside.is_dir() else ():
-        if folder == out.absolute() or not is_session(folder):
-            continue
-        try:
-            session = Session(folder)
-            alike = all(session.rig.get(key) == rig.get(key) for key in ("kind", "stage", "camera"))
-            if alike and session.stored:
-                written_s = (folder / JOURNAL).stat().st_mtime
-                found.append((written_s, session))
-        except (AppError, OSError):
-            continue  # a damaged neighbour is no evidence
-    return max(found, key=lambda one: one[0])[1] if found else None
 
 
 class Pace:
@@ -184,10 +122,27 @@ def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
 
 
 def known_exposures(
-    exposures: Exposures, meterings: Mapping[str, FrameEntry], decided: MeteredEntry | None
+    plan: Plan, meterings: Mapping[str, FrameEntry], decided: MeteredEntry | None
 ) -> Callable[[PlannedFrame], float | None]:
-    """Return what determines a frame's exposure; see `Exposures.seconds`."""
-    return lambda frame: exposures.seconds(frame, meterings, decided)
+    """Return what says a frame's exposure, None where nothing determines it yet.
+
+    meterings: journal lines of metering frames. decided: what metering of the scene asks for.
+    """
+    level = (plan.whiteboards or Boards()).level
+
+    def exposure_s(frame: PlannedFrame) -> float | None:
+        if frame.exposure_s is not None:
+            return frame.exposure_s
+        if frame.is_exposed_as_shots:
+            chosen = {} if decided is None else decided.exposures_s
+            shot = frame.bench.shot
+            return chosen[shot] * frame.light if shot in chosen else None
+        entry = meterings.get(frame.metered_by or "")
+        if entry is None or entry.figures.bright_dn < 1:
+            return None
+        return metered_exposure_s(entry, level, frame.light, ANY_LIMITS)
+
+    return exposure_s
 
 
 def _move_s(step_um: float, speed_um_s: float) -> float:

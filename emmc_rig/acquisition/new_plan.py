@@ -61,10 +61,6 @@ checks:
   largest_dark: 0.05        # mean of a dark frame, 1 at white
   stage_um: 2.0             # read-back after the exposure
   registration_px: 0.5      # against the last good frame, on resuming
-
-# suspend:                  # the capture waits while one of these is out of its range
-#   - {{name: lamp, file: /tmp/photodiode.txt, low: 0.98, high: 1.02}}
-#   - {{name: temperature, camera: DeviceTemperature, high: 45}}
 """
 
 

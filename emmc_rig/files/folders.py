@@ -385,9 +385,7 @@ def _sync(path: Path) -> None:
 
 
 def _sync_folders(folder: Path, names: Iterable[str]) -> None:
-    """Return when the names are on the disk; Windows cannot say."""
-    if os.name == "nt":
-        return
+    """Return when the names are on the disk."""
     for place in {folder, *((folder / name).parent for name in names)}:
         with suppress(FileNotFoundError):
             descriptor = os.open(place, os.O_RDONLY)

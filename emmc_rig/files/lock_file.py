@@ -1,12 +1,13 @@
 """A lock on any disk, for one program at a time: the operating system's, or a file of that name.
 
 The system's lock goes with its program, however that ends. Where files cannot be locked (some
-network disks, Windows) the file itself is the lock, for only one program can make it; it stays when
+network disks) the file itself is the lock, for only one program can make it; it stays when
 that program is killed, and whoever meets it is told which file to delete.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import socket
@@ -38,7 +39,7 @@ class TakenError(Exception):
             delete = f"delete {path}, for this disk cannot lock files"
             here, process = holder.get("host") == socket.gethostname(), holder.get("process")
             ours = process == os.getpid()
-            can_tell = here and isinstance(process, int) and not ours and os.name != "nt"
+            can_tell = here and isinstance(process, int) and not ours
             ended = can_tell and not is_running(int(process or 0))
             self.advice = (
                 f"it has ended: {delete}"
@@ -60,12 +61,10 @@ def take_lock(path: Path) -> Callable[[], None]:
             continue  # it went between two looks at it
         by_file, is_free = False, True
         try:
-            import fcntl
-
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             is_free = False
-        except (OSError, ImportError):
+        except OSError:
             by_file, is_free = True, made
         holder = _holder(os.read(descriptor, 4096))
         is_taken = not is_free or bool(holder.get("by_file"))
@@ -84,7 +83,7 @@ def take_lock(path: Path) -> Callable[[], None]:
 
 def _opened(path: Path) -> tuple[int, bool]:
     """Return the file's descriptor, and whether this program made it."""
-    flags = os.O_RDWR | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
+    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
     try:
         return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666), True
     except FileExistsError:
@@ -92,14 +91,11 @@ def _opened(path: Path) -> tuple[int, bool]:
 
 
 def _release(descriptor: int, path: Path) -> None:
-    named, windows = _is_named(descriptor, path), os.name == "nt"
     try:
-        if named and not windows:
+        if _is_named(descriptor, path):
             os.unlink(path)
     finally:
         os.close(descriptor)
-    if named and windows:  # it removes no open file
-        os.unlink(path)
 
 
 def _is_named(descriptor: int, path: Path) -> bool:
@@ -132,9 +128,7 @@ def _holder(data: bytes) -> dict[str, Any]:
 
 
 def is_running(process: int) -> bool:
-    """Return whether another process of that number runs; Windows is not asked."""
-    if os.name == "nt":
-        return False
+    """Return whether another process of that number runs."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

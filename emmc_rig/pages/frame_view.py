@@ -131,9 +131,14 @@ def _display_codes() -> NDArray[np.uint8]:
     return codes_of(srgb_of(np.linspace(0, 1, 1 << 16, dtype=np.float32)))
 
 
+def thinning_step(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> int:
+    """Return how many 2x2 tiles apart those are that `thinned` takes."""
+    return max(1, int(np.sqrt(mosaic.size / pixels)))
+
+
 def thinned(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> NDArray[np.uint16]:
     """Return a subset of a mosaic's pixels: whole 2x2 tiles, evenly spread."""
-    step = max(1, int(np.sqrt(mosaic.size / pixels)))
+    step = thinning_step(mosaic, pixels)
     if step == 1:
         return mosaic
     rows, columns = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2

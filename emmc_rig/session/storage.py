@@ -26,9 +26,9 @@ class OpenFile:
     """A file that is being written; what was not synced may be lost."""
 
     def __init__(self, path: Path, flags: int) -> None:
-        flags |= os.O_WRONLY | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+        flags |= os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
         # A link under the name would lead the bytes out of the session.
-        self._descriptor = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        self._descriptor = os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
     def write(self, data: bytes | memoryview) -> None:
         """Write all of `data` at the end."""
@@ -77,10 +77,8 @@ class Disk:
         shutil.rmtree(path)
 
     def sync_folder(self, path: Path) -> None:
-        """Return when the names in a folder are on the disk; Windows cannot say."""
-        if os.name == "nt":
-            return
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0))
+        """Return when the names in a folder are on the disk."""
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         try:
             _sync(descriptor)
         finally:

@@ -225,30 +225,6 @@ def a_single_dark_of_the_shots(bench):
     bench.plan(darks={**PLAN["darks"], "of_shots": 2})
 
 
-@walk("give file or camera, one of them")
-def a_condition_of_no_source(bench):
-    bench.plan(suspend=[{"name": "lamp", "low": 1}])
-    yield bench.refused()
-    bench.plan()
-
-
-@walk("give low, high or both")
-def a_condition_without_range(bench):
-    bench.plan(suspend=[{"name": "lamp", "file": "lamp.txt"}])
-    yield bench.refused()
-    bench.plan()
-
-
-@walk("it is empty")
-@walk(" cannot be read (")
-def a_condition_of_an_empty_file(bench):
-    file = bench.folder / "lamp.txt"
-    file.write_text("")
-    bench.plan(suspend=[{"name": "lamp", "file": str(file), "low": 1}])
-    yield bench.refused()
-    file.write_text("1.5 mW")
-
-
 @walk(" shots, from 0")
 def shots_that_are_none(bench):
     bench.boards(shots=[0, 2])

@@ -135,6 +135,18 @@ def test_the_figures_of_a_frame_are_its_saturation_mean_and_brightest():
     assert found.saturated == 0
 
 
+def test_hot_pixels_are_no_light_that_a_frame_is_metered_by():
+    rng = np.random.default_rng(0)
+    drawn = rng.integers(300, 1400, (400, 600), dtype=np.uint16)
+    hot = rng.random(drawn.shape) < 0.002
+    plain, spotted = (
+        figures(decode_raw(encode_dng(dn, "rggb", 256, 4000, 0.01)))
+        for dn in (drawn, np.where(hot, np.uint16(4000), drawn))
+    )
+    assert spotted.bright_dn == pytest.approx(plain.bright_dn, rel=0.01)
+    assert (plain.saturated, spotted.saturated) == (0, 0)
+
+
 def test_a_still_stage_refuses_what_a_real_one_would():
     from drivers.errors import LimitExceededError, NotHomedError
     from simulators.clock import ManualClock
