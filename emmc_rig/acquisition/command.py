@@ -26,7 +26,7 @@ from emmc_rig.acquisition.plan import Plan, load_plan, planned_camera
 from emmc_rig.acquisition.replay import missing_words, replaying, there
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.until import Until, refuse_without_choice
+from emmc_rig.acquisition.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.bench.rig_config import Ask, RigChoice, opened_rig
@@ -269,7 +269,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
     """
     watcher, plan = front.watcher, request.plan
     if request.until_db is not None:
-        refuse_without_choice(plan, request.camera)
+        refuse_unless_shots_can_be_spared(plan, request.camera)
     with ExitStack() as open_things:
         session = begun_session(request)
         rig = open_things.enter_context(opened_rig(request.rig, request.camera, front.ask))

@@ -1,17 +1,18 @@
 """A capture that ends when the scene needs no more shots: which frames of a session come next.
 
-Everything but the shots comes first, so that Psi of every planned shot is known before one of them
-is chosen: measured, or foretold by the parametric fit. Then shots are taken one by one; after each
-the light field so far is reconstructed and assessed, and what is decided is journalled before it is
-acted on, so that a resume goes on with it.
+Everything but the shots comes first, so that Psi of every planned shot is known: measured, or by
+the parametric fit. Then shots are taken one by one, in the order of the plan. After each the light
+field so far is reconstructed; its own deviation says what PSNR to expect, and what is decided is
+journalled before it is acted on, so that a resume goes on with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from calibration.shadow import shadow_mask
-from emmc_rig.acquisition.assessment import METHOD, Assessment, assessed
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
@@ -26,16 +27,17 @@ from reconstruction.result import Progress, Reconstruction
 
 PLANNED_BY = "`emmc-rig calibrate --plan` writes a plan that has them"
 SMALLEST = (16, 16)
+METHOD = "adaptive-fast"
 
 
-def refuse_without_choice(plan: Plan, camera: Camera) -> None:
-    """Raise AppError or CalibrationError unless a plan lets shots be chosen; camera: as planned.
+def refuse_unless_shots_can_be_spared(plan: Plan, camera: Camera) -> None:
+    """Raise AppError or CalibrationError unless a plan has shots to spare; camera: as planned.
 
     Its whiteboards must determine Psi of every shot before the first one is taken.
     """
     if len(plan.shots) < 2:
         raise AppError(
-            "--until: the plan has one shot, so that there is none to choose; list the others that "
+            "--until: the plan has one shot, so that there is none to spare; list the others that "
             "may be taken, each with its mask_um"
         )
     boards = plan.whiteboards
@@ -108,34 +110,48 @@ class Until:
         assert target_db is not None
         began_s = now_s()
         self._watcher.tell(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
-        found = self._assessed(shots, target_db)
+        stated_db, advice = self._stated(shots)
         planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
-        spared = [] if found.next is not None else sorted(planned - set(shots))
+        left = sorted(planned - set(shots))
+        reached = stated_db >= target_db
+        spared = left if reached else []
         entry = DecidedEntry(
             run=session.runs,
             shots=list(shots),
-            stated_db=found.stated_db,
+            stated_db=stated_db,
             target_db=target_db,
-            next=found.next,
-            why=found.why,
-            expected_db=dict(found.expected_db),
+            next=left[0] if left and not reached else None,
+            why="the target is reached"
+            if reached
+            else ""
+            if left
+            else "every planned shot is taken",
             spared=spared,
             spared_frames=sum(
                 frame.kind == "shot" and frame.bench.shot in spared for frame in session.needed
             ),
             method=METHOD,
-            advice=found.advice,
+            advice=advice,
             spans_s={"decide": (began_s, now_s())},
             wall=wall_time(),
         )
         session.note(entry)
         self._watcher.tell(str(entry))
 
-    def _assessed(self, shots: tuple[int, ...], target_db: float) -> Assessment:
+    def _stated(self, shots: tuple[int, ...]) -> tuple[float, str]:
+        """Return the PSNR that the light field of some shots is stated to have, and advice."""
         self._scale = self._scale or session_scale(self._session)
-        result, sigma = light_field_so_far(self._session, self._scale, shots)
+        result = light_field_so_far(self._session, self._scale, shots)
         self._watcher.light_field(shots, result)
-        return assessed(self._scale.psi, result, shots, sigma, target_db)
+        return stated_psnr_db(result), result.advice
+
+
+def stated_psnr_db(result: Reconstruction) -> float:
+    """Return the PSNR that a result's own deviation stands for; raises AppError without one."""
+    sigma = result.maps.get("sigma")
+    if sigma is None:
+        raise AppError(f"{result.method} states no deviation of its light field: use {METHOD}")
+    return float(-10 * np.log10(np.mean(np.square(sigma, dtype=np.float64))))
 
 
 def light_field_so_far(
@@ -143,14 +159,12 @@ def light_field_so_far(
     scale: Scale,
     shots: Sequence[int],
     on_step: Callable[[Progress], None] | None = None,
-) -> tuple[Reconstruction, float]:
-    """Return the light field that some shots of a session give by METHOD, and their noise.
+) -> Reconstruction:
+    """Return the light field that some shots of a session give by METHOD.
 
     Raises AppError, CalibrationError or ReconstructionError.
     """
     taken = scaled_readings(session, scale, shots)
-    sigma = taken.noise_sigma
-    result = reconstruct(
-        METHOD, taken.psi, taken.readings, sigma, usable=taken.usable, on_step=on_step
+    return reconstruct(
+        METHOD, taken.psi, taken.readings, taken.noise_sigma, usable=taken.usable, on_step=on_step
     )
-    return result, sigma

@@ -57,7 +57,7 @@ def capture(
         str | None,
         typer.Option(
             "--until",
-            help="PSNR, as 30dB: choose among the plan's shots, stop when no more are needed",
+            help="PSNR, as 30dB: shot after shot of the plan, stop when no more are needed",
         ),
     ] = None,
     dry_run: Annotated[

@@ -9,11 +9,10 @@ from typing import Any
 
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.assessment import METHOD, stated_psnr_db
 from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.events import Event, EventWatcher
-from emmc_rig.acquisition.until import light_field_so_far
+from emmc_rig.acquisition.until import METHOD, light_field_so_far, stated_psnr_db
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.live.light_field import Pictures, export_of, field_pictures
@@ -268,7 +267,7 @@ class SessionPage(EventWatcher):
                 session = Session(self._folder)
                 self._scale = scale = self._scale or session_scale(session)
                 self._show_field(f"{METHOD} at work", shots)
-                self.light_field(shots, light_field_so_far(session, scale, shots, self._go_on)[0])
+                self.light_field(shots, light_field_so_far(session, scale, shots, self._go_on))
             except _EndedError:
                 return
             except (AppError, CalibrationError, ReconstructionError, SensingError) as fault:

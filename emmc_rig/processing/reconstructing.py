@@ -39,15 +39,13 @@ from emmc_rig.processing.memory import (
 )
 from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures
-from emmc_rig.session.exposure import UNDEREXPOSED, exposure_reasons, shot_exposures
+from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import RECONSTRUCTION, Session
-from reconstruction.adaptive.planning import expected_errors
 from reconstruction.dictionary import Dictionary
-from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import check_frames
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
-from reconstruction.result import Progress, Reconstruction
+from reconstruction.result import Progress
 from reconstruction.tiles import reconstruct_in_blocks
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
@@ -57,7 +55,6 @@ PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi.from_sc
 FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
 RESULT_GROUP = "result.zarr"
 """Light field and maps, where they are written as Zarr."""
-NEEDED = ("disparity", "disparity_sigma", "texture", "sigma")
 Place = tuple[Path, Path]
 """A capture's folder, and the folder to write: in a session only the one it has for this."""
 
@@ -248,7 +245,7 @@ def reconstruct_folder(
         solved = replace(blocks.result(), light_field=light_field, maps=arrays)
         result = Result(solved, blocks.verdict(), saved.load(), frames)
     if is_session(folder):
-        result = with_exposure(result, Session(folder))
+        result = replace(result, verdict=with_exposure(result.verdict, Session(folder)))
     compared_with = _compared(result.light_field, truth, result.psi.layout)
     metrics = {**result.metrics(), **further, **compared_with}
     result.write(out, metrics)
@@ -269,7 +266,7 @@ def _write_blocks(
     """
     psi, verdict = blocks.job.psi, blocks.verdict()
     if is_session(folder):
-        verdict = verdict_with_exposure(verdict, Session(folder))
+        verdict = with_exposure(verdict, Session(folder))
     metrics = {
         **figures(blocks.result(), verdict, frames),
         "shots": psi.shape[0],
@@ -299,55 +296,9 @@ def _compared(light_field: Any, truth: str | None, psi: PsiLayout | SavedPsi) ->
     return {"truth": truth, **compared(light_field, np.asarray(scene))}
 
 
-def with_exposure(result: Result, session: Session) -> Result:
-    """Return the result with what speaks against the exposures of its shots in the verdict."""
-    shots = shot_exposures(session)
-    dark = [one for one in shots if one.level < UNDEREXPOSED]
-    gain_db = None
-    if dark:
-        factor = float(np.exp(np.mean([np.log(one.factor) for one in shots])))
-        gain_db = expected_gain_db(result, factor)
-    reasons = exposure_reasons(shots, gain_db)
-    return replace(result, verdict=result.verdict.with_reasons(reasons))
-
-
-def verdict_with_exposure(verdict: Verdict, session: Session) -> Verdict:
-    """Return the verdict with what speaks against the exposures, without what better ones gain."""
-    return verdict.with_reasons(exposure_reasons(shot_exposures(session), None))
-
-
-def expected_gain_db(result: Result, factor: float) -> float | None:
-    """Return what an exposure `factor` times as long is expected to add to the PSNR.
-
-    The method's own deviation says how large the error is. By how much less shot noise lessens it
-    follows from Psi and what the scene was estimated to be made of. None where the method does not
-    estimate that.
-    """
-    solved: Reconstruction = result.solved
-    if any(name not in solved.maps for name in NEEDED):
-        return None
-    views_v, views_u = solved.light_field.shape[:2]
-    every = [tuple(range(result.psi.shots))]
-    variance = result.frames.noise_sigma**2
-    try:
-        now, then = (
-            expected_errors(
-                result.psi,
-                every,
-                solved.maps["disparity"],
-                solved.maps["disparity_sigma"],
-                solved.maps["texture"],
-                solved.light_field[views_v // 2, views_u // 2],
-                one,
-            )[0]
-            for one in (variance, variance / factor)
-        )
-    except ReconstructionError:
-        return None
-    stated = float(np.mean(np.square(solved.maps["sigma"], dtype=np.float64)))
-    # The expectation may lie above what is stated; more light makes nothing worse.
-    remaining = max(stated - (now - then), min(then, stated))
-    return float(10 * np.log10(stated / remaining))
+def with_exposure(verdict: Verdict, session: Session) -> Verdict:
+    """Return the verdict with what speaks against the exposures of a session's shots."""
+    return verdict.with_reasons(exposure_reasons(shot_exposures(session)))
 
 
 def ceiling_for(

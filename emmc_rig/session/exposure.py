@@ -77,21 +77,17 @@ def _dark_share(entries: Sequence[FrameEntry], darks_s: Sequence[float], gain: f
     return unknown_dn / max(longest.figures.bright_dn, 1.0)
 
 
-def exposure_reasons(shots: Sequence[ShotExposure], gain_db: float | None = None) -> list[Reason]:
-    """Return what speaks against the exposures of shots; nothing for good ones.
-
-    gain_db: of the light field's PSNR, expected from exposing as long as is good.
-    """
+def exposure_reasons(shots: Sequence[ShotExposure]) -> list[Reason]:
+    """Return what speaks against the exposures of shots; nothing for good ones."""
     found = []
     dark = [one for one in shots if one.level < UNDEREXPOSED]
     if dark:
         worst = min(dark, key=lambda one: one.level)
         quieter_db = 10 * math.log10(worst.factor)
-        gain = "" if gain_db is None else f"about {gain_db:.1f} dB of the light field to gain, and "
         found.append(
             Reason(
                 f"the brightest reading of {_shots(worst, dark)} is {worst.level:.1%} of white: "
-                f"{gain}{quieter_db:.1f} dB or more of the readings' noise",
+                f"{quieter_db:.1f} dB or more of the readings' noise",
                 worst.level,
                 f"expose {worst.factor:.2g} times as long, or write exposure_s: auto",
                 "doubt",

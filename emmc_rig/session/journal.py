@@ -198,7 +198,7 @@ class DecidedEntry(Entry):
         if self.next is None:
             spared = f", {len(self.spared)} shots spared" if self.spared else ""
             return f"{stated}; no more, {self.why}{spared}"
-        return f"{stated}; next shot {self.next}, {self.why}"
+        return f"{stated}; next shot {self.next}{f', {self.why}' if self.why else ''}"
 
 
 class HaltEntry(Entry):

@@ -48,13 +48,14 @@ SCANNED = (
     HOUSE / "bench" / "rig_config.py",
 )
 FOLDERS, WRITING_A_PLAN = HOUSE / "files" / "folders.py", ("new_file", "_free")
-NO_CAPTURE = ("direct.py", "simulate.py", "assessment.py")
+NO_CAPTURE = ("direct.py", "simulate.py")
 """Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
 GUARDS = (
     ": is no list of frames; restore it from a copy",  # nor then would its SHA-256 be the journal's
     "cannot be metered, the board is dark",  # such a frame is refused as black before
     "was not captured yet; resume it",  # only frames are read that were hashed just before
     "is damaged, its SHA-256 is not the journal's",
+    "states no deviation of its light field",  # its method does
     "); resume it",
     "no session, it holds no",  # a folder that is none is a plan, or the place for one
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made

@@ -1,7 +1,6 @@
-"""`emmc-rig capture --until`: shots chosen one by one; a session ends when it has enough."""
+"""`emmc-rig capture --until`: shots taken one by one; a session ends when it has enough."""
 
 import json
-import math
 import shutil
 from itertools import pairwise
 from pathlib import Path
@@ -14,9 +13,8 @@ from capture_rigs import begun, still_rig
 from programs import program
 from simulated_disk import SimulatedDisk
 
-from emmc_rig.acquisition.assessment import assessed, stated_psnr_db
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.until import Until
+from emmc_rig.acquisition.until import Until, stated_psnr_db
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
@@ -69,16 +67,15 @@ def decided(session):
 @pytest.fixture(scope="module", autouse=True)
 def _judged_once():
     """The rig's frames are the same each time, so that the same shots are judged but once."""
-    judge, known = Until._assessed, {}
+    judge, known = Until._stated, {}
 
-    def remembered(self, shots, target_db):
-        key = shots, target_db
-        if key not in known:
-            known[key] = judge(self, shots, target_db)
-        return known[key]
+    def remembered(self, shots):
+        if shots not in known:
+            known[shots] = judge(self, shots)
+        return known[shots]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Until, "_assessed", remembered)
+        patch.setattr(Until, "_stated", remembered)
         yield
 
 
@@ -117,7 +114,7 @@ def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
     assert not session.missing()
     assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
     assert not any(name.startswith(("shot-1", "shot-2")) for name in session.stored)
-    # Whiteboards and darks come first: Psi of every shot must be known to choose among them.
+    # Whiteboards and darks come first: Psi of every shot must be known to judge by it.
     assert session.journal.entries[-2] == only
     kinds = {frame.id: frame.kind for frame in session.frames}
     assert [kinds[name] for name in session.stored].index("shot") == len(session.stored) - 1
@@ -166,14 +163,12 @@ def test_it_is_calibrated_reconstructed_and_exported_with_the_shots_it_has(enoug
     assert "shot-1-e0-r0" not in ids
 
 
-def test_every_next_shot_is_the_one_expected_to_help_most(every):
+def test_shots_follow_in_the_order_of_the_plan_while_the_target_is_not_stated(every):
     taken = decided(Session(every))
-    assert [len(one.shots) for one in taken] == [1, 2, 3]
-    for one, after in pairwise(taken):
-        assert one.next == max(one.expected_db, key=lambda shot: one.expected_db[shot])
-        assert one.next is not None
-        assert after.shots == [*one.shots, one.next]
-        assert one.expected_db[one.next] > one.stated_db
+    assert [one.shots for one in taken] == [[0], [0, 1], [0, 1, 2]]
+    assert [one.next for one in taken] == [1, 2, None]
+    assert all(one.stated_db < one.target_db for one in taken)
+    assert all(after.stated_db > one.stated_db for one, after in pairwise(taken))
 
 
 def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, tmp_path):
@@ -211,7 +206,7 @@ def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(ev
         shutil.rmtree(copy)
 
 
-def test_a_stop_while_the_next_shot_is_chosen_keeps_what_was_taken(every, tmp_path):
+def test_a_stop_while_the_light_field_is_judged_keeps_what_was_taken(every, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(every, copy)
     whole = (copy / JOURNAL).read_bytes().splitlines(keepends=True)
@@ -262,7 +257,9 @@ def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_
         ({"whiteboards": {"open": [{}]}}, "30", "held out"),
     ],
 )
-def test_a_capture_that_cannot_choose_says_why_and_makes_nothing(tmp_path, changes, until, line):
+def test_a_capture_that_cannot_spare_shots_says_why_and_makes_nothing(
+    tmp_path, changes, until, line
+):
     path = plan_file(tmp_path, **changes)
     code, _, err = program("capture", path, *RIG, "--until", until, "--out", tmp_path / "s")
     assert code == (2 if "write a PSNR" in line else 1)
@@ -272,44 +269,14 @@ def test_a_capture_that_cannot_choose_says_why_and_makes_nothing(tmp_path, chang
     assert sorted(one.name for one in tmp_path.iterdir()) == ["camera.yaml", "plan.yaml"]
 
 
-def result_with(**maps):
-    light_field = np.full((3, 3, 8, 8, 3), 0.5, np.float32)
-    return Reconstruction("adaptive", light_field, Status.CONVERGED, "", 1, (), 1.0, {}, maps)
-
-
-def planar_result(sigma):
-    return result_with(
-        sigma=np.full((3, 3, 8, 8), sigma),
-        disparity=np.zeros((8, 8)),
-        disparity_sigma=np.full((8, 8), 0.1),
-        texture=np.full((8, 8), 2, np.uint8),
-    )
-
-
 def test_the_stated_psnr_is_that_of_the_deviation():
+    def result_with(**maps):
+        light_field = np.full((3, 3, 8, 8, 3), 0.5, np.float32)
+        return Reconstruction("tv", light_field, Status.CONVERGED, "", 1, (), 1.0, {}, maps)
+
     assert stated_psnr_db(result_with(sigma=np.full((2, 2), 0.1))) == pytest.approx(20)
     with pytest.raises(AppError, match="states no deviation"):
         stated_psnr_db(result_with())
-
-
-def test_shots_that_tell_nothing_are_not_worth_taking(coded_psi):
-    psi = coded_psi(shots=3, size=(8, 8), views=(3, 3))
-    dark = psi.weights.copy()
-    dark[1:] = 0
-    blind = ImagingMatrix(dark, psi.colour)
-    found = assessed(blind, planar_result(0.1), (0,), 0.004, 40.0)
-    assert found.next is None
-    assert "no further shot is expected to gain" in found.why
-    assert found.expected_db == pytest.approx({1: 20.0, 2: 20.0}, abs=1e-6)
-    assert assessed(psi, planar_result(0.1), (0,), 0.004, 40.0).next in (1, 2)
-
-
-def test_enough_is_enough_and_all_is_all(coded_psi):
-    psi = coded_psi(shots=2, size=(8, 8), views=(3, 3))
-    found = assessed(psi, planar_result(0.1), (0,), 0.004, 19.9)
-    assert (found.next, found.why) == (None, "the target is reached")
-    found = assessed(psi, planar_result(0.1), (1, 0), 0.004, math.inf)
-    assert (found.next, found.why) == (None, "every planned shot is taken")
 
 
 def test_what_a_session_needs_follows_from_the_last_instruction(tmp_path: Path):

@@ -15,7 +15,6 @@ from reconstruction.adaptive import assembly, method
 from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.planning import expected_errors, patch_errors
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import fitted, slopes
 from reconstruction.adaptive.search import (
@@ -412,52 +411,6 @@ def test_a_pixel_is_kept_from_the_fit_with_all_its_shots_or_not_at_all():
     held = held_out(usable)
     assert 0 < held.sum() < 0.06 * usable.sum()
     np.testing.assert_array_equal(held, usable & held.any(axis=0))
-
-
-def planned(psi, variance=1e-5):
-    shots = range(psi.shots)
-    return patch_errors(psi, [shots], 0.6, 0.02, 0.1, variance, TexturePrior())[0]
-
-
-def test_expected_error_is_the_prior_without_readings_and_falls_with_every_shot(coded_psi):
-    psi = coded_psi(shots=2, size=(8, 8), views=(3, 3))
-    dark = ImagingMatrix(np.zeros_like(psi.weights), psi.colour)
-    assert planned(dark) == pytest.approx(0.02 * (1 + 2 * 0.1) / 3)
-    one = ImagingMatrix(psi.weights[:1].copy(), psi.colour[:1].copy())
-    again = ImagingMatrix(psi.weights[[0, 0]].copy(), psi.colour[[0, 0]].copy())
-    assert planned(dark) > planned(one) > planned(again) > planned(psi)
-    # The same shot twice is one of half the noise variance.
-    assert planned(again) == pytest.approx(planned(one, 0.5e-5), rel=1e-6)
-
-
-@pytest.mark.parametrize("doubt", [0.0, 0.3])
-def test_expected_error_is_the_error_of_the_posterior_mean(coded_psi, doubt):
-    psi = coded_psi(size=(8, 8), views=(3, 3))
-    prior, variance = TexturePrior(), 1e-4
-    slopes = np.random.default_rng(0).normal(0, 0.05, (2, 8, 8, 3))
-    v, u, y, x, c = np.indices(psi.light_field_shape).reshape(5, -1)
-    at = np.stack([y - 0.6 * (v - 1), x - 0.6 * (u - 1)], axis=1)
-    colours = OPPONENT.T @ np.diag([1, 0.1, 0.1]) @ OPPONENT
-    texture = 0.02 * prior.covariance(np.square(at[:, None] - at[None]).sum(axis=-1))
-    texture *= colours[c[:, None], c[None]]
-    moved = (v - 1) * slopes[0, y, x, c] + (u - 1) * slopes[1, y, x, c]
-    texture += doubt * np.outer(moved, moved)
-    matrix = psi.to_scipy().toarray()
-    seen = matrix @ texture
-    posterior = texture - seen.T @ np.linalg.solve(seen @ matrix.T + variance * np.eye(64), seen)
-    inner = (np.minimum(y, x) >= 2) & (np.maximum(y, x) < 6)
-    expected = patch_errors(psi, [[0]], 0.6, 0.02, 0.1, variance, prior, doubt, slopes)
-    assert expected[0] == pytest.approx(np.diag(posterior)[inner].mean(), rel=1e-3)
-
-
-def test_the_mask_position_with_more_information_is_expected_to_err_less(bayer, planted):
-    maps = planted[3].maps
-    moved = np.concatenate([bayer.weights, np.roll(bayer.weights, 9, axis=5)])
-    psi = ImagingMatrix(moved, bayer.colour[[0, 0]].copy())
-    picture = planted[3].light_field[2, 2]
-    of_scene = (maps["disparity"], maps["disparity_sigma"], maps["texture"], picture)
-    errors = expected_errors(psi, [(0, 0), (0, 1)], *of_scene, 0.004**2, patches=4)
-    assert errors[1] < errors[0]
 
 
 @pytest.mark.parametrize("binning", [1, 2])
