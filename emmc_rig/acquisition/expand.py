@@ -20,7 +20,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.masks import cfa_tile
-from emmc_rig.session.planned import SHOT_DARK, Bench, PlannedFrame
+from emmc_rig.session.planned import SHOT_DARK, Bench, Kind, PlannedFrame
 
 OPEN_LAMP = "white"
 TURN_DEG = 90.0
@@ -49,14 +49,19 @@ def expand(
     AppError for views that the camera does not have, a window that uncovers none, and a shot whose
     masks stand at several places.
     """
-    boards = [*_boards(plan, camera), *_open_boards(plan, camera, window_um, window_side_um)]
-    lit = [
-        *_references(plan, camera, window_um),
-        *_response(plan, window_um),
-        *spread(boards, list(_lamp_checks(plan, camera, window_um))),
-        *_turned_boards(plan, camera, window_um),
-        *_last_references(plan, window_um),
-    ]
+    lit: list[PlannedFrame] = []
+    if (boards := plan.whiteboards) is not None:
+        stepped = [
+            *_boards(plan, boards, camera),
+            *_open_boards(boards, camera, window_um, window_side_um),
+        ]
+        lit = [
+            *_references(plan, boards, camera, window_um),
+            *_response(boards, window_um),
+            *spread(stepped, list(_lamp_checks(boards, camera, window_um))),
+            *_turned_boards(boards, camera, window_um),
+            *_last_references(boards, window_um),
+        ]
     references = [frame for frame in lit if not frame.bench.masks_in and not frame.part]
     others = [frame for frame in lit if frame.bench.masks_in or frame.part]
     last = max((frame.part for frame in lit), default=0)
@@ -71,14 +76,22 @@ def expand(
     return tuple(frames)
 
 
+def _repeated(
+    name: str, kind: Kind, bench: Bench, count: int, **how: Any
+) -> Iterator[PlannedFrame]:
+    """Yield so many equal frames; how: as they are exposed and what else they are."""
+    for repeat in range(count):
+        exposed = {"exposure_s": None} | how
+        yield PlannedFrame(f"{name}-r{repeat}", kind, bench, repeat=repeat, **exposed)
+
+
 def _darks(plan: Plan) -> Iterator[PlannedFrame]:
     if plan.darks is None:
         return
     bench = Bench("scene", "off", 0, 0, masks_in=True)
     for place, exposure_s in enumerate(sorted(set(plan.darks.exposure_s))):
-        for repeat in range(plan.darks.repeats):
-            name = f"dark-{place}-r{repeat}"
-            yield PlannedFrame(name, "dark", bench, exposure_s, repeat=repeat)
+        repeats = plan.darks.repeats
+        yield from _repeated(f"dark-{place}", "dark", bench, repeats, exposure_s=exposure_s)
 
 
 def _board_darks(
@@ -97,17 +110,10 @@ def _board_darks(
         if one.kind != "metering" and one.bench.lamp == OPEN_LAMP and one.light >= 1
     )
     for place, (exposure_s, metered_by, light) in enumerate(exposures):
-        for repeat in range(plan.darks.of_boards):
-            yield PlannedFrame(
-                f"dark-{when}-{place}-r{repeat}",
-                "dark",
-                bench,
-                exposure_s,
-                repeat=repeat,
-                metered_by=metered_by,
-                light=light,
-                part=part,
-            )
+        yield from _repeated(
+            f"dark-{when}-{place}", "dark", bench, plan.darks.of_boards,
+            exposure_s=exposure_s, metered_by=metered_by, light=light, part=part,
+        )  # fmt: skip
 
 
 def lamps_of(plan: Plan, camera: Camera) -> tuple[str, ...]:
@@ -123,10 +129,9 @@ def _metering_id(shot: int, lamp: str) -> str:
     return f"meter-s{shot}-{lamp}"
 
 
-def _references(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None:
-        return
+def _references(
+    plan: Plan, boards: Boards, camera: Camera, window_um: float
+) -> Iterator[PlannedFrame]:
     window = {"aperture_x": window_um, "aperture_y": 0.0}
     fitted = fittings(camera)
     lamps = lamps_of(plan, camera)
@@ -142,21 +147,13 @@ def _references(plan: Plan, camera: Camera, window_um: float) -> Iterator[Planne
             if boards.exposure_s is None:
                 metered_by = _metering_id(shot, lamp)
                 yield PlannedFrame(metered_by, "metering", bench, METERING_EXPOSURE_S)
-            for repeat in range(count):
-                yield PlannedFrame(
-                    f"reference-s{shot}-{lamp}-r{repeat}",
-                    "reference",
-                    bench,
-                    boards.exposure_s,
-                    repeat=repeat,
-                    metered_by=metered_by,
-                )
+            yield from _repeated(
+                f"reference-s{shot}-{lamp}", "reference", bench, count,
+                exposure_s=boards.exposure_s, metered_by=metered_by,
+            )  # fmt: skip
 
 
-def _boards(plan: Plan, camera: Camera) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None:
-        return
+def _boards(plan: Plan, boards: Boards, camera: Camera) -> Iterator[PlannedFrame]:
     rows, columns = camera.views
     views = boards.views
     if views == "all":
@@ -184,26 +181,16 @@ def _boards(plan: Plan, camera: Camera) -> Iterator[PlannedFrame]:
             pinhole = {"aperture_x": float(x_um[u]), "aperture_y": float(y_um[v])}
             for lamp in lamps_of(plan, camera):
                 bench = Bench("whiteboard", lamp, shot, fitted[shot], True, masks_um | pinhole)
-                metered = boards.exposure_s is None
-                for repeat in range(boards.repeats):
-                    yield PlannedFrame(
-                        f"board-s{shot}-v{v}-u{u}-{lamp}-r{repeat}",
-                        "whiteboard",
-                        bench,
-                        None if boards.exposure_s is None else boards.exposure_s * light,
-                        repeat=repeat,
-                        view=(v, u),
-                        metered_by=_metering_id(shot, lamp) if metered else None,
-                        light=light,
-                    )
+                exposed = _white(boards, light, shot, lamp)
+                name = f"board-s{shot}-v{v}-u{u}-{lamp}"
+                yield from _repeated(
+                    name, "whiteboard", bench, boards.repeats, view=(v, u), **exposed
+                )
 
 
 def _open_boards(
-    plan: Plan, camera: Camera, window_um: float, window_side_um: float | None
+    boards: Boards, camera: Camera, window_um: float, window_side_um: float | None
 ) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None or not boards.open:
-        return
     own_um = mask_offsets_um(camera, 0)
     cell_um = camera.lens.aperture_cell_um
     for place, board in enumerate(boards.open):
@@ -233,73 +220,46 @@ def _open_boards(
         }
         bench = Bench("whiteboard", OPEN_LAMP, 0, 0, True, moved | window)
         kind = "held-out" if board.held_out else "open"
-        for repeat in range(board.repeats):
-            yield PlannedFrame(
-                f"{kind}-{place}-r{repeat}",
-                kind,
-                bench,
-                repeat=repeat,
-                window=board.window,
-                **_white(plan, float(np.prod(camera.views)) / opened),
-            )
+        exposed = _white(boards, float(np.prod(camera.views)) / opened)
+        yield from _repeated(
+            f"{kind}-{place}", kind, bench, board.repeats, window=board.window, **exposed
+        )
 
 
-def _white(plan: Plan, light: float = 1.0) -> dict[str, Any]:
-    """Return how a whiteboard of the first shot is exposed, `light` times as long as metered."""
-    boards = plan.whiteboards or Boards()
+def _white(
+    boards: Boards, light: float = 1.0, shot: int = 0, lamp: str = OPEN_LAMP
+) -> dict[str, Any]:
+    """Return how a whiteboard is exposed: `light` times as long as its reference."""
     if boards.exposure_s is not None:
         return {"exposure_s": boards.exposure_s * light, "light": light}
-    return {"exposure_s": None, "metered_by": _metering_id(0, OPEN_LAMP), "light": light}
+    return {"metered_by": _metering_id(shot, lamp), "light": light}
 
 
-def _response(plan: Plan, window_um: float) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None:
-        return
+def _response(boards: Boards, window_um: float) -> Iterator[PlannedFrame]:
     bench = _open_bench(window_um, masks_in=False)
     for share in sorted(boards.response):
-        for repeat in range(RESPONSE_REPEATS):
-            name = f"response-{share:g}-r{repeat}"
-            yield PlannedFrame(name, "check", bench, repeat=repeat, **_white(plan, share))
+        exposed = _white(boards, share)
+        yield from _repeated(f"response-{share:g}", "check", bench, RESPONSE_REPEATS, **exposed)
 
 
-def _lamp_checks(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None:
-        return
+def _lamp_checks(boards: Boards, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
     bench = _open_bench(window_um, True, mask_offsets_um(camera, 0))
-    for repeat in range(boards.lamp_checks):
-        yield PlannedFrame(f"check-r{repeat}", "check", bench, repeat=repeat, **_white(plan))
+    return _repeated("check", "check", bench, boards.lamp_checks, **_white(boards))
 
 
-def _turned_boards(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
+def _turned_boards(boards: Boards, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
     """Yield the board turned: through the masks, which are in the beam, then without them."""
-    boards = plan.whiteboards
-    if boards is None:
-        return
     for masks_in in (True, False):
         offsets_um = mask_offsets_um(camera, 0) if masks_in else {}
         bench = replace(_open_bench(window_um, masks_in, offsets_um), board_turn_deg=TURN_DEG)
-        name = "open" if masks_in else "reference"
-        for repeat in range(boards.turned):
-            yield PlannedFrame(
-                f"turned-{name}-r{repeat}",
-                "turned",
-                bench,
-                repeat=repeat,
-                part=1,
-                **_white(plan),
-            )
+        name = f"turned-{'open' if masks_in else 'reference'}"
+        yield from _repeated(name, "turned", bench, boards.turned, part=1, **_white(boards))
 
 
-def _last_references(plan: Plan, window_um: float) -> Iterator[PlannedFrame]:
-    boards = plan.whiteboards
-    if boards is None or not boards.lamp_checks:
-        return
+def _last_references(boards: Boards, window_um: float) -> Iterator[PlannedFrame]:
     bench = _open_bench(window_um, masks_in=False)
-    for repeat in range(RESPONSE_REPEATS):
-        name = f"reference-again-r{repeat}"
-        yield PlannedFrame(name, "check", bench, repeat=repeat, part=2, **_white(plan))
+    count = RESPONSE_REPEATS if boards.lamp_checks else 0
+    return _repeated("reference-again", "check", bench, count, part=2, **_white(boards))
 
 
 def _open_bench(
@@ -356,16 +316,11 @@ def _shot_darks(
     exposures += [(place, None, meterings[place].id) for place in kept.values()]
     for place, exposure_s, metered_by in exposures:
         bench = Bench("scene", "off", place, 0, masks_in=True)
-        for repeat in range(plan.darks.of_shots):
-            name = f"{SHOT_DARK}-{place if metered_by else 'longest'}-r{repeat}"
-            yield PlannedFrame(
-                name,
-                "dark",
-                bench,
-                exposure_s,
-                repeat=repeat,
-                metered_by=metered_by,
-            )
+        name = f"{SHOT_DARK}-{place if metered_by else 'longest'}"
+        count = plan.darks.of_shots
+        yield from _repeated(
+            name, "dark", bench, count, exposure_s=exposure_s, metered_by=metered_by
+        )
 
 
 def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
@@ -384,18 +339,10 @@ def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFram
             else [(None, BRACKET_STEP**step) for step in range(steps + 1)]
         )
         for step, (exposure_s, light) in enumerate(exposures):
-            for repeat in range(shot.repeats):
-                name = f"shot-{place}-e{step}-r{repeat}"
-                yield PlannedFrame(
-                    name,
-                    "shot",
-                    bench,
-                    exposure_s,
-                    shot.gain,
-                    repeat,
-                    metered_by=metered_by,
-                    light=light,
-                )
+            yield from _repeated(
+                f"shot-{place}-e{step}", "shot", bench, shot.repeats,
+                exposure_s=exposure_s, gain=shot.gain, metered_by=metered_by, light=light,
+            )  # fmt: skip
 
 
 def fittings(camera: Camera) -> list[int]:

@@ -114,18 +114,17 @@ class Until:
         planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
         left = sorted(planned - set(shots))
         reached = stated_db >= target_db
+        following, why = None, "the target is reached" if reached else "every planned shot is taken"
+        if left and not reached:
+            following, why = left[0], ""
         spared = left if reached else []
         entry = DecidedEntry(
             run=session.runs,
             shots=list(shots),
             stated_db=stated_db,
             target_db=target_db,
-            next=left[0] if left and not reached else None,
-            why="the target is reached"
-            if reached
-            else ""
-            if left
-            else "every planned shot is taken",
+            next=following,
+            why=why,
             spared=spared,
             spared_frames=sum(
                 frame.kind == "shot" and frame.bench.shot in spared for frame in session.needed

@@ -24,7 +24,7 @@ from emmc_rig.files.shards import (
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
-from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, checksum_of
+from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiSizes, checksum_of
 
 PSI_GROUP = "psi.zarr"
 AGAIN = "measure Psi again"
@@ -34,7 +34,7 @@ FRAMES_AGAIN = "make the frames again"
 WRITTEN_BY = "name one that `emmc-rig demo`, `simulate` or `capture` wrote"
 
 
-class SavedPsi:
+class SavedPsi(PsiSizes):
     """The imaging matrix in a file, read window by window.
 
     The file's checksum is not verified, which would need all of it: `verify` does. Raises
@@ -46,24 +46,21 @@ class SavedPsi:
         with self._opened() as stored:
             weights = stored.dataset("weights")
             self.shape = weights.shape
-            self.views = weights.shape[1], weights.shape[2]
-            self.size = weights.shape[3], weights.shape[5]
             self.binning = int(np.asarray(stored.attributes["binning"]))
             self.checksum = str(stored.attributes["sha256"])
             if len(self.shape) != 6 or self.binning < 1:
                 raise SensingError(f"{path}: damaged (no shape of an imaging matrix); {AGAIN}")
 
     @property
-    def frames_shape(self) -> tuple[int, int, int]:
-        """(shot, pixel_y, pixel_x)."""
-        rows, columns = (length // self.binning for length in self.size)
-        return self.shape[0], rows, columns
+    def weights_shape(self) -> tuple[int, ...]:
+        """Shape of the weights."""
+        return self.shape
 
     def verify(self) -> None:
         """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
         with self._opened() as stored:
             camera, weights = str(stored.attributes["camera"]), stored.dataset("weights")
-            planes = (self._whole(weights[place]) for place in np.ndindex(self.shape[:3]))
+            planes = (self._whole(weights[place]) for place in np.ndindex(self.weights_shape[:3]))
             colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
             checksum = checksum_of(self.binning, camera, planes, self._whole(colour))
         if checksum != self.checksum:

@@ -50,41 +50,57 @@ def rows_of_colours(light_field: Array) -> Array:
     return np.moveaxis(light_field, -1, -2)
 
 
+class PsiSizes:
+    """What follows from the shape of Psi's weights, (shot, v, u, y, stored colour, x), and k."""
+
+    binning: int
+
+    @property
+    def weights_shape(self) -> tuple[int, ...]:
+        """Shape of the weights."""
+        raise NotImplementedError
+
+    @property
+    def shots(self) -> int:
+        """Number of shots."""
+        return self.weights_shape[0]
+
+    @property
+    def views(self) -> tuple[int, int]:
+        """Rows and columns of views."""
+        return self.weights_shape[1], self.weights_shape[2]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of the light field."""
+        return self.weights_shape[3], self.weights_shape[5]
+
+    @property
+    def frames_shape(self) -> tuple[int, int, int]:
+        """(shot, pixel_y, pixel_x)."""
+        return self.shots, self.size[0] // self.binning, self.size[1] // self.binning
+
+
 @dataclass(frozen=True, eq=False)
-class PsiLayout:
+class PsiLayout(PsiSizes):
     """What a Psi is for, without its coefficients: for sensors whose Psi does not fit into memory.
 
     shape, colour, binning, camera_json: as `ImagingMatrix.weights`' and its other fields.
     """
 
-    shape: tuple[int, int, int, int, int, int]
+    shape: tuple[int, ...]
     colour: NDArray[np.uint8] | None
     binning: int = 1
     camera_json: str = ""
 
     @property
-    def views(self) -> tuple[int, int]:
-        """Rows and columns of views."""
-        return self.shape[1], self.shape[2]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Rows and columns of the light field."""
-        return self.shape[3], self.shape[5]
-
-    @property
-    def shots(self) -> int:
-        """Number of shots."""
-        return self.shape[0]
-
-    @property
-    def frames_shape(self) -> tuple[int, int, int]:
-        """(shot, pixel_y, pixel_x)."""
-        return self.shape[0], self.size[0] // self.binning, self.size[1] // self.binning
+    def weights_shape(self) -> tuple[int, ...]:
+        """Shape of the weights."""
+        return self.shape
 
 
 @dataclass(frozen=True, eq=False)
-class ImagingMatrix:
+class ImagingMatrix(PsiSizes):
     """Psi.
 
     weights: (shot, v, u, y, stored colour, x), float32 or float64. One stored colour where every
@@ -126,7 +142,7 @@ class ImagingMatrix:
             raise SensingError("the imaging matrix has entries that are not finite")
 
     def __repr__(self) -> str:
-        shots, (v, u), (rows, columns) = self.shots, self.light_field_shape[:2], self.size
+        shots, (v, u), (rows, columns) = self.shots, self.views, self.size
         megabytes = self.weights.nbytes / 1e6
         memory = f"{megabytes:.2g} MB" if megabytes < 1000 else f"{megabytes / 1000:.2g} GB"
         return (
@@ -144,29 +160,17 @@ class ImagingMatrix:
     @property
     def layout(self) -> PsiLayout:
         """What this Psi is for, without its coefficients."""
-        shots, v, u, rows, stored, columns = self.weights.shape
-        shape = (shots, v, u, rows, stored, columns)
-        return PsiLayout(shape, self.colour, self.binning, self.camera_json)
+        return PsiLayout(self.weights_shape, self.colour, self.binning, self.camera_json)
 
     @property
-    def shots(self) -> int:
-        """Number of shots."""
-        return self.weights.shape[0]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Rows and columns of the light field."""
-        return self.weights.shape[3], self.weights.shape[5]
+    def weights_shape(self) -> tuple[int, ...]:
+        """Shape of the weights."""
+        return self.weights.shape
 
     @property
     def light_field_shape(self) -> tuple[int, int, int, int, int]:
         """(v, u, y, x, c)."""
-        return self.weights.shape[1], self.weights.shape[2], *self.size, 3
-
-    @property
-    def frames_shape(self) -> tuple[int, int, int]:
-        """(shot, pixel_y, pixel_x)."""
-        return self.shots, self.size[0] // self.binning, self.size[1] // self.binning
+        return *self.views, *self.size, 3
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -27,7 +27,7 @@ from emmc_rig.model.arguments import NAMES, numbers_of, path_of, refusal, requir
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml
-from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.sensing import ImagingMatrix, PsiSizes
 from emmc_rig.model.settings import validated
 from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
 from emmc_rig.processing.memory import (
@@ -122,7 +122,7 @@ def _solved(
     if not find_method(method).needs_dictionary:
         dictionary = None
     elif not isinstance(dictionary, Dictionary):
-        dictionary = open_dictionary(dictionary, psi.layout.views, psi.binning)
+        dictionary = open_dictionary(dictionary, psi.views, psi.binning)
     solve = reconstruct_judged
     if not is_one_block(psi.size, settings):
         check_frames(psi.frames_shape, frames.readings)
@@ -246,7 +246,7 @@ def reconstruct_folder(
         result = Result(solved, blocks.verdict(), saved.load(), frames)
     if is_session(folder):
         result = replace(result, verdict=with_exposure(result.verdict, Session(folder)))
-    compared_with = _compared(result.light_field, truth, result.psi.layout)
+    compared_with = _compared(result.light_field, truth, result.psi)
     metrics = {**result.metrics(), **further, **compared_with}
     result.write(out, metrics)
     return metrics
@@ -269,7 +269,7 @@ def _write_blocks(
         verdict = with_exposure(verdict, Session(folder))
     metrics = {
         **figures(blocks.result(), verdict, frames),
-        "shots": psi.shape[0],
+        "shots": psi.shots,
         "size": list(psi.size),
         "psi_sha256": psi.checksum,
         "dictionary": blocks.job.dictionary,
@@ -288,7 +288,7 @@ def _write_blocks(
     return metrics
 
 
-def _compared(light_field: Any, truth: str | None, psi: PsiLayout | SavedPsi) -> dict[str, Any]:
+def _compared(light_field: Any, truth: str | None, psi: PsiSizes) -> dict[str, Any]:
     """Return how near a light field, an array or dataset, is to the scene captured, if known."""
     if truth is None:
         return {}
