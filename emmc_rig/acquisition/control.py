@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import select
 import signal
+import sys
+import termios
 import threading
 import time
+import tty
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -112,3 +117,32 @@ def signals_interrupt() -> Iterator[None]:
 
     with handled(interrupt, ENDING):
         yield
+
+
+@contextmanager
+def pressed_keys() -> Iterator[Callable[[], str]]:
+    """Yield a function that returns the key just pressed, "" for none, or where none can be."""
+    before = _terminal_settings()
+    if before is None:
+        yield lambda: ""
+        return
+    keyboard = sys.stdin.fileno()
+    try:
+        tty.setcbreak(keyboard)
+        yield (
+            lambda: (
+                os.read(keyboard, 1).decode("ascii", "replace")
+                if select.select([keyboard], [], [], 0)[0]
+                else ""
+            )
+        )
+    finally:
+        termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
+
+
+def _terminal_settings() -> list | None:
+    """Return how the terminal is set that keys come from; None: no terminal."""
+    try:
+        return termios.tcgetattr(sys.stdin)
+    except (termios.error, OSError, ValueError):
+        return None

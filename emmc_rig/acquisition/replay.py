@@ -1,9 +1,8 @@
 """Replaying a recording: which of its RAW files is which planned frame, by what files state.
 
 A file named as a frame (`shot-0-e0-r0.dng`, or as sessions name theirs) is that frame. The others
-are taken by time, then name, where there are as many as frames and all exposures agree; otherwise
-exposure by exposure, where there are as many files as frames of one. Nothing is guessed beyond
-that: what is missing is named, and the rest of the session is taken.
+are taken by time, then name, where there are as many as frames and all exposures agree. Nothing is
+guessed beyond that: what is missing is named, and the rest of the session is taken.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ def matched(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[s
     taken = {file.name for file in found.values()}
     left = [file for file in files if file.name not in taken]
     wanted = [frame for frame in frames if frame.id not in found and not frame.is_optional]
-    return found | (_in_order(wanted, left) or _by_exposure(wanted, left))
+    return found | _in_order(wanted, left)
 
 
 def _by_name(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[str, Recorded]:
@@ -42,22 +41,6 @@ def _in_order(wanted: Sequence[PlannedFrame], left: Sequence[Recorded]) -> dict[
     if len(wanted) != len(left) or not all(map(_agree, wanted, left)):
         return {}
     return {frame.id: file for frame, file in zip(wanted, left, strict=True)}
-
-
-def _by_exposure(wanted: Sequence[PlannedFrame], left: Sequence[Recorded]) -> dict[str, Recorded]:
-    """Return the files of those exposures of which there are as many files as frames.
-
-    None where some frame may have any exposure: then no group is known to be whole.
-    """
-    if any(frame.exposure_s is None for frame in wanted):
-        return {}
-    found: dict[str, Recorded] = {}
-    for exposure_s in {frame.exposure_s for frame in wanted}:
-        alike = [frame for frame in wanted if frame.exposure_s == exposure_s]
-        there = [file for file in left if file.exposure_s and _agree(alike[0], file)]
-        if len(alike) == len(there):
-            found |= {frame.id: file for frame, file in zip(alike, there, strict=True)}
-    return found
 
 
 def _agree(frame: PlannedFrame, file: Recorded) -> bool:

@@ -107,7 +107,7 @@ def capture(
 
 def _write_plan(name: str, path: Path) -> None:
     from emmc_rig.acquisition.command import write_new
-    from emmc_rig.acquisition.new_plan import new_plan
+    from emmc_rig.acquisition.plan import new_plan
     from emmc_rig.files.cameras import find_camera
 
     write_new(path, new_plan(name, find_camera(name)))

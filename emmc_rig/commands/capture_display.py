@@ -16,8 +16,7 @@ from rich.text import Text
 
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import Figures
-from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.keyboard import pressed_keys
+from emmc_rig.acquisition.control import Control, pressed_keys
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.commands.output import columns
 from emmc_rig.files.results import shown_seconds

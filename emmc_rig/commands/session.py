@@ -121,7 +121,7 @@ def export(
         bool, typer.Option("--compress", help="gzip: smaller, and slower by far")
     ] = False,
 ) -> None:
-    """Write a complete session as one HDF5 file with NeXus names; brackets are fused too."""
+    """Write a complete session as one HDF5 file with NeXus names."""
     from emmc_rig.files.results import shown_bytes
     from emmc_rig.session.export import export_hdf5
     from emmc_rig.session.session import Session

@@ -11,7 +11,7 @@ import math
 import struct
 import warnings
 import zlib
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -184,21 +184,6 @@ class StoredArrays:
         filters = [made.get_filter(i)[0] for i in range(made.get_nfilters())]
         if len(set(filters)) < len(filters) or not _FILTERS.issuperset(filters):
             raise ValueError(f"'{name}' is packed in another way than by gzip or lzf, once")
-        chunks: list[Any] = []
-        if filters:
-            found.id.chunk_iter(chunks.append)
-        if any(chunk.size > self._size_bytes for chunk in chunks):
-            raise ValueError(f"'{name}' is cut short")
-        for chunk in chunks:
-            # HDF5 unpacks a chunk to its end, however long that is.
-            if _DEFLATE in filters and MOST_DEFLATED * chunk.size > self._most_bytes:
-                _, packed = found.id.read_direct_chunk(chunk.chunk_offset)
-                try:
-                    unpacked = zlib.decompressobj().decompress(packed, chunk_bytes + 5)
-                except zlib.error as fault:
-                    raise ValueError(f"'{name}' cannot be unpacked ({fault})") from fault
-                if len(unpacked) > chunk_bytes + 4:  # with a checksum
-                    raise ValueError(f"'{name}' has a chunk that unpacks to more than its size")
 
     def array(self, name: str) -> NDArray:
         """Return a data set of numbers or truths; raises KeyError or ValueError."""

@@ -9,7 +9,6 @@ import yaml
 
 from emmc_rig.acquisition.estimate import Pace
 from emmc_rig.acquisition.expand import expand, exposures_s, fittings
-from emmc_rig.acquisition.new_plan import new_plan
 from emmc_rig.acquisition.order import ordered, travel_um
 from emmc_rig.acquisition.plan import (
     Boards,
@@ -18,6 +17,7 @@ from emmc_rig.acquisition.plan import (
     Plan,
     differences,
     load_plan,
+    new_plan,
     plan_schema,
     planned_camera,
     schema_path,
