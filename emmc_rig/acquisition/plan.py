@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +12,6 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    WithJsonSchema,
     field_validator,
     model_validator,
 )
@@ -25,7 +23,6 @@ from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
 
 METERING_EXPOSURE_S = 0.01
-SCHEMA_FILE = "plan.schema.json"
 
 Lamp = Literal["white", "red", "green", "blue"]
 Positive = Annotated[float, Field(gt=0)]
@@ -38,19 +35,11 @@ def _several(value: object) -> object:
 
 
 AUTO = "auto"
-_POSITIVE_SCHEMA = {"type": "number", "exclusiveMinimum": 0}
-_SEVERAL_SCHEMAS = [_POSITIVE_SCHEMA, {"type": "array", "items": _POSITIVE_SCHEMA, "minItems": 1}]
-Exposures = Annotated[
-    tuple[Positive, ...],
-    BeforeValidator(_several),
-    Field(min_length=1),
-    WithJsonSchema({"anyOf": _SEVERAL_SCHEMAS}),
-]
+Exposures = Annotated[tuple[Positive, ...], BeforeValidator(_several), Field(min_length=1)]
 """One exposure in seconds, or several: a bracket."""
 MeteredExposures = Annotated[
     Annotated[Literal["auto"], Tag(AUTO)] | Annotated[Exposures, Tag("seconds")],
     Discriminator(lambda value: AUTO if isinstance(value, str) else "seconds"),
-    WithJsonSchema({"anyOf": [{"const": AUTO}, *_SEVERAL_SCHEMAS]}),
 ]
 """As `Exposures`, or metered."""
 
@@ -271,24 +260,6 @@ def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
     return own.model_copy(update={"offset_um": offsets})
 
 
-def plan_schema() -> dict[str, Any]:
-    """Return the JSON schema of a plan, for editors."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **Plan.model_json_schema(),
-    }
-
-
-def schema_text() -> str:
-    """Return the schema as it is shipped."""
-    return json.dumps(plan_schema(), indent=2) + "\n"
-
-
-def schema_path() -> Path:
-    """Return where the shipped schema lies."""
-    return Path(str(resources.files("emmc_rig.acquisition") / SCHEMA_FILE))
-
-
 def differences(one: Plan, other: Plan) -> list[str]:
     """Return what differs between two plans, in words; nothing for equal ones."""
     return list(_differences(one.model_dump(), other.model_dump(), ""))
@@ -316,7 +287,6 @@ def new_plan(name: str, camera: Camera) -> str:
     rows, columns = camera.views
     shots = "\n".join(_shot(camera, place) for place in range(len(camera.shots)))
     return f"""\
-# yaml-language-server: $schema={schema_path().as_uri()}
 # A capture for `emmc-rig capture`. What stands behind a # is the default, or an example.
 
 title: {name}

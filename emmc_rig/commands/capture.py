@@ -34,9 +34,6 @@ def capture(
     new: Annotated[
         str | None, typer.Option("--new", help="write a commented plan for this camera, and end")
     ] = None,
-    schema: Annotated[
-        bool, typer.Option("--schema", help="print the JSON schema of a plan, for editors, and end")
-    ] = False,
     rig: RigOption = None,
     scene: RigSceneOption = "deep-occlusions",
     size: RigSizeOption = None,
@@ -75,11 +72,6 @@ def capture(
     ] = None,
 ) -> None:
     """Run a plan on the rig; run it again to go on where it stopped. Ctrl-C: after this frame."""
-    from emmc_rig.acquisition.plan import schema_text
-
-    if schema:
-        tell(schema_text().removesuffix("\n"))
-        return
     if new is not None:
         _write_plan(new, out or Path("plan.yaml"))
         return

@@ -18,10 +18,7 @@ from emmc_rig.acquisition.plan import (
     differences,
     load_plan,
     new_plan,
-    plan_schema,
     planned_camera,
-    schema_path,
-    schema_text,
 )
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
@@ -216,11 +213,6 @@ def test_a_camera_file_is_looked_for_beside_the_plan(tmp_path):
     (tmp_path / "mine.yaml").write_text(text)
     plan = load_plan(plan_file(tmp_path, camera="mine.yaml"))
     assert planned_camera(plan, tmp_path).title == "mine"
-
-
-def test_the_schema_that_is_shipped_is_that_of_the_plan():
-    assert schema_path().read_text(encoding="utf-8") == schema_text()
-    assert plan_schema()["properties"]["shots"]["minItems"] == 1
 
 
 @pytest.mark.parametrize("order", ["as-planned", "least-travel"])

@@ -234,12 +234,6 @@ def test_a_dry_run_reports_what_it_will_take_and_makes_nothing(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
 
 
-def test_the_schema_is_printed(run):
-    code, out, _ = run("capture", "--schema")
-    assert code == 0
-    assert json.loads(out)["title"] == "Plan"
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
