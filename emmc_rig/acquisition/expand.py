@@ -77,12 +77,16 @@ def expand(
 
 
 def _repeated(
-    name: str, kind: Kind, bench: Bench, count: int, **how: Any
+    name: str,
+    kind: Kind,
+    bench: Bench,
+    count: int,
+    exposure_s: float | None = None,
+    **more: Any,
 ) -> Iterator[PlannedFrame]:
-    """Yield so many equal frames; how: as they are exposed and what else they are."""
+    """Yield so many equal frames; more: what else they are, see `PlannedFrame`."""
     for repeat in range(count):
-        exposed = {"exposure_s": None} | how
-        yield PlannedFrame(f"{name}-r{repeat}", kind, bench, repeat=repeat, **exposed)
+        yield PlannedFrame(f"{name}-r{repeat}", kind, bench, exposure_s, repeat=repeat, **more)
 
 
 def _darks(plan: Plan) -> Iterator[PlannedFrame]:

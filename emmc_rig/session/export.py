@@ -58,7 +58,11 @@ def export_hdf5(
         file["entry"].attrs["default"] = "data"
         file["entry/program_name"].attrs["version"] = session.header["versions"]["emmc-rig"]
         _write_frames(
-            session, file["entry/instrument/detector"], lines[0].shape, compress, on_frame
+            session,
+            file.require_group("entry/instrument/detector"),
+            lines[0].shape,
+            compress,
+            on_frame,
         )
         file["entry/data"].attrs.update(signal="data", axes=["frame_id", ".", "."])
         file["entry/data/data"] = h5py.SoftLink("/entry/instrument/detector/data")
