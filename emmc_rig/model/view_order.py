@@ -59,15 +59,10 @@ class ViewOrder(StrEnum):
         """Whether columns of views, once they are columns, run backwards."""
         return self in (ViewOrder.MIRRORED, ViewOrder.TURNED)
 
-    def arranged(self, named: np.ndarray, axis: int = 0) -> np.ndarray:
-        """Return an array as its views lie. axis: that of rows of views, columns come next."""
-        lying = named.swapaxes(axis, axis + 1) if self.interchanges else named
-        return np.ascontiguousarray(np.flip(lying, axis + 1) if self.reverses else lying)
-
-    def named(self, lying: np.ndarray, axis: int = 0) -> np.ndarray:
-        """Return an array by the names of its views, the inverse of `arranged`."""
-        named = np.flip(lying, axis + 1) if self.reverses else lying
-        return np.ascontiguousarray(named.swapaxes(axis, axis + 1) if self.interchanges else named)
+    def arranged(self, named: np.ndarray) -> np.ndarray:
+        """Return an array (v, u, ...) as its views lie."""
+        lying = named.swapaxes(0, 1) if self.interchanges else named
+        return np.ascontiguousarray(np.flip(lying, 1) if self.reverses else lying)
 
 
 def others(views: tuple[int, int]) -> tuple[ViewOrder, ...]:

@@ -21,17 +21,22 @@ WRONG = [order for order in ViewOrder if order != ViewOrder.AS_NAMED]
 SIZE = (128, 160)
 
 
+def named(order: ViewOrder, lying: np.ndarray) -> np.ndarray:
+    """Return an array by the names of its views."""
+    names = np.flip(lying, 1) if order.reverses else lying
+    return np.ascontiguousarray(names.swapaxes(0, 1) if order.interchanges else names)
+
+
 @pytest.fixture(scope="module")
 def truth() -> np.ndarray:
     return emmc.scene("deep-occlusions", size=SIZE, seed=3).light_field
 
 
 @pytest.mark.parametrize("order", WRONG)
-def test_named_undoes_arranged(order: ViewOrder) -> None:
-    array = np.random.default_rng(0).random((2, 3, 3, 4, 5))
-    assert np.array_equal(order.named(order.arranged(array)), array)
-    assert np.array_equal(order.arranged(order.named(array, axis=1), axis=1), array)
-    assert not np.array_equal(order.arranged(array, axis=1), array)
+def test_views_named_in_another_order_are_arranged_as_they_lie(order: ViewOrder) -> None:
+    array = np.random.default_rng(0).random((3, 3, 4, 5))
+    assert np.array_equal(order.arranged(named(order, array)), array)
+    assert not np.array_equal(order.arranged(array), array)
 
 
 @pytest.mark.slow
@@ -39,7 +44,7 @@ def test_named_undoes_arranged(order: ViewOrder) -> None:
 @pytest.mark.parametrize("name", ["deep-occlusions", "non-lambertian", "dark", "wide-disparity"])
 def test_parallax_tells_the_order(name: str, order: ViewOrder) -> None:
     scene = emmc.scene(name, size=(96, 128), seed=1).light_field
-    assert order_of(order.named(scene)) == order
+    assert order_of(named(order, scene)) == order
 
 
 @pytest.mark.parametrize("views", [(5, 3), (3, 5), (3, 3)])
@@ -66,7 +71,7 @@ def test_without_parallax_names_are_believed(truth: np.ndarray) -> None:
 def test_a_folder_in_another_order_is_told_and_put_right_by_its_option(
     tmp_path: Path, truth: np.ndarray, order: ViewOrder
 ) -> None:
-    stored = order.named(truth)
+    stored = named(order, truth)
     save_views(tmp_path / "views", stored)
     with pytest.warns(ViewOrderWarning, match=order.words):
         as_named = emmc.scene(str(tmp_path / "views"))
@@ -120,7 +125,7 @@ def test_a_file_in_order_is_left_alone(tmp_path: Path, truth: np.ndarray) -> Non
 
 
 def test_commands_say_it_in_a_line(tmp_path: Path, truth: np.ndarray) -> None:
-    save_views(tmp_path / "views", ViewOrder.TRANSPOSED.named(truth))
+    save_views(tmp_path / "views", named(ViewOrder.TRANSPOSED, truth))
     scene, out = tmp_path / "views", tmp_path / "frames"
     code, _, errors = program("simulate", "--scene", scene, "--out", out)
     assert code == 0
