@@ -21,7 +21,7 @@ MODES: dict[str, dict[str, set[str]]] = {
         "session": {"route", "sensor", "out"},
         "plan": {"camera", "size", "target", "leave_out", "few", "frames", "out"},
     },
-    "capture": {"schema": set(), "new": {"out"}},
+    "capture": {"new": {"out"}},
     "export": {"list_formats": set()},
     "reconstruct": {"list_methods": set()},
     "stability": {"faults": set()},
