@@ -12,7 +12,7 @@ by, so the relative error of Psi after n frames a view is the root of
 (sum var(pinhole) / n + psi^2 var(reference) / m) / sum psi^2.
 
 A fitted mask is not the real one: MODEL_ERROR is in every expected error of a route that has one.
-Both in one (see `combine`): the variances of model and pinhole add as those of two measurements.
+Both in one (see `misfit`): the variances of model and pinhole add as those of two measurements.
 """
 
 from __future__ import annotations

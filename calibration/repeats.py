@@ -52,11 +52,10 @@ class Repeats:
         return np.asarray(alike[np.argmin(np.hypot(*alike.T))], dtype=np.float64)
 
 
-def repeats_of(cells: Array, cell_um: float, reach_um: float, alike: float = ALIKE) -> Repeats:
+def repeats_of(cells: Array, cell_um: float, reach_um: float) -> Repeats:
     """Return how a mask repeats by shifts up to `reach_um` along either axis.
 
-    cells: (row, column, colour), of the colours that the sensor sees. alike: correlation from which
-    on it does.
+    cells: (row, column, colour), of the colours that the sensor sees.
     """
     # Half of what starting most commands takes.
     from scipy.signal import fftconvolve
@@ -79,7 +78,7 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float, alike: float = ALI
     product = sum(overlapped(plane, plane) for plane in np.moveaxis(middle, -1, 0))
     both = overlapped(energy, ones) + overlapped(ones, energy)
     likeness = 2 * product / np.maximum(both, 1e-9)
-    alike_enough = (likeness >= alike).astype(np.uint8)
+    alike_enough = (likeness >= ALIKE).astype(np.uint8)
     count, islands = cv2.connectedComponents(alike_enough, connectivity=4)
     own = islands == islands[tuple(reach)]
     if own[0].any() or own[:, 0].any():

@@ -29,14 +29,13 @@ from calibration.choice import (
     worst,
 )
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
-from calibration.combine import combined
 from calibration.defects import View, find_defects, loss_variance
 from calibration.errors import CalibrationError
 from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
 from calibration.fit import MOST_MORE, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
-from calibration.misfit import Misfit, measured_misfit
+from calibration.misfit import Misfit, combined, measured_misfit
 from calibration.parametric import (
     Parametric,
     Stages,
@@ -502,8 +501,7 @@ def fit_advice(fit: Fit) -> list[str]:
         if moved > LARGEST_MOVE_UM and moved > 5 * one.moved_deviation_um:
             found.append(
                 f"{one.name}: the mask stands {moved:.1f} um from where the stage says "
-                f"({one.moved_um[0]:+.1f}, {one.moved_um[1]:+.1f}); capture it again, or measure "
-                "the stage map"
+                f"({one.moved_um[0]:+.1f}, {one.moved_um[1]:+.1f}); capture it again"
             )
     if fit.undecided:
         shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")

@@ -6,11 +6,9 @@ its slope is the gain K in DN per electron. Every figure's deviation is a jackkn
 groups of rows. Under a colour filter each of its 2 x 2 phases has its own level; all lie on one
 curve. Where light falls off to the corners, saturation is read where it is brightest.
 
-What differs from pixel to pixel is separated from noise by the covariance of the two frames, and
-split into rows, columns and pixels.
+What differs from pixel to pixel is separated from noise by the covariance of the two frames.
 
-Source: EMVA Standard 1288, release 4.0, linear (sections 2 to 8) and general (row, column and pixel
-nonuniformity, spectrograms).
+Source: EMVA Standard 1288, release 4.0, linear (sections 2 to 8).
 """
 
 from __future__ import annotations
@@ -61,7 +59,7 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class TransferCurve:
     """The photon transfer curve of all rows: signal above the dark, variance, exposure."""
 
     mean_dn: Array
@@ -69,24 +67,18 @@ class Curve:
     exposure_s: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Nonuniformity:
-    """What differs between pixels, without noise: the variances of its parts.
+    """What differs between pixels, without noise: its variance, and the variance of that."""
 
-    variances: of those. spectra: by direction ("horizontal", "vertical"), amplitude at `frequency`,
-    cycles a pixel.
-    """
+    variance: float
+    uncertainty: float
 
-    parts: dict[str, float]
-    variances: dict[str, float]
-    frequency: dict[str, Array]
-    spectra: dict[str, Array]
-
-    def figure(self, name: str, scale: float) -> tuple[float, float]:
-        """Return the deviation of a part (or of `total`) and how sure it is, times a scale."""
-        found, sure = self.parts[name], float(np.sqrt(self.variances[name]))
-        value = float(np.sqrt(max(found, 0.0)))
-        return scale * value, scale * (sure / (2 * value) if found > sure else float(np.sqrt(sure)))
+    def figure(self, scale: float) -> tuple[float, float]:
+        """Return the deviation between pixels and how sure it is, times a scale."""
+        value, sure = float(np.sqrt(max(self.variance, 0.0))), float(np.sqrt(self.uncertainty))
+        spread = sure / (2 * value) if self.variance > sure else float(np.sqrt(sure))
+        return scale * value, scale * spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +107,7 @@ class SensorSheet:
     dynamic_range_db: float
     hot_pixels: int
     dead_pixels: int
-    curve: Curve
+    curve: TransferCurve
     linearity_residual: Array
     good: NDArray[np.bool_]
     deviations: dict[str, float] = field(default_factory=dict)
@@ -124,14 +116,12 @@ class SensorSheet:
     black_clipped: bool = False
 
     def bound(self, name: str) -> str:
-        """Return in words of which kind of bound a quantity or "dsnu" is, empty where it is none."""
+        """Return which kind of bound a quantity or "dsnu" is, in words; empty where it is none."""
         if name in OF_SATURATION and not self.saturated:
             return ", at least"
         if name in OF_DARK and self.black_clipped:
             return ", at least (the darks are clipped at 0 DN: raise the camera's black level)"
-        hidden = name == "read_noise_electrons" or (
-            name == "dsnu" and self.dsnu.figure("total", 1.0)[0] < 1
-        )
+        hidden = name == "read_noise_electrons" or (name == "dsnu" and self.dsnu.figure(1.0)[0] < 1)
         if hidden and self.quantised:
             return ", at most (below the steps of the converter: raise the camera's gain)"
         return ""
@@ -146,13 +136,10 @@ class SensorSheet:
             ("DSNU", self.dsnu, 1 / self.gain_dn_per_electron, "e"),
             ("PRNU", self.prnu, 100.0, "%"),
         ):
-            bound = self.bound(words.lower())
-            for name in one.parts:
-                part = words if name == "total" else f"{words} of {name}s"
-                value, deviation = one.figure(name, scale)
-                if "at most" in bound:
-                    value, deviation = max(value, scale * QUANTISED_DN), 0.0
-                found.append((part + bound, value, deviation or None, unit))
+            bound, (value, deviation) = self.bound(words.lower()), one.figure(scale)
+            if "at most" in bound:
+                value, deviation = max(value, scale * QUANTISED_DN), 0.0
+            found.append((words + bound, value, deviation or None, unit))
         return found
 
 
@@ -306,7 +293,9 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
         prnu=_nonuniformity(lit, darks[0], good),
         hot_pixels=int(hot.sum()),
         dead_pixels=int(dead.sum()),
-        curve=Curve(points.signal.ravel(), points.variance.ravel(), points.exposure_s.ravel()),
+        curve=TransferCurve(
+            points.signal.ravel(), points.variance.ravel(), points.exposure_s.ravel()
+        ),
         linearity_residual=_linearity(points).ravel(),
         good=good,
         deviations=deviations,
@@ -491,9 +480,7 @@ def _nonuniformity(pair: Pair, dark: Pair | None, good: NDArray[np.bool_]) -> No
     if dark is not None:
         # One dark each, so that their noise does not vary together.
         frames = [one - black for one, black in zip(frames, (dark.first, dark.second), strict=True)]
-    parts: dict[str, list[float]] = {name: [] for name in ("total", "row", "column", "pixel")}
-    variances: dict[str, list[float]] = {name: [] for name in parts}
-    spectra: dict[str, list[Array]] = {"horizontal": [], "vertical": []}
+    variances, uncertainties = [], []
     planes = (_phases(one[:rows, :columns]) for one in (*frames, good))
     for first, second, use in zip(*planes, strict=True):
         # Each frame's own surface: the lamp may differ between them.
@@ -502,38 +489,26 @@ def _nonuniformity(pair: Pair, dark: Pair | None, good: NDArray[np.bool_]) -> No
             np.where(use, (one - smooth) / (smooth if dark is not None else 1.0), 0)
             for one, smooth in zip((first, second), surfaces, strict=True)
         )
-        m, n = a.shape
-        both = float(np.sum(a * b) / use.sum())
-        of_rows, of_columns = (float(np.mean(a.mean(k) * b.mean(k))) for k in (1, 0))
-        pixel = (both - of_rows - of_columns) / (1 - 1 / m - 1 / n)
-        found = (both, of_rows - pixel / n, of_columns - pixel / m, pixel)
-        for name, value in zip(parts, found, strict=True):
-            parts[name].append(value)
-        noise = float(np.sum((a - b) ** 2) / (2 * use.sum()))
-        # Rows and columns that differ from frame to frame make theirs less sure.
-        of_row_noise, of_column_noise = (float(np.mean((a - b).mean(k) ** 2) / 2) for k in (1, 0))
-
-        def of_product(covariance: float, more: float, count: float) -> float:
-            """Return the variance of a mean of products of two frames' values."""
-            return (covariance**2 + (max(covariance, 0.0) + more) ** 2) / count
-
-        # Two phases of the filter share each row and each column.
-        of_row = 2 * of_product(of_rows, of_row_noise, m)
-        of_column = 2 * of_product(of_columns, of_column_noise, n)
-        of_pixel = of_product(pixel, noise, float(use.sum()))
-        own = (of_row + of_column + of_pixel, of_row, of_column, of_pixel)
-        for name, variance in zip(parts, own, strict=True):
-            variances[name].append(variance)
-        for name, axis in (("horizontal", 1), ("vertical", 0)):
-            spectrum = np.fft.rfft(a, axis=axis) * np.conj(np.fft.rfft(b, axis=axis))
-            spectra[name].append(spectrum.real.mean(axis=1 - axis) / a.shape[axis])
-    halves = {"horizontal": columns // 2, "vertical": rows // 2}
+        variances.append(float(np.sum(a * b) / use.sum()))
+        uncertainties.append(_uncertainty(a, b, float(use.sum())))
     return Nonuniformity(
-        {name: float(np.mean(values)) for name, values in parts.items()},
-        {name: float(np.sum(values)) / len(values) ** 2 for name, values in variances.items()},
-        {name: np.fft.rfftfreq(count, 2.0) for name, count in halves.items()},
-        {name: np.sqrt(np.maximum(np.mean(values, axis=0), 0)) for name, values in spectra.items()},
+        float(np.mean(variances)), float(np.sum(uncertainties)) / len(uncertainties) ** 2
     )
+
+
+def _uncertainty(a: Array, b: Array, count: float) -> float:
+    """Return the variance of the mean product of two frames' values (y, x), `count` of them.
+
+    Rows and columns that differ from frame to frame make it less sure than pixels alone do.
+    """
+
+    def of_product(one: Array, other: Array, count: float) -> float:
+        both, noise = float(np.mean(one * other)), float(np.mean((one - other) ** 2) / 2)
+        return (both**2 + (max(both, 0.0) + noise) ** 2) / count
+
+    # Two phases of the filter share each row and each column.
+    lines = [2 * of_product(a.mean(k), b.mean(k), a.shape[1 - k]) for k in (0, 1)]
+    return of_product(a, b, count) + sum(lines)
 
 
 def _quadratic(values: Array, use: NDArray[np.bool_]) -> Array:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -103,21 +102,6 @@ class StoppableCamera(Camera, Protocol):
         """Break off the exposure under way; False where this camera cannot. Any thread may call.
 
         Whoever waits for the frame gets an `ExposureStoppedError`, half a second later at most.
-        """
-        ...
-
-
-class TriggeredCamera(Camera, Protocol):
-    """A camera that begins an exposure at an edge on a line."""
-
-    def armed(
-        self, line: str, delay_s: float
-    ) -> AbstractContextManager[Callable[[float], RawFrame]]:
-        """Wait for an edge on a line: yields what returns the frame that it exposes.
-
-        That takes the longest wait for the edge, in seconds. `delay_s` is waited by the camera
-        between edge and exposure. Raises `CameraSettingError` for a camera without such a line
-        or delay.
         """
         ...
 

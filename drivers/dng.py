@@ -5,7 +5,6 @@ Source: Adobe Digital Negative specification 1.4 (tags 50706 to 50829) and TIFF/
 
 import io
 from collections.abc import Mapping
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -13,12 +12,20 @@ import tifffile
 
 from drivers.camera import CameraIdentity
 from drivers.errors import RawFrameError
-from drivers.plain_dng import PHASES, PRIVATE_DATA_OWNER, PRIVATE_DATA_TAG, SMALLEST_SIDE_PX
-from drivers.raw import CFA_TILE_PREFIX, RawFrame, decode_raw
+from drivers.raw import CFA_TILE_PREFIX, RawFrame, hashed
 
 Array = np.ndarray
 
-BAYER_PATTERNS = {phase: pattern for pattern, phase in PHASES.items()}
+BAYER_PATTERNS = {
+    "rggb": (0, 1, 1, 2),
+    "grbg": (1, 0, 2, 1),
+    "gbrg": (1, 2, 0, 1),
+    "bggr": (2, 1, 1, 0),
+}
+SMALLEST_SIDE_PX = 22
+"""LibRaw takes anything smaller for a thumbnail."""
+PRIVATE_DATA_TAG, PRIVATE_DATA_OWNER = 50740, b"emmc-rig: camera's bytes\0"
+"""DNGPrivateData, which begins with the name of the program that can read it: this one."""
 MONO = "mono"
 STAND_IN_PHASE = "rggb"
 """Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""
@@ -125,13 +132,20 @@ def frame_of_array(
 ) -> RawFrame:
     """Return the frame of a camera that gives arrays, kept as the DNG that it decodes from."""
     original = encode_dng(mosaic, cfa, black_level_dn, white_level_dn, exposure_s, identity)
-    frame = decode_raw(original, mosaic.shape)
-    return replace(
-        frame,
-        white_level_dn=white_level_dn,
-        exposure_s=exposure_s,
+    own, black = mosaic.copy(), np.full((2, 2), float(black_level_dn))
+    own.flags.writeable = black.flags.writeable = False
+    with hashed(original) as digest:
+        described = {"maker": identity.maker, "model": identity.model}
+    return RawFrame(
+        own,
+        black,
+        white_level_dn,
+        cfa,
+        exposure_s,
+        original,
+        digest.hexdigest(),
         host_time_s=host_time_s,
-        metadata={**frame.metadata, **metadata},
+        metadata={**described, **metadata},
     )
 
 

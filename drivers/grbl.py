@@ -36,8 +36,6 @@ FACTORY_STEPS_PER_MM = 250.0
 SCALES_AGREE = 1e-3
 """Relative; Grbl shows three decimals of steps per millimetre."""
 ALL_AXES = "every axis"
-OUTPUTS = {"coolant": ("M8", "M9"), "mist": ("M7", "M9"), "spindle": ("M3", "M5")}
-"""What switches a pin on and off; Grbl does so once the moves before it have ended."""
 REFUSAL_ADVICE = {
     5: "switch homing on ($22=1) and wire its limit switches",
     8: "it is busy, wait until it stands",
@@ -89,7 +87,6 @@ class GrblStage(HostStage):
         self._boot_s = boot_s
         self._stated_steps_per_mm = dict(steps_per_mm or {})
         self._any_scale = any_scale
-        self._signal: tuple[str, float, str] | None = None
         for axis in self._stated_steps_per_mm:
             self._require_axis(axis)
         self._start_up()
@@ -103,36 +100,6 @@ class GrblStage(HostStage):
         """Return what the controller takes for a millimetre, its `$100` and following."""
         self._require_axis(axis)
         return self._positive(codec.STEPS_PER_MM, axis)
-
-    def check_output(self, axis: str, output: int | str) -> None:
-        """Switch a pin off: coolant, mist (where it is compiled in) or spindle.
-
-        Raises `CommandRefusedError` for any other.
-        """
-        self._require_axis(axis)
-        if output not in OUTPUTS:
-            known = ", ".join(OUTPUTS)
-            raise CommandRefusedError(f"output {output}", "no such pin", axis, f"use {known}")
-        on, off = OUTPUTS[str(output)]
-        if on == "M7" and "M" not in self._options:
-            raise CommandRefusedError(on, "no option M", axis, "this firmware has no mist pin")
-        self._controller.command(off, axis)
-
-    def move_and_signal_um(
-        self, axis: str, target_um: float, output: int | str = "coolant"
-    ) -> float:
-        """As `SignallingStage` says: the last leg is a program, a straight move and the pin's word.
-
-        Stopping such a move holds the controller, which must be homed then; the pin stays low.
-        Source: Grbl v1.1, coolant_control.c and spindle_control.c: the buffer of moves is emptied
-        before a pin changes, and only then the line is answered.
-        """
-        self.check_output(axis, output)
-        self._signal = (axis, target_um, OUTPUTS[str(output)][0])
-        try:
-            return self._move_without_settling({axis: target_um})[axis]
-        finally:
-            self._signal = None
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """As `HostStage.stop`; all axes stop together, and a program that runs is held."""
@@ -183,12 +150,7 @@ class GrblStage(HostStage):
         length_um = math.hypot(*distances_um.values())
         speed_um_s = length_um / slowest_s if slowest_s else self.speed_um_s(next(iter(targets_um)))
         targets_mm = {self._letters[axis]: um / 1e3 for axis, um in targets_um.items()}
-        feed_mm_min = speed_um_s * 60 / 1e3
-        if self._signal is not None and dict([self._signal[:2]]) == dict(targets_um):
-            program = [codec.straight_move(targets_mm, feed_mm_min), self._signal[2]]
-            self._controller.start_program(program)
-            return
-        line = codec.jog(targets_mm, feed_mm_min)
+        line = codec.jog(targets_mm, speed_um_s * 60 / 1e3)
         self._controller.command(line, ", ".join(targets_um))
 
     def _stop_axis(self, axis: str) -> None:
@@ -196,8 +158,7 @@ class GrblStage(HostStage):
         if self._controller.homes:
             self._controller.abandon_homing()
         else:
-            runs = self._controller.runs_program
-            self._controller.send(codec.FEED_HOLD if runs else codec.JOG_CANCEL)
+            self._controller.send(codec.JOG_CANCEL)
 
     def _is_moving(self, axis: str) -> bool:
         status = self._controller.status()
@@ -206,7 +167,7 @@ class GrblStage(HostStage):
         if status.state != "Idle":
             self._controller.raise_alarm()
             raise AxisFaultError(axis, f"the controller is in the state {status.state}")
-        return self._controller.runs_program
+        return False
 
     def _travel_um(self, axis: str) -> tuple[float, float]:
         """Return the travel, short of the switch by as much as homing pulled off."""
@@ -279,7 +240,6 @@ class _Controller:
         self._alarm: codec.Alarm | None = None
         self._restarted = False
         self._homing_lines: list[str] = []
-        self._program_lines: list[str] = []
         self._rests = False
         self._offset_mm: tuple[float, ...] | None = None
 
@@ -287,11 +247,6 @@ class _Controller:
     def homes(self) -> bool:
         """Whether homing was started and has not ended."""
         return bool(self._homing_lines)
-
-    @property
-    def runs_program(self) -> bool:
-        """Whether lines of a program are not answered yet."""
-        return bool(self._program_lines)
 
     def send(self, command: bytes) -> None:
         """Send a real-time command, which has no answer."""
@@ -360,14 +315,6 @@ class _Controller:
             error.about(axis=axis, command=line)
             raise
 
-    def start_program(self, lines: list[str]) -> None:
-        """Send lines of which the last is answered when all of them are carried out."""
-        with self._transport.lock:
-            self._take_waiting()
-            self._program_lines = list(lines)
-            for line in lines:
-                self._transport.write(codec.encode_line(line))
-
     def start_homing(self, lines: list[str]) -> None:
         """Send the homing commands; each is answered when it is done."""
         with self._transport.lock:
@@ -417,7 +364,6 @@ class _Controller:
     def leave_alarm(self) -> None:
         """Reset a controller that waits for it, or is held; it stands, so nothing is lost."""
         self._homing_lines.clear()
-        self._program_lines.clear()
         try:
             state = self.status().state
         except (TransportTimeoutError, AxisFaultError):
@@ -441,7 +387,6 @@ class _Controller:
         if self._alarm is None:
             return
         self._homing_lines.clear()
-        self._program_lines.clear()
         alarm = self._alarm
         fault = FAULTS_BY_ALARM.get(alarm.code, AxisFaultError)
         error = fault(ALL_AXES, f"alarm {alarm.code} ({alarm.meaning})")
@@ -454,7 +399,6 @@ class _Controller:
         if self._restarted:
             self._restarted = False
             self._homing_lines.clear()
-            self._program_lines.clear()
             raise LostPositionError(ALL_AXES, "the controller restarted")
 
     def wait_for_status(self, boot_s: float) -> None:
@@ -514,15 +458,9 @@ class _Controller:
                 self._transport.discard_input()
 
     def _note(self, message: codec.Message | None) -> None:
-        """Remember what an unasked message says about homing or a program."""
+        """Remember what an unasked message says about homing."""
         if isinstance(message, codec.Ok) and self._homing_lines:
             self._homing_lines.pop(0)
-        elif isinstance(message, codec.Ok) and self._program_lines:
-            self._program_lines.pop(0)
-        elif isinstance(message, codec.Refusal) and self._program_lines:
-            line = self._program_lines[0]
-            self._program_lines.clear()
-            raise _refused(line, message, ALL_AXES)
         elif isinstance(message, codec.Status):
             self._rests = message.state in ("Idle", "Alarm")
 

@@ -158,17 +158,8 @@ def jog(targets_mm: Mapping[str, float], feed_mm_min: float) -> str:
     A jog leaves the parser's modes alone, is refused (error:15) instead of alarmed when it leaves
     the travel, and can be cancelled without losing the position ("Jogging").
     """
-    return f"$J={_line_to(targets_mm, feed_mm_min)}"
-
-
-def straight_move(targets_mm: Mapping[str, float], feed_mm_min: float) -> str:
-    """Return the line of a program that moves axes as `jog` does; other lines may follow it."""
-    return f"G1{_line_to(targets_mm, feed_mm_min)}"
-
-
-def _line_to(targets_mm: Mapping[str, float], feed_mm_min: float) -> str:
     words = "".join(f"{letter}{target:.4f}" for letter, target in targets_mm.items())
-    return f"G53G90G21{words}F{feed_mm_min:.3f}"
+    return f"$J=G53G90G21{words}F{feed_mm_min:.3f}"
 
 
 def decode_line(line: bytes) -> Message | None:

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from drivers.camera import CameraIdentity, Limits, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.dng import BAYER_PATTERNS, frame_of_array
+from drivers.dng import BAYER_PATTERNS, SMALLEST_SIDE_PX, frame_of_array
 from drivers.errors import (
     CameraClosedError,
     CameraSettingError,
@@ -29,7 +29,6 @@ from drivers.errors import (
     PortGoneError,
     SpeedFixedError,
 )
-from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.raw import RawFrame
 from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings
 

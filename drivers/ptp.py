@@ -1,7 +1,7 @@
 """PTP still cameras: sessions, captures, downloads in parts, and the camera that gives RAW frames.
 
 Source: ISO 15740 (PIMA 15740:2000), clauses 10 (operations), 11 (responses), 12 (events) and
-13 (properties). What makers do otherwise is in `drivers.ptp_canon` and `drivers.ptp_sony`.
+13 (properties). Cameras that release by operations of their makers' own are `drivers.gphoto`'s.
 """
 
 from __future__ import annotations
@@ -33,10 +33,7 @@ from drivers.errors import (
     UsbStalledError,
     UsbTimeoutError,
 )
-from drivers.ptp_canon import EosBody, is_eos
 from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
-from drivers.ptp_dials import EXPOSURE_UNIT_S, Body, StandardBody
-from drivers.ptp_sony import SonyBody, is_sony
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
 from drivers.usb import open_device
@@ -52,11 +49,16 @@ NO_WAIT_S = 0.001
 MOST_NEW_OBJECTS = 64
 LONGEST_EXPOSURE_S = 3600.0
 """What a camera that states nonsense can make the driver wait."""
+EXPOSURE_UNIT_S = 1e-4
+EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
+"""Bulb and time, by which no exposure can be asked for."""
+ISO_SPECIALS = frozenset((0xFFFF,))
+"""Automatic."""
 
 REFUSALS = {
     Code.SESSION_NOT_OPEN: "open the camera again",
-    Code.OPERATION_NOT_SUPPORTED: "this camera cannot do it over PTP; look in its menus for a "
-    "mode like PTP, PC remote or tethering",
+    Code.OPERATION_NOT_SUPPORTED: "this camera cannot do it by the standard of PTP; look in its "
+    "menus for a mode like PTP, PC remote or tethering, or open it as gphoto2:",
     Code.INVALID_HANDLE: "the picture is gone from the card",
     Code.PROPERTY_NOT_SUPPORTED: "set it on the camera itself",
     Code.STORE_READ_ONLY: "unlock the card",
@@ -91,9 +93,8 @@ class PtpSettings:
 class PtpSession:
     """An open session with a camera; `info` is what it said of itself.
 
-    `body`: how this maker's cameras are released. An exchange that breaks off, Ctrl-C included,
-    is cleared away before the next one. Any thread may call; `lock` is held for one exchange, and
-    by a camera for a whole capture.
+    An exchange that breaks off, Ctrl-C included, is cleared away before the next one. Any thread
+    may call; `lock` is held for one exchange, and by a camera for a whole capture.
     """
 
     def __init__(
@@ -115,7 +116,6 @@ class PtpSession:
         try:
             self._open()
             self.info = codec.DeviceInfo.decode(self.fetch(Operation.GET_DEVICE_INFO))
-            self.body = _body(self)
         except BaseException:
             transport.close()
             raise
@@ -220,9 +220,9 @@ class PtpSession:
         """
         with self.lock:
             self._forget_events()
-            seen = set(self.handles()) if self.body.on_card else set()
+            seen = set(self.handles())
             self._stop_wanted.clear()
-            self.body.release()
+            self.request(Operation.INITIATE_CAPTURE, 0, 0)
             self._owed = True
             taken = self._await_objects(seen, self._transaction, exposure_s, accept, all_of_it)
             self._owed = False
@@ -231,10 +231,6 @@ class PtpSession:
     def stop_capture(self) -> None:
         """Let the capture under way, if any, raise `ExposureStoppedError`; any thread may call."""
         self._stop_wanted.set()
-
-    def next_event(self, timeout_s: float) -> Message | None:
-        """Return what came through the pipe of events next, None when nothing did in time."""
-        return self._transport.event(timeout_s)
 
     def download(
         self,
@@ -308,7 +304,7 @@ class PtpSession:
         """Read events away; one picture too late must not pass for the next."""
         wait_s = self.settings.pair_limit_s if self._owed else NO_WAIT_S
         for _ in range(STALE_EVENTS_TOLERATED):
-            if self.body.event(wait_s) is None:
+            if self._transport.event(wait_s) is None:
                 return
 
     def _await_objects(
@@ -331,7 +327,7 @@ class PtpSession:
                 self._transport.reset()
                 self._open()
                 raise ExposureStoppedError(self.name)
-            event = self.body.event(min(settings.event_poll_s, deadline_s - now_s))
+            event = self._transport.event(min(settings.event_poll_s, deadline_s - now_s))
             if event is None and clock.now_s() < exposed_s:
                 continue
             new = self._new_objects(event, seen)
@@ -373,8 +369,6 @@ class PtpSession:
 
     def _new_objects(self, event: Message | None, seen: set[int]) -> list[int]:
         if event is None or event.code == EventCode.CAPTURE_COMPLETE:
-            if not self.body.on_card:
-                return []
             try:
                 return [handle for handle in self.handles(patient=False) if handle not in seen]
             except CameraBusyError:
@@ -460,6 +454,46 @@ def is_raw(info: ObjectInfo) -> bool:
     return info.format == Format.DNG or suffix in RAW_SUFFIXES
 
 
+class Dial:
+    """A numeric property of the camera, in multiples of `unit`; `special` values are no numbers."""
+
+    def __init__(
+        self, session: PtpSession, code: Property, unit: float, special: frozenset[int]
+    ) -> None:
+        self._session = session
+        self._unit = unit
+        self._special = special
+        self._described = session.describe(code)
+        self._now = self._described.current if self._described else None
+
+    @property
+    def value(self) -> float | None:
+        """What it is; None where the camera does not say, or it is automatic."""
+        now = self._now
+        if not isinstance(now, int) or now <= 0 or now in self._special:
+            return None
+        return now * self._unit
+
+    @property
+    def limits(self) -> Limits | None:
+        """Lowest and highest value; None where it cannot be chosen."""
+        if self._described is None or not self._described.writable:
+            return None
+        low, high = codec.limits(self._described, self._special)
+        return low * self._unit, high * self._unit
+
+    def choose(self, target: float) -> None:
+        """Set the nearest value that the camera has; raises `CameraSettingError`."""
+        described = self._described
+        if described is None or not described.writable:
+            return
+        value = codec.nearest(described, target / self._unit, self._special)
+        try:
+            self._now = self._session.write(described, value)
+        except ValueError as error:
+            raise CameraSettingError(f"property {described.code:#06x}", str(error)) from error
+
+
 class PtpCamera(ShapeFromFrames):
     """A still camera set to RAW (or RAW with JPEG) and manual exposure.
 
@@ -484,11 +518,12 @@ class PtpCamera(ShapeFromFrames):
         self._from_card = from_card
         try:
             info = session.info
-            self._exposure, self._iso = session.body.exposure, session.body.iso
-            if isinstance(session.body, StandardBody) and not session.can(
-                Operation.INITIATE_CAPTURE
-            ):
+            if not session.can(Operation.INITIATE_CAPTURE):
                 raise _refused(Operation.INITIATE_CAPTURE, Code.OPERATION_NOT_SUPPORTED)
+            self._exposure = Dial(
+                session, Property.EXPOSURE_TIME, EXPOSURE_UNIT_S, EXPOSURE_SPECIALS
+            )
+            self._iso = Dial(session, Property.EXPOSURE_INDEX, 1.0, ISO_SPECIALS)
             self.identity = CameraIdentity(info.maker, info.model, info.serial, info.version)
         except BaseException:
             session.close()
@@ -570,14 +605,13 @@ class PtpCamera(ShapeFromFrames):
         session = self.session
         with session.lock:
             exposure_s = self._exposure.value
-            clears = self._from_card and session.body.on_card
-            taken = session.capture(exposure_s or 0.0, is_raw, all_of_it=clears)
+            taken = session.capture(exposure_s or 0.0, is_raw, all_of_it=self._from_card)
             data = session.download(taken.handle, taken.info, self.on_progress)
             arrived_s = session.clock.now_s()
             frame = decode_raw(data, self._shape)
             check_frame(frame, self._cfa, exposure_s, EXPOSURE_UNIT_S)
             self._shape, self._cfa = frame.mosaic.shape, frame.cfa
-            if clears:
+            if self._from_card:
                 for handle in (taken.handle, *(other for other, _ in taken.others)):
                     session.delete(handle)
         return replace(
@@ -590,9 +624,7 @@ class PtpCamera(ShapeFromFrames):
         )
 
     def stop_exposure(self) -> bool:
-        """See `drivers.camera.StoppableCamera`; of Canon's and Sony's own releases none can."""
-        if not isinstance(self.session.body, StandardBody):
-            return False
+        """See `drivers.camera.StoppableCamera`."""
         self.session.stop_capture()
         return True
 
@@ -617,15 +649,6 @@ def open_camera(
     """Open the camera with a serial number, "" for the first; the rest as in `PtpCamera`."""
     device = open_device(PTP_INTERFACE, serial=address, backend=backend, wanted="PTP camera")
     return PtpCamera(PtpSession(PtpUsb(device, clock), clock), shape, cfa, from_card)
-
-
-def _body(session: PtpSession) -> Body:
-    """Return how this camera is released, by its maker and what it says that it can do."""
-    if is_eos(session.info):
-        return EosBody(session)
-    if is_sony(session.info):
-        return SonyBody(session)
-    return StandardBody(session)
 
 
 def _camera_time_s(text: str) -> float | None:

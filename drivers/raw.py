@@ -14,7 +14,6 @@ import rawpy
 import tifffile
 
 from drivers.errors import RawFrameError
-from drivers.plain_dng import read_in_place
 
 Array = np.ndarray
 
@@ -83,7 +82,7 @@ panasonic_load_raw, panasonicC6_load_raw, panasonicC7_load_raw)."""
 class RawFrame:
     """One frame as the sensor gave it.
 
-    `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it; may lie in `original`.
+    `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it.
     `black_level_dn`: float64 `(2, 2)`, of the pixels `mosaic[i::2, j::2]`.
     `cfa`: "rggb", "grbg", "gbrg", "bggr", "mono", or the name of a tile that is not Bayer.
     `exposure_s`: None where neither the file nor the camera says.
@@ -110,8 +109,6 @@ class RawFrame:
 def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
     """Return the frame in the bytes of a RAW file: DNG, or any other that LibRaw knows.
 
-    The mosaic of a plain uncompressed DNG is a view of `data`; LibRaw decodes all others.
-
     Raises `RawFrameError` for bytes that are no RAW file, that are torn, or too few for their
     picture, or a mosaic whose `(y, x)` is not `expected_shape`. LibRaw reports most damage, but
     fills what is missing of a plain DNG, of an empty tile or of a Panasonic's RW2 with zeros: the
@@ -122,7 +119,7 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
         raise RawFrameError("it is empty")
     tags = _read_tiff(data) if data[:4] in TIFF_MAGICS else _TiffTags()
     with hashed(data) as digest:
-        mosaic, black_level_dn, white_level_dn, cfa = tags.pixels or decode_by_libraw(data)
+        mosaic, black_level_dn, white_level_dn, cfa = _decoded(data)
     if mosaic.dtype != np.uint16:
         raise RawFrameError("it holds floating-point pixels, not one mosaic of 16 bits")
     if expected_shape is not None and mosaic.shape != tuple(expected_shape):
@@ -150,7 +147,6 @@ class _TiffTags:
     exposure_s: float | None = None
     tile: str | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
-    pixels: tuple[Array, Array, int, str] | None = None
 
 
 def exposure_and_time(data: bytes) -> tuple[float | None, str]:
@@ -162,7 +158,7 @@ def exposure_and_time(data: bytes) -> tuple[float | None, str]:
     return tags.exposure_s, tags.metadata.get("captured", "")
 
 
-def decode_by_libraw(data: bytes) -> tuple[Array, Array, int, str]:
+def _decoded(data: bytes) -> tuple[Array, Array, int, str]:
     """Return mosaic, black levels `(2, 2)`, white level and phase; raises `RawFrameError`."""
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
@@ -224,8 +220,7 @@ def _read_tiff(data: bytes) -> _TiffTags:
     """Return what the tags say, having checked that every strip lies inside the file."""
     try:
         magic = data[:4]
-        plain = TIFF_MAGICS[magic] == magic
-        stream = io.BytesIO(data if plain else TIFF_MAGICS[magic] + data[4:])
+        stream = io.BytesIO(TIFF_MAGICS[magic] + data[4:])
         with tifffile.TiffFile(stream) as tiff:
             pages = list(tiff.pages)
             for page in pages:
@@ -241,7 +236,6 @@ def _read_tiff(data: bytes) -> _TiffTags:
             description = str(tags.valueof(IMAGE_DESCRIPTION_TAG, ""))
             metadata = {name: tags.valueof(tag) for name, tag in TAG_CODES.items()}
             metadata |= {name: exif.get(key) for name, key in EXIF_NAMES.items() if key in exif}
-            pixels = read_in_place(data, tiff) if plain and missing <= 0 else None
     except Exception as error:  # tifffile raises whatever it runs into in damaged tags
         raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error
     if missing > 0:
@@ -251,7 +245,6 @@ def _read_tiff(data: bytes) -> _TiffTags:
         exposure_s,
         tile if tile != description else None,
         {name: _shown(value) for name, value in metadata.items() if value is not None},
-        pixels,
     )
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import NamedTuple, Protocol, Self, TypeVar, runtime_checkable
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 from drivers.clock import Clock
 from drivers.errors import (
@@ -103,22 +103,6 @@ class Stage(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *exception: object) -> None: ...
-
-
-@runtime_checkable
-class SignallingStage(Stage, Protocol):
-    """A stage that raises a digital output by itself the moment an axis arrives."""
-
-    def check_output(self, axis: str, output: int | str) -> None:
-        """Lower an output; raises a `DriverError` where the axis's controller has none such."""
-
-    def move_and_signal_um(self, axis: str, target_um: float, output: int | str) -> float:
-        """As `move_to_um`, but without waiting for vibration; the output rises on arrival.
-
-        It falls at the next such move. A move that fails raises no output. A camera that it
-        triggers must wait out the vibration by a delay of its own.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -384,13 +368,6 @@ class HostStage(ABC):
         emergency stop, a lost position), `MoveTimeoutError` or an error of the transport, with
         the axes stopped.
         """
-        arrived_um = self._move_without_settling(targets_um)
-        with self._stopped_on_error(targets_um):
-            self._clock.sleep(self._settings.settle_s)
-        return arrived_um
-
-    def _move_without_settling(self, targets_um: Mapping[str, float]) -> dict[str, float]:
-        """As `move_to_um`, up to the arrival."""
         for axis, target_um in targets_um.items():
             check_within_limits(axis, target_um, self.limits_um(axis))
         start_um = {axis: self.position_um(axis) for axis in self._choose(targets_um)}
@@ -402,7 +379,9 @@ class HostStage(ABC):
         }
         with self._stopped_on_error(targets_um):
             reached_um = start_um | self._travel(start_um, waypoints_um)
-            return self._travel(reached_um, targets_um)
+            arrived_um = self._travel(reached_um, targets_um)
+            self._clock.sleep(self._settings.settle_s)
+        return arrived_um
 
     def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
         """As `move_to_um`, relative to where the axes read to be; they must be homed too."""

@@ -15,7 +15,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
@@ -185,36 +185,6 @@ class U3vCamera:
         """
         with self._acquisition("SingleFrame"):
             return self._decode(self._receive())
-
-    @contextmanager
-    def armed(
-        self, line: str = "Line0", delay_s: float = 0.0
-    ) -> Iterator[Callable[[float], RawFrame]]:
-        """Wait for an edge on a line: yields what returns the frame that it exposes.
-
-        That takes the longest wait for the edge, in seconds. `delay_s` is waited by the camera
-        between edge and exposure. Raises `CameraSettingError` for a camera without such a line
-        or delay, and as `snap` does; the camera is untriggered again afterwards.
-        """
-        settings: list[tuple[str, str | float]] = [
-            ("TriggerSelector", "FrameStart"),
-            ("TriggerSource", line),
-            ("TriggerMode", "On"),
-        ]
-        if delay_s:
-            unit_s = SECONDS.get(self.features.unit("TriggerDelay"), SECONDS["us"])
-            settings.insert(2, ("TriggerDelay", delay_s / unit_s))
-        try:
-            for name, value in settings:
-                self.features.set(name, value)
-            self._set_if_possible("TriggerActivation", "RisingEdge")
-            with self._acquisition("SingleFrame"):
-                yield lambda wait_s: self._decode(
-                    self._stream.receive(wait_s + delay_s + self.exposure_s + FRAME_GRACE_S)
-                )
-        finally:
-            with suppress(DriverError):
-                self.features.set("TriggerMode", "Off")
 
     def stream(self) -> Generator[RawFrame, None, None]:
         """Yield frames as they come; closing the generator stops the acquisition.

@@ -3,7 +3,6 @@
 import logging
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
@@ -33,8 +32,6 @@ from drivers.transport import (
 
 _log = logging.getLogger(__name__)
 
-TRIGGER = 1
-"""Which of the device's triggers raises the output on arrival."""
 REFERENCE_FLAGS = {"WR", "WH"}
 DRIVER_OFF_FLAGS = {"FH", "FO", "FD"}
 FAULTS_BY_FLAG: Mapping[str, type[AxisFaultError]] = {
@@ -112,7 +109,6 @@ class ZaberStage(HostStage):
         self._stated_um = _by_axis(microstep_um, axes)
         self._stated_resolution = _by_axis(resolution, axes)
         self._in_microsteps = in_microsteps
-        self._signal: tuple[str, float, int | str] | None = None
         for axis in (*self._stated_um, *self._stated_resolution):
             self._require_axis(axis)
         self._start_up()
@@ -126,44 +122,6 @@ class ZaberStage(HostStage):
         """Return the speed of a move, as the device last said it."""
         self._require_axis(axis)
         return self._move_speeds_um_s[axis]
-
-    def check_output(self, axis: str, output: int | str) -> None:
-        """Lower a digital output of the axis's device; raises `CommandRefusedError` for none such.
-
-        Source: Zaber ASCII Protocol Manual, "io set do".
-        """
-        self._require_axis(axis)
-        self._chain.query(self._addresses[axis][0], 0, f"io set do {output} 0", axis)
-
-    def move_and_signal_um(self, axis: str, target_um: float, output: int | str = 1) -> float:
-        """As `SignallingStage` says; the device raises its output by itself, without the host.
-
-        Raises as `move_to_um`, and `CommandRefusedError` for a device without outputs or triggers.
-        Source: Zaber ASCII Protocol Manual, "trigger", "io set do"; firmware 7.
-        """
-        self.check_output(axis, output)
-        device, _ = self._addresses[axis]
-        self._signal = (axis, target_um, output)
-        try:
-            return self._move_without_settling({axis: target_um})[axis]
-        finally:
-            self._signal = None
-            with suppress(DriverError):  # of a move that failed, the first fault is reported
-                self._chain.query(device, 0, f"trigger {TRIGGER} disable", axis)
-
-    def _arm_signal(self, axis: str, target_um: float, start_um: float) -> None:
-        """Let the output rise where the move that comes now ends, if it is the last leg."""
-        if self._signal is None or self._signal[:2] != (axis, target_um):
-            return
-        device, number = self._addresses[axis]
-        sign = ">=" if target_um >= start_um else "<="
-        target = round(target_um / self._microstep_um[axis])
-        for command in (
-            f"when {number} pos {sign} {target}",
-            f"action a io set do {self._signal[2]} 1",
-            "enable 1",
-        ):
-            self._chain.query(device, 0, f"trigger {TRIGGER} {command}", axis)
 
     def _configure(self) -> None:
         self._chain.checksummed = frozenset()
@@ -203,7 +161,6 @@ class ZaberStage(HostStage):
 
     def _start_moves(self, targets_um: Mapping[str, float], start_um: Mapping[str, float]) -> None:
         for axis, target_um in targets_um.items():
-            self._arm_signal(axis, target_um, start_um[axis])
             target = round(target_um / self._microstep_um[axis])
             self._send_once((axis,), lambda axis=axis, target=target: self._move(axis, target))
 
@@ -391,7 +348,7 @@ class _Chain:
                 except TransportTimeoutError:
                     break
                 message = codec.decode_message(line)
-                if isinstance(message, codec.Reply) and message.message_id == message_id:
+                if message is not None and message.message_id == message_id:
                     replies.append(message)
         return replies
 
@@ -406,7 +363,7 @@ class _Chain:
             for _ in range(FOREIGN_MESSAGES_TOLERATED):
                 line = self._transport.read_until(codec.TERMINATOR)
                 message = codec.decode_message(line, checksum_required)
-                if isinstance(message, codec.Reply) and (
+                if message is not None and (
                     message.device,
                     message.axis,
                     message.message_id,

@@ -49,8 +49,6 @@ NO_FLAG = "--"
 
 _LINE = re.compile(rb"([@!#])([^\r\n]*?)(?::([0-9A-Fa-f]{2}))?\r?\n")
 _REPLY = re.compile(r"(\d{2}) (\d) (?:(\d{2}) )?(OK|RJ) (BUSY|IDLE) (\S{2}) (.*)")
-_ALERT = re.compile(r"(\d{2}) (\d) (BUSY|IDLE) (\S{2})(?: (.*))?")
-_INFO = re.compile(r"(\d{2}) (\d) (?:(\d{2}) )?(.*)")
 
 
 @dataclass(frozen=True)
@@ -63,27 +61,6 @@ class Reply:
     accepted: bool
     busy: bool
     flag: str
-    data: str
-
-
-@dataclass(frozen=True)
-class Alert:
-    """A message that a device sent by itself, such as the end of a move."""
-
-    device: int
-    axis: int
-    busy: bool
-    flag: str
-    data: str
-
-
-@dataclass(frozen=True)
-class Info:
-    """A line of text that accompanies a reply."""
-
-    device: int
-    axis: int
-    message_id: int | None
     data: str
 
 
@@ -109,8 +86,8 @@ def encode_command(device: int, axis: int, message_id: int, data: str = "") -> b
     return b"/%b:%02X\n" % (body, lrc(body))
 
 
-def decode_message(line: bytes, checksum_required: bool = False) -> Reply | Alert | Info:
-    """Return the message in one line, its line end included.
+def decode_message(line: bytes, checksum_required: bool = False) -> Reply | None:
+    """Return the reply in one line, its line end included; None for an alert or information.
 
     A checksum that is there must be right; one that is missing is an error only when
     `checksum_required`. Raises `GarbledReplyError`.
@@ -125,14 +102,12 @@ def decode_message(line: bytes, checksum_required: bool = False) -> Reply | Aler
         raise GarbledReplyError(line, "the checksum is wrong")
     if not body.isascii():
         raise GarbledReplyError(line, "not plain text")
-    return _DECODERS[kind](line, body.decode("ascii"))
-
-
-def _decode_reply(line: bytes, body: str) -> Reply:
-    match = _REPLY.fullmatch(body)
-    if match is None:
+    if kind != b"@":
+        return None
+    reply = _REPLY.fullmatch(body.decode("ascii"))
+    if reply is None:
         raise GarbledReplyError(line, "not a reply")
-    device, axis, message_id, outcome, status, flag, data = match.groups()
+    device, axis, message_id, outcome, status, flag, data = reply.groups()
     return Reply(
         device=int(device),
         axis=int(axis),
@@ -142,22 +117,3 @@ def _decode_reply(line: bytes, body: str) -> Reply:
         flag=flag,
         data=data,
     )
-
-
-def _decode_alert(line: bytes, body: str) -> Alert:
-    match = _ALERT.fullmatch(body)
-    if match is None:
-        raise GarbledReplyError(line, "not an alert")
-    device, axis, status, flag, data = match.groups()
-    return Alert(int(device), int(axis), status == "BUSY", flag, data or "")
-
-
-def _decode_info(line: bytes, body: str) -> Info:
-    match = _INFO.fullmatch(body)
-    if match is None:
-        raise GarbledReplyError(line, "not an information line")
-    device, axis, message_id, data = match.groups()
-    return Info(int(device), int(axis), None if message_id is None else int(message_id), data)
-
-
-_DECODERS = {b"@": _decode_reply, b"!": _decode_alert, b"#": _decode_info}

@@ -13,7 +13,7 @@ import logging
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from drivers import grbl_codec as codec
@@ -84,8 +84,7 @@ class GrblController(SimulatedController):
     """One controller, its axes by letter; machine position 0 is at the upper end of the travel.
 
     Faults as `SimulatedController`'s, and `door`: the safety door opens at the next line.
-    `lost_bytes` counts what came while the receive buffer was full. `on_output` is called for every
-    pin that changes: coolant, mist or spindle, its level and when.
+    `lost_bytes` counts what came while the receive buffer was full.
     """
 
     def __init__(
@@ -101,8 +100,6 @@ class GrblController(SimulatedController):
         self.settings = _default_settings(axes) | dict(settings or {})
         self.work_offset_mm = dict.fromkeys(axes, 0.0)
         self.lost_bytes = 0
-        self.outputs: dict[str, int] = dict.fromkeys(ACCESSORIES, 0)
-        self.on_output: Callable[[str, int, float], None] = lambda *change: None
         self._motors = {letter: Motor(spec, clock) for letter, spec in axes.items()}
         self._boot()
 
@@ -142,8 +139,7 @@ class GrblController(SimulatedController):
         self._homing_letters: tuple[str, ...] = ()
         self._held = False
         self._modes = _Modes()
-        self._stood_s, self._pin_waits = 0.0, False
-        self._switch(dict.fromkeys(self.outputs, 0))
+        self.outputs = dict.fromkeys(ACCESSORIES, 0)
         self._reports_to_offset = 0
         self._reports_to_overrides = 1
         self._status_asked = False
@@ -235,7 +231,6 @@ class GrblController(SimulatedController):
     def _end_block(self, ended_s: float | None) -> None:
         block, self._block = self._block, None
         assert block is not None
-        self._stood_s = self._clock.now_s() if ended_s is None else ended_s
         if self._held:
             self._blocks.appendleft(block)
             self._state = "Hold"
@@ -336,7 +331,6 @@ class GrblController(SimulatedController):
             and len(self._blocks) < PLANNER_BLOCKS
         ):
             if self._switching(self._lines[0][0]) and (self._block or self._blocks):
-                self._pin_waits = True
                 return
             line, _ = self._lines.popleft()
             if self.faults.strikes("door", line):
@@ -549,8 +543,7 @@ class GrblController(SimulatedController):
         targets_mm = self._targets_mm(words, unit, modes.absolute, machine)
         if self._state == "Check":
             return
-        if switched:
-            self._switch(switched)
+        self.outputs |= switched
         if not targets_mm:
             return
         rapid = (motion or modes.motion) == "G0"
@@ -568,14 +561,6 @@ class GrblController(SimulatedController):
             return {}
         words = [f"{letter}{float(value):g}" for letter, value in _WORD.findall(line)]
         return {pin: level for word in words for pin, level in OUTPUTS.get(word, {}).items()}
-
-    def _switch(self, levels: Mapping[str, int]) -> None:
-        at_s = self._stood_s if self._pin_waits else self._clock.now_s()
-        self._pin_waits = False
-        for pin, level in levels.items():
-            if self.outputs[pin] != level:
-                self.outputs[pin] = level
-                self.on_output(pin, level, at_s)
 
     def _set_offsets(self, words: list[tuple[str, float]]) -> None:
         """Shift the work coordinates: G92 until a reset, G10 L2 and L20 as G54 (P0 or P1)."""

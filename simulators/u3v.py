@@ -84,10 +84,6 @@ COLOURS = {
 }
 
 
-LINE_0 = 1
-"""What TriggerSource holds for the line."""
-
-
 @dataclass
 class _Acquisition:
     """Frames in the making: when the next exposure begins, and its number."""
@@ -378,15 +374,9 @@ class U3vCameraSimulator(UsbFunction):
         self._acquisition = _Acquisition(bool(self._read_u32(xml.BASE, xml.MODE)), start_s)
         return OK
 
-    def raise_line(self, at_s: float) -> None:
-        """Line 0 rises at a time; it begins an exposure, after the delay, where that is chosen."""
-        if self._read_u32(xml.BASE, xml.TRIGGER) >> 4 == LINE_0:
-            self._trigger(at_s)
-
     def _trigger(self, at_s: float) -> None:
         if self._acquisition is not None and self._read_u32(xml.BASE, xml.TRIGGER) & 1:
-            (delay_us,) = struct.unpack_from("<f", self._regions[xml.BASE], xml.TRIGGER_DELAY)
-            self._acquisition.next_start_s = at_s + delay_us * 1e-6
+            self._acquisition.next_start_s = at_s
 
     def _next_frame(self, timeout_s: float) -> bool:
         """Put the next frame on its way, waiting for it; return whether it came in time."""

@@ -10,7 +10,7 @@ import logging
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from drivers.clock import Clock
 from drivers.zaber_codec import FLAG_MEANINGS, SPEED_SCALE, lrc
@@ -31,8 +31,6 @@ DRIVER_OFF = "FH"
 TOP_SPEED_PER_RESOLUTION = 16_384
 """`maxspeed` and `move vel` end at this many times the resolution."""
 FINEST_RESOLUTION = 256
-OUTPUTS, TRIGGERS = 4, 6
-"""Of every controller; real ones differ."""
 MOVE_NUMBERS = {"abs": (1, 2), "rel": (1, 2), "vel": (1, 1), "min": (0, 1), "max": (0, 1)}
 """How many numbers each kind of `move` takes; the last one is a speed."""
 OLD_NAMES = {"deviceid": "device.id", "peripheralid": "peripheral.id"}
@@ -184,25 +182,11 @@ class _Axis:
         self._homing = homing
 
 
-@dataclass
-class _Trigger:
-    """`when AXIS pos >= VALUE`, the output that it sets then, and how often it still may."""
-
-    axis: int = 0
-    rises: bool = True
-    value: int = 0
-    output: int = 0
-    level: int = 0
-    left: int = 0
-
-
 class _Device:
     """One controller: its axes, numbered from 1, and its own settings."""
 
     def __init__(self, address: int, axes: list[_Axis], model: int, modified: bool) -> None:
         self.axes = axes
-        self.outputs = [0] * OUTPUTS
-        self.triggers = {number: _Trigger() for number in range(1, TRIGGERS + 1)}
         self.settings = {"comm.checksum": 1, "comm.alert": 0}
         self.constants = {
             "comm.packet.size.max": str(PACKET_SIZE),
@@ -221,8 +205,7 @@ class ZaberChain(SimulatedController):
     `modified`: addresses of devices that have other mechanics than their id states. The microstep
     of an axis is its specification's at the default resolution, whatever its ids.
     Faults as `SimulatedController`'s, and `emergency_stop`: the power of every motor is cut at
-    the next command. `on_output` is called for every digital output that changes: device, output,
-    level and when. Of triggers only `when AXIS pos >= VALUE` (or <=) and `io set do` are modelled.
+    the next command.
     """
 
     def __init__(
@@ -234,7 +217,6 @@ class ZaberChain(SimulatedController):
         modified: Collection[int] = (),
     ) -> None:
         super().__init__(clock, ("emergency_stop",))
-        self.on_output: Callable[[int, int, int, float], None] = lambda *change: None
         models, peripherals = models or {}, peripherals or {}
         self._devices = {
             address: _Device(
@@ -281,31 +263,9 @@ class ZaberChain(SimulatedController):
     def _advance(self) -> None:
         for address, device in self._devices.items():
             for number, axis in enumerate(device.axes, start=1):
-                ends_s = axis.motor.ends_s
-                ended = axis.advance()
-                self._fire(address, device, number, axis, ends_s if ended else None)
-                if ended and device.settings["comm.alert"]:
+                if axis.advance() and device.settings["comm.alert"]:
                     text = f"{address:02d} {number} IDLE {_flag([axis])}"
                     self._send(_encode("!", text, device))
-
-    def _fire(
-        self, address: int, device: _Device, number: int, axis: _Axis, ended_s: float | None
-    ) -> None:
-        """Let the triggers on an axis fire that its position calls for."""
-        for trigger in device.triggers.values():
-            if not trigger.left or trigger.axis != number:
-                continue
-            if (axis.counter >= trigger.value) == trigger.rises:
-                trigger.left -= 1
-                at_s = self._clock.now_s() if ended_s is None else ended_s
-                self._set_output(address, device, trigger.output, trigger.level, at_s)
-
-    def _set_output(
-        self, address: int, device: _Device, output: int, level: int, at_s: float
-    ) -> None:
-        if device.outputs[output - 1] != level:
-            device.outputs[output - 1] = level
-            self.on_output(address, output, level, at_s)
 
     def _next_event_s(self) -> float | None:
         ends_s = [axis.motor.ends_s for device in self._devices.values() for axis in device.axes]
@@ -420,36 +380,6 @@ class ZaberChain(SimulatedController):
         device.axes = [axis.restarted() for axis in device.axes]
         return "0"
 
-    def _io(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        """`io get do [OUTPUT]` and `io set do OUTPUT LEVEL`."""
-        match words:
-            case ["get", "do"]:
-                return " ".join(str(level) for level in device.outputs)
-            case ["get", "do", output]:
-                return str(device.outputs[_within(output, OUTPUTS) - 1])
-            case ["set", "do", output, level]:
-                address = next(key for key, one in self._devices.items() if one is device)
-                place = _within(output, OUTPUTS)
-                self._set_output(address, device, place, _level(level), self._clock.now_s())
-                return "0"
-        raise self._not_modelled(["io", *words])
-
-    def _trigger(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        trigger = device.triggers[_within(words[0] if words else "", TRIGGERS)]
-        match words[1:]:
-            case ["when", axis, "pos", ">=" | "<=" as sign, value]:
-                trigger.axis = _within(axis, len(device.axes))
-                trigger.rises, trigger.value = sign == ">=", _integer(value)
-            case ["action", "a", "io", "set", "do", output, level]:
-                trigger.output, trigger.level = _within(output, OUTPUTS), _level(level)
-            case ["enable", *count] if len(count) < 2:
-                trigger.left = _integer(count[0]) if count else 1 << 31
-            case ["disable"]:
-                trigger.left = 0
-            case _:
-                raise self._not_modelled(["trigger", *words])
-        return "0"
-
     def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         if words != ["enable"]:
             raise _RefusedError("BADCOMMAND")
@@ -518,8 +448,6 @@ class ZaberChain(SimulatedController):
         "estop": _estop,
         "system": _system,
         "driver": _driver,
-        "io": _io,
-        "trigger": _trigger,
         "warnings": _warnings,
         "get": _get,
         "set": _set,
@@ -542,20 +470,6 @@ def _integer(word: str) -> int:
         return int(word)
     except ValueError as error:
         raise _RefusedError("BADDATA") from error
-
-
-def _within(word: str, most: int) -> int:
-    number = _integer(word)
-    if not 1 <= number <= most:
-        raise _RefusedError("BADDATA")
-    return number
-
-
-def _level(word: str) -> int:
-    level = _integer(word)
-    if level not in (0, 1):
-        raise _RefusedError("BADDATA")
-    return level
 
 
 def _flags(axes: list[_Axis]) -> list[str]:

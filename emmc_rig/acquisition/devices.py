@@ -17,7 +17,6 @@ from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.retries import Mending
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.bench.trigger import EDGE_WAIT_S, signalling, triggered
 from emmc_rig.errors import AppError
 from emmc_rig.session.planned import PlannedFrame
 
@@ -59,7 +58,6 @@ class Devices:
         self._rig, self._plan = rig, plan
         self.camera = rig.camera
         self.sent = Sent()
-        self.triggered = False
 
     def home(self) -> None:
         """Home the stage, and bring the axes that no plan moves to their places."""
@@ -118,12 +116,7 @@ class Devices:
     def move_and_expose(
         self, planned: PlannedFrame, exposure_s: float, span: Spans
     ) -> tuple[RawFrame, Figures]:
-        """Bring the stage to its place and expose there, by the program or by a trigger."""
-        axis = self._axis_that_triggers(planned)
-        self.triggered = axis is not None
-        if axis is not None:
-            frame = self._arrive_and_expose(planned, axis, exposure_s, span)
-            return frame, figures(frame)
+        """Bring the stage to its place and expose there."""
         with span("move", planned):
             moved = self.move(planned)
         if moved and self._plan.settle_s:
@@ -185,37 +178,6 @@ class Devices:
         """Return by axis where the stage does not stand yet, from each axis's zero."""
         sent = self.sent.offsets_um
         return {axis: um for axis, um in planned.bench.offsets_um.items() if sent.get(axis) != um}
-
-    def _axis_that_triggers(self, planned: PlannedFrame) -> str | None:
-        """Return the axis whose arrival begins the exposure; None: the program asks for it.
-
-        A controller raises its output when one axis arrives, so that it must be the only one that
-        moves. Metering looks at a frame before it takes the next.
-        """
-        wanted = list(self._wanted_um(planned))
-        trigger = self._rig.trigger
-        if trigger is None or planned.kind == "metering" or len(wanted) != 1:
-            return None
-        return wanted[0] if wanted[0] in trigger.outputs else None
-
-    def _arrive_and_expose(
-        self, planned: PlannedFrame, axis: str, exposure_s: float, span: Spans
-    ) -> RawFrame:
-        rig, sent = self._rig, self.sent.offsets_um
-        assert rig.trigger is not None
-        offset_um = planned.bench.offsets_um[axis]
-        rig.about_to_expose(planned.id)
-        self._set_camera(planned, exposure_s)
-        delay_s = rig.trigger.delay_s + self._plan.settle_s
-        with triggered(self.camera).armed(rig.trigger.line, delay_s) as receive:
-            with span("move", planned):
-                sent.pop(axis, None)
-                target_um = rig.zero_um[axis] + offset_um
-                output = rig.trigger.outputs[axis]
-                signalling(rig.stage).move_and_signal_um(axis, target_um, output)
-                sent[axis] = offset_um
-            with span("expose", planned):
-                return receive(EDGE_WAIT_S)
 
     def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
         """Expose one frame, or of a metering frame as many as it takes to find its exposure."""

@@ -384,7 +384,6 @@ class Sequencer:
             "commanded_um": dict(planned.bench.offsets_um),
             "read_um": read_um,
             "figures": found.as_dict(),
-            "triggered": self._devices.triggered,
             "attempts": attempts,
             "wall": self._wall(),
         }

@@ -22,15 +22,14 @@ from drivers.apt import identify as identify_apt
 from drivers.camera import Camera as CameraDevice
 from drivers.cameras import CAMERA_HELP, CAMERAS
 from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.dng import SMALLEST_SIDE_PX
 from drivers.errors import DriverError, TransportTimeoutError
 from drivers.grbl import GrblStage
 from drivers.grbl import identify as identify_grbl
-from drivers.plain_dng import SMALLEST_SIDE_PX
 from drivers.ports import find_port, list_serial_ports
 from drivers.ptp import open_camera as open_ptp
 from drivers.stage import HostStage, Stage, StageSettings
 from drivers.transport import SerialTransport, Transport
-from drivers.u3v import open_u3v
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
 from emmc_rig.bench.camera_config import CameraChoice, parse_camera, settings_of
@@ -45,7 +44,6 @@ from emmc_rig.bench.stage_config import (
     ZaberConfig,
     parse_stage,
 )
-from emmc_rig.bench.trigger import SimulatedTrigger, Trigger
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, Sensor
@@ -58,8 +56,7 @@ from simulators.effects import Flaws
 from simulators.firmware import SimulatedController
 from simulators.grbl import GrblController
 from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
-from simulators.u3v import COLOURS, U3vCameraSimulator
-from simulators.usb import SimulatedUsb, UsbFunction
+from simulators.usb import SimulatedUsb
 from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
@@ -114,11 +111,10 @@ class Rig:
     zero_um: where each stage axis centres the mask or the pinhole on the optical axis.
     window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
     clock: the devices' own. reopen_camera: opens the camera again after it went away.
-    about_to_expose: called with a frame's name before its exposure. trigger: the line by which
-    the stage's arrival begins an exposure; None: the program waits and asks. window_side_um: side
-    of that square window, to put its edges between views; None: not known. stands_um: where axes
-    that no plan moves stand in a capture, as the focus. recorded_s: of a recording that is
-    replayed, the exposure of each frame by its name.
+    about_to_expose: called with a frame's name before its exposure. window_side_um: side of that
+    square window, to put its edges between views; None: not known. stands_um: where axes that no
+    plan moves stand in a capture, as the focus. recorded_s: of a recording that is replayed, the
+    exposure of each frame by its name.
     """
 
     stage: Stage
@@ -129,7 +125,6 @@ class Rig:
     clock: Clock = SYSTEM_CLOCK
     reopen_camera: Callable[[], CameraDevice] | None = None
     about_to_expose: Callable[[str], None] = _unheard
-    trigger: Trigger | None = None
     window_side_um: float | None = None
     stands_um: Mapping[str, float] = field(default_factory=dict)
     recorded_s: Mapping[str, float] = field(default_factory=dict)
@@ -137,10 +132,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class SimulatedRig(Rig):
-    """A rig, and the firmware behind its devices, whose faults can be armed.
-
-    still: of the PTP camera that the rig has unless its stage triggers the exposures.
-    """
+    """A rig, and the firmware of stage and camera (`still`), whose faults can be armed."""
 
     chain: ZaberChain = field(kw_only=True)
     still: PtpCameraSimulator = field(kw_only=True)
@@ -173,7 +165,6 @@ def simulated_rig(
     seed: int,
     clock: Clock | None = None,
     rays_per_view: int = RAYS_PER_VIEW,
-    trigger: SimulatedTrigger | None = None,
     flaws: Flaws = NO_FLAWS,
     focus_um: float | None = None,
     stands_um: Mapping[str, float] | None = None,
@@ -183,10 +174,9 @@ def simulated_rig(
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
     real one lets moves and exposures take their time; by default they take none. A frame that is
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
-    pixel; few are quick, and grainy beside a good sensor's noise. trigger: the stage's arrival
-    begins the exposures of a USB3 Vision camera. flaws: what is wrong with it. focus_um: where a
-    fifth axis, `focus`, has the scene sharp; None: there is none. stands_um: see `Rig`. Raises
-    AppError for a size that the camera's RAW files cannot hold.
+    pixel; few are quick, and grainy beside a good sensor's noise. flaws: what is wrong with
+    it. focus_um: where a fifth axis, `focus`, has the scene sharp; None: there is none. stands_um:
+    see `Rig`. Raises AppError for a size that the camera's RAW files cannot hold.
     """
     k = camera.sensor.binning
     if min(size) // k < SMALLEST_SIDE_PX:
@@ -242,17 +232,13 @@ def simulated_rig(
         bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
     )
     shape = (size[0] // k, size[1] // k)
-    function: UsbFunction = PtpUsbFunction(simulator)
-    if trigger is not None:
-        function = _triggered_camera(bench, shape, clock, chain, trigger.latency_s)
+    function = PtpUsbFunction(simulator)
     bus = SimulatedUsb(clock, function)
 
     def opened() -> CameraDevice:
         """Open the camera; one whose cable is out is plugged in first."""
         if not any(plug.function is function and plug.present for plug in bus.enumerate_devices()):
             bus.plug(function)
-        if trigger is not None:
-            return open_u3v(backend=bus, clock=clock)
         # The card lies in this computer's memory, hence from_card.
         return open_ptp("", clock, bus, shape, cfa, from_card=True)
 
@@ -269,44 +255,12 @@ def simulated_rig(
         clock,
         opened,
         announced,
-        trigger,
         window_side_um(camera.views, camera.lens.aperture_cell_um),
         stands_um or {},
         chain=chain,
         still=simulator,
     )
     return rig, bench
-
-
-def _triggered_camera(
-    bench: Bench, shape: tuple[int, int], clock: Clock, chain: ZaberChain, latency_s: float
-) -> U3vCameraSimulator:
-    """Return a USB3 Vision camera before the bench, output 1 of every controller on its line 0."""
-    sensor = bench.camera.sensor
-    bits = sensor.noise.white_level_dn.bit_length()
-    wants = []
-    if sensor.cfa_name not in COLOURS:
-        wants.append(f"a sensor of colours {', '.join(COLOURS)}, not {sensor.cfa_name}")
-    if sensor.noise.white_level_dn != 2**bits - 1 or bits not in (8, 10, 12, 16):
-        wants.append(f"white at the top of 8 to 16 bits, not at {sensor.noise.white_level_dn}")
-    if shape[0] % 2 or shape[1] % 2:
-        wants.append(f"an even number of rows and columns, not {shape[0]}x{shape[1]}")
-    if wants:
-        raise AppError(f"trigger: the simulated USB3 Vision camera needs {' and '.join(wants)}")
-    made = U3vCameraSimulator(
-        bench.expose,
-        clock,
-        shape,
-        sensor.cfa_name,
-        sensor.noise.black_level_dn,
-        bits,
-        depths=(str(bits),),
-        exposure_us=(10.0, 2e9),
-    )
-    chain.on_output = lambda device, output, level, at_s: (
-        made.raise_line(at_s + latency_s) if (output, level) == (1, 1) else None
-    )
-    return made
 
 
 def open_stage(

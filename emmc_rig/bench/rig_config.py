@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from drivers.clock import SYSTEM_CLOCK
 from drivers.stage import Stage
@@ -20,7 +20,6 @@ from emmc_rig.bench.hardware import (
     open_stage,
     simulated_rig,
 )
-from emmc_rig.bench.trigger import SimulatedTrigger, Trigger, check_trigger
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.arguments import path_of
@@ -34,7 +33,9 @@ from simulators.still import StillStage
 
 SIMULATED = "simulated"
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
-LATER = ("trigger", "focus_um", "stands_um", "mask")
+LATER = ("focus_um", "stands_um", "mask")
+NO_SETTINGS = ("kind", "trigger")
+"""What a description has, or had in version 0.2, beside the settings of a rig."""
 Ask = Callable[[str], None]
 
 
@@ -75,8 +76,7 @@ class RealRig(AnyRig):
     plate's open window; window_side_um: its side, for plans that open parts of the aperture.
     Of a recording (camera `folder:DIR`, stage `simulated`) neither has to be given.
     by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
-    not, nothing of that changes, as in a recording that is replayed. trigger: the wire by which
-    the stage's arrival begins an exposure, where there is one.
+    not, nothing of that changes, as in a recording that is replayed.
     """
 
     stage: str
@@ -85,29 +85,21 @@ class RealRig(AnyRig):
     window_um: float = 0.0
     window_side_um: float | None = Field(default=None, gt=0)
     by_hand: bool = True
-    trigger: Trigger | None = None
 
 
-class WiredRig(AnyRig):
-    """A YAML file for the simulated rig: with a line from the stage to its camera, a focus axis."""
+class FocusedRig(AnyRig):
+    """A YAML file for the simulated rig with a focus axis."""
 
     kind: Literal["simulated"]
-    trigger: SimulatedTrigger | None = None
-    focus_um: float | None = Field(default=None, gt=0)
-
-    @model_validator(mode="after")
-    def _says_something(self) -> WiredRig:
-        if self.trigger is None and self.focus_um is None:
-            raise ValueError("give trigger or focus_um; without either name the rig simulated")
-        return self
+    focus_um: float = Field(gt=0)
 
 
 class ImagedRig(AnyRig):
     """The simulated rig before a scene; size: rows and columns of the light field.
 
-    rays: per view and pixel; calibration to a per cent needs 1024 or more. trigger: the line from
-    its stage to its camera, which it has not by default. flaws: what is wrong with it, by the names
-    of `simulators.effects`. focus_um: where its focus axis, if it has one, has the scene sharp.
+    rays: per view and pixel; calibration to a per cent needs 1024 or more. flaws: what is
+    wrong with it, by the names of `simulators.effects`. focus_um: where its focus axis, if it has
+    one, has the scene sharp.
     """
 
     scene: str
@@ -115,7 +107,6 @@ class ImagedRig(AnyRig):
     seed: int = Field(default=0, ge=0)
     real_time: bool = False
     rays: int = Field(default=RAYS_PER_VIEW, ge=16)
-    trigger: SimulatedTrigger | None = None
     flaws: tuple[str, ...] = ()
     focus_um: float | None = Field(default=None, gt=0)
 
@@ -178,8 +169,8 @@ class NoAttendant:
 def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
     """Return what a session freezes of a rig: `simulated`, or a YAML file of devices.
 
-    A file of `kind: simulated` is the simulated rig with the file's trigger. Raises AppError with
-    one line.
+    A file of `kind: simulated` is the simulated rig with the file's focus. Raises AppError with one
+    line.
     """
     if spec == SIMULATED:
         return _described(SIMULATED, imaged)
@@ -189,9 +180,9 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
         )
     read = read_yaml(Path(spec), AppError)
     if isinstance(read, dict) and read.get("kind") == SIMULATED:
-        wired = validated(WiredRig, read, spec, AppError)
-        wiring = {name: getattr(wired, name) for name in LATER}
-        return _described(SIMULATED, imaged.model_copy(update=wiring))
+        focused = validated(FocusedRig, read, spec, AppError)
+        more = {name: getattr(focused, name) for name in LATER}
+        return _described(SIMULATED, imaged.model_copy(update=more))
     config = validated(RealRig, read, spec, AppError)
     described = _described("real", config)
     beside = Path(spec).parent / config.stage
@@ -258,7 +249,7 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
     ask: tells a person what to do and returns when it is done. Raises AppError or what opening a
     device raises.
     """
-    settings = {key: value for key, value in description.items() if key != "kind"}
+    settings = {key: value for key, value in description.items() if key not in NO_SETTINGS}
     if description["kind"] == SIMULATED:
         imaged = validated(ImagedRig, settings, "the simulated rig", AppError)
         fine = fine_scene(
@@ -278,14 +269,11 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             imaged.seed,
             clock,
             imaged.rays,
-            imaged.trigger,
             flawed(NO_FLAWS, imaged.flaws),
             imaged.focus_um,
             imaged.stands_um,
         )
         _check_axes(imaged, rig)
-        if imaged.trigger is not None:
-            check_trigger(imaged.trigger, rig.stage, rig.camera)
         yield rig
         return
     real = validated(RealRig, settings, "the rig", AppError)
@@ -297,8 +285,6 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
     else:
         still = open_stage(real.stage)
     with still as stage, closing(open_camera(real.camera)) as device:
-        if real.trigger is not None:
-            check_trigger(real.trigger, stage, device)
         rig = Rig(
             stage,
             device,
@@ -306,7 +292,6 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             zero_um,
             real.window_um,
             reopen_camera=lambda: open_camera(real.camera),
-            trigger=real.trigger,
             window_side_um=real.window_side_um,
             stands_um=real.stands_um,
         )

@@ -66,14 +66,6 @@ def calibrate(
     rays: Annotated[
         int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
     ] = 512,
-    stage: Annotated[
-        bool,
-        typer.Option(
-            "--stage",
-            help="map the mask stage as well: of a session by its open whiteboards (stage.json), "
-            "on the simulated bench by 16 more",
-        ),
-    ] = False,
     sensor: Annotated[
         bool,
         typer.Option("--sensor", help="of a session: the sensor's EMVA 1288 figures, sensor.json"),
@@ -102,7 +94,7 @@ def calibrate(
         _judge_drift(known, drift, out or Path("emmc-drift"))
         return
     if session is not None:
-        _calibrate_session(session, route, out, sensor, stage)
+        _calibrate_session(session, route, out, sensor)
         return
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
@@ -116,7 +108,6 @@ def calibrate(
         target,
         seed,
         rays=rays,
-        map_stage=stage,
         most_frames=frames,
         few=few,
         leave_out=frozenset(leave_out.split(",") if leave_out else ()),
@@ -157,7 +148,7 @@ def _tell_findings(metrics: dict) -> None:
         tell(f"measure again: {line}")
 
 
-def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool, stage: bool) -> None:
+def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -> None:
     from emmc_rig.files.folders import result_folder
     from emmc_rig.processing.session_calibration import calibrate_into
     from emmc_rig.session.session import CALIBRATION, Session
@@ -165,7 +156,7 @@ def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool, s
     captured, place = Session(path), path / CALIBRATION
     out = out or place
     with result_folder(out, "calibrate", belongs_to=place) as folder, shown_progress() as bars:
-        calibration = calibrate_into(folder, captured, route, sensor, stage, bars)
+        calibration = calibrate_into(folder, captured, route, sensor, bars)
     metrics = calibration.metrics
     chosen = metrics["chosen"]
     judged = metrics["held_out"][chosen]
@@ -174,11 +165,10 @@ def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool, s
         f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
     )
     _tell_findings(metrics)
-    mapped = None if calibration.stage is None else calibration.stage.map
-    for sheet in (calibration.sensor, mapped):
-        for name, value, deviation, unit in () if sheet is None else sheet.rows():
-            spread = "" if deviation is None else f" +- {deviation:.2g}"
-            tell(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
+    sheet = calibration.sensor
+    for name, value, deviation, unit in () if sheet is None else sheet.rows():
+        spread = "" if deviation is None else f" +- {deviation:.2g}"
+        tell(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
     tell(f"open {out / 'report.html'}")
     give_result(out)
 

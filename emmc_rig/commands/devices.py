@@ -156,31 +156,19 @@ def jog(
     to: Annotated[bool, typer.Option("--to", help="move to this place, not by it")] = False,
     home_first: Annotated[bool, typer.Option("--home", help="home the axis first")] = False,
     speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
-    signal_on: Annotated[
-        str | None,
-        typer.Option("--signal", help="output that rises on arrival: 1 (Zaber), coolant (Grbl)"),
-    ] = None,
     stage: StageOption = None,
     rig: RigOption = None,
 ) -> None:
     """Move one axis by a distance (write `-- -5` for a negative one), or to a place."""
-    from drivers.stage import SignallingStage
-
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
             opened.set_speed_um_s(axis, speed_um_s)
-        if signal_on is not None and not isinstance(opened, SignallingStage):
-            raise AppError("--signal: only Zaber and Grbl raise an output on arrival")
         with shown_progress("home" if home_first else "move") as progress:
             if home_first:
                 opened.home([axis])
                 progress.begin("move")
-            if signal_on is not None and isinstance(opened, SignallingStage):
-                target_um = distance_um + (0.0 if to else opened.position_um(axis))
-                at_um = opened.move_and_signal_um(axis, target_um, signal_on)
-            else:
-                move = opened.move_to_um if to else opened.move_by_um
-                at_um = move({axis: distance_um})[axis]
+            move = opened.move_to_um if to else opened.move_by_um
+            at_um = move({axis: distance_um})[axis]
         tell(f"{axis} at {at_um:.3f} um")
         give_result(axis=axis, at_um=at_um)
 

@@ -18,7 +18,7 @@ from emmc_rig.errors import ERRORS
 MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
-        "session": {"route", "sensor", "stage", "out"},
+        "session": {"route", "sensor", "out"},
         "plan": {"camera", "size", "target", "rays", "seed", "leave_out", "few", "frames", "out"},
     },
     "capture": {"schema": set(), "new": {"out"}},

@@ -1,10 +1,9 @@
-"""`emmc-rig devices scale`: measure the length of an axis's step, by a ruler or by the camera."""
+"""`emmc-rig devices scale`: measure the length of an axis's step by a ruler."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
 SMALLEST_COUNT = 100
 APPROACH_SHARE = 0.05
 """Every place is come to from below by so much of the whole distance: backlash stays out."""
+FEWEST_PLACES = 3
 
 ReadPlace = Callable[[int], float]
 """Given the number of a place (from 0), returns where the axis reads to be there, in um."""
@@ -38,13 +38,6 @@ def scale(
         str, typer.Option("--stage", help="zaber:PORT, grbl:PORT, apt:PORT, or a YAML file")
     ],
     places: Annotated[int, typer.Option("--places", min=3, help="places to read")] = 5,
-    camera: Annotated[
-        str | None, typer.Option("--camera", help="read the mask's shadow in this camera's frames")
-    ] = None,
-    um_per_pixel: Annotated[
-        float | None,
-        typer.Option("--um-per-pixel", min=0, help="at the mask: pixel pitch over magnification"),
-    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="write the stage's YAML file, with the scale")
     ] = None,
@@ -52,21 +45,17 @@ def scale(
 ) -> None:
     """Measure the length of an axis's step: home, move a known count, read where it stands.
 
-    Without --camera every place is asked for: read it off a ruler or a dial indicator, in um.
+    Every place is asked for: read it off a ruler or a dial indicator, in um.
     Counts are microsteps (Zaber), encoder counts (APT), thousandths of Grbl's own millimetre.
     """
-    from calibration.errors import CalibrationError
-    from calibration.stage_scale import fit_step_length
     from drivers.errors import DriverError
     from emmc_rig.acquisition.signals import signals_interrupt
-    from emmc_rig.bench.hardware import open_camera, open_stage
+    from emmc_rig.bench.hardware import open_stage
     from emmc_rig.bench.stage_config import parse_stage
     from emmc_rig.files.folders import refuse_inside_session
 
     if counts < SMALLEST_COUNT:
         raise AppError(f"{counts} counts are too few to measure: move at least {SMALLEST_COUNT}")
-    if (camera is None) != (um_per_pixel is None):
-        raise typer.BadParameter("--camera and --um-per-pixel belong together")
     if out is not None:
         refuse_inside_session(out.parent)
         if out.exists():
@@ -85,15 +74,10 @@ def scale(
                 raise AppError("nothing was moved: clear the way, then answer y")
             with shown_progress("home"):
                 opened.home([axis])
-            if camera is None:
-                steps, readings = measure(opened, axis, counts, places, _asked)
-            else:
-                with closing(open_camera(camera)) as device, shown_progress("measure"):
-                    reader = shadow_reader(device, um_per_pixel or 0.0)
-                    steps, readings = measure(opened, axis, counts, places, reader)
+            steps, readings = measure(opened, axis, counts, places, _asked)
             found = fit_step_length(steps, readings)
             settings = scale_settings(config, opened, axis, found.um_per_step)
-    except (DriverError, CalibrationError) as fault:
+    except DriverError as fault:
         raise AppError("; ".join([str(fault), *getattr(fault, "__notes__", [])])) from fault
     share = found.deviation_um / found.um_per_step
     tell(
@@ -147,21 +131,44 @@ def _asked(number: int) -> float:
     return typer.prompt(f"place {number + 1}: where does it stand, in um", type=float, err=True)
 
 
-def shadow_reader(camera: Any, um_per_pixel: float) -> ReadPlace:
-    """Return a reader that adds up the moves of the mask's shadow since the first place."""
-    from calibration.stage_scale import shadow_shift_px
+@dataclass(frozen=True)
+class StepLength:
+    """um of one step, its standard deviation, and the largest distance of a reading from the line.
 
-    frames: list[Any] = []
-    moved_px = [0.0, 0.0]
+    um_per_step is positive; `reversed` says that readings fell while the axis counted up.
+    """
 
-    def read(number: int) -> float:
-        frames.append(camera.snap().mosaic)
-        if len(frames) > 1:
-            for axis, shift_px in enumerate(shadow_shift_px(frames.pop(0), frames[0])):
-                moved_px[axis] += shift_px
-        return um_per_pixel * math.hypot(*moved_px)
+    um_per_step: float
+    deviation_um: float
+    worst_um: float
+    reversed: bool
 
-    return read
+
+def fit_step_length(steps: Sequence[float], readings_um: Sequence[float]) -> StepLength:
+    """Return the slope of a straight line through the places, least squares.
+
+    Raises AppError for fewer than three places, places that do not differ, or readings
+    that a line does not explain.
+    """
+    import numpy as np
+
+    if len(steps) < FEWEST_PLACES or len(steps) != len(readings_um):
+        raise AppError(
+            f"{len(steps)} places and {len(readings_um)} readings: read at least {FEWEST_PLACES}"
+        )
+    x, y = np.array(steps, dtype=np.float64), np.array(readings_um, dtype=np.float64)
+    spread = ((x - x.mean()) ** 2).sum()
+    if not (spread > 0 and np.isfinite(y).all()):
+        raise AppError("the places do not differ, or a reading is no number")
+    slope = float(((x - x.mean()) * (y - y.mean())).sum() / spread)
+    residual = y - y.mean() - slope * (x - x.mean())
+    deviation = float(np.sqrt((residual**2).sum() / (len(x) - 2) / spread))
+    if not abs(slope) > 3 * deviation:
+        raise AppError(
+            f"the readings do not follow the axis ({slope:g} um a step, deviation {deviation:g}): "
+            "check that it moved what was measured"
+        )
+    return StepLength(abs(slope), deviation, float(np.abs(residual).max()), slope < 0)
 
 
 def _merged(base: dict, more: dict) -> dict:

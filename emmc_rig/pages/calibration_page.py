@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from calibration.choice import HeldOut
 from calibration.routes import Outcome
 from calibration.sensor import SensorSheet
-from calibration.stage_map import StageMap
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.display import png_of
-from emmc_rig.pages.drawing import ACCENT, INK, LEGEND, sheet, svg_of, titled
+from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
 from emmc_rig.pages.page import (
     Card,
     Head,
@@ -49,7 +48,6 @@ WORDS = {
 }
 
 
-PLACES = ("Frame", "Sent to, um", "Mask stood at, um", "Deviation, um", "Left by the map, um")
 GOOD_CHI2 = 1.5
 """Held-out residual, in variances of the noise, above which something is not modelled."""
 
@@ -60,13 +58,11 @@ def write_calibration_report(
     metrics: Mapping,
     truth: Mapping[str, float] | None = None,
     sensor: SensorSheet | None = None,
-    stage: StageMap | None = None,
-    places: Sequence[tuple[str, ...]] = (),
 ) -> None:
     """Write the page whole or not at all.
 
     metrics: as `emmc_rig.calibrate` makes them. truth: parameters of a simulated bench, shown
-    beside the fit. places: of the stage, see PLACES.
+    beside the fit.
     """
     unwatched = [one.removeprefix("not measured: ") for one in outcome.unwatched]
     sections = [
@@ -83,12 +79,6 @@ def write_calibration_report(
     sections += [Section("residuals", "Residual maps", body), Section("psi", "Psi", _psi(outcome))]
     if sensor is not None:
         sections.append(Section("sensor", "Sensor", _sensor(sensor)))
-    if stage is not None:
-        heads = ("Quantity", "Value", "Standard deviation", "Unit")
-        body = fragment("figures.html", heads=heads, rows=_figures(stage.rows()), pictures={})
-        if places:
-            body += fragment("figures.html", heads=PLACES, rows=places, pictures={})
-        sections.append(Section("stage", "Stage map", body))
     sections.append(provenance_section(_provenance(metrics)))
     title = f"Calibration of {metrics['camera']}"
     write_text(
@@ -202,9 +192,9 @@ def _psi(outcome: Outcome) -> str:
 
 
 def _sensor(sheet_: SensorSheet) -> str:
-    (first, (transfer,)), (second, (linearity,)), (third, (rows,)) = (
+    (first, (transfer,)), (second, (linearity,)) = (
         sheet(1, 4.8, label=label)
-        for label in ("temporal variance, DN²", "deviation from the line, %", "amplitude")
+        for label in ("temporal variance, DN²", "deviation from the line, %")
     )
     curve = sheet_.curve
     transfer.plot(curve.mean_dn, curve.variance_dn2, "o", color=ACCENT, markersize=4)
@@ -215,15 +205,8 @@ def _sensor(sheet_: SensorSheet) -> str:
     linearity.plot(curve.exposure_s, sheet_.linearity_residual, "o", color=ACCENT, markersize=4)
     linearity.axhline(0, color=INK, linewidth=0.8)
     titled(linearity, "Linearity", "exposure, s")
-    for name, one, scale in (("DSNU, DN", sheet_.dsnu, 1.0), ("PRNU, %", sheet_.prnu, 100.0)):
-        for direction, line_style in (("horizontal", "-"), ("vertical", ":")):
-            amplitude = scale * one.spectra[direction][1:]
-            label = f"{name}, {direction}"
-            rows.plot(one.frequency[direction][1:], amplitude, line_style, label=label)
-    rows.legend(**LEGEND)
-    titled(rows, "Spectrograms", "cycles a pixel")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
-    drawn = {"Photon transfer curve": first, "Linearity": second, "Spectrograms": third}
+    drawn = {"Photon transfer curve": first, "Linearity": second}
     pictures = {name: data_address(svg_of(one), ".svg") for name, one in drawn.items()}
     return fragment("figures.html", heads=heads, rows=_figures(sheet_.rows()), pictures=pictures)
 

@@ -44,7 +44,6 @@ class CalibrateSettings:
     seed: int = 0
     flaws: Flaws = ORDINARY_BENCH
     rays: int = RAYS_PER_VIEW
-    map_stage: bool = False
     most_frames: int | None = None
     leave_out: frozenset[str] = frozenset()
     few: bool = False

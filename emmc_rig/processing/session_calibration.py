@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calibration.boards import each_reading
 from calibration.routes import Outcome
 from calibration.sensor import SensorSheet, characterise
-from calibration.stage_map import Place, StageMap, locate, stage_map
 from calibration.whiteboard import Calibration, NewArray, in_memory
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
@@ -23,14 +21,13 @@ from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.processing.calibration_settings import ROUTES
 from emmc_rig.processing.stored import REPORT, arrays_in, outcome_figures, save_outcome
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.session.board_sets import sensor_pairs, stage_frames
+from emmc_rig.session.board_sets import sensor_pairs
 from emmc_rig.session.frame_means import camera_of
 from emmc_rig.session.measured_psi import session_outcome
-from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import camera_json_of, taken_shots
 from emmc_rig.session.session import CALIBRATION, Session
 
-SENSOR, STAGE = "sensor.json", "stage.json"
+SENSOR = "sensor.json"
 
 
 def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, Any]:
@@ -38,52 +35,6 @@ def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, 
         name: {"value": value, "deviation": deviation, "unit": unit}
         for name, value, deviation, unit in rows
     }
-
-
-@dataclass(frozen=True, eq=False)
-class SessionStage:
-    """Where the mask stage of a session was sent, where it read to be, and where the mask stood.
-
-    read_um: by the stage's own scale, None where the journal does not say. deviation_um: of each
-    measured place, x or y.
-    """
-
-    map: StageMap
-    frames: tuple[str, ...]
-    commanded_um: Sequence[tuple[float, float]]
-    read_um: Sequence[tuple[float, float] | None]
-    places: Sequence[Place]
-
-    def figures(self) -> dict[str, Any]:
-        """Return plain data: what the stage does, and every place, all in um."""
-        places = [
-            {
-                "frame": frame,
-                "commanded_um": list(sent),
-                "read_um": None if read is None else list(read),
-                "measured_um": [place.x_um, place.y_um],
-                "deviation_um": place.deviation_um,
-                "left_by_the_map_um": left.tolist(),
-            }
-            for frame, sent, read, place, left in zip(
-                self.frames, self.commanded_um, self.read_um, self.places,
-                self.map.residual_um, strict=True,
-            )
-        ]  # fmt: skip
-        map_um = {"matrix": self.map.matrix.tolist(), "offset_um": list(self.map.offset_um)}
-        return {**_figures(self.map.rows()), "Map": map_um, "Places": places}
-
-    def rows(self) -> list[tuple[str, ...]]:
-        """Return the places for a table: frame, commanded, measured, left by the map."""
-        return [
-            (
-                one["frame"],
-                *("{:.2f}, {:.2f}".format(*one[key]) for key in ("commanded_um", "measured_um")),
-                f"{one['deviation_um']:.2f}",
-                "{:+.2f}, {:+.2f}".format(*one["left_by_the_map_um"]),
-            )
-            for one in self.figures()["Places"]
-        ]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,7 +49,6 @@ class SessionCalibration:
     calibration: Calibration
     metrics: dict[str, Any]
     sensor: SensorSheet | None = None
-    stage: SessionStage | None = None
 
     @property
     def psi(self) -> ImagingMatrix:
@@ -122,19 +72,8 @@ class SessionCalibration:
     def write(self, folder: Path, truth: Mapping[str, float] | None = None) -> None:
         """Write the same files into an existing folder; truth: parameters of a simulated bench."""
         save_outcome(folder, self.outcome, self.calibration)
-        stage = self.stage
-        write_calibration_report(
-            folder / REPORT,
-            self.outcome,
-            self.metrics,
-            truth,
-            self.sensor,
-            stage=None if stage is None else stage.map,
-            places=() if stage is None else stage.rows(),
-        )
+        write_calibration_report(folder / REPORT, self.outcome, self.metrics, truth, self.sensor)
         write_metrics(folder, self.metrics)
-        if stage is not None:
-            (folder / STAGE).write_text(metrics_text(stage.figures()), encoding="utf-8")
         if self.sensor is not None:
             figures = _figures(self.sensor.rows())
             curve = self.sensor.curve
@@ -143,14 +82,6 @@ class SessionCalibration:
                 "variance_dn2": curve.variance_dn2.tolist(),
                 "exposure_s": curve.exposure_s.tolist(),
             }
-            for name, one in (("DSNU, DN", self.sensor.dsnu), ("PRNU, share", self.sensor.prnu)):
-                figures[f"Spectrogram of {name}"] = {
-                    direction: {
-                        "cycles_per_pixel": one.frequency[direction].tolist(),
-                        "amplitude": amplitude.tolist(),
-                    }
-                    for direction, amplitude in one.spectra.items()
-                }
             (folder / SENSOR).write_text(metrics_text(figures), encoding="utf-8")
 
     def __repr__(self) -> str:
@@ -165,24 +96,22 @@ def calibrate(
     route: str = "auto",
     *,
     sensor: bool = False,
-    stage: bool = False,
     watcher: Watcher | None = None,
 ) -> SessionCalibration:
     """Return Psi as a session's whiteboards measure it; `.save(folder)` writes it with a report.
 
     session: itself, or its folder. route: parametric, mixed or free; `auto` takes every one that
     the session has whiteboards for, and chooses. sensor: its figures too, from the darks and the
-    references at several exposures. stage: a map of the mask stage, from every frame of the open
-    aperture.
+    references at several exposures.
     Raises AppError or CalibrationError.
     """
     if not isinstance(session, Session):
         session = Session(path_of(session, "session", "a session, or its folder"))
-    return _calibrated(session, route, sensor, stage, watcher or Silent(), in_memory)
+    return _calibrated(session, route, sensor, watcher or Silent(), in_memory)
 
 
 def calibrate_into(
-    folder: Path, session: Session, route: str, sensor: bool, stage: bool, watcher: Watcher
+    folder: Path, session: Session, route: str, sensor: bool, watcher: Watcher
 ) -> SessionCalibration:
     """Calibrate and write the result into an existing folder.
 
@@ -192,21 +121,17 @@ def calibrate_into(
     whole = taken_shots(session) == tuple(range(len(camera_of(session).shots)))
     with arrays_in(folder) as on_disk:
         empty = on_disk if route == "free" and whole else in_memory
-        calibration = _calibrated(session, route, sensor, stage, watcher, empty)
+        calibration = _calibrated(session, route, sensor, watcher, empty)
         calibration.write(folder)
     return calibration
 
 
 @one_blas_thread()
 def _calibrated(
-    session: Session, route: str, sensor: bool, stage: bool, watcher: Watcher, empty: NewArray
+    session: Session, route: str, sensor: bool, watcher: Watcher, empty: NewArray
 ) -> SessionCalibration:
     if route not in ROUTES:
         raise AppError(f"--route {route}: use one of {', '.join(ROUTES)}")
-    if stage and not camera_of(session).moving_masks:
-        raise AppError(f"{session.folder}: --stage: no mask of this camera moves")
-    if stage and route == "free":
-        raise AppError("--stage needs the fitted mask: leave --route at auto")
     started = time.perf_counter()
     watcher.begin("frames", None)
     whiteboards = (frame for frame in session.frames if frame.kind == "whiteboard")
@@ -238,32 +163,4 @@ def _calibrated(
         watcher.begin("sensor", None)
         white_dn = camera_of(session).sensor.noise.white_level_dn
         sheet = characterise(*sensor_pairs(session), white_dn)
-    mapped = None
-    if stage:
-        watcher.begin("stage", None)
-        mapped = _stage_of(session, outcome)
-    return SessionCalibration(outcome, chosen, metrics, sheet, mapped)
-
-
-def _stage_of(session: Session, outcome: Outcome) -> SessionStage:
-    """Return the map of the mask stage; raises AppError or CalibrationError without one."""
-    known = outcome.mixed or outcome.parametric
-    if known is None:
-        raise AppError(
-            f"{session.folder}: --stage needs open whiteboards, to which the mask is fitted; "
-            "`emmc-rig calibrate --plan` writes a plan that has"
-        )
-    planned, boards = stage_frames(session)
-    layout = outcome.calibration.psi.layout
-    shadow = known.shadow
-    seen = each_reading(boards, layout, outcome.good)
-    places = [locate(board, shadow.mask, shadow.placement) for board in seen]
-    sent = [one.stage_um for one in boards.frames]
-    found = stage_map(sent, places)
-    read = [_read_um(session, one) for one in planned]
-    return SessionStage(found, tuple(one.id for one in planned), sent, read, places)
-
-
-def _read_um(session: Session, frame: PlannedFrame) -> tuple[float, float] | None:
-    read = session.stored[frame.id].get("read_um", {})
-    return (read["mask_x"], read["mask_y"]) if {"mask_x", "mask_y"} <= set(read) else None
+    return SessionCalibration(outcome, chosen, metrics, sheet)

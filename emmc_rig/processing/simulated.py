@@ -20,7 +20,7 @@ from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.expand import mask_offsets_um
-from emmc_rig.acquisition.plan import OpenBoard, Plan
+from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Rig, simulated_rig
@@ -39,7 +39,6 @@ from simulators.bench import Bench
 from simulators.effects import Flaws
 
 Array = NDArray[np.floating]
-STAGE_PLACES, STAGE_REACH_UM = 16, 220.0
 PINHOLE_REPEATS = 2
 GREY = 0.5
 """Of the scene that a calibration's shots show."""
@@ -190,8 +189,6 @@ def rig_to_calibrate(settings: CalibrateSettings, scene: Array | None = None) ->
 def simulated_plan(settings: CalibrateSettings) -> Plan:
     """Return the plan of `write_plan`, with the pinhole before the views of every shot.
 
-    With more places of the mask stage where its map is wanted.
-
     Raises AppError where the target cannot be reached.
     """
     mask = shadow_mask(settings.camera, settings.size)
@@ -204,13 +201,6 @@ def simulated_plan(settings: CalibrateSettings) -> Plan:
     if not settings.few:
         repeats = max(plan.whiteboards.repeats, PINHOLE_REPEATS)
         changes |= {"shots": "all", "repeats": repeats}
-    if settings.map_stage:
-        if not settings.camera.moving_masks:
-            raise AppError("--stage: no mask of this camera moves")
-        reach = STAGE_REACH_UM
-        places_um = np.random.default_rng(settings.seed).uniform(-reach, reach, (STAGE_PLACES, 2))
-        further = [OpenBoard(mask_um=(float(x), float(y)), repeats=1) for x, y in places_um]
-        changes["open"] = (*plan.whiteboards.open, *further)
     boards = plan.whiteboards.model_copy(update=changes)
     return plan.model_copy(update={"whiteboards": boards})
 
@@ -236,7 +226,7 @@ def calibrate_simulated(
     sensor = "response" not in settings.leave_out
     with simulated_session(plan, camera, rig, watcher) as session:
         captured_s = time.perf_counter() - started
-        found = calibrate(session, route, sensor=sensor, stage=settings.map_stage, watcher=watcher)
+        found = calibrate(session, route, sensor=sensor, watcher=watcher)
         held_out = sum(frame.kind == "held-out" for frame in session.frames)
     watcher.begin("the true Psi, for comparison", None)
     true = true_psi(camera, rig, bench)

@@ -1,4 +1,4 @@
-"""A session's whiteboards by what takes them: fits, the free route, judges, stage and sensor."""
+"""A session's whiteboards by what takes them: fits, the free route, judges and sensor."""
 
 from __future__ import annotations
 
@@ -116,28 +116,6 @@ def _checks(session: Session, boards: BoardSet, channels: NDArray[np.uint8]) -> 
         mean = mean_of(session, [frame])
         dark_dn = boards.dark_at(mean.exposure_s).mean_dn
         yield check_of(mean, frame.bench.masks_in, dark_dn, channels)
-
-
-def stage_frames(session: Session) -> tuple[list[PlannedFrame], BoardSet]:
-    """Return each single frame of the open aperture with the masks in, planned and as a whiteboard.
-
-    Of the first shot, under the white lamp: each shows where the mask stage stood.
-    """
-    planned = [
-        frame
-        for frame in session.frames
-        if frame.kind in ("open", "held-out", "check")
-        and frame.bench.masks_in
-        and frame.bench.shot == 0
-        and frame.bench.lamp == "white"
-    ]
-    white = references_of(session).get((0, "white"))
-    references = {} if white is None else {(0, "white"): mean_of(session, white)}
-    boards = tuple(
-        BoardFrame(partial(mean_of, session, [one]), 1, stage_um_of(one), window=one.window)
-        for one in planned
-    )
-    return planned, BoardSet(session_darks(session, of_shots=False), references, boards)
 
 
 def sensor_pairs(session: Session) -> tuple[list[Pair], Iterator[Pair]]:

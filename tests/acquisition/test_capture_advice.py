@@ -57,7 +57,6 @@ GUARDS = (
     "); resume it",
     "no session, it holds no",  # a folder that is none is a plan, or the place for one
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
-    "give trigger or focus_um; without either",  # likewise
     ": the stage has no such axis, only ",  # a rig is opened before a session is made
     " is moved by plans: give its zero_um instead",  # likewise
     "no file of it is frame ",  # frames without a file are not taken, but for --until

@@ -6,10 +6,10 @@ import pytest
 from calibration.board_angle import board_over_angle
 from calibration.boards import Board, BoardSet
 from calibration.colours import crosstalk
-from calibration.combine import combined
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain
 from calibration.levels import Check, fit_levels
+from calibration.misfit import combined
 from calibration.whiteboard import Calibration
 from emmc_rig.model.sensing import ImagingMatrix
 

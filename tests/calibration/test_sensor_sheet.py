@@ -65,7 +65,7 @@ def test_the_full_well_is_where_every_pixel_is_full_whatever_the_steps_of_exposu
 
 def test_the_pixels_own_differences_are_separated_from_noise_and_lamp(sheet):
     for one, scale, truth in ((sheet.prnu, 100, 1.0), (sheet.dsnu, 1, 1.5)):
-        value, deviation = one.figure("total", scale)
+        value, deviation = one.figure(scale)
         assert abs(value - truth) < 4 * deviation
         assert value == pytest.approx(truth, rel=0.05)
 
@@ -77,32 +77,9 @@ def test_the_stated_deviation_of_dsnu_is_that_of_repeated_measurements():
         one = characterise(
             frames(flaws, lit=False, times=DARKS_S, seed=seed), frames(flaws, seed=50), WHITE_DN
         )
-        found.append(one.dsnu.figure("total", 1.0))
+        found.append(one.dsnu.figure(1.0))
     values, stated = np.transpose(found)
     assert 0.5 < np.std(values, ddof=1) / np.mean(stated) < 1.8
-
-
-def test_rows_and_columns_are_separated_from_pixels_and_a_pattern_stands_in_the_spectrogram(sheet):
-    rng = np.random.default_rng(3)
-    rows, columns = rng.normal(0, 3.0, (SIZE[0], 1)), rng.normal(0, 2.0, (1, SIZE[1]))
-    columns = columns + 4.0 * np.sqrt(2) * np.sin(2 * np.pi * np.arange(SIZE[1]) / 16)
-    pattern = rows + columns
-
-    def patterned(pairs):
-        return [
-            Pair(one.exposure_s, *((f + pattern).round() for f in (one.first, one.second)))
-            for one in pairs
-        ]
-
-    darks = patterned(frames(lit=False, times=DARKS_S))
-    found = characterise(darks, patterned(frames()), WHITE_DN).dsnu
-    smooth = np.concatenate([rows[k::2] - rows[k::2].mean() for k in (0, 1)])
-    assert found.figure("row", 1.0)[0] == pytest.approx(np.std(smooth), rel=0.15)
-    assert found.figure("column", 1.0)[0] == pytest.approx(np.sqrt(4.0**2 + 2.0**2), rel=0.15)
-    assert found.figure("pixel", 1.0)[0] == pytest.approx(1.5, rel=0.15)
-    peak = np.argmax(found.spectra["horizontal"][1:]) + 1
-    assert found.frequency["horizontal"][peak] == pytest.approx(1 / 16)
-    assert sheet.dsnu.figure("row", 1.0)[0] < 0.3
 
 
 def test_pixels_that_differ_more_behind_one_filter_in_four_count_a_quarter_in_the_variance():
@@ -115,8 +92,7 @@ def test_pixels_that_differ_more_behind_one_filter_in_four_count_a_quarter_in_th
         for t in DARKS_S
     ]
     found = characterise(darks, frames(), WHITE_DN).dsnu
-    assert found.figure("total", 1.0)[0] == pytest.approx(expected, rel=0.05)
-    assert found.figure("pixel", 1.0)[0] == pytest.approx(expected, rel=0.05)
+    assert found.figure(1.0)[0] == pytest.approx(expected, rel=0.05)
 
 
 def test_read_noise_below_the_steps_of_the_converter_is_an_upper_bound():

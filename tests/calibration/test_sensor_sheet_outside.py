@@ -12,6 +12,7 @@ SIZE = (120, 160)
 SENSOR = {
     "bayer": False, "gain": 0.25, "white_dn": 16383, "black_dn": 512.0, "prnu": 0.01, "dsnu": 3.0,
 }  # fmt: skip
+OF_DARK = "read_noise_electrons black_level_dn dark_current_electrons_per_s dsnu"
 TRUE = {
     "gain_dn_per_electron": "gain",
     "read_noise_electrons": "read_noise",
@@ -49,7 +50,7 @@ def misses(true, sheet):
         ("dsnu", sheet.dsnu, 1 / sheet.gain_dn_per_electron, true.dsnu),
     ):
         if not sheet.bound(name):
-            value, deviation = one.figure("total", scale)
+            value, deviation = one.figure(scale)
             found[name] = (value - truth) / deviation
     return found
 
@@ -65,16 +66,15 @@ def misses(true, sheet):
         ({"falls_off": 0.45}, ""),
         ({"falls_off": 0.45, "flats_s": FLATS_S[:8]}, "full_well_electrons"),
         ({"falls_off": 0.45, "flats_s": (*FLATS_S[:7], 0.28, 0.32)}, ""),
-        ({"black_dn": 0.0}, "read_noise_electrons black_level_dn dark_current_electrons_per_s dsnu"),
-        ({"black_dn": 1.0}, "read_noise_electrons black_level_dn dark_current_electrons_per_s dsnu"),
+        ({"black_dn": 0.0}, OF_DARK),
+        ({"black_dn": 1.0}, OF_DARK),
         ({"gain": 0.05, "read_noise": 1.0}, "read_noise_electrons dsnu"),
     ],
 )  # fmt: skip
 def test_what_lamp_lens_and_converter_do_is_told_apart_from_the_sensor(changes, marked):
     true, sheet = sheet_of(**changes)
-    assert {name for name in [*TRUE, "black_level_dn", "dsnu", "prnu"] if sheet.bound(name)} == set(
-        marked.split()
-    )
+    bounds = {name for name in [*TRUE, "black_level_dn", "dsnu", "prnu"] if sheet.bound(name)}
+    assert bounds == set(marked.split())
     missed = misses(true, sheet)
     assert max(map(abs, missed.values())) < 3.5, missed
 
@@ -83,7 +83,7 @@ def test_rows_that_flicker_make_dsnu_less_sure_and_not_less():
     missed = []
     for seed in range(6):
         true, sheet = sheet_of(row_noise=3.0, seed=seed)
-        value, deviation = sheet.dsnu.figure("total", 1 / sheet.gain_dn_per_electron)
+        value, deviation = sheet.dsnu.figure(1 / sheet.gain_dn_per_electron)
         missed.append((value - true.dsnu) / deviation)
         assert sheet.read_noise_electrons == pytest.approx(np.hypot(3, 3), rel=0.15)
     assert np.sqrt(np.mean(np.square(missed))) < 1.8

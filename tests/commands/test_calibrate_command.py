@@ -141,19 +141,6 @@ def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_t
             assert named in found
 
 
-@pytest.mark.slow
-def test_the_stage_is_mapped_and_shown(camera_file, tmp_path):
-    settings = CalibrateSettings(
-        "small", find_camera(str(camera_file)), (32, 40), rays=64, map_stage=True
-    )
-    run_calibrate(settings, tmp_path)
-    figures = json.loads((tmp_path / "stage.json").read_text())
-    assert figures["Scale, x"]["value"] == pytest.approx(1, abs=2e-3)
-    assert figures["Repeatability, x"]["value"] < 1.0
-    assert len({tuple(one["commanded_um"]) for one in figures["Places"]}) >= 18
-    assert "Stage map" in (tmp_path / "report.html").read_text()
-
-
 def test_a_size_that_is_none_is_wrong_usage(run, tmp_path):
     code, _, error = run("calibrate", "--size", "32", "--out", tmp_path / "result")
     assert code == 2

@@ -382,18 +382,3 @@ def test_a_request_to_end_serving_is_not_called_ctrl_c():
     assert process.returncode == 128 + signal.SIGTERM
     assert "no longer serving (SIGTERM)" in err
     assert "Ctrl-C" not in err
-
-
-def test_a_jog_raises_an_output_on_arrival_where_the_stage_can(run):
-    code, out, _ = run("jog", "--rig", "simulated", "--home", "--signal", 1, "mask_x", 100)
-    assert (code, out.startswith("mask_x at 100.")) == (0, True)
-    code, _, err = run("jog", "--rig", "simulated", "--home", "--signal", 9, "mask_x", 100)
-    assert (code, "BADDATA" in one_line(err)) == (1, True)
-    code, _, err = run("jog", "--rig", "simulated:grbl", "--home", "--signal", 1, "x", "--", -100)
-    assert (code, "no such pin" in one_line(err)) == (1, True)
-    code, out, _ = run(
-        "jog", "--rig", "simulated:grbl", "--home", "--signal", "coolant", "x", "--", -100
-    )
-    assert (code, out.startswith("x at -")) == (0, True)
-    code, _, err = run("jog", "--rig", "simulated:apt", "--home", "--signal", 1, "x", 100)
-    assert (code, "only Zaber" in one_line(err)) == (1, True)

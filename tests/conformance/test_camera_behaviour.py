@@ -4,13 +4,10 @@
 """
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
-from simulated_eos import EosCameraSimulator
 from simulated_raw_camera import SimulatedRawCamera
 
 from drivers.camera import Camera, RawFileCamera
@@ -39,9 +36,9 @@ def raw_file_camera(folder):
     return RawFileCamera(SimulatedRawCamera(see, clock, CFA), SHAPE, CFA, clock=clock)
 
 
-def ptp_camera(folder, simulator: Callable[..., PtpCameraSimulator] = PtpCameraSimulator):
+def ptp_camera(folder):
     clock = ManualClock()
-    bus = SimulatedUsb(clock, PtpUsbFunction(simulator(see, clock, CFA)))
+    bus = SimulatedUsb(clock, PtpUsbFunction(PtpCameraSimulator(see, clock, CFA)))
     device = open_device(PTP_INTERFACE, backend=bus)
     return PtpCamera(PtpSession(PtpUsb(device, clock), clock))
 
@@ -75,8 +72,6 @@ def dump_camera(folder):
 CAMERAS = {
     "raw file": raw_file_camera,
     "ptp": ptp_camera,
-    "eos": partial(ptp_camera, simulator=EosCameraSimulator),
-    "old eos": partial(ptp_camera, simulator=partial(EosCameraSimulator, old=True)),
     "folder": folder_camera,
     "u3v": u3v_camera,
     "dump": dump_camera,

@@ -258,55 +258,6 @@ def test_a_program_that_runs_is_held_by_a_stop(bench):
     stage.move_by_um({"x": -10.0})
 
 
-@pytest.mark.parametrize("output", ["coolant", "spindle"])
-def test_a_pin_rises_when_the_axis_arrives_from_below_and_not_before(bench, output):
-    stage = bench.homed()
-    changes = []
-    bench.device.on_output = lambda pin, level, at_s: changes.append(
-        (pin, level, bench.device.position_um("X"), at_s)
-    )
-    for target_um in (-5_000.0, -3_000.0, -9_000.0):
-        begun_s = bench.clock.now_s()
-        at_um = stage.move_and_signal_um("x", target_um, output)
-        assert at_um == pytest.approx(target_um, abs=5)
-        pin, level, seen_um, at_s = changes[-1]
-        assert (pin, level) == (output, 1)
-        assert seen_um - bench.device.axes["X"].travel_um == pytest.approx(target_um, abs=5)
-        assert begun_s < at_s <= bench.clock.now_s()
-        stage.move_by_um({"x": -100.0})
-    assert [level for _, level, *_ in changes] == [1, 0, 1, 0, 1]
-
-
-def test_stopping_a_move_that_signals_leaves_the_pin_low_and_wants_homing(bench):
-    stage = bench.homed()
-    stage.move_to_um({"x": -9_000.0})
-    sleep = bench.clock.sleep
-
-    def interrupted(seconds):
-        sleep(seconds)
-        raise KeyboardInterrupt
-
-    bench.clock.sleep = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        stage.move_and_signal_um("x", -5_000.0)
-    bench.clock.sleep = sleep
-    sleep(30.0)
-    assert bench.device.position_um("X") - bench.device.axes["X"].travel_um < -5_100
-    assert bench.device.outputs["coolant"] == 0
-    stage.home()
-    stage.move_and_signal_um("x", -4_000.0)
-    assert bench.device.outputs["coolant"] == 1
-
-
-@pytest.mark.parametrize("output", [1, "laser", "mist"])
-def test_a_pin_that_grbl_has_not_is_refused_before_anything_moves(bench, output):
-    stage = bench.homed()
-    before_um = bench.device.position_um("X")
-    with pytest.raises(CommandRefusedError, match=r"no such pin|no option M"):
-        stage.move_and_signal_um("x", -5_000.0, output)
-    assert bench.device.position_um("X") == before_um
-
-
 def test_a_speed_faster_than_the_axis_is_refused(bench):
     stage = bench.stage()
     top_um_s = BENCH_AXES["X"].max_speed_um_s

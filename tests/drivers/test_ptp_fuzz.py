@@ -18,7 +18,7 @@ from drivers.dng import encode_dng
 from drivers.errors import DriverError
 from drivers.ptp import PtpCamera, PtpSession, PtpSettings
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.raw import decode_by_libraw, decode_raw
+from drivers.raw import decode_raw
 from drivers.usb import open_device
 from simulators.clock import ManualClock
 from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
@@ -142,31 +142,12 @@ def test_values_of_any_type_are_read_or_refused(fuzz):
 
 def check_raw(seed):
     with errors_of_the_driver_allowed():
-        damaged = damage(DNG, seed)
-        frame = decode_raw(damaged)
-        if not np.shares_memory(frame.mosaic, np.frombuffer(damaged, np.uint8)):
-            return  # LibRaw's own; without a colour pattern it need not agree with itself
-        mosaic, black, white, phase = decode_by_libraw(damaged)
-        np.testing.assert_array_equal(frame.mosaic, mosaic)
-        np.testing.assert_array_equal(frame.black_level_dn, black)
-        assert (frame.white_level_dn, frame.cfa[:4]) == (white, phase[:4])
+        decode_raw(damage(DNG, seed))
 
 
 @pytest.mark.slow
-def test_a_damaged_raw_file_is_refused_in_one_line_or_read_as_libraw_reads_it(fuzz):
+def test_a_damaged_raw_file_is_refused_in_one_line_or_read(fuzz):
     fuzz(check_raw, st.integers(0, 2**63))
-
-
-@pytest.mark.parametrize(
-    "seed",
-    [
-        pytest.param(66529, id="an entry that cannot be read"),
-        pytest.param(697839551939, id="the width twice"),
-        pytest.param(828332144567, id="an offset of one byte"),
-    ],
-)
-def test_a_raw_file_of_a_damaged_directory_is_left_to_libraw(seed):
-    check_raw(seed)
 
 
 @dataclass

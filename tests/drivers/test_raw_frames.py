@@ -1,46 +1,19 @@
 """RAW files: what the sensor read comes back exactly, and what is damaged is not believed."""
 
 import hashlib
-import io
-from typing import Any
 
 import numpy as np
 import pytest
-import tifffile
 from simulated_raw_camera import SimulatedRawCamera
 
 from drivers.camera import Camera, RawFileCamera
 from drivers.dng import encode_dng
 from drivers.errors import RawFrameError
-from drivers.raw import decode_by_libraw, decode_raw
+from drivers.raw import decode_raw
 from simulators.clock import ManualClock
 
 BAYER = ("rggb", "grbg", "gbrg", "bggr")
 BLACK_DN = np.array([[60, 61], [62, 63]])
-
-
-def rewritten(data: bytes, byteorder: Any = "<", extratags: Any = (), **options: Any) -> bytes:
-    """The same DNG written anew, with other options and more tags."""
-    out = io.BytesIO()
-    own = (270, 271, 272, 274, 305, *range(33421, 60000))
-    with tifffile.TiffFile(io.BytesIO(data)) as tiff:
-        page = tiff.pages.first
-        tags = [
-            (tag.code, tag.dtype, tag.count, tag.value, True)
-            for tag in page.tags
-            if tag.code in own
-        ]
-        with tifffile.TiffWriter(out, byteorder=byteorder) as writer:
-            writer.write(
-                page.asarray(),
-                photometric=32803,
-                planarconfig=1,
-                metadata=None,
-                software=False,
-                extratags=[*tags, *extratags],
-                **options,
-            )
-    return out.getvalue()
 
 
 def noise(shape=(40, 48), white_level_dn=4095, seed=0):
@@ -79,49 +52,6 @@ def test_a_tile_that_is_not_bayer_keeps_its_pixels_levels_and_name(tile):
     np.testing.assert_array_equal(frame.mosaic, mosaic)
     np.testing.assert_array_equal(frame.black_level_dn, BLACK_DN)
     assert frame.cfa == tile
-
-
-@pytest.mark.parametrize("cfa", [*BAYER, "mono", "xtrans"])
-@pytest.mark.parametrize("black_dn", [0, 64, BLACK_DN], ids=str)
-@pytest.mark.parametrize("shape", [(22, 22), (23, 51), (40, 48)])
-def test_libraw_agrees_with_what_was_read_in_place(cfa, black_dn: Any, shape):
-    if cfa == "mono" and isinstance(black_dn, np.ndarray):
-        pytest.skip("a monochrome DNG has one black level")
-    data = encode_dng(noise(shape), cfa, black_dn, 4095, 0.01)
-    frame = decode_raw(data)
-    in_place = np.shares_memory(frame.mosaic, np.frombuffer(data, np.uint8))
-    assert in_place == (cfa != "mono")
-    mosaic, black, white, phase = decode_by_libraw(data)
-    np.testing.assert_array_equal(frame.mosaic, mosaic)
-    np.testing.assert_array_equal(frame.black_level_dn, black)
-    assert frame.white_level_dn == white
-    assert phase == frame.cfa or frame.cfa == "xtrans"
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": "zlib"},
-        {"rowsperstrip": 7},
-        {"byteorder": ">"},
-        {"extratags": [(50829, 4, 4, (0, 0, 40, 48), True)]},
-        {"extratags": [(50829, 4, 4, (2, 2, 38, 46), True)]},
-        {"extratags": [(50712, 3, 4, (0, 1000, 2000, 4095), True)]},
-        {"extratags": [(50715, 10, 48, (1, 1) * 48, True)]},
-    ],
-    ids=["zlib", "strips", "big-endian", "active area", "crop", "linearisation", "column blacks"],
-)
-def test_libraw_agrees_whatever_else_a_file_holds(options):
-    data = rewritten(encode_dng(noise(), "grbg", BLACK_DN, 4095, 0.01), **options)
-    try:
-        mosaic, black, white, phase = decode_by_libraw(data)
-    except RawFrameError:
-        assert_refused(data)
-        return
-    frame = decode_raw(data)
-    np.testing.assert_array_equal(frame.mosaic, mosaic)
-    np.testing.assert_array_equal(frame.black_level_dn, black)
-    assert (frame.white_level_dn, frame.cfa) == (white, phase)
 
 
 @pytest.mark.parametrize("exposure_s", [1 / 8000, 0.0123, 1.0, 30.0])

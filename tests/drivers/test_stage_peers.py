@@ -131,27 +131,6 @@ def test_zaber_motion_finds_the_axis_where_its_last_session_left_it(wire):
             before = float(target)
 
 
-@pytest.mark.slow
-def test_zaber_motion_lets_an_output_rise_when_the_axis_arrives():
-    ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
-    chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK})
-    levels = []
-    chain.on_output = lambda device, output, level, at_s: levels.append((output, level))
-    with TcpServer(chain) as server, ascii_protocol.Connection.open_tcp(*server.address) as opened:
-        (device,) = opened.detect_devices(identify_devices=False)
-        device.get_axis(1).home()
-        trigger = device.triggers.get_trigger(1)
-        for target in (40_000, 90_000):
-            trigger.fire_when(f"1 pos >= {target}")
-            trigger.on_fire(ascii_protocol.TriggerAction.A, 0, "io set do 1 1")
-            trigger.enable(1)
-            assert not device.io.get_digital_output(1)
-            device.get_axis(1).move_absolute(target)
-            assert device.io.get_digital_output(1)
-            device.io.set_digital_output(1, ascii_protocol.DigitalOutputAction.OFF)
-    assert levels == [(1, 1), (1, 0), (1, 1), (1, 0)]
-
-
 @pytest.fixture
 def apt_controller():
     spec = replace(Z825, max_speed_um_s=50_000.0, acceleration_um_s2=1e6, start_um=150.0)

@@ -1,8 +1,8 @@
 """A coded-mask bench that shares no code with the program: NumPy alone, own rays, electrons, DN.
 
-Rays run from 144 points of every pixel to whole aperture cells, whose shadow on the mask is a box of
-the mask's summed-area table. Lengths in um. It takes frames in the order in which it is asked, by
-its own clock, and knows the truth of what it took: `Bench.psi()`.
+Rays run from 144 points of every pixel to whole aperture cells, whose shadow on the mask is a box
+of the mask's summed-area table. Lengths in um. It takes frames in the order in which it is asked,
+by its own clock, and knows the truth of what it took: `Bench.psi()`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FINER = 20
 
 @dataclass(frozen=True)
 class Optics:
-    """Where things are; `board_*`, `lamp_*` and `gloss` are what the white board sends into the lens.
+    """Where things are, what they pass, and what the white board sends into the lens.
 
     blur_um: standard deviation of the mask's edges. tilt: tangent by which the mask's distance
     grows with x and y. glass_um: between mask and sensor, n = 1.52. open, closed: transmittances of
@@ -164,7 +164,7 @@ class Bench:
         return self.known[key]
 
     def psi(self, mask_x: float = 0.0, mask_y: float = 0.0) -> np.ndarray:
-        """Return the true coefficients before an even board, (v, u, y, x); open without mask: sum 1."""
+        """Return the true coefficients, (v, u, y, x); without a mask their sum is 1."""
         every = self.shadow(mask_x, mask_y) * self.light()
         glare = self.optics.glare
         return (1 - glare) * every + glare * every.mean((2, 3), keepdims=True)

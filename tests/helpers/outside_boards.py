@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from outside_bench import Bench, Optics, Sensor
+from outside_bench import Bench, Optics
 
 from calibration.boards import BoardFrame, BoardSet
 from calibration.frames import average
-from calibration.levels import check_of
 from calibration.shadow import shadow_mask
 from emmc_rig.model.camera import Camera
 
@@ -18,7 +17,7 @@ REPEATS = 4
 OPEN_S = 0.15
 
 
-def camera_of(optics: Optics = Optics(), cfa: str = "rggb", pattern: Any = None) -> Camera:
+def camera_of(optics: Optics, cfa: str = "rggb", pattern: Any = None) -> Camera:
     """Return the camera as its owner would describe it: the design, without what is wrong."""
     return Camera.model_validate(
         {

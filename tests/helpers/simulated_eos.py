@@ -8,26 +8,65 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any
 
 from drivers.clock import Clock
-from drivers.ptp_canon import (
-    RECORD,
-    TO_HOST,
-    EosEvent,
-    EosOperation,
-    EosProperty,
-    iso,
-    shutter_s,
-)
 from drivers.ptp_codec import Code, EventCode, Operation, Property
 from simulators.ptp import EXPOSURE_UNIT_S, Answer, Array, PtpCameraSimulator
+
+TO_HOST = 4
+"""As capture destination: pictures go to the computer, not onto the card."""
+
+
+class EosOperation(IntEnum):
+    """Operations of EOS cameras."""
+
+    SET_PROPERTY = 0x9110
+    SET_REMOTE_MODE = 0x9114
+    SET_EVENT_MODE = 0x9115
+    GET_EVENT = 0x9116
+    RELEASE_ON = 0x9128
+    RELEASE_OFF = 0x9129
+
+
+class EosEvent(IntEnum):
+    """Records that GetEvent gives; their first field is an object or a property."""
+
+    OBJECT_ADDED = 0xC181
+    PROPERTY_CHANGED = 0xC189
+    CHOICES_CHANGED = 0xC18A
+
+
+class EosProperty(IntEnum):
+    """Properties of EOS cameras."""
+
+    SHUTTER = 0xD102
+    ISO = 0xD103
+    CAPTURE_DESTINATION = 0xD11C
+
+
+RECORD = struct.Struct("<II")
+FRACTIONS = {0: 0.0, 3: 1 / 3, 4: 1 / 2, 5: 2 / 3}
+"""Of a stop, by the last three bits of a code; other codes of ISO are automatic."""
+
+
+def shutter_s(code: int) -> float:
+    """Return the exposure that a code means: 0x38 is 1 s, 8 more is half of it."""
+    return 2.0 ** (7 - code // 8 - FRACTIONS[code % 8])
+
+
+def iso(code: int) -> float | None:
+    """Return the sensitivity that a code means: 0x48 is ISO 100, 8 more is twice it."""
+    if not 0x28 <= code <= 0xB0 or code % 8 not in FRACTIONS:
+        return None
+    return 100 * 2.0 ** (code // 8 - 9 + FRACTIONS[code % 8])
+
 
 SHUTTERS = tuple(code for code in range(0x10, 0x99) if code % 8 in (0, 3, 5))
 ISOS = (0, *(code for code in range(0x48, 0x69) if code % 8 in (0, 3, 5)))
 """The first is automatic."""
 CARD = 2
-NOT_FOCUSED, CARD_FULL = 1, 7
 LISTED = 3
 AS_STANDARD = {0x9101: Operation.GET_STORAGE_IDS, 0x9102: Operation.GET_STORAGE_INFO}
 """EOS operations that other programs use, and what they do."""
@@ -36,10 +75,7 @@ OFFSETS = {"object": 8, "storage": 12, "format": 16, "size": 28, "parent": 32, "
 
 
 class EosCameraSimulator(PtpCameraSimulator):
-    """An EOS in manual mode; `old`: it has the release of the first ones, without a button.
-
-    `focus`: whether it finds focus.
-    """
+    """An EOS in manual mode, released by a button with two stages."""
 
     maker, model = "Canon Inc.", "Canon EOS simulated"
     vendor_extension = 0x0B
@@ -51,16 +87,11 @@ class EosCameraSimulator(PtpCameraSimulator):
         render: Callable[[float], Array],
         clock: Clock,
         *arguments: Any,
-        old: bool = False,
         **settings: Any,
     ) -> None:
         lacks = (Operation.INITIATE_CAPTURE, Operation.GET_THUMB)
         super().__init__(render, clock, *arguments, lacks=lacks, **settings)
-        newer = (EosOperation.RELEASE_ON, EosOperation.RELEASE_OFF)
-        absent = newer if old else (EosOperation.REMOTE_RELEASE,)
-        known = (one for one in EosOperation if one not in absent)
-        self.vendor_operations = (*known, *AS_STANDARD)
-        self.focus = True
+        self.vendor_operations = (*EosOperation, *AS_STANDARD)
         self._codes = {
             EosProperty.SHUTTER: 0x68,
             EosProperty.ISO: 0x48,
@@ -107,22 +138,13 @@ class EosCameraSimulator(PtpCameraSimulator):
             return self._set(data)
         elif not self._remote:
             return Answer(Code.ACCESS_DENIED)
-        elif code == EosOperation.REMOTE_RELEASE:
-            return self._release(transaction)
         elif code == EosOperation.RELEASE_ON:
             pressed, self._button = self._button, self._button | arguments[0]
-            if pressed == 1 and self._button == 3 and self.focus:
+            if pressed == 1 and self._button == 3:
                 return Answer(self._capture(arguments, b"", transaction).code)
         elif code == EosOperation.RELEASE_OFF:
             self._button &= ~arguments[0]
         return Answer()
-
-    def _release(self, transaction: int) -> Answer:
-        """Release at once: why it could not is a number beside OK."""
-        if not self.focus:
-            return Answer(parameters=(NOT_FOCUSED,))
-        code = self._capture((), b"", transaction).code
-        return Answer(parameters=(CARD_FULL,)) if code == Code.STORE_FULL else Answer(code, (0,))
 
     def _set(self, data: bytes) -> Answer:
         if len(data) != 12:
@@ -140,7 +162,7 @@ class EosCameraSimulator(PtpCameraSimulator):
 
     def _apply(self) -> None:
         """Let the sensor expose by what the codes mean; automatic is the lowest ISO."""
-        exposure_s = shutter_s(self._codes[EosProperty.SHUTTER]) or EXPOSURE_UNIT_S
+        exposure_s = shutter_s(self._codes[EosProperty.SHUTTER])
         self._values[Property.EXPOSURE_TIME] = max(1, round(exposure_s / EXPOSURE_UNIT_S))
         self._values[Property.EXPOSURE_INDEX] = round(iso(self._codes[EosProperty.ISO]) or 100)
 

@@ -171,27 +171,6 @@ def test_a_stopped_zaber_brakes_at_its_acceleration(homed_zaber):
     assert int(homed_zaber.data("1 1 7 get pos")) - start == pytest.approx(8_192.0, abs=2)
 
 
-def test_zaber_outputs_are_set_by_command_and_by_a_trigger_at_its_place(homed_zaber):
-    assert homed_zaber.data("1 0 1 io set do 4 1") == "0"
-    assert homed_zaber.data("1 0 2 io get do") == "0 0 0 1"
-    assert homed_zaber.data("1 0 3 io get do 4") == "1"
-    assert homed_zaber.data("1 0 4 io get do 3") == "0"
-    assert homed_zaber.data("1 0 5 io get do 5") == "BADDATA"
-    homed_zaber.ask("1 0 6 trigger 6 when 2 pos >= 1000")
-    homed_zaber.ask("1 0 7 trigger 6 action a io set do 1 1")
-    homed_zaber.ask("1 0 8 trigger 6 enable 1")
-    homed_zaber.ask("1 2 9 home", after_s=60.0)
-    homed_zaber.ask("1 1 10 move abs 5000", after_s=10.0)
-    homed_zaber.ask("1 2 11 move abs 999", after_s=10.0)
-    assert homed_zaber.data("1 0 12 io get do") == "0 0 0 1"
-    homed_zaber.ask("1 2 13 move abs 1000", after_s=10.0)
-    assert homed_zaber.data("1 0 14 io get do") == "1 0 0 1"
-    homed_zaber.ask("1 0 15 io set do 1 0")
-    homed_zaber.ask("1 2 16 move abs 0", after_s=10.0)
-    homed_zaber.ask("1 2 17 move abs 2000", after_s=10.0)
-    assert homed_zaber.data("1 0 18 io get do 1") == "0"
-
-
 def test_a_zaber_homes_at_its_approach_speed(zaber):
     # From 4000 microsteps at 8192 / 1.6384 = 5000 microsteps/s: 0.8 s and a short ramp.
     zaber.ask("1 1 1 set limit.approach.maxspeed 8192")
