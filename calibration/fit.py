@@ -14,7 +14,12 @@ and softenings are taken as normal, of variances tau^2 that the whiteboards' res
 effects: Searle, Casella, McCulloch 1992, chapter 6); the placement's covariance C then grows by
 C N diag(tau^2) N^T C, N the information between its parameters and the views' own.
 
-Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
+What all pixels of one whiteboard share is no noise of single pixels: shutter and lamp change its
+brightness, and the mask stands a little elsewhere. Each whiteboard has these three of its own,
+normal about 0, of the widths that make the readings likeliest.
+
+Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963; of the widths (evidence):
+MacKay 1992.
 """
 
 from __future__ import annotations
@@ -59,6 +64,13 @@ LEAST_FIT_CORRELATION = 0.7
 SOFT_EDGES = 0.1
 """Of a cell: how soft edges are taken to be where a fit begins."""
 OFFSETS = slice(0, 2)
+OWN = 3
+"""Parameters of one whiteboard: relative brightness, and by how many um (x, y) the mask is moved."""
+FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
+BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
+MOVES_UM = np.geomspace(0.01, 10.0, 11)
+"""Widths of the whiteboards' own that are tried."""
+WIDTH_ROUNDS = 2
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
 TAUS_UM = np.geomspace(0.002, 0.2, 6)
@@ -108,7 +120,9 @@ class Fit:
     fall below. chi2: mean squared residual over the noise without outliers. undecided: names of
     parameters that the prior decides more than the whiteboards; more_boards: how many more of the
     same kinds would decide them (MOST_MORE: no number of them). history: robust deviation of the
-    residuals over the noise after every step, at least 1.
+    residuals over the noise after every step, at least 1. brightness_spread, moved_spread_um: by
+    which whiteboards differ among themselves; the references differ by the first as well, which
+    the covariance does not count.
     """
 
     placement: Placement
@@ -124,6 +138,8 @@ class Fit:
     more_boards: int
     boards: tuple[BoardCheck, ...]
     history: tuple[float, ...] = field(default=())
+    brightness_spread: float = 0.0
+    moved_spread_um: float = 0.0
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -168,15 +184,78 @@ def _samples(
     return found
 
 
-def _scaled_residuals(shadow: Shadow, sample: _Sample) -> Array:
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The placement, and each whiteboard's own: (board, OWN)."""
+
+    placement: Placement
+    own: NDArray[np.float64]
+
+    def vector(self) -> NDArray[np.float64]:
+        """Return all parameters as one vector."""
+        return np.concatenate([self.placement.vector(), self.own.ravel()])
+
+    def moved(self, step: Array) -> _State:
+        """Return the state after a step, within what is possible."""
+        size = len(step) - self.own.size
+        own = self.own + step[size:].reshape(self.own.shape)
+        return _State(self.placement.moved(step[:size]), own)
+
+    def stage_um(self, board: Board, index: int) -> tuple[float, float]:
+        """Return where the mask stood of a whiteboard."""
+        x, y = board.stage_um
+        return x + float(self.own[index, 1]), y + float(self.own[index, 2])
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """Precisions of all parameters, and where they are drawn to."""
+
+    precision: NDArray[np.float64]
+    centre: NDArray[np.float64]
+
+    def loss(self, at: _State) -> float:
+        """Return what the prior adds to the loss."""
+        return 0.5 * float(np.sum(self.precision * (at.vector() - self.centre) ** 2))
+
+
+def _prior(
+    placement: Array, centre: Array, widths: tuple[float, float], boards: int
+) -> _Prior:
+    """Return the prior of a placement (precisions, centre) and of the whiteboards' own."""
+    own = np.tile(1 / np.square([widths[0], widths[1], widths[1]]), boards)
+    return _Prior(np.concatenate([placement, own]), np.concatenate([centre, np.zeros(len(own))]))
+
+
+def _scaled_residuals(
+    shadow: Shadow, sample: _Sample, at: _State, index: int
+) -> NDArray[np.float64]:
+    board = sample.board
     predicted = shadow.readings(
         sample.pixels,
         sample.channels,
-        sample.board.views_open,
-        sample.board.stage_um,
-        sample.board.shot,
+        board.views_open,
+        at.stage_um(board, index),
+        board.shot,
     )
-    return (sample.reading - predicted) / sample.deviation
+    return (sample.reading - (1 + at.own[index, 0]) * predicted) / sample.deviation
+
+
+def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> list[Array]:
+    shadow = Shadow(mask, at.placement)
+    return [_scaled_residuals(shadow, one, at, index) for index, one in enumerate(samples)]
+
+
+def _with_own(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
+    """Return the slopes by the placement and by a whiteboard's own, (n, parameter + OWN)."""
+    brighter = 1 + own[0]
+    return np.column_stack([brighter * slope, read, brighter * slope[:, OFFSETS]])
+
+
+def _places(at: _State, index: int) -> NDArray[np.int64]:
+    """Return where the placement's and one whiteboard's own parameters lie in the vector."""
+    size = len(at.placement.vector())
+    return np.concatenate([np.arange(size), size + index * OWN + np.arange(OWN)])
 
 
 def _spread(residuals: Sequence[Array]) -> float:
@@ -207,30 +286,33 @@ class _Normal:
     count: int
 
 
-def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) -> _Normal:
-    shadow = Shadow(mask, placement)
-    residuals = [_scaled_residuals(shadow, sample) for sample in samples]
+def _normal(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> _Normal:
+    shadow = Shadow(mask, at.placement)
+    residuals = _all_residuals(mask, at, samples)
     spread = _spread(residuals)
-    size = len(placement.vector())
+    size = len(at.vector())
     matrix, information = np.zeros((size, size)), np.zeros((size, size))
     gradient = np.zeros(size)
     squares, kept = 0.0, 0
-    for sample, residual in zip(samples, residuals, strict=True):
+    for index, (sample, residual) in enumerate(zip(samples, residuals, strict=True)):
+        places, board = _places(at, index), sample.board
+        block = np.ix_(places, places)
         for first in range(0, len(residual), CHUNK):
             part = slice(first, first + CHUNK)
-            slope = shadow.with_slopes(
+            read, slope = shadow.with_slopes(
                 sample.pixels[part],
                 sample.channels[part],
-                sample.board.views_open,
-                sample.board.stage_um,
-                sample.board.shot,
-            )[1]
+                board.views_open,
+                at.stage_um(board, index),
+                board.shot,
+            )
+            slope = _with_own(read, slope, at.own[index])
             slope /= sample.deviation[part, None] * spread
             scaled = residual[part] / spread
             weight = _weights(scaled)
-            matrix += slope.T @ (slope * weight[:, None])
-            information += slope.T @ slope
-            gradient += slope.T @ (weight * scaled)
+            matrix[block] += slope.T @ (slope * weight[:, None])
+            information[block] += slope.T @ slope
+            gradient[places] += slope.T @ (weight * scaled)
             inside = weight > 0
             squares += float((residual[part][inside] ** 2).sum())
             kept += int(inside.sum())
@@ -239,30 +321,33 @@ def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) 
 
 
 def _view_terms(
-    mask: ShadowMask, placement: Placement, samples: Sequence[_Sample], spread: float
+    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return what `bias_covariance` takes of the views' own displacements and softenings."""
-    shadow = Shadow(mask, placement)
-    size, own_size = len(placement.vector()), OF_VIEW * mask.views[0] * mask.views[1]
+    shadow = Shadow(mask, at.placement)
+    size, own_size = len(at.vector()), OF_VIEW * mask.views[0] * mask.views[1]
     mixed, own = np.zeros((size, own_size)), np.zeros((own_size, own_size))
     pull = np.zeros(own_size)
-    for sample in samples:
+    for index, residual in enumerate(_all_residuals(mask, at, samples)):
+        sample = samples[index]
         board = sample.board
-        scaled = _scaled_residuals(shadow, sample) / spread
+        scaled = residual / spread
         weight = _weights(scaled)
         for first in range(0, len(scaled), CHUNK):
             part = slice(first, first + CHUNK)
-            slope, by_view = shadow.slopes_by_view(
+            how = (
                 sample.pixels[part],
                 sample.channels[part],
                 board.views_open,
-                board.stage_um,
+                at.stage_um(board, index),
                 board.shot,
             )
+            slope, by_view = shadow.slopes_by_view(*how)
+            slope = _with_own(shadow.readings(*how), slope, at.own[index])
             scale = 1 / (sample.deviation[part, None] * spread)
             slope, by_view = slope * scale, by_view * scale
             weighted = by_view * weight[part, None]
-            mixed += slope.T @ weighted
+            mixed[_places(at, index)] += slope.T @ weighted
             own += by_view.T @ weighted
             pull += weighted.T @ scaled[part]
     return mixed, own, pull
@@ -273,8 +358,8 @@ def bias_covariance(
 ) -> NDArray[np.float64]:
     """Return what the views' own displacements and softenings add to the placement's covariance.
 
-    covariance: of the placement without them, (parameter, parameter). mixed: information between
-    the placement and the views' own (see `Shadow.slopes_by_view`). own, pull: information of the
+    covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
+    information between these and the views' own (see `Shadow.slopes_by_view`). own, pull: information of the
     latter, and the gradient of the log likelihood by them, at the placement fitted.
     """
     left = own - mixed.T @ covariance @ mixed
@@ -297,16 +382,29 @@ def bias_covariance(
 
 
 def _posterior(
-    mask: ShadowMask,
-    placement: Placement,
-    samples: Sequence[_Sample],
-    spread: float,
-    prior: Array,
-    centre: Array,
+    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float, prior: _Prior
 ) -> float:
-    shadow = Shadow(mask, placement)
-    loss = sum(_loss(_scaled_residuals(shadow, sample) / spread) for sample in samples)
-    return loss + 0.5 * float(np.sum(prior * (placement.vector() - centre) ** 2))
+    residuals = _all_residuals(mask, at, samples)
+    return sum(_loss(one / spread) for one in residuals) + prior.loss(at)
+
+
+def _widths(normal: _Normal, at: _State, placement: Array, centre: Array) -> tuple[float, float]:
+    """Return the widths of brightness and place that make the readings likeliest, at a fit.
+
+    placement, centre: precisions of its prior, and where it is drawn to.
+    """
+    boards = len(at.own)
+    away = at.vector() - np.concatenate([centre, np.zeros(at.own.size)])
+    pull = normal.gradient + normal.matrix @ away
+
+    def evidence(widths: tuple[float, float]) -> float:
+        precision = _prior(placement, centre, widths, boards).precision
+        factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
+        seen = np.linalg.solve(factor, pull)
+        own = precision[len(placement) :]
+        return float(0.5 * seen @ seen - np.log(np.diag(factor)).sum() + 0.5 * np.log(own).sum())
+
+    return max(product(BRIGHTNESSES, MOVES_UM), key=evidence)
 
 
 @one_blas_thread()
@@ -338,23 +436,33 @@ def fit_placement(
     deviations = tolerances.deviations(camera.views)
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
-    prior = 1 / deviations**2
+    of_placement = 1 / deviations**2
+    widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
+    at = _State(placement, np.zeros((len(boards), OWN)))
     rng = np.random.default_rng(settings.seed)
     history: list[float] = []
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
-        placement, taken, converged, normal = _descend(
-            mask, placement, samples, prior, centre, settings, history
-        )
+        prior = _prior(of_placement, centre, widths, len(boards))
+        at, taken, converged, normal = _descend(mask, at, samples, prior, settings, history)
         steps += taken
     assert normal is not None
-    placement = with_aperture_mean_one(placement)
-    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior)), np.float64)
-    information = normal.information * normal.spread**2 + np.diag(prior)
-    bound = np.asarray(np.linalg.inv(information), np.float64)
-    correlation = _correlation(mask, placement, samples)
+    for _ in range(WIDTH_ROUNDS):
+        widths = _widths(normal, at, of_placement, centre)
+        prior = _prior(of_placement, centre, widths, len(boards))
+        at, taken, converged, normal = _descend(mask, at, samples, prior, settings, history)
+        steps += taken
+    size = len(of_placement)
+    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
+    information = normal.information * normal.spread**2 + np.diag(prior.precision)
+    bound = np.asarray(np.linalg.inv(information), np.float64)[:size, :size]
+    terms = _view_terms(mask, at, samples, normal.spread)
+    covariance = (covariance + bias_covariance(covariance, *terms))[:size, :size]
+    checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
+    correlation = _correlation(mask, at, samples)
+    placement = with_aperture_mean_one(at.placement)
     if correlation < LEAST_FIT_CORRELATION:
         raise CalibrationError(
             f"the fit does not explain the whiteboards: their correlation with the shadow of the "
@@ -370,10 +478,9 @@ def fit_placement(
     lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
     kept = max(normal.kept, 1)
-    terms = _view_terms(mask, placement, samples, normal.spread)
     return Fit(
         placement,
-        covariance + bias_covariance(covariance, *terms),
+        covariance,
         bound,
         correlation,
         normal.squares / kept,
@@ -383,8 +490,10 @@ def fit_placement(
         "" if converged else "raise max_steps, or capture another whiteboard",
         undecided,
         more,
-        tuple(_check(mask, placement, sample) for sample in samples),
+        checks,
         tuple(history),
+        float(widths[0]),
+        float(widths[1]),
     )
 
 
@@ -426,44 +535,43 @@ def _windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]
 
 def _descend(
     mask: ShadowMask,
-    placement: Placement,
+    at: _State,
     samples: Sequence[_Sample],
-    prior: Array,
-    centre: Array,
+    prior: _Prior,
     settings: FitSettings,
     history: list[float],
-) -> tuple[Placement, int, bool, _Normal]:
-    """Return the placement after Levenberg-Marquardt steps on these samples."""
+) -> tuple[_State, int, bool, _Normal]:
+    """Return the state after Levenberg-Marquardt steps on these samples."""
     damping = 1e-3
-    normal = _normal(mask, placement, samples)
+    normal = _normal(mask, at, samples)
     for step in range(settings.max_steps):
-        pull = prior * (centre - placement.vector())
-        value = _posterior(mask, placement, samples, normal.spread, prior, centre)
+        pull = prior.precision * (prior.centre - at.vector())
+        value = _posterior(mask, at, samples, normal.spread, prior)
         while True:
-            matrix = normal.matrix + np.diag(prior)
+            matrix = normal.matrix + np.diag(prior.precision)
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            trial = _stepped(placement, matrix, normal.gradient + pull)
-            found = _posterior(mask, trial, samples, normal.spread, prior, centre)
+            trial = _stepped(at, matrix, normal.gradient + pull)
+            found = _posterior(mask, trial, samples, normal.spread, prior)
             if found <= value or damping > 1e6:
                 break
             damping *= 8
         damping = max(damping / 5, 1e-7)
-        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior)
-        size = float(np.max(np.abs(trial.vector() - placement.vector()) / deviations))
+        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior.precision)
+        size = float(np.max(np.abs(trial.vector() - at.vector()) / deviations))
         if found <= value:
-            placement = trial
-        normal = _normal(mask, placement, samples)
+            at = trial
+        normal = _normal(mask, at, samples)
         history.append(normal.spread)
         if size < settings.tolerance or value - found < LEAST_GAIN:
-            return placement, step + 1, True, normal
-    return placement, settings.max_steps, False, normal
+            return at, step + 1, True, normal
+    return at, settings.max_steps, False, normal
 
 
-def _stepped(placement: Placement, matrix: Array, gradient: Array) -> Placement:
-    """Return the placement after a step; one that meets a limit lets the others move without it."""
-    here = placement.vector()
+def _stepped(at: _State, matrix: Array, gradient: Array) -> _State:
+    """Return the state after a step; one that meets a limit lets the others move without it."""
+    here = at.vector()
     move = np.linalg.solve(matrix, gradient)
-    trial = placement.moved(move)
+    trial = at.moved(move)
     held = np.abs(trial.vector() - here - move) > 1e-12
     if not held.any():
         return trial
@@ -471,7 +579,7 @@ def _stepped(placement: Placement, matrix: Array, gradient: Array) -> Placement:
     move[held] = (trial.vector() - here)[held]
     rest = gradient[free] - matrix[np.ix_(free, held)] @ move[held]
     move[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
-    return placement.moved(move)
+    return at.moved(move)
 
 
 def _contrast(board: Board) -> float:
@@ -482,41 +590,41 @@ def _contrast(board: Board) -> float:
     return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
 
 
-def _correlation(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) -> float:
+def _correlation(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> float:
     """Return the correlation of readings and fit, colour by colour, outliers clipped."""
-    shadow = Shadow(mask, placement)
-    product = mine = theirs = 0.0
-    for sample in samples:
-        fitted = sample.reading - _scaled_residuals(shadow, sample) * sample.deviation
+    products = mine = theirs = 0.0
+    for sample, residual in zip(samples, _all_residuals(mask, at, samples), strict=True):
+        fitted = sample.reading - residual * sample.deviation
         for channel in np.unique(sample.channels):
             seen = sample.channels == channel
             a = sample.reading[seen] - np.median(sample.reading[seen])
             a = np.clip(a, -4 * np.std(a), 4 * np.std(a))
             b = fitted[seen] - fitted[seen].mean()
             a -= a.mean()
-            product += float(a @ b)
+            products += float(a @ b)
             mine += float(a @ a)
             theirs += float(b @ b)
-    return product / np.sqrt(max(mine * theirs, 1e-300))
+    return products / np.sqrt(max(mine * theirs, 1e-300))
 
 
-def _check(mask: ShadowMask, placement: Placement, sample: _Sample) -> BoardCheck:
-    """Return how far one board's brightness and mask are off, all else as fitted."""
-    shadow = Shadow(mask, placement)
-    board = sample.board
+def _check(mask: ShadowMask, at: _State, sample: _Sample, index: int) -> BoardCheck:
+    """Return how far one board's brightness and mask are off, the placement as fitted."""
+    shadow = Shadow(mask, at.placement)
+    board, own = sample.board, at.own[index]
     fitted, slope = shadow.with_slopes(
-        sample.pixels, sample.channels, board.views_open, board.stage_um, board.shot
+        sample.pixels, sample.channels, board.views_open, at.stage_um(board, index), board.shot
     )
     rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
-    residual = (sample.reading - fitted) / sample.deviation
+    residual = (sample.reading - (1 + own[0]) * fitted) / sample.deviation
     weight = np.ones(len(residual))
-    found = np.zeros(3)
+    more = np.zeros(3)
     matrix = np.eye(3)
     for _ in range(8):
         matrix = rows.T @ (rows * weight[:, None])
-        found = np.linalg.solve(matrix, rows.T @ (weight * residual))
-        left = residual - rows @ found
+        more = np.linalg.solve(matrix, rows.T @ (weight * residual))
+        left = residual - rows @ more
         weight = _weights(left / _spread([left]))
+    found = own + more
     spread = _spread([residual])
     inside = _weights(residual / spread) > 0
     deviation = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread

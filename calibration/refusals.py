@@ -104,6 +104,8 @@ def _refuse_lit_darks(boards: BoardSet) -> None:
 
 
 def _refuse_saturated(boards: BoardSet) -> None:
+    """Raise CalibrationError for frames that are saturated below the white level."""
+
     def lit() -> Iterator[tuple[str, MeanFrame]]:
         for (_, lamp), frame in boards.references.items():
             yield f"the reference whiteboard, {lamp} lamp", frame
@@ -132,8 +134,9 @@ def _above_dn(frame: MeanFrame, boards: BoardSet) -> Array:
 
 def _gain(frame: MeanFrame, boards: BoardSet) -> float:
     """Return the noise's variance per DN of light."""
-    light = float(np.mean(_above_dn(frame, boards)))
-    return (frame.variance_dn2 - boards.dark.variance_dn2) / light
+    dark_dn = boards.dark_at(frame.exposure_s).mean_dn
+    light = float(np.mean(frame.mean_dn - dark_dn))
+    return (frame.noise_dn2(dark_dn) - boards.dark.variance_dn2) / light
 
 
 def _plateau(above_dn: Array, gain: float, count: int) -> float:

@@ -179,7 +179,7 @@ def calibrate(
                 on_stage(f"Psi, {name}")
                 bare[name] = _calibration(one, camera, layout, few, good)
                 calibrations[name] = _counting_misfit(bare[name], one)
-                judged[name] = _judged(name, one.shadow, judges, seen)
+                judged[name] = _judged(name, one, judges, seen)
                 frames[name] = few.exposures
         refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
         findings += mask_findings((mixed or parametric).fit)
@@ -206,6 +206,8 @@ def calibrate(
             calibrations["combined"] = both
             judged["combined"] = _judged_measured("combined", both, still[0], layout.binning)
             frames["combined"] = few.exposures
+    for name, one in calibrations.items():
+        _make_less_sure(one, _unsteady(name, sets, parametric))
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > AT_THE_NOISE:
@@ -252,6 +254,21 @@ def calibrate(
         tuple(unwatched(_missing(sets, levels, layout, bool(turned)))),
         seen_colours,
     )
+
+
+def _unsteady(route: str, sets: Sequence[BoardSet], parametric: Parametric | None) -> float:
+    """Return the relative error that shutter and lamp leave in all of a Psi alike.
+
+    Every whiteboard is divided by the references, which are as unsteady as it is; of single views
+    as measured through a pinhole each has its own beside.
+    """
+    if parametric is not None:
+        spread = parametric.fit.brightness_spread
+    else:
+        means = [one.references[key] for one in sets for key in one.references]
+        dark_dn = sets[0].dark.mean_dn
+        spread = float(np.mean([one.flicker(dark_dn) / np.sqrt(one.count) for one in means]))
+    return spread * (np.sqrt(2) if route == "free" else 1.0)
 
 
 def _missing(
@@ -376,12 +393,15 @@ def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
     return max(missed / taken, 0.0) if taken > 0 else 0.0
 
 
-def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
+def _judged(name: str, one: Parametric, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
+
+    def judged(board: Board) -> HeldOut:
+        predicted = predicted_by_shadow(one.shadow, board)
+        return judge(name, board, predicted, unsteady=one.fit.brightness_spread)
+
     groups = {
-        ("open aperture" if i == 0 else "mask moved"): judge(
-            name, board, predicted_by_shadow(shadow, board)
-        )
+        ("open aperture" if i == 0 else "mask moved"): judged(board)
         for i, board in enumerate(judges)
     }
     for board in seen:
@@ -390,7 +410,7 @@ def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[B
             through = f"view ({v[0]}, {u[0]})"
             if board.views_open.sum() > 1:
                 through = f"views ({v[0]}, {u[0]}) to ({v[1]}, {u[1]})"
-            groups[through] = judge(name, board, predicted_by_shadow(shadow, board))
+            groups[through] = judged(board)
     return worst(groups)
 
 
