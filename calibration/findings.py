@@ -6,12 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.board_angle import BoardAngle
+from numpy.typing import NDArray
+
+from calibration.board_angle import BoardAngle, turned_moves
 from calibration.fit import Fit
 from calibration.levels import Levels
 from calibration.placement import Placement
 
 SIGNIFICANT = 5.0
+LEAST_MOVE_UM = 0.2
 NOTEWORTHY = {
     "tilt_x_rad": (
         5e-4,
@@ -103,10 +106,42 @@ def unwatched(missing: Sequence[str]) -> list[str]:
 
 
 def angle_findings(board: BoardAngle) -> list[str]:
-    """Return how uneven the white board is over angle."""
+    """Return how uneven the white board is over angle, and whether the mask moved meanwhile."""
+    found = []
+    for turn_deg, moved_um, deviation in turned_moves(board)[:1]:
+        if moved_um > max(LEAST_MOVE_UM, SIGNIFICANT * deviation):
+            found.append(
+                f"the mask moved by {moved_um:.1f} +- {deviation:.1f} um before the board turned by "
+                f"{turn_deg:g} degrees: taken out of what is said of the board; let the mount "
+                "settle, and capture the turned boards next to the others"
+            )
     if not board.uneven:
-        return []
-    return [
+        return found
+    words = (
         f"the white board is uneven by {np.ptp(board.radiance):.1%} over the directions into the "
         "aperture: taken out; what is alike in every direction from its middle cannot be measured"
+    )
+    if board.sense == 0:
+        words += (
+            "; which way it was turned is not known, and both are counted: turn it by 180 degrees "
+            "as well"
+        )
+    elif board.sense < 0:
+        words += "; it was turned the other way than the rows and columns of the sensor run"
+    return [*found, words]
+
+
+def leaning_findings(leans: NDArray[np.floating], turned: bool) -> list[str]:
+    """Return what of the views' light, (v, u), may be board or lamp as well as the lens.
+
+    turned: the board was turned, and does not send it.
+    """
+    if not leans.any():
+        return []
+    board = "the lamp (from one side, or its gloss)" if turned else "lamp or board"
+    return [
+        f"the views' light differs by {np.ptp(leans):.1%} smoothly over the aperture, more than "
+        f"lenses make: it may be {board}, or a board that does not fill the aperture, and counts "
+        "in Psi's deviation; take the whiteboards again with the lamp moved: what stays is the "
+        "camera's"
     ]

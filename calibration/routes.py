@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import board_over_angle, take_out
+from calibration.board_angle import board_over_angle, leaning, less_sure, take_out
 from calibration.boards import (
     Board,
     BoardSet,
@@ -31,7 +31,13 @@ from calibration.choice import (
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
 from calibration.defects import View, find_defects, loss_variance
 from calibration.errors import CalibrationError
-from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
+from calibration.findings import (
+    angle_findings,
+    leaning_findings,
+    level_findings,
+    mask_findings,
+    unwatched,
+)
 from calibration.fit import MOST_MORE, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
@@ -147,11 +153,13 @@ def calibrate(
         refuse_without_mask(board)
     stage_um = shot_stages(camera)[0]
     modelled = bool({"parametric", "mixed", "combined"} & set(routes))
+    shadow: Shadow | None = None
     if not modelled or pinholes is not None:
         boards = pinholes or held_out
-        findings += _unlike_the_design(
+        odd, shadow = _unlike_the_design(
             camera, layout, boards, judges, good, seen_colours, not modelled
         )
+        findings += odd
     calibrations: dict[str, Calibration] = {}
     bare: dict[str, Calibration] = {}
     judged: dict[str, HeldOut] = {}
@@ -234,12 +242,19 @@ def calibrate(
         calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
     if turned:
         boards = {turn: as_readings(one, layout, good)[0] for turn, one in turned.items()}
-        board = board_over_angle(calibrations[chosen.route].psi, boards)
+        by = mixed or parametric
+        shadow = shadow if by is None else by.shadow
+        board = board_over_angle(calibrations[chosen.route].psi, boards, shadow)
         refuse_uneven_board(board)
         findings += angle_findings(board)
         if board.uneven:
             for one in calibrations.values():
                 take_out(board, one)
+    if parametric is not None:
+        leans = leaning(parametric.fit, parametric.mask)
+        findings += leaning_findings(leans, bool(turned))
+        for one in calibrations.values():
+            less_sure(one, leans)
     return Outcome(
         chosen.route,
         why,
@@ -295,17 +310,18 @@ def _unlike_the_design(
     good: NDArray[np.bool_],
     crosstalk: Crosstalk | None,
     fitted: bool,
-) -> list[str]:
-    """Return what of the mask is off; raises CalibrationError for another mask, or a tilted board.
+) -> tuple[list[str], Shadow | None]:
+    """Return what of the mask is off, and its shadow.
 
-    Nothing for cameras whose mask is not modelled. Of those through the pinhole the middle view
+    Raises CalibrationError for another mask, or a tilted board. Nothing for cameras whose mask is
+    not modelled. Of those through the pinhole the middle view
     and two corners' are enough. fitted: the mask is fitted to these as well, which distinguishes
     another distance and references with less light from whiteboards that every coefficient follows.
     """
     try:
         mask = shadow_mask(camera, layout.size)
     except CalibrationError:
-        return []
+        return [], None
     if crosstalk is not None:
         mask = mixing(mask, crosstalk.seen)
     v, u = camera.views
@@ -316,14 +332,14 @@ def _unlike_the_design(
     placement = refuse_another_mask(seen or judges, camera, mask)
     refuse_tilted_board(Shadow(mask, placement), judges, ROUGHER)
     if not fitted:
-        return []
+        return [], Shadow(mask, placement)
     seen = [*seen, *judges]
     start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
     fit = fit_placement(seen, camera, mask, start=start)
     refuse_odd_fit(fit, seen)
     refuse_tilted_board(Shadow(mask, fit.placement), seen, limits=FREE_GRADIENT)
     # Finer than that, Psi as measured is what counts, and few whiteboards do not determine it well.
-    return mask_findings(fit, ("distance_share", "clear"))
+    return mask_findings(fit, ("distance_share", "clear")), Shadow(mask, fit.placement)
 
 
 def _mixed(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
