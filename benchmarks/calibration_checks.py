@@ -25,6 +25,16 @@ import numpy as np
 import pandas
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from simulated_calibration import (
+    CalibrateSettings,
+    calibrate_simulated,
+    rig_to_calibrate,
+    simulated_plan,
+    stated_error,
+    true_error,
+    true_parameters,
+    true_psi,
+)
 
 import emmc_rig as emmc
 from calibration.boards import channels_of
@@ -40,6 +50,7 @@ from drivers.dng import encode_dng
 from drivers.raw import decode_raw
 from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.plan import Checks, Plan, PlannedShot
+from emmc_rig.demo import simulated_session
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import SavedPsi
 from emmc_rig.files.results import parse_size
@@ -48,19 +59,8 @@ from emmc_rig.model.camera import psi_layout
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
-from emmc_rig.processing.calibration_settings import CalibrateSettings
-from emmc_rig.processing.simulated import (
-    calibrate_simulated,
-    rig_to_calibrate,
-    simulated_plan,
-    simulated_session,
-    stated_error,
-    true_error,
-    true_parameters,
-    true_psi,
-)
 from emmc_rig.progress import Silent
-from emmc_rig.session.frame_file import frame_file
+from emmc_rig.session.frame_file import NO_FIGURES, frame_entry, frame_file
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import session_readings, shot_frames
@@ -90,7 +90,7 @@ COMPARED_ROWS, FRAME_S, SEED, LEAST_LOST_DB = 32, 0.5, 0, 0.2
 PROGRAM = """\
 import atexit, time
 from emmc_rig.cli import main
-from emmc_rig.files.memory import peak_memory_mib
+from emmc_rig.processing.memory import peak_memory_mib
 atexit.register(lambda: print(peak_memory_mib(), time.process_time()))
 main()
 """
@@ -415,9 +415,10 @@ def draw_session(folder: Path, settings: CalibrateSettings, channels: NDArray[np
         data = encode_dng(
             mosaic, camera.sensor.cfa_name, noise.black_level_dn, noise.white_level_dn, exposure_s
         )
-        file = frame_file(decode_raw(data))
-        facts = {**file.facts, "exposure_s": exposure_s, "gain": 1.0, "host_time_s": seconds}
-        session.store(planned, file.suffix, file.data, file.sha256, lambda facts=facts: facts)
+        frame = decode_raw(data)
+        entry = frame_entry(frame, exposure_s, 1.0, figures=NO_FIGURES)
+        entry = entry.model_copy(update={"host_time_s": seconds})
+        session.store(planned, frame_file(frame), lambda entry=entry: entry)
     return shadow
 
 

@@ -52,7 +52,7 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
     psi = build_imaging_matrix(find_camera(camera), size)
     light_field = np.random.default_rng(0).random(psi.light_field_shape, dtype=np.float32)
     frames = psi.forward(light_field)
-    inverse = psi.solver(0.01).inverse
+    inverse = psi.inverted_blocks(0.01)
     planar = np.ascontiguousarray(rows_of_colours(light_field))
     dual = np.zeros((*planar.shape[:3], 4, *planar.shape[3:]), dtype=np.float32)
     taps, room = stencils(1, psi.light_field_shape, planar.dtype), np.empty_like(planar)
@@ -60,7 +60,7 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
     bands = row_bands(psi.frames_shape[1], get_num_threads())
     pool = ThreadPoolExecutor(len(bands))
     one, operator = np.float32(1), (psi.weights, psi.colour_map)
-    data = tv_kernels.Data(*operator, inverse, frames, psi.binning)
+    data = tv_kernels.FrameFit(*operator, inverse, frames, psi.binning)
     steps = tv_kernels.Steps(one, one / 64, one, one, colour_metric(2.0).astype(np.float32))
     once = psi.weights.nbytes + light_field.nbytes
     return {
@@ -69,10 +69,6 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
         ),
         "adjoint": (
             lambda: kernels.back_project(*operator, frames, psi.binning, light_field), once,
-        ),
-        "data step": (
-            lambda: kernels.data_step(*operator, inverse, frames, psi.binning, planar),
-            once + light_field.nbytes,
         ),
         "TV step": (
             lambda: tv_kernels.sweep(data, steps, taps, planar, dual, room, bands, moved, pool.map),

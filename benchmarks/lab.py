@@ -17,7 +17,9 @@ from emmc_rig.study.trial import Capture
 matplotlib.use("Agg")
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
 GROUP_A = ("dragons", "dice", "fish", "buttercup", "occlusions", "begonia", "antinous")
-GROUP_B = ("messerschmitt", "bikes", "isochart", "general11", "lytro1", "lytro2")
+GROUP_B = (
+    "messerschmitt", "bikes", "isochart", "general11", "lytro1@by-parallax", "lytro2@by-parallax",
+)  # fmt: skip
 """Real light fields in the folder EMMC_LIGHTFIELDS: tune on A, report on B."""
 SMALLEST = (32, 40)
 

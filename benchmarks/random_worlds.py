@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.camera import Camera
 from simulators import textures
 from simulators.raycaster import Ball, Card, World, tabulated
 from simulators.scenes import rendered
@@ -24,6 +25,14 @@ WORLD_SIZE = 128, 160
 WORLDS_AT_HAND = 32
 DARKEST = 0.3
 """Least factor on a world's light, drawn log-uniformly up to 1."""
+
+
+def with_pattern(camera: Camera, mask: str, **changes: object) -> Camera:
+    """Return a camera with other settings of one mask's pattern, which are not checked."""
+    changed = camera.masks[mask]
+    pattern = changed.pattern.model_copy(update=changes)
+    masks = {**camera.masks, mask: changed.model_copy(update={"pattern": pattern})}
+    return camera.model_copy(update={"masks": masks})
 
 
 @lru_cache(maxsize=2 * WORLDS_AT_HAND)

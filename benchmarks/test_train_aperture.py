@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import yaml
+from random_worlds import with_pattern
 from train_aperture import PATCH_PX, Moments, aperture_of, learned_cells, patch_moments, train
 
 from emmc_rig.errors import AppError
@@ -134,7 +135,7 @@ def decibels(mean_square):
 def random_aperture(camera):
     rng = np.random.default_rng(5)
     for name in camera.masks:
-        camera = camera.with_pattern(name, cells=rng.uniform(0, 1, (5, 5)).tolist())
+        camera = with_pattern(camera, name, cells=rng.uniform(0, 1, (5, 5)).tolist())
     return camera
 
 

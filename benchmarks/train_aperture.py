@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from random_worlds import DARKEST, world
+from random_worlds import DARKEST, with_pattern, world
 from scipy.optimize import minimize
 from training_patches import cut_patches
 
@@ -136,7 +136,7 @@ def aperture_of(camera: Camera) -> Aperture:
 
         def passing(cells: Array, shot: int = shot, name: str = name) -> Array:
             """Return the weights (view, pixel) that one shot has with these cells."""
-            psi = camera.with_pattern(name, cells=cells.tolist()).psi((PATCH_PX, PATCH_PX))
+            psi = with_pattern(camera, name, cells=cells.tolist()).psi((PATCH_PX, PATCH_PX))
             return psi.weights[shot].astype(np.float64).sum(axis=3).reshape(-1, PATCH_PX**2)
 
         whole = passing(np.ones(shape))

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from random_worlds import DARKEST, WORLDS_AT_HAND, world
+from random_worlds import DARKEST, WORLDS_AT_HAND, with_pattern, world
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parent / "unrolled_plugin"))
@@ -117,7 +117,7 @@ class TrainingData:
         truth = np.ascontiguousarray(light * truth[..., rng.permutation(3)], np.float32)
         cameras = list(self.cameras.values())
         psi = with_drawn_masks(cameras[rng.integers(len(cameras))], rng).psi((side, side))
-        if psi.is_colour_blind:
+        if psi.colour is None and not np.ptp(psi.weights, axis=4).any():  # no colour is seen
             truth = np.broadcast_to(truth.mean(axis=-1, keepdims=True), truth.shape).copy()
         sigma = np.exp(rng.uniform(*np.log(NOISE)))
         frames = psi.forward(truth)
@@ -137,7 +137,7 @@ def with_drawn_masks(camera: Camera, rng: np.random.Generator) -> Camera:
     """Return a camera with other random patterns of the same kinds; made ones stay as they are."""
     for name, mask in camera.masks.items():
         if hasattr(mask.pattern, "seed"):
-            camera = camera.with_pattern(name, seed=int(rng.integers(2**31)))
+            camera = with_pattern(camera, name, seed=int(rng.integers(2**31)))
     return camera
 
 

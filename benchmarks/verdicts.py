@@ -13,8 +13,9 @@ from matplotlib import pyplot as plt
 
 from emmc_rig.model.errors import ModelError
 from emmc_rig.study.points import NotApplicableError
+from emmc_rig.study.stability.fault import MASK, SENSOR, SHOTS
 from emmc_rig.study.stability.faults import FAULTS, Point
-from emmc_rig.study.trial import MASK, SENSOR, SHOTS, Capture
+from emmc_rig.study.trial import Capture
 from reconstruction.errors import ReconstructionError
 from reconstruction.verdict.run import reconstruct_judged
 

@@ -36,7 +36,7 @@ CLIP = 4.0
 SAMPLED = 500_000
 """Pixels at most: of more the board's unevenness is known to 1e-5."""
 CLEARLY = 12.0
-"""Difference of the squared misfits, in deviations, from which on one sense of turning is likelier."""
+"""Difference of the squared misfits, in deviations, that decides the sense of turning."""
 LEAST_LEANING, LEANS = 5e-3, 5.0
 """Of the light, peak to peak over the views, and deviations of it, from which on it matters."""
 NATURAL = 2.0

@@ -20,6 +20,10 @@ LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
 
 
+Opening = tuple[NDArray[np.bool_], tuple[float, float], int]
+"""Views open, (view_y, view_x); place of the mask in um, x and y; shot."""
+
+
 @dataclass(frozen=True, eq=False)
 class BoardFrame:
     """One whiteboard setting as captured: its mean frame, and how the bench stood.
@@ -135,6 +139,11 @@ class Board:
     views_open: NDArray[np.bool_]
     stage_um: tuple[float, float]
     shot: int
+
+    @property
+    def opening(self) -> Opening:
+        """Views open, place of the mask, shot: what `Shadow.readings` takes."""
+        return self.views_open, self.stage_um, self.shot
 
     @property
     def usable(self) -> NDArray[np.bool_]:

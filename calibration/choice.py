@@ -15,7 +15,7 @@ from calibration.shadow import Shadow
 from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]
-AT_THE_NOISE = 1.5
+LARGEST_CHI2 = 1.5
 """Mean squared residual over the variance: what is left is less than the noise."""
 ROUTES = ("combined", "parametric", "mixed", "free")
 """The surest first, then from the simplest to the freest."""
@@ -25,16 +25,13 @@ ROUTES = ("combined", "parametric", "mixed", "free")
 class HeldOut:
     """How one description predicts a whiteboard that it has not seen.
 
-    chi2: mean squared residual over its variance, all usable pixels. trimmed: without the worst
-    1 % of them. whiteness: correlation of neighbours' residuals. residual: (pixel_y, pixel_x), in
-    deviations, 0 where not usable. brightness: of the whiteboard, over what is predicted. groups:
-    chi2 by kind of whiteboard; all else is of the worst.
+    chi2: mean squared residual over its variance, all usable pixels. residual: (pixel_y, pixel_x),
+    in deviations, 0 where not usable. brightness: of the whiteboard, over what is predicted.
+    groups: chi2 by kind of whiteboard; all else is of the worst.
     """
 
     route: str
     chi2: float
-    trimmed: float
-    whiteness: float
     relative_error: float
     residual: NDArray[np.float32]
     brightness: float = 1.0
@@ -50,9 +47,7 @@ def worst(judged: Mapping[str, HeldOut]) -> HeldOut:
 def predicted_by_shadow(shadow: Shadow, board: Board) -> Array:
     """Return what a placement predicts of a whiteboard, (pixel_y, pixel_x)."""
     pixels = np.argwhere(np.ones(board.reading.shape, dtype=bool))
-    read = shadow.readings(
-        pixels, board.channels.ravel(), board.views_open, board.stage_um, board.shot
-    )
+    read = shadow.readings(pixels, board.channels.ravel(), *board.opening)
     return read.reshape(board.reading.shape)
 
 
@@ -122,13 +117,9 @@ def judge(
         scaled[rows] = residual / np.sqrt(np.where(good, variance, 1.0))
         missed, power = missed + float((residual**2).sum()), power + float((reading**2).sum())
         light, expected = light + float(reading.sum()), expected + float(prediction.sum())
-    squares = scaled[usable] ** 2
-    limit = np.quantile(squares, 0.99)
     return HeldOut(
         route,
-        float(squares.mean(dtype=np.float64)),
-        float(squares[squares <= limit].mean(dtype=np.float64)),
-        neighbour_correlation(scaled, usable),
+        float(np.mean(scaled[usable] ** 2, dtype=np.float64)),
         float(np.sqrt(missed / power)),
         scaled,
         light / max(expected, 1e-9),
@@ -149,23 +140,6 @@ def _brighter(board: Board, predicted: Array, spread: Array, unsteady: float) ->
     return light / (light2 + unsteady**-2)
 
 
-def neighbour_correlation(residual: Array, usable: NDArray[np.bool_]) -> float:
-    """Return the correlation of residuals two pixels apart along rows and columns: 0 if white.
-
-    Two, so that neighbours see the same colour of a Bayer mosaic.
-    """
-    limit = 5 * max(float(np.median(np.abs(residual[usable]))) * 1.4826, 1e-12)
-    values = np.clip(residual, -limit, limit)
-    product = squares = 0.0
-    for axis in (0, 1):
-        a, b = (np.moveaxis(values, axis, 0)[part] for part in (slice(None, -2), slice(2, None)))
-        m, n = (np.moveaxis(usable, axis, 0)[part] for part in (slice(None, -2), slice(2, None)))
-        both = m & n
-        product += float((a[both] * b[both]).sum())
-        squares += float((0.5 * (a[both] ** 2 + b[both] ** 2)).sum())
-    return product / max(squares, 1e-12)
-
-
 def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
     """Return the description to use, and why in words.
 
@@ -175,15 +149,15 @@ def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
         raise CalibrationError("no description of Psi to choose from")
     known = sorted(judged, key=lambda one: ROUTES.index(one.route))
     for one in known:
-        if one.chi2 <= AT_THE_NOISE:
+        if one.chi2 <= LARGEST_CHI2:
             return one, (
                 f"{one.route}: every kind of whiteboard lies at the noise (the worst, "
-                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {AT_THE_NOISE:g})"
+                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {LARGEST_CHI2:g})"
             )
     best = min(known, key=lambda one: one.chi2)
     return best, (
         f"{best.route}: none reaches the noise on every kind of whiteboard; this one comes nearest "
-        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {AT_THE_NOISE:g}), and its "
+        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {LARGEST_CHI2:g}), and its "
         "deviations count what is missed"
     )
 

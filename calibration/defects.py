@@ -154,9 +154,7 @@ def mask_with_losses(mask: ShadowMask, placement: Placement, lost: Array) -> Sha
 
 def _residual(shadow: Shadow, board: Board) -> Array:
     pixels = np.argwhere(board.usable)
-    predicted = shadow.readings(
-        pixels, board.channels[board.usable], board.views_open, board.stage_um, board.shot
-    )
+    predicted = shadow.readings(pixels, board.channels[board.usable], *board.opening)
     scale = np.sqrt(board.variance[board.usable].astype(np.float64))
     return (board.reading[board.usable] - predicted) / scale
 

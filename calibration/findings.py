@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from calibration.board_angle import BoardAngle, turned_moves
@@ -111,8 +110,8 @@ def angle_findings(board: BoardAngle) -> list[str]:
     for turn_deg, moved_um, deviation in turned_moves(board)[:1]:
         if moved_um > max(LEAST_MOVE_UM, SIGNIFICANT * deviation):
             found.append(
-                f"the mask moved by {moved_um:.1f} +- {deviation:.1f} um before the board turned by "
-                f"{turn_deg:g} degrees: taken out of what is said of the board; let the mount "
+                f"the mask moved by {moved_um:.1f} +- {deviation:.1f} um before the board turned "
+                f"by {turn_deg:g} degrees: taken out of what is said of the board; let the mount "
                 "settle, and capture the turned boards next to the others"
             )
     if not board.uneven:

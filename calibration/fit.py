@@ -25,14 +25,14 @@ MacKay 1992.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from calibration.boards import Board
+from calibration.boards import Board, Opening
 from calibration.errors import CalibrationError
 from calibration.placement import (
     SCALARS,
@@ -55,17 +55,17 @@ CHUNK = 4096
 FIRST_WINDOW_PX = 64
 FEWEST_PIXELS = 400
 """Of a whiteboard, however many there are."""
-DECIDED = 0.7
+MOST_OF_PRIOR = 0.7
 """Of the prior's deviation: a parameter known no better stays at the design."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
-MOST_MORE = 200
+MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
 SOFT_EDGES = 0.1
 """Of a cell: how soft edges are taken to be where a fit begins."""
 OFFSETS = slice(0, 2)
 OWN = 3
-"""Parameters of one whiteboard: relative brightness, and by how many um (x, y) the mask is moved."""
+"""Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
 FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
 BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
 MOVES_UM = np.geomspace(0.01, 10.0, 11)
@@ -115,19 +115,16 @@ class BoardCheck:
 class Fit:
     """The placement fitted, how sure it is, and how well it explains the whiteboards.
 
-    covariance: (parameter, parameter), in the order of `placement.vector()`; bound: likewise, the
-    inverse of the Fisher information of the readings used (with the prior), which it does not
-    fall below. chi2: mean squared residual over the noise without outliers. undecided: names of
-    parameters that the prior decides more than the whiteboards; more_boards: how many more of the
-    same kinds would decide them (MOST_MORE: no number of them). history: robust deviation of the
-    residuals over the noise after every step, at least 1. brightness_spread, moved_spread_um: by
-    which whiteboards differ among themselves; the references differ by the first as well, which
-    the covariance does not count.
+    covariance: (parameter, parameter), in the order of `placement.vector()`. chi2: mean squared
+    residual over the noise without outliers. undecided: names of parameters that the prior decides
+    more than the whiteboards; more_boards: how many more of the same kinds would decide them
+    (MOST_MORE_BOARDS: no number of them). brightness_spread, moved_spread_um: by which whiteboards
+    differ among themselves; the references differ by the first as well, which the covariance does
+    not count.
     """
 
     placement: Placement
     covariance: NDArray[np.float64]
-    bound: NDArray[np.float64]
     correlation: float
     chi2: float
     outliers: float
@@ -137,7 +134,6 @@ class Fit:
     undecided: tuple[str, ...]
     more_boards: int
     boards: tuple[BoardCheck, ...]
-    history: tuple[float, ...] = field(default=())
     brightness_spread: float = 0.0
     moved_spread_um: float = 0.0
 
@@ -201,10 +197,10 @@ class _State:
         own = self.own + step[size:].reshape(self.own.shape)
         return _State(self.placement.moved(step[:size]), own)
 
-    def stage_um(self, board: Board, index: int) -> tuple[float, float]:
-        """Return where the mask stood of a whiteboard."""
-        x, y = board.stage_um
-        return x + float(self.own[index, 1]), y + float(self.own[index, 2])
+    def opening(self, board: Board, index: int) -> Opening:
+        """Return what `Shadow` asks of a whiteboard, the mask where it stood of that one."""
+        views_open, (x, y), shot = board.opening
+        return views_open, (x + float(self.own[index, 1]), y + float(self.own[index, 2])), shot
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,25 +215,18 @@ class _Prior:
         return 0.5 * float(np.sum(self.precision * (at.vector() - self.centre) ** 2))
 
 
-def _prior(
-    placement: Array, centre: Array, widths: tuple[float, float], boards: int
-) -> _Prior:
+def _prior(placement: Array, centre: Array, widths: tuple[float, float], boards: int) -> _Prior:
     """Return the prior of a placement (precisions, centre) and of the whiteboards' own."""
     own = np.tile(1 / np.square([widths[0], widths[1], widths[1]]), boards)
-    return _Prior(np.concatenate([placement, own]), np.concatenate([centre, np.zeros(len(own))]))
+    precision = np.concatenate([placement, own]).astype(np.float64)
+    return _Prior(precision, np.concatenate([centre, np.zeros(len(own))]).astype(np.float64))
 
 
 def _scaled_residuals(
     shadow: Shadow, sample: _Sample, at: _State, index: int
 ) -> NDArray[np.float64]:
-    board = sample.board
-    predicted = shadow.readings(
-        sample.pixels,
-        sample.channels,
-        board.views_open,
-        at.stage_um(board, index),
-        board.shot,
-    )
+    opening = at.opening(sample.board, index)
+    predicted = shadow.readings(sample.pixels, sample.channels, *opening)
     return (sample.reading - (1 + at.own[index, 0]) * predicted) / sample.deviation
 
 
@@ -249,7 +238,8 @@ def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> 
 def _with_own(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
     """Return the slopes by the placement and by a whiteboard's own, (n, parameter + OWN)."""
     brighter = 1 + own[0]
-    return np.column_stack([brighter * slope, read, brighter * slope[:, OFFSETS]])
+    rows = [brighter * slope, read, brighter * slope[:, OFFSETS]]
+    return np.column_stack(rows).astype(np.float64, copy=False)
 
 
 def _places(at: _State, index: int) -> NDArray[np.int64]:
@@ -275,11 +265,10 @@ def _weights(scaled: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Normal:
-    """Gauss-Newton normal equations, Fisher information, loss and what the residuals are like."""
+    """Gauss-Newton normal equations, and what the residuals are like."""
 
     matrix: NDArray[np.float64]
     gradient: NDArray[np.float64]
-    information: NDArray[np.float64]
     spread: float
     squares: float
     kept: int
@@ -291,33 +280,25 @@ def _normal(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> _Normal
     residuals = _all_residuals(mask, at, samples)
     spread = _spread(residuals)
     size = len(at.vector())
-    matrix, information = np.zeros((size, size)), np.zeros((size, size))
-    gradient = np.zeros(size)
+    matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
     for index, (sample, residual) in enumerate(zip(samples, residuals, strict=True)):
-        places, board = _places(at, index), sample.board
+        places, opening = _places(at, index), at.opening(sample.board, index)
         block = np.ix_(places, places)
         for first in range(0, len(residual), CHUNK):
             part = slice(first, first + CHUNK)
-            read, slope = shadow.with_slopes(
-                sample.pixels[part],
-                sample.channels[part],
-                board.views_open,
-                at.stage_um(board, index),
-                board.shot,
-            )
+            read, slope = shadow.with_slopes(sample.pixels[part], sample.channels[part], *opening)
             slope = _with_own(read, slope, at.own[index])
             slope /= sample.deviation[part, None] * spread
             scaled = residual[part] / spread
             weight = _weights(scaled)
             matrix[block] += slope.T @ (slope * weight[:, None])
-            information[block] += slope.T @ slope
             gradient[places] += slope.T @ (weight * scaled)
             inside = weight > 0
             squares += float((residual[part][inside] ** 2).sum())
             kept += int(inside.sum())
     count = sum(len(residual) for residual in residuals)
-    return _Normal(matrix, gradient, information, spread, squares, kept, count)
+    return _Normal(matrix, gradient, spread, squares, kept, count)
 
 
 def _view_terms(
@@ -330,18 +311,12 @@ def _view_terms(
     pull = np.zeros(own_size)
     for index, residual in enumerate(_all_residuals(mask, at, samples)):
         sample = samples[index]
-        board = sample.board
         scaled = residual / spread
         weight = _weights(scaled)
         for first in range(0, len(scaled), CHUNK):
             part = slice(first, first + CHUNK)
-            how = (
-                sample.pixels[part],
-                sample.channels[part],
-                board.views_open,
-                at.stage_um(board, index),
-                board.shot,
-            )
+            opening = at.opening(sample.board, index)
+            how = sample.pixels[part], sample.channels[part], *opening
             slope, by_view = shadow.slopes_by_view(*how)
             slope = _with_own(shadow.readings(*how), slope, at.own[index])
             scale = 1 / (sample.deviation[part, None] * spread)
@@ -359,8 +334,9 @@ def bias_covariance(
     """Return what the views' own displacements and softenings add to the placement's covariance.
 
     covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
-    information between these and the views' own (see `Shadow.slopes_by_view`). own, pull: information of the
-    latter, and the gradient of the log likelihood by them, at the placement fitted.
+    information between these and the views' own (see `Shadow.slopes_by_view`). own, pull:
+    information of the latter, and the gradient of the log likelihood by them, at the placement
+    fitted.
     """
     left = own - mixed.T @ covariance @ mixed
     kind = np.resize(KINDS, len(pull))
@@ -440,24 +416,21 @@ def fit_placement(
     widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
     at = _State(placement, np.zeros((len(boards), OWN)))
     rng = np.random.default_rng(settings.seed)
-    history: list[float] = []
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
         prior = _prior(of_placement, centre, widths, len(boards))
-        at, taken, converged, normal = _descend(mask, at, samples, prior, settings, history)
+        at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     assert normal is not None
     for _ in range(WIDTH_ROUNDS):
         widths = _widths(normal, at, of_placement, centre)
         prior = _prior(of_placement, centre, widths, len(boards))
-        at, taken, converged, normal = _descend(mask, at, samples, prior, settings, history)
+        at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     size = len(of_placement)
     covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
-    information = normal.information * normal.spread**2 + np.diag(prior.precision)
-    bound = np.asarray(np.linalg.inv(information), np.float64)[:size, :size]
     terms = _view_terms(mask, at, samples, normal.spread)
     covariance = (covariance + bias_covariance(covariance, *terms))[:size, :size]
     checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
@@ -471,17 +444,18 @@ def fit_placement(
         )
     shares = shares_of_prior(placement, covariance, tolerances)
     undecided = tuple(
-        name for name, share in zip(labels(camera.views), shares, strict=True) if share > DECIDED
+        name
+        for name, share in zip(labels(camera.views), shares, strict=True)
+        if share > MOST_OF_PRIOR
     )
     # Precision beyond the prior's grows with the number of whiteboards.
     have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
-    lacking = float((1 / DECIDED**2 - 1) / have.min()) - 1
-    more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE))
+    lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
+    more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE_BOARDS))
     kept = max(normal.kept, 1)
     return Fit(
         placement,
         covariance,
-        bound,
         correlation,
         normal.squares / kept,
         1 - normal.kept / max(normal.count, 1),
@@ -491,7 +465,6 @@ def fit_placement(
         undecided,
         more,
         checks,
-        tuple(history),
         float(widths[0]),
         float(widths[1]),
     )
@@ -539,7 +512,6 @@ def _descend(
     samples: Sequence[_Sample],
     prior: _Prior,
     settings: FitSettings,
-    history: list[float],
 ) -> tuple[_State, int, bool, _Normal]:
     """Return the state after Levenberg-Marquardt steps on these samples."""
     damping = 1e-3
@@ -561,7 +533,6 @@ def _descend(
         if found <= value:
             at = trial
         normal = _normal(mask, at, samples)
-        history.append(normal.spread)
         if size < settings.tolerance or value - found < LEAST_GAIN:
             return at, step + 1, True, normal
     return at, settings.max_steps, False, normal
@@ -611,9 +582,8 @@ def _check(mask: ShadowMask, at: _State, sample: _Sample, index: int) -> BoardCh
     """Return how far one board's brightness and mask are off, the placement as fitted."""
     shadow = Shadow(mask, at.placement)
     board, own = sample.board, at.own[index]
-    fitted, slope = shadow.with_slopes(
-        sample.pixels, sample.channels, board.views_open, at.stage_um(board, index), board.shot
-    )
+    opening = at.opening(board, index)
+    fitted, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
     rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
     residual = (sample.reading - (1 + own[0]) * fitted) / sample.deviation
     weight = np.ones(len(residual))

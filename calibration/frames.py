@@ -203,9 +203,9 @@ def _check_steady(levels: list[float], noise: float, what: str, lit: bool) -> No
 
 
 def _check_rows(rows: NDArray[np.float64], noise_dn2: float, what: str) -> None:
-    """Raise CalibrationError when rows (repeat, y) differ apart from the brightness of their frames.
+    """Raise CalibrationError when rows differ apart from the brightness of their frames.
 
-    noise_dn2: variance of a row's mean by the noise of its pixels.
+    rows: mean of each, (repeat, y). noise_dn2: variance of a row's mean by the noise of its pixels.
     """
     levels = rows.mean(axis=1, keepdims=True)
     alone = np.var(rows / levels * levels.mean(), axis=0, ddof=1).mean() - noise_dn2

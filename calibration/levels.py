@@ -53,10 +53,9 @@ class Check:
 class Levels:
     """The lamp's logarithm at knots in time, (knot, channel), and the response's bend per DN.
 
-    drift: peak to peak of the lamp over the checks, the largest of the colours. residual: root
-    mean square of the checks' logarithms, over their deviations. bend_known: more than one
-    exposure shows it. deviation: of the lamp's logarithm, typical; significance: of the largest
-    step of it from the first knot.
+    drift: peak to peak of the lamp over the checks, the largest of the colours. bend_known:
+    more than one exposure shows it. deviation: of the lamp's logarithm, typical; significance: of
+    the largest step of it from the first knot.
     """
 
     knots_s: NDArray[np.float64]
@@ -69,7 +68,6 @@ class Levels:
     colour_drift: float
     deviation: float
     significance: float
-    residual: float
 
     @property
     def bent(self) -> bool:
@@ -184,7 +182,7 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
         lamp[1:, channel] = solution[part]
         deviations.append(np.sqrt(np.diag(covariance)[part]) * max(residual, 1.0))
         steps.append(np.abs(lamp[1:, channel]))
-    known = bool(np.ptp([one.exposure_s for one in checks if one.board == boards[0]]) > 0) or any(
+    known = any(
         np.ptp([one.exposure_s for one in checks if one.board == board]) > 0 for board in boards
     )
     spread = np.ptp(lamp[:, channels], axis=0)
@@ -200,5 +198,4 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
         float(np.ptp(differences, axis=0).max()),
         float(np.median(deviations)),
         float(np.max(np.array(steps) / np.array(deviations))),
-        residual,
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibration.defects import Defects
 from calibration.fit import Fit
 from calibration.misfit import Misfit
+from calibration.openings import views_open
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
@@ -51,12 +52,6 @@ def shot_stages(camera: Camera) -> Stages:
     return [shot.offset_um.get(name, (0.0, 0.0)) for shot in camera.shots]
 
 
-def _one_view(views: tuple[int, int], v: int, u: int) -> NDArray[np.bool_]:
-    chosen = np.zeros(views, dtype=bool)
-    chosen[v, u] = True
-    return chosen
-
-
 def _bands(
     layout: PsiLayout, shot: int, stored: int
 ) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.uint8]]]:
@@ -87,7 +82,7 @@ def coefficient_planes(
     scale = stored_colours * layout.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
         plane = np.empty(layout.size, dtype=np.float32)
-        chosen = _one_view((views_v, views_u), v, u)
+        chosen = views_open((views_v, views_u), (v, u))
         for band, samples, channels in _bands(layout, shot, stored):
             read = samples_shadow.readings(samples, channels, chosen, stages[shot], shot)
             plane[band] = read.reshape(plane[band].shape) / scale
@@ -116,7 +111,7 @@ def psi_deviation(
     shots, views_v, views_u, _, stored_colours, _ = layout.shape
     scale = stored_colours * layout.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
-        chosen = _one_view((views_v, views_u), v, u)
+        chosen = views_open((views_v, views_u), (v, u))
         for band, samples, channels in _bands(layout, shot, stored):
             slopes = samples_shadow.with_slopes(samples, channels, chosen, stages[shot], shot)[1]
             spread = np.sqrt(np.square(slopes @ root).sum(axis=1)) / scale
@@ -125,23 +120,26 @@ def psi_deviation(
     return deviation
 
 
-def psi_information(
-    shadow: Shadow, pixels: int = SAMPLED, seed: int = 0
-) -> tuple[NDArray[np.float64], float]:
+def drawn_pixels(mask: ShadowMask) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Return SAMPLED pixels (n, 2) drawn at random, and the one colour that each sees."""
+    rng = np.random.default_rng(0)
+    rows, columns = mask.pixel_shape()
+    chosen = np.stack([rng.integers(rows, size=SAMPLED), rng.integers(columns, size=SAMPLED)], 1)
+    return chosen, rng.integers(ANY_COLOUR, size=SAMPLED).astype(np.uint8)
+
+
+def psi_information(shadow: Shadow) -> tuple[NDArray[np.float64], float]:
     """Return what turns a covariance of the placement into the error of Psi, and |Psi|^2.
 
     The expected squared Frobenius error of Psi is trace(matrix covariance); both per pixel and
-    coefficient, from `pixels` of them drawn at random, each seeing one colour.
+    coefficient, from SAMPLED of them drawn at random, each seeing one colour.
     """
     mask = shadow.mask
-    rng = np.random.default_rng(seed)
-    rows, columns = mask.pixel_shape()
-    chosen = np.stack([rng.integers(rows, size=pixels), rng.integers(columns, size=pixels)], 1)
-    channels = rng.integers(ANY_COLOUR, size=pixels).astype(np.uint8)
+    chosen, channels = drawn_pixels(mask)
     size = len(shadow.placement.vector())
     matrix, squares = np.zeros((size, size)), 0.0
     for v, u in np.ndindex(mask.views):
-        values, slopes = shadow.with_slopes(chosen, channels, _one_view(mask.views, v, u))
+        values, slopes = shadow.with_slopes(chosen, channels, views_open(mask.views, (v, u)))
         matrix += slopes.T @ slopes
         squares += float(values @ values)
-    return matrix / pixels, squares / pixels
+    return matrix / SAMPLED, squares / SAMPLED

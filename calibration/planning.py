@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.openings import CENTRED, Window, views_open
-from calibration.parametric import SAMPLED, psi_information
+from calibration.parametric import SAMPLED, drawn_pixels, psi_information
 from calibration.placement import Placement, Tolerances
-from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
+from calibration.shadow import Shadow, ShadowMask
 from emmc_rig.model.noise import SensorNoise
 
 Array = NDArray[np.floating]
@@ -99,13 +99,10 @@ def reading_variance(reading: Array, kind: Kind, light: Light) -> Array:
 
 
 def information_of(
-    mask: ShadowMask, placement: Placement, kind: Kind, light: Light, seed: int = 0
+    mask: ShadowMask, placement: Placement, kind: Kind, light: Light
 ) -> NDArray[np.float64]:
     """Return the Fisher information of one frame, (parameter, parameter)."""
-    rng = np.random.default_rng(seed)
-    rows, columns = mask.pixel_shape()
-    chosen = np.stack([rng.integers(rows, size=SAMPLED), rng.integers(columns, size=SAMPLED)], 1)
-    channels = rng.integers(ANY_COLOUR, size=SAMPLED).astype(np.uint8)
+    chosen, channels = drawn_pixels(mask)
     shadow = Shadow(mask, placement)
     opened = kind.views_open(mask.views)
     reading, slopes = shadow.with_slopes(chosen, channels, opened, kind.stage_um)
@@ -172,10 +169,7 @@ class FreeNoise:
 
 def free_noise(mask: ShadowMask, placement: Placement, light: Light) -> FreeNoise:
     """Return what the noise of the free route's error is made of."""
-    rng = np.random.default_rng(0)
-    rows, columns = mask.pixel_shape()
-    chosen = np.stack([rng.integers(rows, size=SAMPLED), rng.integers(columns, size=SAMPLED)], 1)
-    channels = rng.integers(ANY_COLOUR, size=SAMPLED).astype(np.uint8)
+    chosen, channels = drawn_pixels(mask)
     shadow = Shadow(mask, placement)
     pinhole = white = squares = 0.0
     for view in np.ndindex(mask.views):

@@ -288,7 +288,7 @@ def _gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
     rows, columns = board.reading.shape
     y, x = np.unravel_index(chosen, (rows, columns))
     channels, pixels = board.channels[y, x], np.stack([y, x], axis=1)
-    at = shadow.readings(pixels, channels, board.views_open, board.stage_um, board.shot)
+    at = shadow.readings(pixels, channels, *board.opening)
     levels = [np.where(channels == c, at, 0) for c in np.unique(channels)]
     terms = np.stack([at * (y / rows - 0.5), at * (x / columns - 0.5), *levels], axis=1)
     value = board.reading[y, x].astype(np.float64)

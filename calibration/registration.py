@@ -116,13 +116,8 @@ def correlated(
         # A speck or a hot pixel must not outweigh the mask.
         limit = 4 * np.std(centred[seen])
         centred = np.clip(centred, -limit, limit)
-        drawn = shadow.readings(
-            pixels,
-            np.full(len(pixels), channel, np.uint8),
-            board.views_open,
-            board.stage_um,
-            board.shot,
-        ).reshape(y.shape)
+        seen_as = np.full(len(pixels), channel, np.uint8)
+        drawn = shadow.readings(pixels, seen_as, *board.opening).reshape(y.shape)
         drawn -= drawn[margin:-margin, margin:-margin].mean()
         turned = centred[::-1, ::-1]
         product = product + fftconvolve(drawn, turned, mode="valid")

@@ -19,7 +19,7 @@ from calibration.boards import (
     sensor_blemishes,
 )
 from calibration.choice import (
-    AT_THE_NOISE,
+    LARGEST_CHI2,
     HeldOut,
     choose,
     judge,
@@ -38,10 +38,11 @@ from calibration.findings import (
     mask_findings,
     unwatched,
 )
-from calibration.fit import MOST_MORE, SOFT_EDGES, Fit, fit_placement
+from calibration.fit import MOST_MORE_BOARDS, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
 from calibration.misfit import Misfit, combined, measured_misfit
+from calibration.openings import views_open
 from calibration.parametric import (
     Parametric,
     Stages,
@@ -76,7 +77,7 @@ LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
 LARGEST_MOVE_UM = 1.0
-ROUGHER = 3.0
+REGISTERED_MISS = 3.0
 """Times what a fitted mask misses: what one that is but registered does."""
 
 
@@ -218,7 +219,7 @@ def calibrate(
         _make_less_sure(one, _unsteady(name, sets, parametric))
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
-    if chosen.chi2 > AT_THE_NOISE:
+    if chosen.chi2 > LARGEST_CHI2:
         missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
         _make_less_sure(calibrations[chosen.route], missed)
         advice.append(
@@ -330,7 +331,7 @@ def _unlike_the_design(
     some.sort(key=lambda one: wanted.index(one.pinhole or wanted[0]))
     seen = as_readings(boards.with_frames(some), layout, good)
     placement = refuse_another_mask(seen or judges, camera, mask)
-    refuse_tilted_board(Shadow(mask, placement), judges, ROUGHER)
+    refuse_tilted_board(Shadow(mask, placement), judges, REGISTERED_MISS)
     if not fitted:
         return [], Shadow(mask, placement)
     seen = [*seen, *judges]
@@ -477,8 +478,7 @@ def _counting_defects(
     for ((shot, v, u, stored), bare), (_, plane) in zip(clean, soiled, strict=True):
         touched = np.argwhere(bare != plane)
         y, x = touched.T
-        opened = np.zeros(one.mask.views, dtype=bool)
-        opened[v, u] = True
+        opened = views_open(one.mask.views, (v, u))
         channels = np.full(len(touched), stored, dtype=np.uint8)
         if layout.colour is not None:
             channels = layout.colour[shot, y, x]
@@ -543,7 +543,7 @@ def fit_advice(fit: Fit) -> list[str]:
         shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
         more = (
             "capture some through the pinhole"
-            if fit.more_boards >= MOST_MORE
+            if fit.more_boards >= MOST_MORE_BOARDS
             else f"{fit.more_boards} more of the same kinds, or fewer through the pinhole"
         )
         found.append(

@@ -99,26 +99,19 @@ class AptStage(HostStage):
         self._homing_since_s: dict[str, float] = {}
         self._start_up()
 
-    def speed_um_s(self, axis: str) -> float:
-        """Return the speed of a move, as the controller last said it."""
-        self._require_axis(axis)
-        return self._move_speeds_um_s[axis]
-
     def _configure(self) -> None:
         self._homing_since_s.clear()
         self._velocities: dict[str, codec.VelocityParameters] = {}
-        self._move_speeds_um_s: dict[str, float] = {}
-        self._home_speeds_um_s: dict[str, float] = {}
         for axis, channel in self._channels.items():
             channel.send(Id.HW_NO_FLASH_PROGRAMMING)
             channel.send(Id.HW_STOP_UPDATEMSGS)
-            channel.settle()
+            channel.link.settle()
             channel.send(Id.MOD_SET_CHANENABLESTATE, channel.number, codec.ENABLE)
             no_backlash = codec.encode_position(channel.number, 0)
             channel.send(Id.MOT_SET_GENMOVEPARAMS, data=no_backlash)
             self._read_velocity(axis)
-            home = codec.decode_home(channel.query(Id.MOT_REQ_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS))
-            self._home_speeds_um_s[axis] = self._um_s(axis, home.velocity)
+            home = channel.query(Id.MOT_REQ_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS)
+            self._home_speeds_um_s[axis] = self._um_s(axis, codec.decode_home(home)[0])
 
     def _read(self, axis: str) -> Reading:
         status = self._status(axis)
@@ -154,7 +147,7 @@ class AptStage(HostStage):
         for axis, target_um in targets_um.items():
             channel = self._channels[axis]
             target = round(target_um * channel.actuator.counts_per_um)
-            channel.link.forget_complaint()
+            channel.link.take_complaint()
             channel.send(Id.MOT_MOVE_ABSOLUTE, data=codec.encode_position(channel.number, target))
 
     def _stop_axis(self, axis: str) -> None:
@@ -194,9 +187,6 @@ class AptStage(HostStage):
 
     def _top_speed_um_s(self, axis: str) -> float:
         return self._channels[axis].actuator.top_speed_um_s
-
-    def _homing_speed_um_s(self, axis: str) -> float:
-        return self._home_speeds_um_s[axis]
 
     def _read_velocity(self, axis: str) -> None:
         answer = self._channels[axis].query(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
@@ -269,10 +259,6 @@ class _Link:
         complaint, self._complaint = self._complaint, None
         return complaint
 
-    def forget_complaint(self) -> None:
-        """Forget what the controller complained about."""
-        self._complaint = None
-
     def _exchange(
         self, raw: bytes, answer: Id, channel: "_Channel", channel_matters: bool
     ) -> Message:
@@ -340,10 +326,6 @@ class _Channel:
         except DriverError as error:
             error.about(axis=self.name, command=question.name)
             raise
-
-    def settle(self) -> None:
-        """Take everything off the wire until nothing comes."""
-        self.link.settle()
 
     def sent(self, message: Message, channel_matters: bool) -> bool:
         """Return whether a message with data comes from this channel.

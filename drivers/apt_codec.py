@@ -150,17 +150,6 @@ class VelocityParameters:
 
 
 @dataclass(frozen=True)
-class HomeParameters:
-    """Data of HOMEPARAMS, in the controller's units."""
-
-    channel: int
-    direction: int
-    limit_switch: int
-    velocity: int
-    offset: int
-
-
-@dataclass(frozen=True)
 class HardwareInfo:
     """Data of HW_GET_INFO."""
 
@@ -250,9 +239,10 @@ def decode_velocity(message: Message) -> VelocityParameters:
     return VelocityParameters(*_unpack(message, _VELOCITY))
 
 
-def decode_home(message: Message) -> HomeParameters:
-    """Return the homing parameters; raises `GarbledReplyError`."""
-    return HomeParameters(*_unpack(message, _HOME))
+def decode_home(message: Message) -> tuple[int, int]:
+    """Return velocity and offset of homing in its units; raises `GarbledReplyError`."""
+    *_, velocity, offset = _unpack(message, _HOME)
+    return velocity, offset
 
 
 def decode_info(message: Message) -> HardwareInfo:

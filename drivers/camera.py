@@ -84,7 +84,7 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the camera; closing twice is allowed."""
+        """Close the camera; closing twice is allowed."""
 
 
 class StreamingCamera(Camera, Protocol):

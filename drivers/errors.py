@@ -194,41 +194,40 @@ class AxisFaultError(DriverError):
     """The axis reports a fault."""
 
     loses_position = True
+    usual_fault = "none that it names"
+    usual_advice = "resolve it, then home the axis"
 
-    def __init__(
-        self, axis: str, fault: str, advice: str = "resolve it, then home the axis"
-    ) -> None:
-        super().__init__(f"{axis} reports a fault, {fault}", advice, axis=axis)
+    def __init__(self, axis: str, fault: str = "", advice: str = "") -> None:
+        what = f"{axis} reports a fault, {fault or self.usual_fault}"
+        super().__init__(what, advice or self.usual_advice, axis=axis)
 
 
 class StalledError(AxisFaultError):
     """The motor was blocked during a move."""
 
-    def __init__(self, axis: str, fault: str = "stalled") -> None:
-        super().__init__(axis, fault, "clear the obstacle, then home it")
+    usual_fault = "stalled"
+    usual_advice = "clear the obstacle, then home it"
 
 
 class EmergencyStopError(AxisFaultError):
     """The emergency stop was pressed, or the motor driver is off."""
 
-    def __init__(self, axis: str, fault: str = "emergency stop") -> None:
-        super().__init__(axis, fault, "make the bench safe, release the stop, then home it")
+    usual_fault = "emergency stop"
+    usual_advice = "make the bench safe, release the stop, then home it"
 
 
 class LimitSwitchError(AxisFaultError):
     """The axis ran into the end of its travel."""
 
-    def __init__(self, axis: str, fault: str = "limit switch reached") -> None:
-        super().__init__(
-            axis, fault, "check the limits and what stands in the way, then home the axis"
-        )
+    usual_fault = "limit switch reached"
+    usual_advice = "check the limits and what stands in the way, then home the axis"
 
 
 class LostPositionError(AxisFaultError):
     """The axis no longer knows where it is."""
 
-    def __init__(self, axis: str, fault: str = "position lost") -> None:
-        super().__init__(axis, fault, "home it, and repeat what was done since it was last homed")
+    usual_fault = "position lost"
+    usual_advice = "home it, and repeat what was done since it was last homed"
 
 
 class MoveTimeoutError(DriverError):

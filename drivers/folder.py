@@ -134,7 +134,7 @@ class FolderCamera:
         return tuple(found)
 
     def choose(self, name: str) -> None:
-        """Let the next frame be that of a file."""
+        """Choose the file that the next frame is read from."""
         self._left, self._next, self._chosen = [self.folder / name], None, True
 
     def close(self) -> None:

@@ -128,7 +128,7 @@ class Features:
         return self._asked(name, self._choices)
 
     def set(self, name: str, value: Value) -> None:
-        """Store a number, a truth, a text, or a choice by name.
+        """Store a number, a truth, or a choice by name.
 
         Raises `CameraSettingError`, before anything is sent, for a value that the feature cannot
         take or while it may not be changed.
@@ -453,9 +453,7 @@ class Features:
     def _set(self, node: _Node, value: Value) -> None:
         if WRITE not in self._access(node):
             raise CameraSettingError(node.name, "cannot be changed now: stop the acquisition first")
-        if node.kind in ("StringReg", "String"):
-            self._set_text(node, str(value))
-        elif node.kind == "Enumeration":
+        if node.kind == "Enumeration":
             offered = self._choices(node)
             if value not in offered:
                 raise CameraSettingError(node.name, f"offers {', '.join(offered)}, not {value}")
@@ -468,16 +466,6 @@ class Features:
             raise CameraSettingError(node.name, f"is a number, not {value!r}")
         else:
             self._set_number(node, value)
-
-    def _set_text(self, node: _Node, value: str) -> None:
-        if node.kind == "String":
-            self._set_text(self._node(node.text("pValue")), value)
-            return
-        length = self._length(node, TEXT_LIMIT)
-        raw = value.encode()
-        if len(raw) > length:
-            raise CameraSettingError(node.name, f"holds {length} bytes, not {len(raw)}")
-        self._port.write(self._address(node), raw.ljust(length, b"\0"))
 
     def _set_number(self, node: _Node, value: Number) -> None:
         low, high = self._limits(node)
@@ -599,13 +587,13 @@ def _bits(node: _Node, length: int) -> tuple[int, int]:
 
 HAS, READ, WRITE = "has", "reads", "writes"
 Access = frozenset[str]
-"""What a camera has of a feature, and what it lets be done with it now."""
+"""Whether a feature exists, and can be read and written now."""
 ABSENT: Access = frozenset()
 UNAVAILABLE, READABLE = Access((HAS,)), Access((HAS, READ))
 EVERYTHING = Access((HAS, READ, WRITE))
 ACCESS_MODES = {"RO": READABLE, "WO": Access((HAS, WRITE)), "RW": EVERYTHING}
 EVERYTHING_OF = {READABLE: EVERYTHING, UNAVAILABLE: UNAVAILABLE, ABSENT: ABSENT}
-"""What may be left of a node by what it is worked out from."""
+"""Access to a node that the access to its inputs allows."""
 _INPUTS = ("pVariable", "pAddress", "pIndex", "pMin", "pMax", "pInc")
 _COMPUTED = ("SwissKnife", "IntSwissKnife", "Category", "EnumEntry")
 _ENDS = ("LSB", "MSB")

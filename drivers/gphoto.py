@@ -187,7 +187,7 @@ class GphotoCamera(ShapeFromFrames):
         )
 
     def close(self) -> None:
-        """Let go of the camera; closing twice is allowed."""
+        """Close the camera; closing twice is allowed."""
         with self._lock:
             if not self._closed:
                 self._closed = True

@@ -62,9 +62,9 @@ class GrblStage(HostStage):
     not report whether it was homed, so every axis must be homed after connecting. Homing some of
     the axes needs firmware that homes them one by one (option H of `$I`). The scale is the
     controller's `$100` and following; `steps_per_mm`, by name of an axis, states what they must
-    be, without which the firmware's default counts as never set. `any_scale` skips that: only to
-    measure it. Construction waits up to `boot_s` for the controller to start; it moves nothing.
-    Raises `ScaleError`, or `TransportTimeoutError` when the controller does not answer.
+    be, without which the firmware's default counts as never set. Construction waits up to
+    `boot_s` for the controller to start; it moves nothing. Raises `ScaleError`, or
+    `TransportTimeoutError` when the controller does not answer.
     Source: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Configuration".
     """
 
@@ -76,7 +76,6 @@ class GrblStage(HostStage):
         settings: StageSettings = DEFAULT_SETTINGS,
         boot_s: float = BOOT_S,
         steps_per_mm: Mapping[str, float] | None = None,
-        any_scale: bool = False,
     ) -> None:
         super().__init__(axes, (transport,), clock, settings)
         for letter in axes.values():
@@ -86,15 +85,9 @@ class GrblStage(HostStage):
         self._letters = dict(axes)
         self._boot_s = boot_s
         self._stated_steps_per_mm = dict(steps_per_mm or {})
-        self._any_scale = any_scale
         for axis in self._stated_steps_per_mm:
             self._require_axis(axis)
         self._start_up()
-
-    def speed_um_s(self, axis: str) -> float:
-        """Return the speed of a move; it is the host's to choose, up to the axis's `$110`."""
-        self._require_axis(axis)
-        return self._move_speeds_um_s[axis]
 
     def steps_per_mm(self, axis: str) -> float:
         """Return what the controller takes for a millimetre, its `$100` and following."""
@@ -110,11 +103,11 @@ class GrblStage(HostStage):
         super().stop(axes)
 
     def _configure(self) -> None:
-        self._controller = _Controller(self._transport, self._clock, self._distrust_all)
+        self._controller = _Controller(self._transport, self._clock, self._mark_all_unknown)
         self._controller.wait_for_boot(self._boot_s)
         self._options = self._controller.command("$I").get("OPT", "").split(",")[0]
         self._controller.command("$$")
-        self._distrust_all("it was not homed since it was connected")
+        self._mark_all_unknown("it was not homed since it was connected")
         self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}
         for axis in self._axes:
             self._check_scale(axis)
@@ -195,14 +188,12 @@ class GrblStage(HostStage):
     def _check_scale(self, axis: str) -> None:
         steps_per_mm, stated = self.steps_per_mm(axis), self._stated_steps_per_mm.get(axis)
         setting = f"${codec.STEPS_PER_MM + self._index(axis)}"
-        if self._any_scale:
-            return
         if stated is None and steps_per_mm == FACTORY_STEPS_PER_MM:
             raise ScaleError(
                 axis,
                 f"{setting}={steps_per_mm:g} steps per mm is the firmware's default",
                 f"set {setting} to what motor and screw make, or confirm it as steps_per_mm in "
-                "the stage's YAML file after `emmc-rig devices scale`",
+                "the stage's YAML file",
             )
         if stated is not None and abs(stated / steps_per_mm - 1) > SCALES_AGREE:
             raise ScaleError(
@@ -222,8 +213,8 @@ class GrblStage(HostStage):
             raise _no_such_axis(axis, "$$", f"${number}={value:g}")
         return value
 
-    def _distrust_all(self, why: str) -> None:
-        self._distrust(self._axes, why)
+    def _mark_all_unknown(self, why: str) -> None:
+        self._mark_unknown(self._axes, why)
 
 
 class _Controller:

@@ -119,13 +119,6 @@ class Feedback:
 
 
 @dataclass(frozen=True)
-class StartupLine:
-    """A line that Grbl ran by itself when it started; no answer to anything."""
-
-    text: str
-
-
-@dataclass(frozen=True)
 class Status:
     """A status report; positions in the unit that `$13` says, None where the report has none."""
 
@@ -134,10 +127,9 @@ class Status:
     machine: tuple[float, ...] | None
     work: tuple[float, ...] | None
     offset: tuple[float, ...] | None
-    pins: str = ""
 
 
-Message = Ok | Refusal | Alarm | Banner | Setting | Feedback | StartupLine | Status
+Message = Ok | Refusal | Alarm | Banner | Setting | Feedback | Status
 
 
 def encode_line(text: str) -> bytes:
@@ -163,9 +155,10 @@ def jog(targets_mm: Mapping[str, float], feed_mm_min: float) -> str:
 
 
 def decode_line(line: bytes) -> Message | None:
-    """Return the message in one line, its line end included; None for an empty line.
+    """Return the message in one line, its line end included.
 
-    Raises `GarbledReplyError`.
+    None for an empty line, and for one that Grbl ran by itself when it started. Raises
+    `GarbledReplyError`.
     """
     if not line.endswith(b"\n") or b"\n" in line[:-1]:
         raise GarbledReplyError(line, "not one line")
@@ -191,7 +184,7 @@ def decode_line(line: bytes) -> Message | None:
     if match := re.fullmatch(r"\[([A-Za-z0-9]+):(.*)\]", text):
         return Feedback(match[1], match[2])
     if text.startswith((">", "$N")):
-        return StartupLine(text)
+        return None
     raise GarbledReplyError(line, "not a Grbl message")
 
 
@@ -220,7 +213,6 @@ def _decode_status(line: bytes, text: str) -> Status:
         machine=machine,
         work=work,
         offset=offset,
-        pins=values.get("Pn", ""),
     )
 
 

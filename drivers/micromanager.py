@@ -88,7 +88,7 @@ class LoadedCore:
                 apply()
 
     def close(self) -> None:
-        """Let go; the last user unloads the devices."""
+        """Release the core; the last user unloads the devices."""
         with _loading:
             self.users -= 1
             if self.users <= 0 and self._core is not None:
@@ -286,7 +286,7 @@ class MicroManagerCamera:
                 core.stopSequenceAcquisition()
 
     def close(self) -> None:
-        """Let go of the core; closing twice is allowed."""
+        """Release the core; closing twice is allowed."""
         if not self._closed:
             self._closed = True
             self._loaded.forget(self._apply)
@@ -448,7 +448,7 @@ class MicroManagerStage(HostStage):
             raise
 
     def close(self) -> None:
-        """Let go of the core; closing twice is allowed."""
+        """Release the core; closing twice is allowed."""
         if not self._closed:
             self._closed = True
             super().close()

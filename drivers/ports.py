@@ -10,10 +10,10 @@ import glob
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from drivers.errors import PortNotFoundError
 
@@ -28,41 +28,18 @@ PROTOCOLS_BY_USB_ID = {
 }
 """What usually answers behind a USB vendor and product; other adapters may carry anything."""
 COMMAND_LINE_SHOWN = 60
+PROC = Path("/proc")
 
 
-@dataclass(frozen=True)
-class PortInfo:
-    """One serial port of this computer; what its USB adapter does not state is None or ""."""
-
-    device: str
-    description: str
-    vendor_id: int | None
-    product_id: int | None
-    serial_number: str
-    manufacturer: str
-
-    @property
-    def guess(self) -> str:
-        """The protocol that usually answers here, "" where anything may."""
-        if self.vendor_id is None:
-            return ""
-        exact = PROTOCOLS_BY_USB_ID.get((self.vendor_id, self.product_id))
-        return exact or PROTOCOLS_BY_USB_ID.get((self.vendor_id, None), "")
+def guess_of(port: ListPortInfo) -> str:
+    """Return the protocol that usually answers on a port, "" where anything may."""
+    exact = PROTOCOLS_BY_USB_ID.get((port.vid, port.pid))
+    return exact or PROTOCOLS_BY_USB_ID.get((port.vid, None), "")
 
 
-def list_serial_ports() -> list[PortInfo]:
+def list_serial_ports() -> list[ListPortInfo]:
     """Return the serial ports of this computer, by name."""
-    return [
-        PortInfo(
-            device=port.device,
-            description=port.description or "",
-            vendor_id=port.vid,
-            product_id=port.pid,
-            serial_number=port.serial_number or "",
-            manufacturer=port.manufacturer or "",
-        )
-        for port in sorted(list_ports.comports(), key=lambda port: port.device)
-    ]
+    return sorted(list_ports.comports(), key=lambda port: port.device)
 
 
 def find_port(wanted: str) -> str:
@@ -91,7 +68,7 @@ def usb_serial_number(device: str) -> str:
     real = os.path.realpath(device)
     for port in list_serial_ports():
         if os.path.realpath(port.device) == real:
-            return port.serial_number
+            return port.serial_number or ""
     return ""
 
 
@@ -101,7 +78,7 @@ def holder_of(device: str) -> str:
     Looks for a lock on the device in /proc/locks, which shows those of every user, then for the
     device among the open files of the processes that this user may inspect. Linux only.
     """
-    pid = next(_pids_with_lock(device), None) or next(_pids_with_open_file(device), None)
+    pid = next(_pids_with_lock(device), None) or next(pids_with_open_file(device), None)
     return "" if pid is None else f"{_program(pid)} (pid {pid})"
 
 
@@ -124,13 +101,13 @@ def _pids_with_lock(device: str) -> Iterator[int]:
             yield int(fields[4])
 
 
-def _pids_with_open_file(device: str) -> Iterator[int]:
-    real = os.path.realpath(device)
-    for process in glob.iglob("/proc/[0-9]*"):
+def pids_with_open_file(path: str, proc: Path = PROC) -> Iterator[int]:
+    """Yield the processes that have a file open, as far as this user may see; Linux only."""
+    real = os.path.realpath(path)
+    for process in sorted(proc.glob("[0-9]*")):
         with suppress(OSError):  # a process of another user, or one that has just ended
-            numbers = os.listdir(f"{process}/fd")
-            if any(os.readlink(f"{process}/fd/{number}") == real for number in numbers):
-                yield int(os.path.basename(process))
+            if any(os.readlink(link) == real for link in (process / "fd").iterdir()):
+                yield int(process.name)
 
 
 def _program(pid: int) -> str:

@@ -1,4 +1,4 @@
-"""PTP still cameras: sessions, captures, downloads in parts, and the camera that gives RAW frames.
+"""PTP still cameras: sessions, captures, downloads, and the camera that gives RAW frames.
 
 Source: ISO 15740 (PIMA 15740:2000), clauses 10 (operations), 11 (responses), 12 (events) and
 13 (properties). Cameras that release by operations of their makers' own are `drivers.gphoto`'s.
@@ -48,7 +48,7 @@ STALE_EVENTS_TOLERATED = 64
 NO_WAIT_S = 0.001
 MOST_NEW_OBJECTS = 64
 LONGEST_EXPOSURE_S = 3600.0
-"""What a camera that states nonsense can make the driver wait."""
+"""Upper bound on the wait for an exposure, whatever the camera states."""
 EXPOSURE_UNIT_S = 1e-4
 EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
 """Bulb and time, by which no exposure can be asked for."""
@@ -74,11 +74,11 @@ Parameters = tuple[int, ...]
 
 @dataclass(frozen=True)
 class PtpSettings:
-    """How patient the driver is, and how much it fetches at a time.
+    """How patient the driver is.
 
     busy_limit_s: how long "busy" is believed. capture_limit_s: from the end of the exposure until
     the picture is on the card. pair_limit_s: how long to wait for a RAW file once the camera says
-    that it is done. attempts: how often a part is fetched again after a fault.
+    that it is done. attempts: how often a picture is fetched, where that breaks off.
     """
 
     busy_limit_s: float = 10.0
@@ -86,7 +86,6 @@ class PtpSettings:
     capture_limit_s: float = 20.0
     pair_limit_s: float = 2.0
     event_poll_s: float = 0.5
-    part_bytes: int = 1 << 22
     attempts: int = 3
 
 
@@ -110,7 +109,7 @@ class PtpSession:
         self._transport = transport
         self._transaction = 0
         self._broken = False
-        self._owed = False
+        self._picture_pending = False
         self._stop_wanted = threading.Event()
         self._closed = False
         try:
@@ -211,7 +210,7 @@ class PtpSession:
 
     def capture(
         self, exposure_s: float, accept: Callable[[ObjectInfo], bool], all_of_it: bool = False
-    ) -> Capture:
+    ) -> Taken:
         """Release the shutter and return the first new object that is accepted.
 
         Folders are passed over. An event that never comes is made up for by looking at the card.
@@ -223,13 +222,13 @@ class PtpSession:
             seen = set(self.handles())
             self._stop_wanted.clear()
             self.request(Operation.INITIATE_CAPTURE, 0, 0)
-            self._owed = True
+            self._picture_pending = True
             taken = self._await_objects(seen, self._transaction, exposure_s, accept, all_of_it)
-            self._owed = False
+            self._picture_pending = False
             return taken
 
     def stop_capture(self) -> None:
-        """Let the capture under way, if any, raise `ExposureStoppedError`; any thread may call."""
+        """Let the capture under way raise `ExposureStoppedError`; any thread may call."""
         self._stop_wanted.set()
 
     def download(
@@ -238,15 +237,31 @@ class PtpSession:
         info: ObjectInfo,
         on_progress: Callable[[int, int], object] = lambda done, size: None,
     ) -> bytes:
-        """Return the bytes of an object, in parts where the camera can.
+        """Return the bytes of an object; one that breaks off is fetched again, as `settings` say.
 
-        A part that breaks off is asked for again, `settings.attempts` times without progress.
         `on_progress` gets bytes done and in all. Raises `DownloadError`, or as `request` does.
         """
-        with self.lock:
-            if info.size != codec.EVERYTHING and self.can(Operation.GET_PARTIAL_OBJECT):
-                return self._download_parts(handle, info, on_progress)
-            return self._download_whole(handle, info, on_progress)
+        known = info.size != codec.EVERYTHING
+        most = info.size if known else codec.EVERYTHING
+        for attempt in range(1, self.settings.attempts + 1):
+            received = io.BytesIO()
+
+            def take(piece: memoryview, received: io.BytesIO = received) -> None:
+                received.write(piece)
+                on_progress(received.tell(), info.size if known else received.tell())
+
+            try:
+                self.request(Operation.GET_OBJECT, handle, sink=take, most=most)
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
+                reason = str(error)
+                _log.info("%s: fetching %s again: %s", self.name, info.name, error)
+            else:
+                if not known or received.tell() == info.size:
+                    return received.getvalue()
+                reason = "the camera sent no more"
+            if attempt == self.settings.attempts:
+                raise DownloadError(info.name, received.tell(), info.size, reason)
+        raise AssertionError("unreachable")
 
     def _open(self) -> None:
         """Open the session, whatever state an earlier program left the camera in."""
@@ -302,7 +317,7 @@ class PtpSession:
 
     def _forget_events(self) -> None:
         """Read events away; one picture too late must not pass for the next."""
-        wait_s = self.settings.pair_limit_s if self._owed else NO_WAIT_S
+        wait_s = self.settings.pair_limit_s if self._picture_pending else NO_WAIT_S
         for _ in range(STALE_EVENTS_TOLERATED):
             if self._transport.event(wait_s) is None:
                 return
@@ -314,7 +329,7 @@ class PtpSession:
         exposure_s: float,
         accept: Callable[[ObjectInfo], bool],
         all_of_it: bool,
-    ) -> Capture:
+    ) -> Taken:
         settings, clock = self.settings, self.clock
         exposed_s = clock.now_s() + min(exposure_s, LONGEST_EXPOSURE_S)
         deadline_s = exposed_s + settings.capture_limit_s
@@ -356,7 +371,7 @@ class PtpSession:
                 grace_s = settings.pair_limit_s
                 deadline_s = min(deadline_s, max(clock.now_s(), exposed_s) + grace_s)
         if found is not None:
-            return Capture(*found, tuple(others))
+            return Taken(*found, tuple(others))
         if others:
             names = ", ".join(info.name for _, info in others)
             raise CaptureError(
@@ -377,70 +392,9 @@ class PtpSession:
             return [handle for handle in event.parameters[:1] if handle not in seen]
         return []
 
-    def _download_parts(
-        self, handle: int, info: ObjectInfo, on_progress: Callable[[int, int], object]
-    ) -> bytes:
-        received = io.BytesIO()
-        failures = 0
-        while (done := received.tell()) < info.size:
-            wanted = min(self.settings.part_bytes, info.size - done)
-            reason = "the camera sent nothing"
-            try:
-                answered = self.request(
-                    Operation.GET_PARTIAL_OBJECT,
-                    handle,
-                    done,
-                    wanted,
-                    sink=received.write,
-                    most=wanted,
-                )
-                came = received.tell() - done
-                if answered and answered[0] != came:
-                    reason = f"{came} bytes came of the {answered[0]} that it says it sent"
-                    received.seek(done)
-            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
-                # Nobody knows whether what came before the fault is in its place.
-                reason = str(error)
-                received.seek(done)
-            if received.tell() > done:
-                failures = 0
-            else:
-                failures += 1
-                _log.info("%s: fetching %s again: %s", self.name, info.name, reason)
-                if failures >= self.settings.attempts:
-                    raise DownloadError(info.name, done, info.size, reason)
-            on_progress(received.tell(), info.size)
-        received.truncate()
-        return received.getvalue()
-
-    def _download_whole(
-        self, handle: int, info: ObjectInfo, on_progress: Callable[[int, int], object]
-    ) -> bytes:
-        known = info.size != codec.EVERYTHING
-        most = info.size if known else codec.EVERYTHING
-        for attempt in range(1, self.settings.attempts + 1):
-            received = io.BytesIO()
-
-            def take(piece: memoryview, received: io.BytesIO = received) -> None:
-                received.write(piece)
-                on_progress(received.tell(), info.size if known else received.tell())
-
-            try:
-                self.request(Operation.GET_OBJECT, handle, sink=take, most=most)
-            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
-                reason = str(error)
-                _log.info("%s: fetching %s again: %s", self.name, info.name, error)
-            else:
-                if not known or received.tell() == info.size:
-                    return received.getvalue()
-                reason = "the camera sent no more"
-            if attempt == self.settings.attempts:
-                raise DownloadError(info.name, received.tell(), info.size, reason)
-        raise AssertionError("unreachable")
-
 
 @dataclass(frozen=True)
-class Capture:
+class Taken:
     """A new object on the card, and the others of the same exposure."""
 
     handle: int
@@ -578,7 +532,6 @@ class PtpCamera(ShapeFromFrames):
         return {
             "battery": "not reported" if battery is None else f"{battery:g} %",
             "cards": cards or "none",
-            "downloads": "in parts" if self.session.can(Operation.GET_PARTIAL_OBJECT) else "whole",
         }
 
     def set_exposure_s(self, exposure_s: float) -> None:

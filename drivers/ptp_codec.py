@@ -51,7 +51,6 @@ class Operation(IntEnum):
     GET_PROPERTY_DESCRIPTION = 0x1014
     GET_PROPERTY = 0x1015
     SET_PROPERTY = 0x1016
-    GET_PARTIAL_OBJECT = 0x101B
 
 
 class Code(IntEnum):

@@ -79,23 +79,19 @@ class PtpUsb:
         self._event_buffer = array.array("B", bytes(self._events.whole_packets(EVENT_BYTES)))
         self._unread_events: deque[Message] = deque()
 
-    def exchange(
-        self, command: Message, data: bytes | None, sink: Sink, most: int, timeout_s: float = 0.0
-    ) -> Message:
+    def exchange(self, command: Message, data: bytes | None, sink: Sink, most: int) -> Message:
         """Send a command, with data or without, and return the response.
 
         Data that the camera sends goes to `sink` piece by piece, `most` bytes at most; the piece
-        is only valid during the call. `timeout_s` is how long the first answer may take where
-        that is more than a transfer's. Raises `CameraFormatError` or an error of USB, after which
+        is only valid during the call. Raises `CameraFormatError` or an error of USB, after which
         `recover` must come first.
         """
         self._out.write(encode_message(command), self._timeout_s, end=True)
         if data is not None:
             container = encode_data(command.code, command.transaction, data)
             self._out.write(container, self._timeout_s, end=True)
-        wait_s = max(timeout_s, self._timeout_s)
         for _ in range(STALE_CONTAINERS_TOLERATED):
-            header, start = self._read_start(wait_s)
+            header, start = self._read_start()
             ours = header.transaction == command.transaction
             if header.kind == Kind.DATA:
                 self._read_payload(header, start, sink if ours else _forget, most)
@@ -147,7 +143,7 @@ class PtpUsb:
         self.recover(0)
 
     def close(self) -> None:
-        """Let go of the camera; closing twice is allowed."""
+        """Close the camera; closing twice is allowed."""
         self._device.close()
 
     def _flush(self) -> None:
@@ -179,13 +175,13 @@ class PtpUsb:
         if status[:1] == b"\x01":
             pipe.clear_halt()
 
-    def _read_start(self, timeout_s: float) -> tuple[Header, bytes]:
+    def _read_start(self) -> tuple[Header, bytes]:
         """Return the next container's header and first packet.
 
         Asking for one packet only means that no read can run on into the next container.
         """
         for _ in range(EMPTY_READS_TOLERATED):
-            count = self._in.read_into(self._first, timeout_s)
+            count = self._in.read_into(self._first, self._timeout_s)
             if count:
                 start = self._first[:count].tobytes()
                 return decode_header(start), start

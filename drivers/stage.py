@@ -98,7 +98,7 @@ class Stage(Protocol):
         """Open the ports again after an unplug; every axis must be homed before its next move."""
 
     def close(self) -> None:
-        """Let go of the ports; nothing is moved or stopped."""
+        """Close the ports; nothing is moved or stopped."""
 
     def __enter__(self) -> Self: ...
 
@@ -178,7 +178,7 @@ class Link(Protocol):
         """Open it again, wherever it is now; raises a `PortError`."""
 
     def close(self) -> None:
-        """Let go of it; closing twice is allowed."""
+        """Close it; closing twice is allowed."""
 
 
 class HostStage(ABC):
@@ -186,7 +186,8 @@ class HostStage(ABC):
 
     No move is ever sent twice: when the answer to one is lost, the position decides whether it
     was carried out. Any exception during a move, Ctrl-C included, stops the axes that move.
-    A protocol's constructor ends with `_start_up`.
+    A protocol's constructor ends with `_start_up`; `_configure` and `_apply_speed` fill in the
+    speeds of moves, and of homing where it differs.
     """
 
     def __init__(
@@ -201,7 +202,9 @@ class HostStage(ABC):
         self._clock = clock
         self._settings = settings
         self._speeds_um_s = dict(settings.speeds_um_s)
-        self._not_trusted: dict[str, str] = {}
+        self._unknown_because: dict[str, str] = {}
+        self._move_speeds_um_s: dict[str, float] = {}
+        self._home_speeds_um_s: dict[str, float] = {}
         chosen = (settings.soft_limits_um, settings.speeds_um_s, settings.top_speeds_um_s)
         for axis in chain.from_iterable(chosen):
             self._require_axis(axis)
@@ -242,9 +245,10 @@ class HostStage(ABC):
     def _top_speed_um_s(self, axis: str) -> float:
         """Return the fastest speed that the device can give the axis."""
 
-    @abstractmethod
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move."""
+        self._require_axis(axis)
+        return self._move_speeds_um_s[axis]
 
     def _is_homing(self, axis: str) -> bool:
         """Return whether the homing that was started still goes on; raises as `_is_moving`."""
@@ -252,7 +256,7 @@ class HostStage(ABC):
 
     def _homing_speed_um_s(self, axis: str) -> float:
         """Return the speed at which the axis looks for its reference."""
-        return self.speed_um_s(axis)
+        return self._home_speeds_um_s.get(axis) or self.speed_um_s(axis)
 
     def _readings_are_checked(self, axis: str) -> bool:
         """Return whether a checksum protects what `_read` reads."""
@@ -274,7 +278,7 @@ class HostStage(ABC):
         self.close()
 
     def close(self) -> None:
-        """Let go of the ports; nothing is moved or stopped."""
+        """Close the ports; nothing is moved or stopped."""
         for transport in self._transports:
             transport.close()
 
@@ -285,7 +289,7 @@ class HostStage(ABC):
         marks every position as unknown: an axis must be homed before its next move. Raises a
         `PortError` when a port stays away, and what talking to the device raises.
         """
-        self._distrust(self._axes, "the connection was lost")
+        self._mark_unknown(self._axes, "the connection was lost")
         for transport in self._transports:
             self._reopen(transport, self._clock.now_s() + wait_s)
         for axis in self._axes:
@@ -295,7 +299,7 @@ class HostStage(ABC):
     def is_homed(self, axis: str) -> bool:
         """Return whether the axis knows where it is."""
         self._require_axis(axis)
-        return axis not in self._not_trusted and self._noting_loss(axis, self._read).homed
+        return axis not in self._unknown_because and self._marking_lost(axis, self._read).homed
 
     def position_um(self, axis: str) -> float:
         """Return where the axis reads to be; raises `NotHomedError` while it does not know.
@@ -304,12 +308,12 @@ class HostStage(ABC):
         moves may be further by the second. Raises `GarbledReplyError` when they never do.
         """
         self._require_axis(axis)
-        self._require_trust(axis)
+        self._require_known_position(axis)
         before_s = self._clock.now_s()
-        reading = self._noting_loss(axis, self._read)
+        reading = self._marking_lost(axis, self._read)
         if not self._readings_are_checked(axis):
             reading = self._confirmed(axis, reading, before_s)
-        self._require_trust(axis)
+        self._require_known_position(axis)
         if not reading.homed:
             raise NotHomedError(axis)
         return reading.position_um
@@ -349,16 +353,16 @@ class HostStage(ABC):
         """
         chosen = self._choose(axes)
         with self._stopped_on_error(chosen):
-            self._distrust(chosen, "its homing did not finish")
+            self._mark_unknown(chosen, "its homing did not finish")
             self._start_home(chosen)
             started_s = self._clock.now_s()
             limits_s = {axis: self._homing_time_limit_s(axis) for axis in chosen}
             self._wait_until_idle(limits_s, started_s, self._is_homing)
             for axis in chosen:
                 if not self._read(axis).homed:
-                    raise NotHomedError(axis, self._not_trusted[axis])
+                    raise NotHomedError(axis, self._unknown_because[axis])
         for axis in chosen:
-            self._not_trusted.pop(axis, None)
+            self._unknown_because.pop(axis, None)
 
     def move_to_um(self, targets_um: Mapping[str, float]) -> dict[str, float]:
         """Move the axes together, wait until they settle, and return where they read to be.
@@ -437,12 +441,12 @@ class HostStage(ABC):
         if axis not in self._axes:
             raise UnknownAxisError(axis, self._axes)
 
-    def _require_trust(self, axis: str) -> None:
-        if axis in self._not_trusted:
-            raise NotHomedError(axis, self._not_trusted[axis])
+    def _require_known_position(self, axis: str) -> None:
+        if axis in self._unknown_because:
+            raise NotHomedError(axis, self._unknown_because[axis])
 
-    def _distrust(self, axes: Iterable[str], why: str) -> None:
-        self._not_trusted.update(dict.fromkeys(axes, why))
+    def _mark_unknown(self, axes: Iterable[str], why: str) -> None:
+        self._unknown_because.update(dict.fromkeys(axes, why))
 
     def _choose(self, axes: Iterable[str] | None) -> tuple[str, ...]:
         chosen = self._axes if axes is None else tuple(axes)
@@ -452,7 +456,7 @@ class HostStage(ABC):
 
     def _confirmed(self, axis: str, reading: Reading, before_s: float) -> Reading:
         for _ in range(READINGS_TRIED):
-            again = self._noting_loss(axis, self._read)
+            again = self._marking_lost(axis, self._read)
             possible_um = self._settings.tolerance_um
             if reading.moving or again.moving:
                 possible_um += self.speed_um_s(axis) * (self._clock.now_s() - before_s)
@@ -545,25 +549,25 @@ class HostStage(ABC):
         """
         moved_s = started_s
         for axis, limit_s in limits_s.items():
-            while self._noting_loss(axis, is_moving):
+            while self._marking_lost(axis, is_moving):
                 moved_s = self._clock.now_s()
                 if moved_s - started_s > limit_s:
                     raise MoveTimeoutError(axis, limit_s)
                 self._clock.sleep(self._settings.poll_s)
         return moved_s
 
-    def _noting_loss(self, axis: str, ask: Callable[[str], Answer]) -> Answer:
+    def _marking_lost(self, axis: str, ask: Callable[[str], Answer]) -> Answer:
         """Return what `ask` returns; an error that loses the position marks it as unknown."""
         try:
             return ask(axis)
         except DriverError as error:
-            self._note_loss(error)
+            self._mark_lost(error)
             raise
 
-    def _note_loss(self, error: DriverError) -> None:
+    def _mark_lost(self, error: DriverError) -> None:
         if error.loses_position:
             lost = (error.axis,) if error.axis in self._axes else self._axes
-            self._distrust(lost, error.what)
+            self._mark_unknown(lost, error.what)
 
     @contextmanager
     def _stopped_on_error(self, axes: Iterable[str]) -> Iterator[None]:
@@ -575,7 +579,7 @@ class HostStage(ABC):
             yield
         except BaseException as error:
             if isinstance(error, DriverError):
-                self._note_loss(error)
+                self._mark_lost(error)
             for axis in axes:
                 try:
                     self._stop_axis(axis)

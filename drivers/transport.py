@@ -37,6 +37,8 @@ NETWORK_HOLDER = "another program over the network"
 QUIET_LIMIT = 20
 """Reads of `discard_until_quiet` before a device counts as one that never falls silent."""
 RTS_PAUSE_S = 0.05
+BAUD = 115200
+"""Of all controllers that are driven here."""
 QUERY_ATTEMPTS = 3
 FOREIGN_MESSAGES_TOLERATED = 64
 EXCHANGE_LIMIT_S = 2.0
@@ -96,7 +98,7 @@ class Transport(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the port; closing twice is allowed."""
+        """Close the port; closing twice is allowed."""
 
     @abstractmethod
     def _now_s(self) -> float:
@@ -154,24 +156,17 @@ class SerialTransport(Transport):
     def __init__(
         self,
         port: str,
-        baud: int = 115200,
         timeout_s: float = 0.5,
         write_timeout_s: float = 1.0,
         flow_control: bool = False,
     ) -> None:
         super().__init__(port, timeout_s)
         self.write_timeout_s = write_timeout_s
-        self._baud = baud
         self._flow_control = flow_control
         self._heard = False
         device = find_port(port)
         self._serial = self._open(device)
         self._serial_number = "" if "://" in device else usb_serial_number(device)
-
-    @property
-    def usb_serial_number(self) -> str:
-        """Serial number of the USB adapter, by which the port is found again; "" if it has none."""
-        return self._serial_number
 
     def write(self, data: bytes) -> None:
         """Send all of `data`; raises `PortGoneError` or `TransportTimeoutError`."""
@@ -219,7 +214,7 @@ class SerialTransport(Transport):
             self._serial = self._open(find_port(BY_SERIAL_NUMBER + number if number else self.port))
 
     def close(self) -> None:
-        """Let go of the port; closing twice is allowed."""
+        """Close the port; closing twice is allowed."""
         with self.lock:
             # pyserial forgets to close a socket that the other side has closed already.
             opened = getattr(self._serial, "_socket", None)
@@ -231,7 +226,7 @@ class SerialTransport(Transport):
         try:
             opened = serial.serial_for_url(
                 device,
-                baudrate=self._baud,
+                baudrate=BAUD,
                 timeout=self.timeout_s,
                 write_timeout=self.write_timeout_s,
                 rtscts=self._flow_control,

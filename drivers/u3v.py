@@ -78,54 +78,33 @@ IN_FLIGHT = 3
 
 def open_camera(address: str, clock: Clock, backend: Any = None) -> U3vCamera:
     """Open the camera with a serial number, "" for the first; see `drivers.cameras`."""
-    return open_u3v(address, backend=backend, clock=clock)
-
-
-def open_u3v(
-    serial: str = "",
-    *,
-    backend: Any = None,
-    clock: Clock = SYSTEM_CLOCK,
-    pixel_format: str = "",
-    black_level_dn: float | None = None,
-) -> U3vCamera:
-    """Open the first camera, or that with a serial number; raises a `DriverError`.
-
-    The rest as in `U3vCamera`.
-    """
-    device = open_device(codec.CONTROL, serial=serial, backend=backend, wanted="USB3 Vision camera")
-    return U3vCamera(device, clock, pixel_format, black_level_dn)
+    device = open_device(
+        codec.CONTROL, serial=address, backend=backend, wanted="USB3 Vision camera"
+    )
+    return U3vCamera(device, clock)
 
 
 class U3vCamera:
     """A `drivers.camera.StreamingCamera` over an open USB device, which it closes.
 
-    pixel_format: GenICam name; "" takes the deepest that the camera offers and we can read.
-    black_level_dn: for a camera whose black level is not known, or not in DN; by default what
-    its `BlackLevel` says, taken as DN, or as per cent of white where that is its unit.
+    Pixels come in the deepest format that it offers and we can read. The black level is what its
+    `BlackLevel` says, taken as DN, or as per cent of white where that is its unit.
     The constructor switches automatic and processed modes off and stops an acquisition that was
     left running. Raises a `DriverError`, the device closed.
     """
 
-    def __init__(
-        self,
-        device: UsbDevice,
-        clock: Clock = SYSTEM_CLOCK,
-        pixel_format: str = "",
-        black_level_dn: float | None = None,
-    ) -> None:
+    def __init__(self, device: UsbDevice, clock: Clock = SYSTEM_CLOCK) -> None:
         self._device = device
         self._clock = clock
-        self._given_black_dn = black_level_dn
         self._acquiring = False
         self._in_flight = 0
         try:
-            self._open(pixel_format)
+            self._open()
         except BaseException:
             device.close()
             raise
 
-    def _open(self, pixel_format: str) -> None:
+    def _open(self) -> None:
         device, clock = self._device, self._clock
         interface = device.claim(codec.CONTROL)
         self._control = control = U3vControl(
@@ -146,7 +125,7 @@ class U3vCamera:
         self._stop()
         for name, value in RAW_SETTINGS:
             self._set_if_possible(name, value)
-        self._format = self._choose_format(pixel_format)
+        self._format = self._choose_format()
         self.cfa = self._format.cfa
         self.shape = (int(self.features.number("Height")), int(self.features.number("Width")))
         self._exposure_name = self._first_of(EXPOSURE_NAMES)
@@ -287,14 +266,10 @@ class U3vCamera:
             )
         return replace(frame, exposure_s=self.exposure_s, gain=self.gain, host_time_s=host_time_s)
 
-    def _choose_format(self, wanted: str) -> PixelFormat:
+    def _choose_format(self) -> PixelFormat:
         features = self.features
         offered = features.choices("PixelFormat")
-        if wanted:
-            if wanted not in BY_NAME:
-                raise CameraSettingError("PixelFormat", f"{wanted} is none that can be read here")
-            features.set("PixelFormat", wanted)
-        elif features.is_writable("PixelFormat"):
+        if features.is_writable("PixelFormat"):
             best = next((form.name for form in FORMATS if form.name in offered), None)
             if best is None:
                 raise CameraSettingError(
@@ -357,8 +332,6 @@ class U3vCamera:
         return self.features.unit(self._gain_name).lower() in DECIBEL
 
     def _black_level_dn(self) -> float:
-        if self._given_black_dn is not None:
-            return self._given_black_dn
         name = self._first_of(BLACK_LEVEL_NAMES)
         if not name:
             return 0.0

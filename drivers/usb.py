@@ -32,11 +32,11 @@ from drivers.errors import (
     UsbTransferError,
     UsbUnavailableError,
 )
+from drivers.ports import PROC, pids_with_open_file
 
 Kind = tuple[int, int, int]
 """Class, subclass and protocol of an interface."""
 
-PROC = Path("/proc")
 TRANSFER_BYTES = 1 << 22
 """Largest single transfer: the kernel's default memory for USB is 16 MiB for all devices."""
 
@@ -174,14 +174,8 @@ class UsbDevice:
             )
         return answer.tobytes() if isinstance(answer, array.array) else b""
 
-    def reset(self) -> None:
-        """Reset the device as if it had been plugged in again; claims are lost."""
-        self._require_open()
-        with self._faults():
-            self._device.reset()
-
     def close(self) -> None:
-        """Let go of the device, unplugged or not; closing twice is allowed."""
+        """Close the device, unplugged or not; closing twice is allowed."""
         if self._closed:
             return
         self._closed = True
@@ -355,15 +349,10 @@ def find_holders(bus: int, address: int, proc: Path = PROC) -> tuple[str, ...]:
     """
     file = f"/dev/bus/usb/{bus:03d}/{address:03d}"
     found = []
-    for process in sorted(proc.glob("[0-9]*")):
-        if process.name == str(os.getpid()):
-            continue
-        try:
-            holds = any(os.readlink(link) == file for link in (process / "fd").iterdir())
-            if holds:
-                found.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
-        except OSError:
-            continue
+    for pid in pids_with_open_file(file, proc):
+        if pid != os.getpid():
+            with suppress(OSError):
+                found.append(f"{(proc / str(pid) / 'comm').read_text().strip()} (process {pid})")
     return tuple(found)
 
 

@@ -8,7 +8,6 @@ from itertools import cycle
 from typing import Any
 
 from drivers import zaber_codec as codec
-from drivers import zaber_models as models
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     AxisFaultError,
@@ -59,10 +58,7 @@ REFUSAL_ADVICE = {
 
 SCALES_AGREE = 1e-3
 """Relative: data sheets round a microstep to at least that, and no two screws are so alike."""
-SCALE_ADVICE = (
-    "write microstep_um from its data sheet into the stage's YAML file, or measure it with "
-    "`emmc-rig devices scale`"
-)
+SCALE_ADVICE = "write microstep_um (data sheet, Zaber Launcher) into the stage's YAML file"
 
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d+)?")
 
@@ -83,9 +79,8 @@ class ZaberStage(HostStage):
 
     `microstep_um` is the length of a microstep, one for all axes or by name; what it does not
     state is looked up by the ids of device and peripheral. `resolution` is the device's setting
-    of that name for which it was stated. `in_microsteps` takes a microstep as the unit in place
-    of a micrometre: only to measure its length. Construction asks every axis for its scale,
-    limits and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
+    of that name for which it was stated. Construction asks every axis for its scale, limits
+    and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
     contradicts what was stated, `TransportTimeoutError` for a device that does not answer.
     Source: Zaber ASCII Protocol Manual (commands `home`, `move abs`, `stop`, `warnings`,
     `driver enable`; settings `pos`, `limit.min`, `limit.max`, `maxspeed`, `comm.checksum`,
@@ -101,27 +96,15 @@ class ZaberStage(HostStage):
         clock: Clock = SYSTEM_CLOCK,
         settings: StageSettings = DEFAULT_SETTINGS,
         resolution: int | Mapping[str, int] | None = None,
-        in_microsteps: bool = False,
     ) -> None:
         super().__init__(axes, (transport,), clock, settings)
         self._chain = _Chain(transport, clock)
         self._addresses = dict(axes)
         self._stated_um = _by_axis(microstep_um, axes)
         self._stated_resolution = _by_axis(resolution, axes)
-        self._in_microsteps = in_microsteps
         for axis in (*self._stated_um, *self._stated_resolution):
             self._require_axis(axis)
         self._start_up()
-
-    def resolution(self, axis: str) -> int | None:
-        """Return how many microsteps make a full step; None for a motor that has no steps."""
-        self._require_axis(axis)
-        return self._resolutions[axis]
-
-    def speed_um_s(self, axis: str) -> float:
-        """Return the speed of a move, as the device last said it."""
-        self._require_axis(axis)
-        return self._move_speeds_um_s[axis]
 
     def _configure(self) -> None:
         self._chain.checksummed = frozenset()
@@ -190,18 +173,13 @@ class ZaberStage(HostStage):
         resolution = self._resolutions[axis]
         if resolution is None:
             return self._first_speeds_um_s[axis]
-        return models.FULL_STEPS_PER_S * resolution * self._microstep_um[axis]
-
-    def _homing_speed_um_s(self, axis: str) -> float:
-        return self._home_speeds_um_s[axis]
+        return codec.FULL_STEPS_PER_S * resolution * self._microstep_um[axis]
 
     def _readings_are_checked(self, axis: str) -> bool:
         return self._addresses[axis][0] in self._chain.checksummed
 
     def _scale_um(self, axis: str) -> float:
         """Return the length of a microstep, from the device or stated; both must agree."""
-        if self._in_microsteps:
-            return 1.0
         resolution = self._resolutions[axis]
         stated_um = self._stated_um.get(axis)
         wanted = self._stated_resolution.get(axis)
@@ -213,7 +191,7 @@ class ZaberStage(HostStage):
             )
         device_id = self._optional(axis, "deviceid", whole_device=True)
         peripheral_id = self._optional(axis, "peripheralid")
-        model = models.find_model(device_id or 0, peripheral_id)
+        model = codec.find_model(device_id or 0, peripheral_id)
         identity = f"device id {device_id}, peripheral id {peripheral_id or 'none'}"
         if self._is_modified(axis, peripheral_id):
             model, identity = None, f"{identity}, modified hardware"
@@ -225,7 +203,7 @@ class ZaberStage(HostStage):
                 what = f"the length of its microstep is unknown ({identity})"
                 raise ScaleError(axis, what, SCALE_ADVICE)
             return stated_um
-        known_um = model.microstep_um * models.DEFAULT_RESOLUTION / resolution
+        known_um = model.microstep_um * codec.DEFAULT_RESOLUTION / resolution
         if stated_um is not None and abs(stated_um / known_um - 1) > SCALES_AGREE:
             raise ScaleError(
                 axis,

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
     from emmc_rig.model.frames import Frames
     from emmc_rig.model.sensing import ImagingMatrix as Psi
-    from emmc_rig.processing.inputs import open_frames
-    from emmc_rig.processing.reconstructing import reconstruct
+    from emmc_rig.processing.reconstructing import open_frames, reconstruct
     from emmc_rig.processing.result import Result
     from emmc_rig.processing.session_calibration import calibrate
     from emmc_rig.session.session import Session
@@ -43,7 +42,7 @@ _HOME = {
     "capture": "emmc_rig.acquisition.command:capture",
     "rig": "emmc_rig.bench.rig_config:rig",
     "scene": "emmc_rig.files.scenes:open_scene",
-    "open_frames": "emmc_rig.processing.inputs:open_frames",
+    "open_frames": "emmc_rig.processing.reconstructing:open_frames",
     "reconstruct": "emmc_rig.processing.reconstructing:reconstruct",
     "Camera": "emmc_rig.model.camera:Camera",
     "ERRORS": "emmc_rig.errors:ERRORS",

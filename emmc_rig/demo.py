@@ -7,14 +7,21 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from calibration.whiteboard import Calibration, ideal_boards, lamps_needed, measure_psi
-from emmc_rig.acquisition.command import CaptureRequest, planned_frames
+from drivers.raw import RawFrame
+from emmc_rig.acquisition.checks import Figures
+from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.plan import Boards, Checks, Darks, Plan, PlannedShot
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Rig, simulated_rig
+from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import save_maps
 from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
@@ -30,16 +37,16 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.report import ReportContent, write_report
-from emmc_rig.processing.simulated import place_rig, simulated_session
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.frame_means import decoded, session_darks
 from emmc_rig.session.measured_psi import Scale
+from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import scaled_readings, shot_frames
 from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.missed import missed_readings
+from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.bench import Bench
@@ -86,6 +93,41 @@ class _Stages:
         started = self.clock()
         yield
         self.seconds[name] = self.clock() - started
+
+
+class FrameSteps(CaptureWatcher):
+    """A capture shown as steps of a stage, one a frame."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        self._watcher = watcher
+
+    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        """Count a frame."""
+        self._watcher.step(planned.id)
+
+
+@contextmanager
+def simulated_session(plan: Plan, camera: Camera, rig: Rig, watcher: Watcher) -> Iterator[Session]:
+    """Yield the session that the sequencer captures on a rig; its folder is gone afterwards.
+
+    camera: as planned. Raises AppError or a `DriverError`.
+    """
+    text = yaml.safe_dump(plan.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
+    with TemporaryDirectory(prefix="emmc-rig-") as name:
+        folder = Path(name) / "session"
+        request = CaptureRequest(folder, plan, text, camera, folder, {"kind": SIMULATED})
+        session = new_session(request, planned_frames(request, rig))
+        Sequencer(session, plan, rig, FrameSteps(watcher)).run()
+        yield session
+
+
+def place_rig(rig: Rig, frame: PlannedFrame) -> None:
+    """Bring a simulated bench to how it stands for a frame."""
+    bench = frame.bench
+    rig.attendant.place(bench.target, bench.board_turn_deg)
+    rig.attendant.fit_masks(bench.fitting, bench.masks_in)
+    rig.attendant.set_lamp(bench.lamp)
+    rig.stage.move_to_um({axis: rig.zero_um[axis] + um for axis, um in bench.offsets_um.items()})
 
 
 def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = None) -> dict:

@@ -10,7 +10,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.colour import coloured
 from reconstruction.differences import norm_squared
 from reconstruction.flat import FlatPsi, flat_psi
-from reconstruction.patch_term import PatchTerm
+from reconstruction.problem import PatchTerm
 
 Array = NDArray[np.floating]
 SMALLEST_RELATIVE_MU = 2e-5

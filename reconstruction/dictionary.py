@@ -83,26 +83,14 @@ class Dictionary:
         """The atoms as rows (atom, v u y x c), a view of the same memory."""
         return self.atoms.reshape(self.size, -1)
 
-    def checked(
-        self, views: tuple[int, int], patch: tuple[int, int], colours: int = 3
-    ) -> Dictionary:
-        """Return the dictionary, or raise DictionaryError naming what does not fit.
-
-        views: rows and columns of views. patch: rows and columns of pixels.
-        """
-        has_v, has_u, has_y, has_x, has_c = self.patch_shape
-        faults = [
-            (f"{has_v}x{has_u} views", f"{views[0]}x{views[1]}", (has_v, has_u) != tuple(views)),
-            (f"{has_y}x{has_x} pixels", f"{patch[0]}x{patch[1]}", (has_y, has_x) != tuple(patch)),
-            (f"{has_c} colour(s)", f"{colours}", has_c != colours),
-        ]
-        differences = [f"{has}, not {needs}" for has, needs, differs in faults if differs]
-        if differences:
+    def check_views(self, views: tuple[int, int]) -> None:
+        """Raise DictionaryError for patches of other views, or of other colours than RGB."""
+        v, u, _, _, colours = self.patch_shape
+        if (v, u) != tuple(views) or colours != 3:
             raise DictionaryError(
-                f"the dictionary's patches have {'; '.join(differences)}: "
-                "train or choose a dictionary for these patches"
+                f"the dictionary's patches have {v}x{u} views of {colours} colour(s), not "
+                f"{views[0]}x{views[1]} of 3: train or choose a dictionary for these views"
             )
-        return self
 
     def save(self, path: str | os.PathLike) -> None:
         """Write HDF5 (checksummed); the file appears whole or not at all.
@@ -173,7 +161,6 @@ def dct_dictionary(
     patch: tuple[int, int],
     frequencies: tuple[int, int, int, int] | None = None,
     chroma_frequencies: tuple[int, int, int, int] | None = None,
-    colours: int = 3,
 ) -> Dictionary:
     """Return products of cosines along v, u, y and x, each in every opponent colour.
 
@@ -186,24 +173,23 @@ def dct_dictionary(
         frequencies: how many, from 0, along v, u, y, x for the luminance. The default, 3 along v
             and u and all along y and x, codes real 9x9 patches to 0.1 dB as well as all 6,075.
         chroma_frequencies: likewise for the chrominances; default 2 and half of the pixels'.
-        colours: 3, or 1 for the luminance alone.
 
     Raises:
-        DictionaryError: an axis of no samples or frequencies; other colours than 1 or 3.
+        DictionaryError: an axis of no samples or frequencies.
     """
-    _check_patch(views, patch, colours)
+    _check_patch(views, patch)
     sizes = *views, *patch
     counts = frequencies or (*(min(3, n) for n in views), *patch)
     chroma = chroma_frequencies or (*(min(2, n) for n in views), *(max(1, n // 2) for n in patch))
-    sets = [_cosines(sizes, counts), *[_cosines(sizes, chroma)] * (colours - 1)]
-    return Dictionary.normalised(_coloured(sets), "dct")
+    chrominance = _cosines(sizes, chroma)
+    atoms = _coloured(_cosines(sizes, counts), chrominance)
+    return Dictionary.normalised(atoms, "dct")
 
 
 def lambertian_dictionary(
     views: tuple[int, int],
     patch: tuple[int, int],
     disparities: Sequence[float] | None = None,
-    colours: int = 3,
 ) -> Dictionary:
     """Return textures on planes: texture(y - d (v - V // 2), x - d (u - U // 2)), in one colour.
 
@@ -216,13 +202,12 @@ def lambertian_dictionary(
         views: rows and columns of views.
         patch: rows and columns of pixels.
         disparities: of the planes; default `plane_disparities`.
-        colours: 3, or 1 for the luminance alone.
 
     Raises:
         DictionaryError: no disparity, one not finite or so large that the outer views of a patch
-            share nothing with the centre; other colours than 1 or 3; an axis of no samples.
+            share nothing with the centre; an axis of no samples.
     """
-    _check_patch(views, patch, colours)
+    _check_patch(views, patch)
     if disparities is None:
         disparities = plane_disparities(views, patch)
     planes = np.unique(np.asarray(disparities, dtype=float))
@@ -237,15 +222,14 @@ def lambertian_dictionary(
         *(_ridges(views, patch, d, 8, 1.5, (edge, line)) for d in planes),
         *(_spots(views, patch, d, 1.5, 1.0) for d in planes),
     ]
-    sets = [_distinct([_flat(views, patch), *textures])]
-    if colours == 3:
-        nearest = int(np.abs(planes).argmin())
-        soft = [
-            _ridges(views, patch, d, 6, 2.0, (_edge(_CHROMA_BLUR_PX),))
-            for d in planes[nearest % 2 :: 2]
-        ]
-        sets += [_distinct([_flat(views, patch), *soft])] * 2
-    return Dictionary.normalised(_coloured(sets), "lambertian")
+    nearest = int(np.abs(planes).argmin())
+    soft = [
+        _ridges(views, patch, d, 6, 2.0, (_edge(_CHROMA_BLUR_PX),))
+        for d in planes[nearest % 2 :: 2]
+    ]
+    flat = np.ones((1, *views, *patch), np.float32)
+    atoms = _coloured(_distinct([flat, *textures]), _distinct([flat, *soft]))
+    return Dictionary.normalised(atoms, "lambertian")
 
 
 def usual_patch(binning: int) -> tuple[int, int]:
@@ -270,20 +254,18 @@ def _reach(views: tuple[int, int]) -> int:
     return max(max(views) // 2, 1)
 
 
-def _check_patch(views: tuple[int, int], patch: tuple[int, int], colours: int) -> None:
+def _check_patch(views: tuple[int, int], patch: tuple[int, int]) -> None:
     if min(*views, *patch) < 1:
         raise DictionaryError(
             f"{views[0]}x{views[1]} views of {patch[0]}x{patch[1]} pixels: needs 1x1 of 1x1 or more"
         )
-    if colours not in (1, 3):
-        raise DictionaryError(f"{colours} colours: needs 1 or 3")
 
 
-def _coloured(sets: Sequence[Textures]) -> NDArray[np.float32]:
-    """Return atoms (atom, v, u, y, x, c): the n-th set in the n-th opponent colour."""
-    mixes = OPPONENT if len(sets) == 3 else np.ones((1, 1))
+def _coloured(luminance: Textures, chrominance: Textures) -> NDArray[np.float32]:
+    """Return atoms (atom, v, u, y, x, c): textures in the opponent colours."""
+    sets = luminance, chrominance, chrominance
     return np.concatenate(
-        [textures[..., None] * mix for textures, mix in zip(sets, mixes, strict=True)]
+        [textures[..., None] * mix for textures, mix in zip(sets, OPPONENT, strict=True)]
     ).astype(np.float32)
 
 
@@ -353,10 +335,6 @@ def _spots(
         x - _offsets(patch[1] / 2 + abs(disparity), step_px)[:, None, None, None, None]
     )
     return (down[:, None] * right).reshape(-1, *y.shape).astype(np.float32)
-
-
-def _flat(views: tuple[int, int], patch: tuple[int, int]) -> Textures:
-    return np.ones((1, *views, *patch), np.float32)
 
 
 def _distinct(sets: Sequence[Textures]) -> Textures:

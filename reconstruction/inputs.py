@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
-from reconstruction.patch_term import PatchTerm
 
 Array = NDArray[np.floating]
 WHITER = 2.0
@@ -79,16 +78,3 @@ def checked_noise(
         )
     mean = float(np.mean(np.square(each[used], dtype=np.float64))) if used.any() else 0.0
     return float(np.sqrt(mean)), np.where(used, np.square(each), mean).astype(np.float32)
-
-
-def check_light_fields(psi: ImagingMatrix, patches: PatchTerm | None, start: Array | None) -> None:
-    """Raise ReconstructionError for patches or a start that do not fit Psi's light field."""
-    shape = psi.light_field_shape
-    if patches is not None and patches.target.shape != shape:
-        raise ReconstructionError(
-            f"patches for a light field of shape {patches.target.shape} given, Psi needs {shape}"
-        )
-    if start is not None and start.shape != shape:
-        raise ReconstructionError(f"a start of shape {start.shape} given, Psi needs {shape}")
-    if start is not None and not np.isfinite(start).all():
-        raise ReconstructionError("the start holds values that are not finite")

@@ -26,7 +26,7 @@ NO_SHARE = np.zeros((0, 0), dtype=np.float32)
 NO_PULL = np.zeros((0, 0, 0, 0, 0), dtype=np.float32)
 
 
-class Data(NamedTuple):
+class FrameFit(NamedTuple):
     """What the frames say: Psi's weights and colour map, its inverted blocks, the frames, k.
 
     share, pulled: a sample q descended to becomes share q + pulled before the frames correct it;
@@ -253,7 +253,7 @@ def _sweep_band(data, steps, stencils, light_field, dual, ahead, begin, end, mov
 
 
 def sweep(
-    data: Data,
+    data: FrameFit,
     steps: Steps,
     stencils: Stencils,
     light_field: NDArray[np.floating],

@@ -30,7 +30,7 @@ class Given:
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). dictionary: for methods that need one.
-    estimates: what `estimate_patches` found from the same inputs, to go on from. clock: seconds.
+    estimates: what `estimate_patches` found from the same inputs, to go on from.
     """
 
     psi: ImagingMatrix
@@ -38,9 +38,8 @@ class Given:
     noise_sigma: float | Array
     usable: NDArray[np.bool_] | None
     dictionary: Dictionary | None
-    estimates: PatchEstimates | None
     on_step: Callable[[Progress], None] | None
-    clock: Callable[[], float]
+    estimates: PatchEstimates | None = None
 
     @property
     def typical_noise(self) -> float:

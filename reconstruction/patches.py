@@ -60,14 +60,6 @@ def regular_grid(
     return PatchGrid(corners.astype(np.int64), patch)
 
 
-def window(patch: tuple[int, int], kind: str) -> NDArray[np.float32]:
-    """Return the weight of each sample of a patch, (rows, columns): "flat", or "hann"."""
-    if kind == "flat":
-        return np.ones(patch, dtype=np.float32)
-    sides = [np.sin(np.pi * (np.arange(n) + 1) / (n + 1)) ** 2 for n in patch]
-    return np.outer(*sides).astype(np.float32)
-
-
 def padded(length: int) -> int:
     """Return the length rounded up to whole vector registers."""
     return -(-length // LANES) * LANES
@@ -79,12 +71,10 @@ class PatchSensing:
 
     weights: (patch, shot, part, padded sample), the coefficients of Psi, a part being a view, or
         a colour of a view where pixels see three colours. Zero where a pixel is not usable.
-    colours: (patch, shot, sample) uint8, the colour stored there; None where three are stored.
     data: (patch, padded measurement), 0 where not usable. measured: usable pixels of each patch.
     """
 
     weights: NDArray[np.float32]
-    colours: NDArray[np.uint8] | None
     data: NDArray[np.float32]
     measured: NDArray[np.int64]
 
@@ -104,9 +94,6 @@ def sense_patches(
     parts = views_v * views_u * stored
     count = len(corners)
     weights = np.zeros((count, shots, parts, padded(samples)), dtype=np.float32)
-    colours = None
-    if psi.colour is not None:
-        colours = np.empty((count, shots, samples), dtype=np.uint8)
     data = np.zeros((count, padded(shots * pixels)), dtype=np.float32)
     measured = np.empty(count, dtype=np.int64)
     for i, (y, x) in enumerate(corners):
@@ -117,11 +104,9 @@ def sense_patches(
         if not kept.all():
             cut = cut * kept.repeat(k, axis=1).repeat(k, axis=2)[:, None, None, None]
         weights[i, :, :, :samples] = cut.reshape(shots, parts, samples)
-        if colours is not None and psi.colour is not None:
-            colours[i] = psi.colour[:, rows, columns].reshape(shots, samples)
         data[i, : shots * pixels] = np.where(kept, frames[:, seen[0], seen[1]], 0).ravel()
         measured[i] = kept.sum()
-    return PatchSensing(weights, colours, data, measured)
+    return PatchSensing(weights, data, measured)
 
 
 def pixel_of_sample(shape: tuple[int, int], binning: int) -> NDArray[np.int64]:
@@ -193,17 +178,17 @@ def sense_atoms(selected, weights, pixel, pixels, shot, out):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def overlap_add(corners, patches, share, total, weight):
-    """Add patches (patch, v, u, y, x, c), weighted by share (patch, y, x), to total and weight."""
+    """Add patches (patch, v, u, y, x, c), weighted by share (patch,), to total and weight."""
     count, views_v, views_u, rows, columns, colours = patches.shape
     for p in range(count):
         top, left = corners[p]
+        part = share[p]
         for v in range(views_v):
             for u in range(views_u):
                 for y in range(rows):
                     for x in range(columns):
-                        part = share[p, y, x]
                         for c in range(colours):
                             total[v, u, top + y, left + x, c] += part * patches[p, v, u, y, x, c]
         for y in range(rows):
             for x in range(columns):
-                weight[top + y, left + x] += share[p, y, x]
+                weight[top + y, left + x] += part

@@ -3,7 +3,7 @@
 For every patch, min_beta 1/2 |Psi D beta - I|^2 + eta |beta|_1 (eq. 8), or a greedy relative of
 it, with D beta the patch. The sensed dictionary Psi D is built once per patch, or once for all
 patches where mask, colours and usable pixels repeat; the sparse solver runs on it; overlapping
-patches are averaged with the weights of a window.
+patches are averaged.
 
 Cost of a patch with n atoms, m measurements, N samples x views (and n_c stored colours):
 building 2 n N n_c operations, `admm` n m^2 + 4 n m per pass, `lars` 4 n m per step, `omp` 2 n m
@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar
 
 import numpy as np
 from numba import get_num_threads
@@ -39,7 +39,6 @@ from reconstruction.patches import (
     selected_atoms,
     sense_atoms,
     sense_patches,
-    window,
 )
 from reconstruction.result import Progress, Reconstruction, Status
 
@@ -50,13 +49,14 @@ BATCH_BYTES = 48 * 2**20
 
 
 class SparseSettings(Settings):
-    """Patches and their aggregation; `solver` says how each is coded."""
+    """The patches; `solver` says how each is coded."""
+
+    removed: ClassVar[tuple[str, ...]] = ("aggregation",)
 
     stride: int = Field(default=5, ge=1, description="samples between patches")
     flat_favour: float = Field(
         default=8.0, ge=1, description="flat atoms cost this many times less than others"
     )
-    aggregation: Literal["flat", "hann"] = "flat"
     solver: bpdn.BPDNSettings = Field(default_factory=bpdn.BPDNSettings)
 
 
@@ -78,8 +78,8 @@ def favoured(atoms: NDArray[np.float32], favour: float) -> NDArray[np.float32]:
 class PatchEstimates:
     """Patches put together.
 
-    light_field: (v, u, y, x, c), 0 where no patch says anything. weight: (y, x), the sum of the
-    windows there. atoms: of each patch. converged: share of the patches. empty: patches without
+    light_field: (v, u, y, x, c), 0 where no patch says anything. weight: (y, x), how many patches
+    do. atoms: of each patch. converged: share of the patches. empty: patches without
     a usable pixel. classes: distinct sensed dictionaries. passes: the solver's mean.
     """
 
@@ -149,13 +149,12 @@ class _Coder:
         settings: SparseSettings,
     ) -> None:
         rows, columns = dictionary.patch_shape[2:4]
-        dictionary.checked(psi.light_field_shape[:2], (rows, columns))
+        dictionary.check_views(psi.light_field_shape[:2])
         self.psi, self.frames, self.usable = psi, frames, usable
         self.noise_sigma, self.settings = noise_sigma, settings
         self.atoms = favoured(dictionary.atoms, settings.flat_favour)
         self.matrix = self.atoms.reshape(dictionary.size, -1)
         self.grid = regular_grid(psi.size, (rows, columns), settings.stride, psi.binning)
-        self.window = window((rows, columns), settings.aggregation)
         self.pixel = pixel_of_sample((rows, columns), psi.binning)
         self.pixels = rows * columns // psi.binning**2
         self.classes = 0
@@ -234,8 +233,8 @@ def estimate_patches(
     with ThreadPoolExecutor(threads) as pool:
         for found in _in_order(pool, coder.code, coder.batches(), 2 * threads):
             indices, patches, measured, codes = found
-            share = coder.window * (measured > 0)[:, None, None]
             shape = (len(indices), *dictionary.patch_shape)
+            share = (measured > 0).astype(np.float32)
             overlap_add(coder.grid.corners[indices], patches.reshape(shape), share, total, weight)
             used[indices] = [np.count_nonzero(code.weights) for code in codes]
             converged += sum(code.converged for code in codes)
@@ -275,7 +274,6 @@ def reconstruct_sparse(
     settings: SparseSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
     found: PatchEstimates | None = None,
 ) -> Reconstruction:
     """Return the light field whose patches are sparse in the dictionary.
@@ -288,7 +286,7 @@ def reconstruct_sparse(
     patch.
     """
     settings = settings or SparseSettings()
-    started = clock()
+    started = time.perf_counter()
     frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
     if found is None:
         found = estimate_patches(psi, frames, noise_sigma, dictionary, settings, usable, on_step)
@@ -312,7 +310,7 @@ def reconstruct_sparse(
         advice="; ".join(advice),
         steps=round(found.passes),
         objective=(),
-        seconds=clock() - started,
+        seconds=time.perf_counter() - started,
         parameters={
             "noise_sigma": noise_sigma,
             "patches": len(found.atoms),

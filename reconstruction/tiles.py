@@ -10,9 +10,8 @@ Up to `BlockSettings.whole` samples a light field is one block: the method itsel
 
 from __future__ import annotations
 
-import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -31,7 +30,7 @@ from reconstruction.errors import ReconstructionError
 from reconstruction.flat import flat_psi
 from reconstruction.methods import BlockSettings, MethodSettings, find_method, reconstruct
 from reconstruction.methods.surfaces import sparse_patches, takes_patches
-from reconstruction.methods.tv_dict import patched_weights
+from reconstruction.methods.variational import patched_weights
 from reconstruction.result import Progress, Reconstruction, Status
 from reconstruction.screening import screened
 from reconstruction.sparse import SparseSettings
@@ -39,7 +38,6 @@ from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
-NUMBER = re.compile(r"\d+(?:\.\d+)?")
 REACH = 48
 """Samples of halo for methods that carry information from sample to sample: steps of the
 variational methods move it by one, and what lies further hardly matters."""
@@ -224,7 +222,7 @@ def assembled(grid: Grid, place: Place, axes: int, dtype: np.dtype, part: Part) 
 
 
 @dataclass(frozen=True)
-class Survey:
+class CaptureSurvey:
     """What is settled once for the whole capture, so that blocks are functions of it.
 
     settings: of the methods, with mu, primal step and steps settled. halo: see `Grid`. left_out:
@@ -239,7 +237,7 @@ class Survey:
     largest_px: float
 
     @classmethod
-    def of_one_block(cls, settings: MethodSettings, shots: int) -> Survey:
+    def of_one_block(cls, settings: MethodSettings, shots: int) -> CaptureSurvey:
         """Return what settles nothing: a single block is the whole."""
         return cls(settings, 0, (), (1.0,) * shots, (), 0.0)
 
@@ -291,7 +289,7 @@ def surveyed(
     usable: NDArray[np.bool_],
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
-) -> Survey:
+) -> CaptureSurvey:
     """Return what is settled from sample windows of a capture, read one at a time.
 
     frames, usable: (shot, pixel_y, pixel_x).
@@ -348,7 +346,7 @@ def surveyed(
     if patched:
         sparse = sparse_patches(settings.sparse, k)
     settled = _settled(mosaic, read, noise_sigma, use, settings, sparse)
-    return Survey(settled, halo, left_out, gains, words, largest)
+    return CaptureSurvey(settled, halo, left_out, gains, words, largest)
 
 
 def _settled(
@@ -424,15 +422,18 @@ AXES = {"light_field": 2, "sigma": 2}
 
 
 def summed_up(
-    name: str, results: Iterable[Reconstruction], survey: Survey, seconds: float
+    name: str, results: Iterable[Reconstruction], survey: CaptureSurvey, seconds: float
 ) -> Reconstruction:
     """Return what blocks say together, without arrays: the mean of their figures.
 
     The halo's largest disparity is the survey's; steps are those of all blocks.
     """
-    solved = [one for one in results if one.status != Status.INCOMPLETE]
-    keys = dict.fromkeys(key for one in solved for key in one.parameters)
-    each = {key: [one.parameters[key] for one in solved if key in one.parameters] for key in keys}
+    solved = [result for result in results if result.status != Status.INCOMPLETE]
+    keys = dict.fromkeys(key for result in solved for key in result.parameters)
+    each = {
+        key: [result.parameters[key] for result in solved if key in result.parameters]
+        for key in keys
+    }
     parameters = {key: float(np.mean(values)) for key, values in each.items()}
     for key, extreme in (("lowest_px", min), ("highest_px", max)):
         if key in each:
@@ -440,41 +441,18 @@ def summed_up(
     # Where the whole has no single place, the verdict names the block.
     for key in ("misfit_row", "misfit_column"):
         parameters.pop(key, None)
-    count = len(solved)
+    advice = [result.advice for result in solved if result.advice]
     return Reconstruction(
         method=name,
         light_field=np.empty((0, 0, 0, 0, 3), np.float32),
         status=Status.IN_TILES,
-        advice="; ".join(in_few_words([[one.advice] for one in solved if one.advice], count)),
-        steps=sum(one.steps for one in solved),
+        advice=f"{len(advice)} of {len(solved)} blocks, the first: {advice[0]}" if advice else "",
+        steps=sum(result.steps for result in solved),
         objective=(),
         seconds=seconds,
         parameters={**parameters, "halo": survey.halo, "largest_px": survey.largest_px},
         screening=survey.words,
     )
-
-
-def in_few_words(said: Sequence[Sequence[str]], blocks: int) -> list[str]:
-    """Return what blocks have in common once, with the range of its numbers.
-
-    said: the lines of each block; blocks: how many there are in all. Lines are taken apart at
-    semicolons; parts that the same blocks have stay together.
-    """
-    alike: dict[tuple[str, ...], dict[int, str]] = {}
-    for block, lines in enumerate(said):
-        for part in (part for line in lines for part in line.split("; ")):
-            alike.setdefault(tuple(NUMBER.split(part)), {})[block] = part
-    together: dict[frozenset[int], list[str]] = {}
-    for words, by_block in alike.items():
-        numbers = zip(*(NUMBER.findall(part) for part in by_block.values()), strict=True)
-        spans = [sorted(set(each), key=float) for each in numbers]
-        ends = [f"{span[0]} to {span[-1]}" if len(span) > 1 else span[0] for span in spans]
-        whole = "".join(word for pair in zip(words, [*ends, ""], strict=True) for word in pair)
-        together.setdefault(frozenset(by_block), []).append(whole)
-    return [
-        f"{'; '.join(parts)}, in {len(where)} of {blocks} blocks"
-        for where, parts in together.items()
-    ]
 
 
 def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:
@@ -494,13 +472,12 @@ def reconstruct_in_blocks(
     settings: MethodSettings,
     usable: NDArray[np.bool_],
     on_step: Callable[[Progress], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> tuple[Reconstruction, Verdict]:
     """Return a light field and the verdict on it, block by block in this process.
 
     frames, usable: (shot, pixel_y, pixel_x). Raises ReconstructionError as `reconstruct`.
     """
-    started = clock()
+    started = time.perf_counter()
     if not usable.any():
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
     survey = surveyed(name, psi, frames, noise_sigma, usable, dictionary, settings)
@@ -521,7 +498,7 @@ def reconstruct_in_blocks(
         if on_step is not None:
             on_step(Progress(done, None, None, len(grid)))
     arrays = _whole(grid, parts)
-    whole = summed_up(name, results, survey, clock() - started)
+    whole = summed_up(name, results, survey, time.perf_counter() - started)
     light_field = arrays.pop("light_field")
     return replace(whole, light_field=light_field, maps=arrays), judged_together(verdicts)
 

@@ -1,7 +1,7 @@
 """DV_K and patches with the exact data step, by default total variation: the paper's eq. 9.
 
 min 1/2 |Psi L - I|^2 + mu DV_K(L) + rho/2 sum W |L - M|^2, the last being what a collection of
-patches asks for (see `patch_term`), if one is given. DV_K is the paper's colour-coupled
+patches asks for (see `problem`), if one is given. DV_K is the paper's colour-coupled
 spatio-angular differential (Section VI-B; K = 1: total variation), with one liberty: the
 differences are measured in opponent colours (luminance and two chrominances, orthonormal), and
 those of the chrominances count `chroma_weight` times. Colours vary less than brightness, so this
@@ -10,7 +10,7 @@ resolves what mask and CFA leave ambiguous; a weight of 1 is the paper's DV_K ex
 The algorithm is over-relaxed primal-dual splitting (Condat 2013, algorithm 3.1) with the proximal
 step of frames and patches together: with a = 1/gamma + rho W and q what the dual variable descends
 to, z = (q / gamma + rho W M) / a, then z - Psi^T (Psi Psi^T + a)^-1 (Psi z - I), one small block
-per pixel. The paper's eq. 10-13 (`tests/full_splitting.py`) take gradients instead.
+per pixel. The paper's eq. 10-13 take gradients instead.
 
 Bytes of one step, float32, for N = v u y x c values, one stored colour of three and s shots:
 light field read and written 2 x 4N, and once more written, 4N; dual variable read and written
@@ -43,9 +43,8 @@ from reconstruction.choices import (
 )
 from reconstruction.differences import norm_squared as norm_squared_of
 from reconstruction.differences import stencils
-from reconstruction.inputs import check_light_fields, checked_inputs
-from reconstruction.patch_term import PatchTerm
-from reconstruction.problem import Problem, colour_metric
+from reconstruction.inputs import checked_inputs
+from reconstruction.problem import PatchTerm, Problem, colour_metric
 from reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
@@ -93,25 +92,21 @@ def reconstruct_tv(
     settings: TVSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
     patch_term: PatchTerm | None = None,
-    start: Array | None = None,
 ) -> Reconstruction:
     """Return the light field of least total variation that explains the frames.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
     deviation, which sets mu when the settings do not. usable: pixels to fit (default all);
     saturated and dead ones are left out exactly. patch_term: estimates to stay near, rho times
-    their weight. start: the light field to begin with, (v, u, y, x, c); default: the patches where
-    there are any, and a blurred picture. Raises ReconstructionError for frames, patches or a start
-    that do not fit Psi or are not finite, and for a noise level that is negative or not finite.
+    their weight, and to begin with. Raises ReconstructionError for frames that do not fit Psi or
+    are not finite, and for a noise level that is negative or not finite.
     """
     settings = settings or TVSettings()
-    started = clock()
+    started = time.perf_counter()
     if settings.rho == 0:
         patch_term = None
     data, usable = checked_inputs(psi, frames, noise_sigma, usable)
-    check_light_fields(psi, patch_term, start)
     dtype = psi.weights.dtype.type
     mu = settings.mu or choose_mu(psi, data[usable], noise_sigma, settings.order)
     guess = smooth_guess(psi, data, usable)
@@ -122,8 +117,7 @@ def reconstruct_tv(
     metric = colour_metric(settings.chroma_weight).astype(dtype)
     problem = Problem(psi, data, usable, mu, settings.order, metric, patch_term, settings.rho)
     light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)
-    begin = first_light_field(psi, guess, patch_term) if start is None else start
-    light_field[:] = rows_of_colours(begin)
+    light_field[:] = rows_of_colours(first_light_field(psi, guess, patch_term))
     sweep, bands = sweeping(problem, dtype(gamma), dtype(settings.relaxation), light_field)
     moved = np.zeros((psi.frames_shape[1], 2))
     history: list[tuple[int, float]] = []
@@ -148,7 +142,7 @@ def reconstruct_tv(
         advice="" if converged else "raise max_steps or loosen rtol",
         steps=step,
         objective=tuple(history),
-        seconds=clock() - started,
+        seconds=time.perf_counter() - started,
         parameters={
             "mu": float(mu),
             "chroma_weight": settings.chroma_weight,
@@ -172,8 +166,8 @@ def sweeping(
     norm_squared = spread * norm_squared_of(order, (*light_field.shape[:2], None, None))
     pull = problem.pixel_weight()
     total = 1 / gamma + pull
-    inverse = psi.solver(np.where(problem.usable, total, np.inf)).inverse
-    fit = kernels.Data(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
+    inverse = psi.inverted_blocks(np.where(problem.usable, total, np.inf))
+    fit = kernels.FrameFit(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
     if problem.patch_term is not None:
         share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
         pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]

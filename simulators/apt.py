@@ -337,9 +337,8 @@ class AptController(SimulatedController):
         self._say(address, Id.MOT_GET_GENMOVEPARAMS, data=data)
 
     def _set_home(self, address: int, bay: _Bay, message: Message) -> None:
-        parameters = codec.decode_home(message)
-        bay.home_velocity = max(1, parameters.velocity)
-        bay.home_offset = parameters.offset
+        velocity, bay.home_offset = codec.decode_home(message)
+        bay.home_velocity = max(1, velocity)
 
     def _get_home(self, address: int, bay: _Bay, message: Message) -> None:
         data = struct.pack("<HHHii", 1, 2, 1, bay.home_velocity, bay.home_offset)

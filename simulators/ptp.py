@@ -67,7 +67,6 @@ FAULTS = (
     "unplug_in_download",
     "stall_in_download",
     "lost_bytes",
-    "short_part",
     "garbled_header",
     "silent",
     "card_full",
@@ -306,15 +305,6 @@ class PtpCameraSimulator:
     def _thumb(self, *request: object) -> Answer:
         return Answer(Code.NO_THUMBNAIL)
 
-    def _partial_object(self, arguments: tuple[int, ...], *request: object) -> Answer:
-        handle, offset, most = arguments[:3]
-        if handle not in self.objects:
-            return Answer(Code.INVALID_HANDLE)
-        part = memoryview(self.objects[handle][1])[offset : offset + most]
-        if self.faults.strikes("short_part"):
-            part = part[: len(part) // 2]
-        return Answer(parameters=(len(part),), data=part)
-
     def _delete(self, arguments: tuple[int, ...], *request: object) -> Answer:
         if self.objects.pop(arguments[0], None) is None:
             return Answer(Code.INVALID_HANDLE)
@@ -456,10 +446,8 @@ _ANSWERS: dict[int, str] = {
     Operation.GET_PROPERTY_DESCRIPTION: "_describe",
     Operation.GET_PROPERTY: "_read",
     Operation.SET_PROPERTY: "_write",
-    Operation.GET_PARTIAL_OBJECT: "_partial_object",
 }
 """Names of the methods that answer: a subclass may answer otherwise."""
-_DOWNLOADS = (Operation.GET_OBJECT, Operation.GET_PARTIAL_OBJECT)
 
 
 class PtpUsbFunction(UsbFunction):
@@ -566,7 +554,7 @@ class PtpUsbFunction(UsbFunction):
             header = HEADER.pack(size, Kind.DATA, command.code, command.transaction)
             if faults.strikes("garbled_header"):
                 header = header[::-1]
-            self._queue_data(header, memoryview(answer.data), command.code in _DOWNLOADS)
+            self._queue_data(header, memoryview(answer.data), command.code == Operation.GET_OBJECT)
         response = Message(Kind.RESPONSE, answer.code, command.transaction, answer.parameters)
         self._queue.append((encode_message(response), True))
 

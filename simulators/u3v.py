@@ -359,8 +359,6 @@ class U3vCameraSimulator(UsbFunction):
             return self._start()
         if offset == xml.STOP:
             self._acquisition = None
-        elif offset == xml.SOFTWARE_TRIGGER:
-            self._trigger(self._clock.now_s())
         else:
             self._regions[xml.BASE][offset : offset + 4] = data
             self._update_sizes()
@@ -373,10 +371,6 @@ class U3vCameraSimulator(UsbFunction):
         start_s = float("inf") if triggered else self._clock.now_s()
         self._acquisition = _Acquisition(bool(self._read_u32(xml.BASE, xml.MODE)), start_s)
         return OK
-
-    def _trigger(self, at_s: float) -> None:
-        if self._acquisition is not None and self._read_u32(xml.BASE, xml.TRIGGER) & 1:
-            self._acquisition.next_start_s = at_s
 
     def _next_frame(self, timeout_s: float) -> bool:
         """Put the next frame on its way, waiting for it; return whether it came in time."""

@@ -14,7 +14,7 @@ from drivers.pixel_formats import BY_NAME
 BASE = 0x100000
 WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x00, 0x04, 0x08, 0x0C
 WIDTH_MAX, HEIGHT_MAX, PIXEL_FORMAT, PAYLOAD = 0x10, 0x14, 0x18, 0x1C
-MODE, START, STOP, TRIGGER, SOFTWARE_TRIGGER = 0x20, 0x24, 0x28, 0x2C, 0x30
+MODE, START, STOP, TRIGGER = 0x20, 0x24, 0x28, 0x2C
 EXPOSURE, GAIN, BLACK_LEVEL, LOCKED, FRAME_RATE, AUTO = 0x34, 0x38, 0x3C, 0x40, 0x44, 0x48
 SENSOR = 0x50
 SIZE = 0x70
@@ -60,7 +60,6 @@ def describe(
         _masked("TriggerModeReg", TRIGGER, 0, 0),
         _choice("TriggerSource", {"Software": 0, "Line0": 1}, "TriggerSourceReg"),
         _masked("TriggerSourceReg", TRIGGER, 4, 7),
-        _command("TriggerSoftware", SOFTWARE_TRIGGER),
         _choice("ExposureAuto", {"Off": 0, "Continuous": 1}, "ExposureAutoReg"),
         _masked("ExposureAutoReg", AUTO, AUTO_EXPOSURE_BIT, AUTO_EXPOSURE_BIT),
         _choice("GainAuto", {"Off": 0, "Continuous": 1}, "GainAutoReg"),
@@ -100,7 +99,7 @@ def describe(
         "Width Height OffsetX OffsetY WidthMax HeightMax SensorWidth SensorHeight PixelFormat "
         "PayloadSize AcquisitionMode "
         "AcquisitionStart AcquisitionStop TriggerSelector TriggerMode TriggerSource "
-        "TriggerSoftware ExposureAuto ExposureTime GainAuto Gain BlackLevel "
+        "ExposureAuto ExposureTime GainAuto Gain BlackLevel "
         "AcquisitionFrameRate TLParamsLocked SensorName DeviceVendorName DeviceModelName "
         "DeviceSerialNumber"
     )

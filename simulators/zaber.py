@@ -13,8 +13,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 from drivers.clock import Clock
-from drivers.zaber_codec import FLAG_MEANINGS, SPEED_SCALE, lrc
-from drivers.zaber_models import DEFAULT_RESOLUTION
+from drivers.zaber_codec import DEFAULT_RESOLUTION, FLAG_MEANINGS, SPEED_SCALE, lrc
 from simulators.firmware import SimulatedController
 from simulators.motion import AxisSpec, End, Motion, Motor
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.amend import amendment
+from emmc_rig.acquisition.checks import refuse_impossible
 from emmc_rig.acquisition.control import Control, interruptible
 from emmc_rig.acquisition.estimate import (
     Estimate,
@@ -28,7 +29,6 @@ from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.metering import first_meterings
 from emmc_rig.acquisition.order import ordered
 from emmc_rig.acquisition.plan import Plan, load_plan, planned_camera
-from emmc_rig.acquisition.preflight import refuse_impossible
 from emmc_rig.acquisition.replay import missing_words, replaying, there
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -46,7 +46,7 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import validated
 from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
-from emmc_rig.session.journal import camera_of_first_run
+from emmc_rig.session.journal import UntilEntry, metered
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
@@ -196,8 +196,8 @@ def estimated(
 ) -> Estimate:
     """Return what frames will take; earlier: another session of the same stage and camera."""
     meterings = {} if session is None else first_meterings(session)
-    entries = [] if session is None else session.journal.entries
-    known = known_exposures(Exposures(plan, earlier), meterings, entries)
+    decided = None if session is None else metered(session.journal.entries)
+    known = known_exposures(Exposures(plan, earlier), meterings, decided)
     return pace_of(rig, plan).estimate(frames, known)
 
 
@@ -216,9 +216,9 @@ def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -
 
 def refuse_other_camera(session: Session, rig: Rig) -> None:
     """Raise AppError when the session was begun with another camera body or frame size."""
-    then, now = camera_of_first_run(session.journal.entries), rig.camera.identity
-    if then is None or not session.stored:
+    if session.first_run is None or not session.stored:
         return
+    then, now = session.first_run.camera, rig.camera.identity
     if then["serial"] != now.serial or then["shape"] != list(rig.camera.shape):
         raise AppError(
             f"session {session.folder.name} was begun with camera {then['model']} "
@@ -320,7 +320,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                 session = session.amend(_frozen(request, edit.frames), edit.changes)
             with way_on_named(request, session):
                 if request.until_db not in (None, session.target_db):
-                    session.note("until", target_db=request.until_db, wall=wall_time())
+                    session.note(UntilEntry(target_db=request.until_db, wall=wall_time()))
                 choose = None if recording is None else there(session, recording)
                 if session.target_db is not None:
                     choose = Until(session, watcher)

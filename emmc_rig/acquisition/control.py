@@ -8,10 +8,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-
-from emmc_rig.acquisition.signals import ENDING, handled
+from typing import Any
 
 PAUSE_POLL_S = 0.05
+ENDING = ("SIGTERM", "SIGHUP")
+"""A request to end, and a terminal that closed; not every system has both."""
 
 
 class Control:
@@ -88,4 +89,27 @@ def uninterrupted() -> Iterator[None]:
         yield
         return
     with handled(signal.SIG_IGN, ("SIGINT", *ENDING)):
+        yield
+
+
+@contextmanager
+def handled(handler: Any, names: Iterable[str]) -> Iterator[None]:
+    """Let `handler` take the signals named, as far as there are such; main thread only."""
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
+@contextmanager
+def signals_interrupt() -> Iterator[None]:
+    """Let a request to end, or a closed terminal, act as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    with handled(interrupt, ENDING):
         yield

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
@@ -40,7 +41,7 @@ class Spans:
 
     def __init__(self, now_s: Callable[[], float], watcher: CaptureWatcher) -> None:
         self._now_s, self._watcher = now_s, watcher
-        self.seconds: dict[str, list[float]] = {}
+        self.seconds: dict[str, tuple[float, float]] = {}
 
     @contextmanager
     def __call__(self, step: str, planned: PlannedFrame) -> Iterator[None]:
@@ -48,7 +49,7 @@ class Spans:
         self._watcher.step(step, planned)
         began_s = self._now_s()
         yield
-        self.seconds[step] = [began_s, self._now_s()]
+        self.seconds[step] = began_s, self._now_s()
 
 
 class Devices:
@@ -154,7 +155,7 @@ class Devices:
             with suppress(DriverError):
                 self.camera.close()
 
-    def facts(self) -> dict[str, object]:
+    def facts(self) -> dict[str, Any]:
         """Return what the journal says of the devices of a run."""
         stage, camera = self._rig.stage, self.camera
         settings = {}

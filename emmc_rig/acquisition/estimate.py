@@ -20,7 +20,7 @@ from emmc_rig.acquisition.plan import METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
-from emmc_rig.session.journal import Entry, metered
+from emmc_rig.session.journal import FrameEntry, MeteredEntry
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import JOURNAL, Session
 
@@ -72,10 +72,10 @@ class Exposures:
             entry = earlier.stored.get(frame.id) if earlier is not None else None
             if entry is not None and frame.kind in ("reference", "shot"):
                 key = (frame.kind, frame.bench.lamp)
-                self._earlier.setdefault(key, float(entry["exposure_s"]))
+                self._earlier.setdefault(key, entry.exposure_s)
 
     def seconds(
-        self, frame: PlannedFrame, meterings: Mapping[str, Entry], decided: Entry | None
+        self, frame: PlannedFrame, meterings: Mapping[str, FrameEntry], decided: MeteredEntry | None
     ) -> float | None:
         """Return a frame's exposure; None where nothing determines it.
 
@@ -83,16 +83,16 @@ class Exposures:
         """
         if frame.exposure_s is not None:
             return frame.exposure_s
-        shot = str(frame.bench.shot)
+        shot = frame.bench.shot
         if frame.is_exposed_as_shots:
-            if decided is not None and shot in decided["exposures_s"]:
-                return decided["exposures_s"][shot] * frame.light
+            if decided is not None and shot in decided.exposures_s:
+                return decided.exposures_s[shot] * frame.light
             earlier_s = self._earlier.get(
                 ("shot", "white" if frame.kind == "dark" else frame.bench.lamp)
             )
         else:
             entry = meterings.get(frame.metered_by or "")
-            if entry is not None and entry["figures"]["bright_dn"] >= 1:
+            if entry is not None and entry.figures.bright_dn >= 1:
                 return metered_exposure_s(entry, self._level, frame.light, ANY_LIMITS)
             earlier_s = self._earlier.get(("reference", frame.bench.lamp))
         return None if earlier_s is None else earlier_s * frame.light
@@ -184,10 +184,9 @@ def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
 
 
 def known_exposures(
-    exposures: Exposures, meterings: Mapping[str, Entry], entries: list[Entry]
+    exposures: Exposures, meterings: Mapping[str, FrameEntry], decided: MeteredEntry | None
 ) -> Callable[[PlannedFrame], float | None]:
-    """Return what determines a frame's exposure, by a session's journal as it is now."""
-    decided = metered(entries)
+    """Return what determines a frame's exposure; see `Exposures.seconds`."""
     return lambda frame: exposures.seconds(frame, meterings, decided)
 
 

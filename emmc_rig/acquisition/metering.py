@@ -8,18 +8,16 @@ until the median reading is brighter than 1 / LARGEST_RANGE of that level.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 
 from drivers.camera import Limits
 from drivers.errors import CameraSettingError
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.plan import Metering
-from emmc_rig.session.journal import Entry, kinds_of
+from emmc_rig.session.journal import Figures, FrameEntry, MeteredEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.session import Session
+from emmc_rig.session.session import Session, wall_time
 
 METERING_TRIES = 8
 STEP = 4.0
@@ -45,44 +43,39 @@ def better_metering_s(
     return next_s if limits_s[0] <= next_s <= limits_s[1] else None
 
 
-def metered_exposure_s(
-    metered: Entry, level: float, light: float, limits_s: tuple[float, float]
-) -> float:
+def metered_exposure_s(metered: FrameEntry, level: float, light: float, limits_s: Limits) -> float:
     """Return the exposure at which `light` times less light reads `level` of white.
 
     metered: the journal line of the metering frame. Clipped to the camera's limits. Raises
     `CameraSettingError` where the board was dark.
     """
-    black_dn = float(np.mean(metered["black_level_dn"]))
-    bright_dn = metered["figures"]["bright_dn"]
-    if bright_dn < 1:
+    if metered.figures.bright_dn < 1:
         raise CameraSettingError("exposure", "cannot be metered, the board is dark: light the lamp")
-    wanted = level * (metered["white_level_dn"] - black_dn) / bright_dn
     low_s, high_s = limits_s
-    return min(max(metered["exposure_s"] * wanted * light, low_s), high_s)
+    return min(max(metered.exposure_s * level / metered.level * light, low_s), high_s)
 
 
-def first_meterings(session: Session) -> dict[str, Entry]:
+def first_meterings(session: Session) -> dict[str, FrameEntry]:
     """Return the first journal line of every metering frame.
 
     The first counts even where its file is damaged by now: frames exposed by it are there, and
     those still to come must be exposed alike.
     """
     ids = {frame.id for frame in session.frames if frame.kind == "metering"}
-    found: dict[str, Entry] = {}
-    for entry in kinds_of(session.journal.entries, "frame"):
-        if entry["id"] in ids:
-            found.setdefault(entry["id"], entry)
+    found: dict[str, FrameEntry] = {}
+    for entry in of_kind(session.journal.entries, FrameEntry):
+        if entry.id in ids:
+            found.setdefault(entry.id, entry)
     return found
 
 
 def asked_of_scene(
     frames: Iterable[PlannedFrame],
-    entries: Mapping[str, Entry],
+    entries: Mapping[str, FrameEntry],
     metering: Metering,
     limits_s: Limits,
-) -> dict[str, Any]:
-    """Return what a journal line `metered` says: exposures by shot, and frames asked for.
+) -> MeteredEntry:
+    """Return by what each metered shot is exposed, and which longer frames are asked for.
 
     frames: the session's. entries: of its metering frames, by id. limits_s: of the camera. Raises
     `CameraSettingError` where the scene is dark.
@@ -100,7 +93,7 @@ def asked_of_scene(
         group = group_of[frame.bench.shot]
         exposure_s = metered_exposure_s(entry, metering.level, 1.0, limits_s)
         chosen_s[group] = min(exposure_s, chosen_s.get(group, exposure_s))
-        steps[group] = max(_steps(entry["figures"]), steps.get(group, 0))
+        steps[group] = max(_steps(entry.figures), steps.get(group, 0))
     asked = [
         frame.id
         for frame in shots
@@ -108,14 +101,12 @@ def asked_of_scene(
         and frame.light <= BRACKET_STEP ** steps[group_of[frame.bench.shot]]
         and frame.light * chosen_s[group_of[frame.bench.shot]] <= limits_s[1]
     ]
-    return {
-        "exposures_s": {str(shot): chosen_s[group] for shot, group in group_of.items()},
-        "asked": asked,
-    }
+    exposures_s = {shot: chosen_s[group] for shot, group in group_of.items()}
+    return MeteredEntry(exposures_s=exposures_s, asked=asked, wall=wall_time())
 
 
-def _steps(figures: Mapping[str, float]) -> int:
+def _steps(figures: Figures) -> int:
     """Return how many longer exposures a scene of these figures asks for."""
-    ratio = figures["bright_dn"] / max(figures["median_dn"], 1.0)
+    ratio = figures.bright_dn / max(figures.median_dn, 1.0)
     wanted = np.log(max(ratio / LARGEST_RANGE, 1.0)) / np.log(BRACKET_STEP)
     return min(MOST_STEPS, int(np.ceil(wanted)))

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +21,12 @@ from numpy.typing import NDArray
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check
+from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
 from emmc_rig.acquisition.estimate import Exposures, known_exposures, pace_of
 from emmc_rig.acquisition.metering import asked_of_scene, first_meterings, metered_exposure_s
 from emmc_rig.acquisition.plan import Boards, Plan
-from emmc_rig.acquisition.preflight import refuse_impossible
 from emmc_rig.acquisition.retries import Budget, mending
 from emmc_rig.acquisition.suspend import Suspend
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
@@ -37,8 +35,18 @@ from emmc_rig.bench.hardware import Rig
 from emmc_rig.bench.registration import Shift, registered
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, shown_bytes, versions
-from emmc_rig.session.frame_file import decode_frame, frame_facts, frame_file
-from emmc_rig.session.journal import Entry, metered, metered_words
+from emmc_rig.session.frame_file import decode_frame, frame_entry, frame_file
+from emmc_rig.session.journal import (
+    ComparedEntry,
+    CompleteEntry,
+    Entry,
+    FrameEntry,
+    HaltEntry,
+    ResumedEntry,
+    RetryEntry,
+    RunEntry,
+    metered,
+)
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session, wall_time
 from emmc_rig.session.verify import verify_frames
@@ -86,12 +94,12 @@ class Sequencer:
         self._budget = Budget(plan.retries)
         self._writer = Writer()
         self._before: NDArray[np.uint16] | None = None
-        self._metered: dict[str, Entry] = {}
+        self._metered: dict[str, FrameEntry] = {}
         self._left_of_shot: dict[int, set[str]] = {}
         self._began_s = 0.0
         self._taken = self._run = self._more = 0
         # How long the frame before took to hand over: its own line is written by then.
-        self._handed: dict[str, list[float]] = {}
+        self._handed: dict[str, tuple[float, float]] = {}
         self._may_saturate = _may_saturate(session.frames)
 
     def run(self) -> RunEnd:
@@ -122,12 +130,13 @@ class Sequencer:
         session = self._session
         session.make_ready()
         session.note(
-            "run",
-            wall=self._wall(),
-            versions=versions(),
-            command=command_line(),
-            resumed=bool(session.stored),
-            **self._devices.facts(),
+            RunEntry(
+                wall=self._wall(),
+                versions=versions(),
+                command=command_line(),
+                resumed=bool(session.stored),
+                **self._devices.facts(),
+            )
         )
         self._run = session.runs
         self._discard_damaged(set(session.stored))
@@ -158,15 +167,15 @@ class Sequencer:
             devices.attend(planned)
             if devices.move(planned) and self._plan.settle_s:
                 devices.settle()
-            shift = registered(devices.snap(planned, entry["exposure_s"])[0], then)
+            shift = registered(devices.snap(planned, entry.exposure_s)[0], then)
 
         self._retrying(planned.id, compare)
         limit_px = self._plan.checks.registration_px
+        good = shift.likeness >= LEAST_LIKENESS and shift.length_px <= limit_px
         facts = {"id": planned.id, **asdict(shift), "limit_px": limit_px}
-        if shift.likeness >= LEAST_LIKENESS and shift.length_px <= limit_px:
-            self._note("registered", **facts)
+        self._note(ComparedEntry(kind="registered" if good else "refused", **facts))
+        if good:
             return
-        self._note("refused", **facts)
         what = (
             f"lies {shift.length_px:.2f} px ({shift.x_px:+.2f}, {shift.y_px:+.2f}) off"
             if shift.likeness >= LEAST_LIKENESS
@@ -232,13 +241,13 @@ class Sequencer:
         why = reason()
         if why and not control.stopping:
             began_s = self._now_s()
-            self._note("paused", reason=why, wall=self._wall())
+            self._note(HaltEntry(kind="paused", reason=why, wall=self._wall()))
             self._watcher.paused(why)
             while why and not control.stopping:
                 control.wait()
                 why = reason()
             seconds = self._now_s() - began_s
-            self._note("resumed", seconds=seconds, wall=self._wall())
+            self._note(ResumedEntry(seconds=seconds, wall=self._wall()))
             self._watcher.resumed(seconds)
         return not control.stopping
 
@@ -309,7 +318,7 @@ class Sequencer:
         if planned.is_exposed_as_shots:
             asked = metered(self._session.journal.entries)
             assert asked is not None
-            return asked["exposures_s"][str(planned.bench.shot)] * planned.light
+            return asked.exposures_s[planned.bench.shot] * planned.light
         assert planned.metered_by is not None
         entry = self._metered[planned.metered_by]
         level = (self._plan.whiteboards or Boards()).level
@@ -323,11 +332,11 @@ class Sequencer:
             return False
         limits_s = self._devices.camera.exposure_limits_s
         asked = asked_of_scene(session.frames, self._metered, self._plan.metering, limits_s)
-        self._note("metered", **asked, wall=self._wall())
+        self._note(asked)
         self._writer.flush()
-        self._watcher.tell(metered_words(asked))
+        self._watcher.tell(str(asked))
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
-        if not asked["asked"]:
+        if not asked.asked:
             return False
         self._left_of_shot = self._missing_of_shots()
         self._watcher.more(len(session.needed) + self._more)
@@ -340,7 +349,9 @@ class Sequencer:
             return
         self._remaining_reported_s = now_s
         left = [frame for frame in self._session.missing() if frame.id != taken.id]
-        known = known_exposures(self._exposures, self._metered, self._session.journal.entries)
+        known = known_exposures(
+            self._exposures, self._metered, metered(self._session.journal.entries)
+        )
         rest = self._pace.estimate(left, known, self._devices.sent.offsets_um)
         self._watcher.left(rest.seconds, rest.guessed)
 
@@ -356,7 +367,8 @@ class Sequencer:
                 todo = attempt
             except DriverError as error:
                 faults += 1
-                self._note("retry", id=name, fault=str(error), attempt=faults, at_s=self._now_s())
+                at_s = self._now_s()
+                self._note(RetryEntry(id=name, fault=str(error), attempt=faults, at_s=at_s))
                 self._budget.spend(name, error, faults)
                 self._watcher.tell(f"{name}, try {faults}: {error}")
                 todo = partial(self._devices.mend, mending(error, faults))
@@ -369,42 +381,47 @@ class Sequencer:
         frame: RawFrame,
         found: Figures,
         read_um: dict[str, float],
-        spans_s: dict[str, list[float]],
+        spans_s: dict[str, tuple[float, float]],
         attempts: int,
     ) -> None:
         """Give a frame to the writer's thread, with what its journal line says."""
         camera = self._devices.camera
-        entry = {
-            "run": self._run,
-            "plan": self._session.amendments,
-            **frame_facts(frame),
-            "exposure_s": camera.exposure_s if frame.exposure_s is None else frame.exposure_s,
-            "gain": camera.gain if frame.gain is None else frame.gain,
-            "lamp": planned.bench.lamp,
-            "commanded_um": dict(planned.bench.offsets_um),
-            "read_um": read_um,
-            "figures": found.as_dict(),
-            "attempts": attempts,
-            "wall": self._wall(),
-        }
+        entry = frame_entry(
+            frame,
+            # Only asked for where it is needed: a camera may read its next frame for that.
+            camera.exposure_s if frame.exposure_s is None else frame.exposure_s,
+            camera.gain if frame.gain is None else frame.gain,
+            run=self._run,
+            plan=self._session.amendments,
+            lamp=planned.bench.lamp,
+            commanded_um=dict(planned.bench.offsets_um),
+            read_um=read_um,
+            figures=found,
+            attempts=attempts,
+            wall=self._wall(),
+        )
         if planned.kind == "metering":
             self._metered.setdefault(planned.id, entry)
         self._writer.put(partial(self._store, planned, frame, entry, spans_s))
 
     def _store(
-        self, planned: PlannedFrame, frame: RawFrame, entry: Entry, spans_s: dict[str, list[float]]
+        self,
+        planned: PlannedFrame,
+        frame: RawFrame,
+        entry: FrameEntry,
+        spans_s: dict[str, tuple[float, float]],
     ) -> None:
         """Write a frame and its journal line; runs in the writer's thread."""
         self._watcher.step("write", planned)
         began_s = self._now_s()
         file = frame_file(frame)
 
-        def facts() -> Entry:
-            spans = {**spans_s, "write": [began_s, self._now_s()]}
-            return {**file.facts, **entry, "spans_s": spans}
+        def written() -> FrameEntry:
+            spans = {**spans_s, "write": (began_s, self._now_s())}
+            return entry.model_copy(update={"spans_s": spans})
 
         session, shot = self._session, planned.bench.shot
-        session.store(planned, file.suffix, file.data, file.sha256, facts)
+        session.store(planned, file, written)
         self._watcher.stored(planned)
         left = self._left_of_shot.get(shot, set())
         if planned.id in left:
@@ -423,7 +440,7 @@ class Sequencer:
         session = self._session
         planned = {frame.id for frame in session.frames} & ids
         entries = [entry for name, entry in session.stored.items() if name in planned]
-        size = sum(entry["bytes"] for entry in entries)
+        size = sum(entry.bytes for entry in entries)
         if size > REPORTED_BYTES:
             self._watcher.tell(f"hashing {len(entries)} frames, {shown_bytes(size)}")
         damaged = verify_frames(session, entries)
@@ -432,8 +449,8 @@ class Sequencer:
             self._watcher.tell(f"{fault}; it is taken again")
         return damaged
 
-    def _note(self, kind: str, **facts: Any) -> None:
-        self._writer.put(partial(self._session.note, kind, **facts))
+    def _note(self, entry: Entry) -> None:
+        self._writer.put(partial(self._session.note, entry))
 
     # Tear down.
 
@@ -443,7 +460,7 @@ class Sequencer:
         session = self._session
         left = len(session.missing())
         if not left and not session.is_complete:
-            session.note("complete", frames=len(session.needed), wall=self._wall())
+            session.note(CompleteEntry(frames=len(session.needed), wall=self._wall()))
         return left
 
     @contextmanager
@@ -458,7 +475,7 @@ class Sequencer:
                 if isinstance(error, Exception | KeyboardInterrupt):
                     with suppress(Exception):
                         reason = str(error) or "stopped at once by the user"
-                        self._note("stopped", reason=reason, wall=self._wall())
+                        self._note(HaltEntry(kind="stopped", reason=reason, wall=self._wall()))
             raise
         finally:
             with uninterrupted():

@@ -16,7 +16,7 @@ from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
-from emmc_rig.session.journal import decided_words, decisions, ended
+from emmc_rig.session.journal import DecidedEntry, ended, of_kind
 from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import scaled_readings
@@ -95,7 +95,7 @@ class Until:
         """Return the shots to be taken so far: the plan's first, those decided, those begun."""
         session = self._session
         shots = [frame for frame in session.frames if frame.kind == "shot"]
-        decided = [entry["next"] for entry in decisions(session.journal.entries)]
+        decided = [entry.next for entry in of_kind(session.journal.entries, DecidedEntry)]
         begun = sorted({frame.bench.shot for frame in shots if frame.id in session.stored})
         first = min(frame.bench.shot for frame in shots)
         wanted = dict.fromkeys([first, *decided, *begun])
@@ -111,25 +111,25 @@ class Until:
         found = self._assessed(shots, target_db)
         planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
         spared = [] if found.next is not None else sorted(planned - set(shots))
-        entry = {
-            "run": session.runs,
-            "shots": list(shots),
-            "stated_db": found.stated_db,
-            "target_db": target_db,
-            "next": found.next,
-            "why": found.why,
-            "expected_db": {str(shot): value for shot, value in found.expected_db.items()},
-            "spared": spared,
-            "spared_frames": sum(
+        entry = DecidedEntry(
+            run=session.runs,
+            shots=list(shots),
+            stated_db=found.stated_db,
+            target_db=target_db,
+            next=found.next,
+            why=found.why,
+            expected_db=dict(found.expected_db),
+            spared=spared,
+            spared_frames=sum(
                 frame.kind == "shot" and frame.bench.shot in spared for frame in session.needed
             ),
-            "method": METHOD,
-            "advice": found.advice,
-            "spans_s": {"decide": [began_s, now_s()]},
-            "wall": wall_time(),
-        }
-        session.note("decided", **entry)
-        self._watcher.tell(decided_words(entry))
+            method=METHOD,
+            advice=found.advice,
+            spans_s={"decide": (began_s, now_s())},
+            wall=wall_time(),
+        )
+        session.note(entry)
+        self._watcher.tell(str(entry))
 
     def _assessed(self, shots: tuple[int, ...], target_db: float) -> Assessment:
         self._scale = self._scale or session_scale(self._session)

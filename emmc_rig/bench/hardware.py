@@ -26,7 +26,7 @@ from drivers.dng import SMALLEST_SIDE_PX
 from drivers.errors import DriverError, TransportTimeoutError
 from drivers.grbl import GrblStage
 from drivers.grbl import identify as identify_grbl
-from drivers.ports import find_port, list_serial_ports
+from drivers.ports import find_port, guess_of, list_serial_ports
 from drivers.ptp import open_camera as open_ptp
 from drivers.stage import HostStage, Stage, StageSettings
 from drivers.transport import SerialTransport, Transport
@@ -263,20 +263,18 @@ def simulated_rig(
     return rig, bench
 
 
-def open_stage(
-    spec: str, settings: Mapping[str, Any] | None = None, to_measure: bool = False
-) -> Stage:
+def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> Stage:
     """Return the stage that `spec` names, connected; it must be closed.
 
     spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
     `emmc_rig.bench.stage_config`;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
-    once. settings: single settings that replace those of the file. to_measure: see `_stage`.
+    once. settings: single settings that replace those of the file.
     Raises AppError or a `DriverError`.
     """
     name, _, protocol = spec.partition(":")
     if name == SIMULATED:
-        return open_simulated(protocol or "zaber", settings, to_measure)[0]
+        return open_simulated(protocol or "zaber", settings)[0]
     config = parse_stage(spec, settings)
     if isinstance(config, PluginConfig):
         care = config.stage_settings()
@@ -295,7 +293,7 @@ def open_stage(
                 opened.callback(transports[port].close)
             return transports[port]
 
-        stage = _stage(config, transport, SYSTEM_CLOCK, to_measure)
+        stage = _stage(config, transport, SYSTEM_CLOCK)
         opened.pop_all()
     return stage
 
@@ -315,7 +313,7 @@ def _open_micromanager_stage(config: MicroManagerConfig) -> Stage:
 
 
 def open_simulated(
-    protocol: str, settings: Mapping[str, Any] | None = None, to_measure: bool = False
+    protocol: str, settings: Mapping[str, Any] | None = None
 ) -> tuple[HostStage, SimulatedController]:
     """Return a stage over simulated firmware in memory, and that firmware."""
     clock = ManualClock()
@@ -323,7 +321,7 @@ def open_simulated(
     wire = firmware.transport()
     config = parse_stage(f"{protocol}:{SIMULATED}{SIMULATED_SCALES[protocol]}", settings)
     assert isinstance(config, SerialConfig)
-    return _stage(config, lambda port: wire, clock, to_measure), firmware
+    return _stage(config, lambda port: wire, clock), firmware
 
 
 def simulated_firmware(protocol: str, clock: Clock) -> SimulatedController:
@@ -341,7 +339,7 @@ def probe_port(port: str) -> str:
     may leave it in the middle of a message. Raises a `PortError` when it cannot be opened.
     """
     device = find_port(port)
-    guesses = {one.device: one.guess for one in list_serial_ports()}
+    guesses = {one.device: guess_of(one) for one in list_serial_ports()}
     guess = guesses.get(device, "")
     transport = SerialTransport(port, timeout_s=PROBE_TIMEOUT_S, flow_control=guess == "apt")
     with closing(transport):
@@ -379,33 +377,20 @@ _PROBES = {"apt": _probe_apt, "zaber": _probe_zaber, "grbl": identify_grbl}
 """In this order: half a line of text would leave an APT controller in the middle of a message."""
 
 
-def _actuator(axis: AptAxisConfig, to_measure: bool) -> Actuator:
-    """Return an axis's actuator, with its counts as stated; to measure it, a count is the unit."""
+def _actuator(axis: AptAxisConfig) -> Actuator:
+    """Return an axis's actuator, with its counts as stated."""
     known = ACTUATORS[axis.actuator]
-    counts_per_um = axis.counts_per_um or known.counts_per_um
-    if not to_measure:
-        return replace(known, counts_per_um=counts_per_um)
-    return Actuator(1.0, known.travel_um * counts_per_um, known.top_speed_um_s * counts_per_um)
+    return replace(known, counts_per_um=axis.counts_per_um or known.counts_per_um)
 
 
-def _stage(
-    config: SerialConfig,
-    transport: Callable[[str], Transport],
-    clock: Clock,
-    to_measure: bool = False,
-) -> HostStage:
-    """Return the stage of a configuration over transports opened by port.
-
-    to_measure: the unit is a device's own count (Grbl: its own millimetre), of unknown length.
-    """
+def _stage(config: SerialConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:
+    """Return the stage of a configuration over transports opened by port."""
     try:
         settings = config.stage_settings()
         if isinstance(config, ZaberConfig):
             wire = transport(config.port)
             axes = config.axes or _found_axes(wire, clock)
-            return ZaberStage(
-                wire, axes, config.microstep_um, clock, settings, config.resolution, to_measure
-            )
+            return ZaberStage(wire, axes, config.microstep_um, clock, settings, config.resolution)
         if isinstance(config, GrblConfig):
             return GrblStage(
                 transport(config.port),
@@ -413,12 +398,9 @@ def _stage(
                 clock,
                 settings,
                 steps_per_mm=config.steps_per_mm,
-                any_scale=to_measure,
             )
         channels = {
-            name: AptAxis(
-                transport(one.port), _actuator(one, to_measure), one.destination, one.channel
-            )
+            name: AptAxis(transport(one.port), _actuator(one), one.destination, one.channel)
             for name, one in config.axes.items()
         }
         return AptStage(channels, clock, settings)

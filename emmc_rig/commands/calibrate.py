@@ -17,7 +17,7 @@ DEFAULT_CAMERA = "rgbw-bayer-1shot"
 def calibrate(
     session: Annotated[
         Path | None,
-        typer.Argument(help="a session of `capture`; without one, a simulated bench"),
+        typer.Argument(help="a session of `capture`"),
     ] = None,
     camera: Annotated[
         str, typer.Option("--camera", help="a shipped camera or a YAML file")
@@ -59,34 +59,28 @@ def calibrate(
         str | None,
         typer.Option(
             "--leave-out",
-            help="what the rig cannot take, with --plan or on the simulated bench: some of lamp, "
-            "response, colours, turned; commas between",
+            help="with --plan: what the rig cannot take, some of lamp, response, colours, turned; "
+            "commas between",
         ),
     ] = None,
-    rays: Annotated[
-        int, typer.Option("--rays", min=16, help="per view of the simulated bench; few are grainy")
-    ] = 512,
     sensor: Annotated[
         bool,
         typer.Option("--sensor", help="of a session: the sensor's EMVA 1288 figures, sensor.json"),
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the noise")] = 0,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help="folder to write (default: of a session, in the session; emmc-calibration with "
-            "--plan, else emmc-bench or emmc-drift)",
+            help="folder to write (default: in the session; emmc-calibration with --plan, "
+            "emmc-drift with --drift)",
         ),
     ] = None,
 ) -> None:
-    """Measure Psi from whiteboards, of a session or a simulated bench, and say how sure it is."""
+    """Measure Psi from a session's whiteboards, and say how sure it is; or plan them."""
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
-    from emmc_rig.processing.board_plan import write_plan
-    from emmc_rig.processing.calibration_settings import CalibrateSettings
-    from emmc_rig.processing.simulated import run_calibrate
+    from emmc_rig.processing.board_plan import PlanSettings, write_plan
 
     if drift is not None:
         if known is None:
@@ -96,46 +90,26 @@ def calibrate(
     if session is not None:
         _calibrate_session(session, route, out, sensor)
         return
+    if not plan:
+        raise typer.BadParameter("name a session, or --plan its whiteboards")
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
     shape = parse_size(size)
     assert shape is not None
-    settings = CalibrateSettings(
-        camera,
-        find_camera(camera),
-        shape,
-        route,
-        target,
-        seed,
-        rays=rays,
-        most_frames=frames,
-        few=few,
-        leave_out=frozenset(leave_out.split(",") if leave_out else ()),
-    )
-    if plan:
-        out = out or Path("emmc-calibration")
-        with result_folder(out, "calibrate --plan") as folder, shown_progress("plan"):
-            metrics = write_plan(settings, folder)
-        tell(
-            f"{metrics['frames']} frames for a relative error of Psi of "
-            f"{metrics['expected_relative_error']:.2%}, the model's own included"
-        )
-        if wanted := metrics["few_would_take_frames"]:
-            tell(f"every view is opened: few whiteboards would take {wanted} frames")
-        tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
-        give_result(out)
-        return
-    out = out or Path("emmc-bench")
-    with result_folder(out, "calibrate") as folder, shown_progress() as bars:
-        metrics = run_calibrate(settings, folder, bars)
-    chosen = metrics["chosen"]
+    settings = PlanSettings(
+        camera, find_camera(camera), shape, target, frames,
+        frozenset(leave_out.split(",") if leave_out else ()), few,
+    )  # fmt: skip
+    out = out or Path("emmc-calibration")
+    with result_folder(out, "calibrate --plan") as folder, shown_progress("plan"):
+        metrics = write_plan(settings, folder)
     tell(
-        f"{metrics['why']}; {metrics['frames'][chosen]} frames, Psi to "
-        f"{metrics['psi_relative_error'][chosen]:.2%} of the bench's own "
-        f"(the design is off by {metrics['design_relative_error']:.0%})"
+        f"{metrics['frames']} frames for a relative error of Psi of "
+        f"{metrics['expected_relative_error']:.2%}, the model's own included"
     )
-    _tell_findings(metrics)
-    tell(f"open {out / 'report.html'}")
+    if wanted := metrics["few_would_take_frames"]:
+        tell(f"every view is opened: few whiteboards would take {wanted} frames")
+    tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
     give_result(out)
 
 

@@ -129,7 +129,7 @@ def _run(
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.files.results import shown_bytes, shown_seconds
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
-    from emmc_rig.session.journal import decided_words, ended
+    from emmc_rig.session.journal import ended
     from emmc_rig.session.session import REPORT
 
     control = Control(stays=page == "steers")
@@ -180,7 +180,7 @@ def _run(
     )
     last = ended(session.journal.entries)
     if last is not None:
-        tell(decided_words(last))
+        tell(str(last))
     for reason in exposure_reasons(shot_exposures(session)):
         show_reason(**asdict(reason))
     tell(f"open {session.folder / REPORT}")

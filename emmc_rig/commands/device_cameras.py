@@ -158,7 +158,7 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     import cv2
 
     from emmc_rig.pages.frame_view import preview
-    from emmc_rig.session.frame_file import frame_file
+    from emmc_rig.session.frame_file import frame_facts, frame_file
 
     number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))
     stem = folder / f"frame-{number:04d}"
@@ -170,7 +170,8 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     facts = {
         "camera_bytes": original.name,
         "sha256": file.sha256,
-        **file.facts,
+        **frame_facts(frame),
+        **({} if file.camera_sha256 is None else {"camera_sha256": file.camera_sha256}),
     }
     files = {
         stem.with_suffix(".png"): png.tobytes(),

@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drivers.cameras import CAMERAS
-from emmc_rig.acquisition.signals import ENDING, handled, signals_interrupt
+from emmc_rig.acquisition.control import ENDING, handled, signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
-from emmc_rig.commands.stage_scale import register as register_scale
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -46,14 +45,13 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 register(app)
 app.command()(conform)
-register_scale(app)
 
 
 @app.command("list")
 def list_devices(rig: RigOption = None) -> None:
     """List serial ports (adapter, what usually answers there, who holds them) and USB cameras."""
     from drivers.clock import SYSTEM_CLOCK
-    from drivers.ports import holder_of, list_serial_ports
+    from drivers.ports import guess_of, holder_of, list_serial_ports
 
     if rig is not None:
         from emmc_rig.bench.hardware import simulated_bus
@@ -70,11 +68,10 @@ def list_devices(rig: RigOption = None) -> None:
         return
     rows = []
     for port in ports:
-        known = port.vendor_id is not None and port.product_id is not None
-        usb_id = f"{port.vendor_id:04x}:{port.product_id:04x}" if known else ""
-        held_by = holder_of(port.device)
-        named = port.device, usb_id, port.serial_number, port.description
-        rows.append((*named, port.guess, held_by))
+        known = port.vid is not None and port.pid is not None
+        usb_id = f"{port.vid:04x}:{port.pid:04x}" if known else ""
+        named = port.device, usb_id, port.serial_number or "", port.description or ""
+        rows.append((*named, guess_of(port), holder_of(port.device)))
     show_table(("port", "USB id", "serial number", "description", "guess", "held by"), rows)
 
 
@@ -114,7 +111,7 @@ def probe(
     rig: RigOption = None,
 ) -> None:
     """Ask ports what answers there; nothing moves."""
-    from drivers.ports import list_serial_ports
+    from drivers.ports import guess_of, list_serial_ports
     from emmc_rig.bench.hardware import probe_port, probe_simulated
 
     # Silence in all protocols but one is what a probe expects.
@@ -123,7 +120,7 @@ def probe(
         protocol = simulated_protocol(rig)
         tell(f"simulated:{protocol}: {probe_simulated(protocol)}")
         return
-    chosen = ports or [port.device for port in list_serial_ports() if port.guess]
+    chosen = ports or [port.device for port in list_serial_ports() if guess_of(port)]
     if not chosen:
         raise AppError("no port with a known adapter: name the ports to ask")
     with shown_progress() as progress:

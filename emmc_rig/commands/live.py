@@ -172,7 +172,7 @@ def _scale(psi: str | None) -> Scale | None:
     """Return what --psi names; None where nothing, or the design, which needs the camera's size."""
     if psi is None or psi == DESIGN:
         return None
-    from emmc_rig.live.scale import open_scale
+    from emmc_rig.live.light_field import open_scale
 
     return open_scale(Path(psi))
 
@@ -187,8 +187,7 @@ def _light_field(
     """Return what reconstructs while the camera watches; None without a Psi."""
     if psi is None:
         return None
-    from emmc_rig.live.light_field import LiveLightField
-    from emmc_rig.live.scale import designed_scale
+    from emmc_rig.live.light_field import LiveLightField, designed_scale
     from reconstruction.methods import DEFAULT_METHOD, find_method
 
     chosen = method or DEFAULT_METHOD

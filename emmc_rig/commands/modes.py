@@ -19,7 +19,7 @@ MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
         "session": {"route", "sensor", "out"},
-        "plan": {"camera", "size", "target", "rays", "seed", "leave_out", "few", "frames", "out"},
+        "plan": {"camera", "size", "target", "leave_out", "few", "frames", "out"},
     },
     "capture": {"schema": set(), "new": {"out"}},
     "export": {"list_formats": set()},

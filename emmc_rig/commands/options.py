@@ -14,7 +14,11 @@ SIZE_VARIABLE = "EMMC_SIZE"
 
 SceneOption = Annotated[
     str,
-    typer.Option("--scene", help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in name"),
+    typer.Option(
+        "--scene",
+        help="a folder of view_ROW_COL.png or an HDF5 file (NAME@by-parallax: its views in the "
+        "order that parallax shows), or a built-in name",
+    ),
 ]
 CameraOption = Annotated[
     str, typer.Option("--camera", help="a shipped camera (see `emmc-rig cameras`) or a YAML file")

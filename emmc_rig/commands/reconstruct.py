@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from emmc_rig.commands.options import ClusterOption, DictionaryOption, check_workers
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
-
-if TYPE_CHECKING:
-    from emmc_rig.processing.captures import Request
 
 
 def reconstruct(
@@ -38,12 +35,6 @@ def reconstruct(
     ] = None,
     truth: Annotated[
         str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
-    ] = None,
-    tile: Annotated[
-        int | None,
-        typer.Option(
-            "--tile", min=1, help="large light fields: which blocks come first; changes no result"
-        ),
     ] = None,
     workers: Annotated[
         int | None,
@@ -73,9 +64,8 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct the light field of a folder of frames, by any method."""
-    from emmc_rig.processing.captures import Request, reconstruct_captures
-    from emmc_rig.processing.inputs import load_settings
     from emmc_rig.processing.memory import parse_memory
+    from emmc_rig.processing.reconstructing import load_settings, reconstruct_captures
     from reconstruction.methods import DEFAULT_METHOD, find_method
 
     if list_methods:
@@ -91,38 +81,37 @@ def reconstruct(
         if method is not None or settings is not None:
             raise typer.BadParameter("--budget chooses the method and its settings")
         from emmc_rig.processing.budget import method_within
-        from emmc_rig.processing.inputs import open_frames
+        from emmc_rig.processing.reconstructing import open_frames
 
         method, why = method_within(*open_frames(frames[0], psi), budget)
         say("chosen", why, "cyan")
     method = method or DEFAULT_METHOD
     if dictionary is not None and not find_method(method).needs_dictionary:
         raise typer.BadParameter(f"--dictionary: no effect on --method {method}; leave it out")
-    requests = [
-        Request(folder, place, method, psi, dictionary, chosen, truth, why, tile, as_zarr)
-        for folder, place in _places(frames, out)
-    ]
+    places = _places(frames, out)
     limit = None if memory is None else parse_memory(memory)
     failed, refused = False, False
     with shown_progress() as bars:
-        bars.begin(method if len(requests) == 1 else f"{method}, {len(requests)} captures", None)
+        bars.begin(method if len(places) == 1 else f"{method}, {len(places)} captures", None)
         done = []
-        for request, outcome in reconstruct_captures(
-            requests, workers, cluster, limit, lambda step: bars.advance(step)
-        ):
-            if isinstance(outcome, Exception) and len(requests) == 1:
+        for place, outcome in reconstruct_captures(
+            places, workers, cluster, limit, lambda step: bars.advance(step),
+            method=method, psi_path=psi, dictionary_spec=dictionary, settings=chosen, truth=truth,
+            chosen=why, as_zarr=as_zarr,
+        ):  # fmt: skip
+            if isinstance(outcome, Exception) and len(places) == 1:
                 raise outcome
-            done.append((request, outcome))
-    for request, outcome in done:
-        if len(requests) > 1:
-            tell(f"{request.folder}:")
+            done.append((place, outcome))
+    for (folder, written), outcome in done:
+        if len(places) > 1:
+            tell(f"{folder}:")
         if isinstance(outcome, Exception):
             tell(f"failed: {outcome}", "red")
             failed = True
             continue
-        _say_result(outcome, request)
+        _say_result(outcome, written)
         show_verdict(outcome["verdict"])
-        give_result(request.out)
+        give_result(written)
         refused = refused or outcome["verdict"]["level"] == "do not use"
     if failed or (strict and refused):
         raise typer.Exit(1)
@@ -151,8 +140,7 @@ def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
     ]
 
 
-def _say_result(metrics: dict, request: Request) -> None:
-
+def _say_result(metrics: dict, out: Path) -> None:
     for line in metrics["screening"]:
         say("screening", line)
     compared = ""
@@ -170,7 +158,7 @@ def _say_result(metrics: dict, request: Request) -> None:
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     written = ("pictures", "light_field.h5", "result.zarr")
-    shown = next(request.out / name for name in written if (request.out / name).exists())
+    shown = next(out / name for name in written if (out / name).exists())
     tell(f"open {shown}")
 
 

@@ -1,11 +1,10 @@
-"""The commands `emmc-rig session`: list, compare, show, verify, export, prune, sheet, bench."""
+"""The commands `emmc-rig session`: list, show, verify, export, sheet."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
 from dataclasses import asdict
-from datetime import date
 from pathlib import Path
 from typing import Annotated
 
@@ -21,42 +20,22 @@ Folder = Annotated[Path, typer.Argument(help="a session folder")]
 @app.command("list")
 def list_sessions(
     folder: Annotated[Path, typer.Argument(help="the folder that holds sessions")] = Path(),
-    camera: Annotated[str, typer.Option("--camera", help="only those of it; part of a name")] = "",
-    since: Annotated[str, typer.Option("--since", help="begun then or later, 2026-11-22")] = "",
-    before: Annotated[str, typer.Option("--before", help="begun before, 2026-11-22")] = "",
-    verdict: Annotated[
-        str,
-        typer.Option("--verdict", help="of the light field: trust, cannot tell, doubt, do not use"),
-    ] = "",
-    psnr: Annotated[str | None, typer.Option("--psnr", help="stated at least, as 25dB")] = None,
 ) -> None:
     """List the sessions in a folder and below it: state, frames, camera, verdict, PSNR stated."""
     from rich.markup import escape
     from rich.table import Column
 
-    from emmc_rig.commands.verdict import VERDICT_COLOURS
     from emmc_rig.errors import AppError
-    from emmc_rig.files.results import parse_psnr, shown_bytes
-    from emmc_rig.session.listing import Wanted, sessions_in
+    from emmc_rig.files.results import shown_bytes
+    from emmc_rig.session.listing import sessions_in
 
-    if verdict and verdict not in VERDICT_COLOURS:
-        raise typer.BadParameter(f"--verdict {verdict}: one of {', '.join(VERDICT_COLOURS)}")
-    for option, day in (("--since", since), ("--before", before)):
-        if day and not _is_day(day):
-            raise typer.BadParameter(f"{option} {day}: write a day as 2026-11-22")
-    least_db = None if psnr is None else parse_psnr(psnr, "--psnr")
-    wanted = Wanted(camera, since, before, verdict, least_db)
-    there, found = 0, []
     with shown_progress("read sessions") as progress:
+        found = []
         for one in sessions_in(folder):
-            there += 1
             progress.step(one.name)
-            if wanted.fits(one):
-                found.append(one)
-    if not there:
-        raise AppError(f"{folder}: holds no session; `emmc-rig capture PLAN` makes one")
+            found.append(one)
     if not found:
-        raise AppError(f"{folder}: none of its {there} session(s) is such; ask for less")
+        raise AppError(f"{folder}: holds no session; `emmc-rig capture PLAN` makes one")
     rows = []
     for one in found:
         # Its path from here distinguishes sessions of one name in several folders.
@@ -74,33 +53,6 @@ def list_sessions(
     give_result(sessions=[{**asdict(one), "folder": str(one.folder)} for one in found])
 
 
-def _is_day(text: str) -> bool:
-    try:
-        date.fromisoformat(text)
-    except ValueError:
-        return False
-    return True
-
-
-@app.command()
-def compare(
-    sessions: Annotated[list[Path], typer.Argument(help="two session folders, or more")],
-) -> None:
-    """Show in what sessions differ: plan, rig, exposures, verdict, PSNR stated."""
-    from emmc_rig.session.listing import compared
-    from emmc_rig.session.session import Session
-
-    if len(sessions) < 2:
-        raise typer.BadParameter("name two sessions, or more")
-    opened = [Session(one) for one in sessions]
-    heads = ("", *(one.folder.name for one in opened))
-    rows = compared(opened)
-    show_table(heads, [(name, *values) for name, values in rows])
-    give_result(
-        sessions=list(map(str, sessions)), compared={name: list(values) for name, values in rows}
-    )
-
-
 @app.command()
 def show(session: Folder) -> None:
     """Show what a session holds, without reading its frames."""
@@ -111,7 +63,8 @@ def show(session: Folder) -> None:
     from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
 
-    listed, opened = summary(session), Session(session)
+    opened = Session(session)
+    listed = summary(opened)
     tell(f"{listed.name}: {listed.title}")
     tell(f"  {'state':<12} {listed.state} after {opened.runs} run(s)")
     tell(f"  {'begun':<12} {listed.created}")
@@ -120,13 +73,14 @@ def show(session: Folder) -> None:
     for kind, (done, planned) in counts(opened).items():
         tell(f"  {kind:<12} {done} of {planned}")
     if opened.amendments:
-        plans = Counter(entry.get("plan", 0) for entry in opened.stored.values())
+        plans = Counter(entry.plan for entry in opened.stored.values())
         for number in range(opened.amendments + 1):
             name = amended_name(PLAN, number)
             tell(f"  {'plan ' + str(number):<12} {plans[number]} frames, by {name}")
     leftovers, foreign = opened.unexpected_files()
     if leftovers:
-        tell(f"  {len(leftovers)} leftover(s) of a crash: `emmc-rig session prune`")
+        names = ", ".join(leftovers)
+        tell(f"  {len(leftovers)} leftover(s) of a crash, which do not count: {names}")
     for name in foreign:
         tell(f"  {name}: not of this session")
     for reason in exposure_reasons(shot_exposures(opened)):
@@ -178,27 +132,6 @@ def export(
         export_hdf5(opened, out, compress, progress.step)
     tell(f"wrote {out}, {shown_bytes(out.stat().st_size)}")
     give_result(out, bytes=out.stat().st_size)
-
-
-@app.command()
-def prune(
-    session: Folder,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would go")] = False,
-) -> None:
-    """Remove what a crash left in a session; frames that count and other files stay."""
-    from emmc_rig.files.results import shown_bytes
-    from emmc_rig.session.lock import held
-    from emmc_rig.session.prune import prune as pruned
-    from emmc_rig.session.session import Session
-
-    Session(session)  # no lock for what is none
-    with held(session), shown_progress("look"):
-        removed, size = pruned(Session(session), dry_run)
-    verb = "would remove" if dry_run else "removed"
-    for name in removed:
-        tell(f"{verb} {name}")
-    tell(f"{verb} {len(removed)} leftover(s), {shown_bytes(size)}")
-    give_result(removed=removed, bytes=size, dry_run=dry_run)
 
 
 @app.command()

@@ -67,8 +67,7 @@ def simulate_into(
     frames.zarr and psi.zarr in their place.
     """
     import emmc_rig as emmc
-    from emmc_rig.files.frames import FRAMES, FRAMES_GROUP, PSI
-    from emmc_rig.files.psi import PSI_GROUP, save_shards
+    from emmc_rig.files.psi import FRAMES, FRAMES_GROUP, PSI, PSI_GROUP, save_shards
     from emmc_rig.files.results import save_frames, write_metrics
     from emmc_rig.model.lightfield import psnr_db
 

@@ -36,13 +36,6 @@ def stability(
     fast: Annotated[
         bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
     ] = False,
-    screening: Annotated[
-        bool | None,
-        typer.Option(
-            "--screening/--no-screening",
-            help="screen the frames for bad pixels and shots (default: both, where it matters)",
-        ),
-    ] = None,
     faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
@@ -70,13 +63,12 @@ def stability(
     settings = stability_settings(
         fast, scene or [], parse_size(size), camera=camera or CAMERA, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
-        screening={None: "both", True: "on", False: "off"}[screening],
     )  # fmt: skip
     with shown_progress() as bars:
         outcome = run_stability(settings, out, bars, workers=workers, cluster=cluster)
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
     title = f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view"
-    shown = [(f"{row.title}, {row.unit}", *row.cells) for row in rows]
+    shown = [(f"{fault.title}, {fault.unit}", *cells) for fault, cells in rows]
     show_table(("fault", *methods), shown, title)
     for line in outcome.left_out:
         say("left out", line)

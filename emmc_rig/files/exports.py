@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
-from emmc_rig.files.frames import FRAMES
+from emmc_rig.files.psi import FRAMES
 from emmc_rig.files.results import METRICS
-from emmc_rig.files.scenes import fine_scene, open_scene
+from emmc_rig.files.scenes import fine_scene, open_scene, path_in
 from emmc_rig.model.errors import SceneError, nearest_of
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.lightfield import load_hdf5
@@ -32,7 +32,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     truth: the scene that was captured, to compare with. size: of a scene, see `open_scene`; results
     keep theirs. Raises AppError or SceneError.
     """
-    folder = Path(spec)
+    folder = path_in(spec)
     if is_session(folder):
         folder = folder / IN_SESSION
         if not (folder / LIGHT_FIELD).is_file():
@@ -58,7 +58,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     fitting = {name: values for name, values in maps.items() if _fits(values, light_field.shape)}
     return Export(
         folder.resolve().name, caption, light_field, true, metrics=metrics, source=spec, **{
-            name: fitting.get(name) for name in ("disparity", "sigma", "model", "misfit")
+            name: fitting.get(name) for name in ("disparity", "sigma", "misfit")
         },
     )  # fmt: skip
 

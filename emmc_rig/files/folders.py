@@ -3,12 +3,12 @@
     OUT/
         metrics.json, ...    what a command wrote
         files.json           the command, and the SHA-256 of every file it wrote
-        .emmc-rig.partial/   while a command writes: new/, moves.json, kept/, lock
+        .emmc-rig.partial/   while a command writes: new/, kept/, lock, and at its end files.json
 
-A command writes into `new`. When all of it is on the disk, `moves.json` says so; then files of the
-earlier result are deleted, the new ones renamed into their places, and the hidden folder goes.
-Moves that were interrupted are finished, by the command itself or by the next one into the folder;
-also those of version 0.2, which first moved the earlier result to `earlier`.
+A command writes into `new`. Once all of it is on the disk, so is the hidden folder's files.json:
+from then on the new result holds, and whoever comes next finishes what a kill interrupts. Files
+that only the earlier files.json lists are deleted, those in `new` renamed into their places, and
+files.json last of all.
 
 Nothing is written where a session of `emmc-rig capture` lies: see `refuse_inside_session`.
 """
@@ -19,7 +19,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -30,8 +30,9 @@ from emmc_rig.model.json_text import parse_json
 
 FILES = "files.json"
 PARTIAL = ".emmc-rig.partial"
-NEW, EARLIER, MOVES = "new", "earlier", "moves.json"
-KEPT, LOCK = "kept", "lock"
+NEW, KEPT, LOCK = "new", "kept", "lock"
+MOVES = "moves.json"
+"""Of version 0.2, while it replaced a result."""
 SESSION_HEADER, SESSION_JOURNAL = "session.json", "journal.jsonl"
 
 
@@ -114,14 +115,14 @@ def result_folder(
         refuse_inside_session(out, belongs_to)
         made = _make_folders(folder, out)
         with _workplace(folder / PARTIAL, resumes):
-            _finish_moves(folder)
+            _finish(folder)
             earlier = _replaceable(folder, out, command, adds)
             if not adds:
                 _refuse_holding(folder, out)
             new = folder / PARTIAL / NEW
             new.mkdir()
             yield new
-            _take_place(folder, out, earlier, command, adds)
+            _take_place(folder, out, earlier, adds)
             if resumes:
                 _clear(folder / PARTIAL)
     except OSError as fault:
@@ -227,45 +228,40 @@ def _make_folders(folder: Path, out: Path) -> list[Path]:
 def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
     """Make a hidden folder that is this program's alone; it goes at the end with all in it.
 
-    What a killed program left in it goes too, but for interrupted moves, and what is kept where
-    `resumes`. Raises AppError where another program works in it, and OSError.
+    What a killed program left in it goes too, but for a result that takes its place, and what is
+    kept where `resumes`. Raises AppError where another program works in it, and OSError.
     """
-    release = _held(place)
-    spared = KEPT if resumes else None
-    try:
-        if not (place / MOVES).exists():
-            _clear(place, spared)
-        yield
-    finally:
-        try:
-            with suppress(OSError):
-                if not (place / MOVES).exists():
-                    _clear(place, spared)
-        finally:
-            with suppress(OSError):
-                release()
-                place.rmdir()
-
-
-def _held(place: Path) -> Callable[[], None]:
-    """Make a folder and lock it; returns what removes the lock. Raises AppError, OSError."""
-    while True:
+    release = None
+    while release is None:
         place.mkdir(exist_ok=True)
         try:
-            return take_lock(place / LOCK)
+            release = take_lock(place / LOCK)
         except TakenError as taken:
             raise AppError(
                 f"{place.parent}: another emmc-rig command writes there: {taken}"
             ) from None
         except FileNotFoundError:
             continue  # whoever held it has removed it meanwhile
+    try:
+        _clear(place, KEPT if resumes else None)
+        yield
+    finally:
+        try:
+            with suppress(OSError):
+                _clear(place, KEPT if resumes else None)
+        finally:
+            with suppress(OSError):
+                release()
+                place.rmdir()
 
 
 def _clear(place: Path, spared: str | None = None) -> None:
-    """Empty a hidden folder of this program; nothing behind a link is touched.
+    """Empty a hidden folder, unless a result in it takes its place; links are not followed.
 
     spared: the one folder in it that stays, unless it is empty.
     """
+    if (place / FILES).exists() or (place / MOVES).exists():
+        return
     for path in list(place.iterdir()):
         is_folder = path.is_dir() and not path.is_symlink()
         if path.name == LOCK or (path.name == spared and is_folder and any(path.iterdir())):
@@ -327,76 +323,65 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _take_place(folder: Path, out: Path, earlier: Listing, command: str, adds: bool) -> None:
+def _take_place(folder: Path, out: Path, earlier: Listing, adds: bool) -> None:
     """Replace the earlier result by what lies in `new`: all of it or, after an error, nothing."""
-    partial = folder / PARTIAL
-    new = dict(_synced(partial / NEW))
-    kept = {name: sha for name, sha in earlier.files.items() if adds and name not in new}
-    listing = Listing(command, {**kept, **new}).text()
-    new[FILES] = _write_synced(partial / NEW / FILES, listing)
-    replaced = {FILES: _digest(folder / FILES), **earlier.files}
+    new, partial, files = folder / PARTIAL / NEW, folder / PARTIAL, {}
+    for path in sorted(new.rglob("*")):
+        if not path.is_dir():
+            _sync(path)
+            files[path.relative_to(new).as_posix()] = _digest(path)
+    kept = {name: sha for name, sha in earlier.files.items() if adds and name not in files}
     # Somebody may have edited it since the command began.
-    _refuse_foreign(folder, out, {**replaced, **new}, Listing(earlier.command, replaced))
-    gone = {name: sha for name, sha in replaced.items() if name not in kept}
-    _write_synced(partial / "moves", json.dumps({"command": command, "earlier": gone, "new": new}))
-    os.replace(partial / "moves", partial / MOVES)
+    if (Listing.read(folder) or Listing(earlier.command)) != earlier:
+        raise AppError(f"--out {out}: {FILES} is not what `emmc-rig {earlier.command}` wrote")
+    _refuse_foreign(folder, out, {**earlier.files, **files}, earlier)
+    (new / FILES).write_bytes(Listing(earlier.command, {**kept, **files}).text().encode())
+    _sync(new / FILES)
+    os.replace(new / FILES, partial / FILES)
     try:
-        _finish_moves(folder)
+        _finish(folder)
     except BaseException:
-        # After Ctrl-C, or a fault that has passed; otherwise the next command finishes them.
+        # After Ctrl-C, or a fault that has passed; otherwise the next command finishes it.
         with suppress(OSError):
-            _finish_moves(folder)
+            _finish(folder)
         raise
 
 
-def _finish_moves(folder: Path) -> None:
-    """Finish the moves that `moves.json` lists; without such a file, do nothing.
+def _finish(folder: Path) -> None:
+    """Let the result that the hidden folder's files.json lists take its place, if there is one.
 
     Raises AppError where somebody changed, after a kill, what would be replaced.
     """
     partial = folder / PARTIAL
-    try:
-        moves = parse_json((partial / MOVES).read_bytes(), str(partial / MOVES), AppError)
-    except FileNotFoundError:
+    if (partial / MOVES).exists():
+        raise AppError(
+            f"{partial}: version 0.2 was interrupted as it replaced a result; choose another folder"
+        )
+    listing = Listing.read(partial)
+    if listing is None:
         return
-    command, earlier = moves.get("command", ""), moves["earlier"]
-    if isinstance(earlier, list):  # of version 0.2, whose files.json was the first to move
-        was = Listing.read(partial / EARLIER) or Listing.read(folder) or Listing("")
-        command, known = was.command, {FILES: _digest(folder / FILES), **was.files}
-        earlier = {name: known[name] for name in earlier}
-    left = [name for name in moves["new"] if (partial / NEW / name).exists()]
-    obsolete = [name for name in earlier if name not in moves["new"]]
-    _refuse_foreign(folder, folder, (*left, *obsolete), Listing(command, earlier))
+    earlier = Listing.read(folder) or Listing(listing.command)
+    left = [name for name in listing.files if (partial / NEW / name).exists()]
+    obsolete = [name for name in earlier.files if name not in listing.files]
+    _refuse_foreign(folder, folder, (*left, *obsolete), earlier)
     for name in obsolete:
         (folder / name).unlink(missing_ok=True)
-    _remove_empty(folder, obsolete)
+    above = {path for name in obsolete for path in _above(folder, name)}
+    for path in sorted(above, key=lambda path: len(path.parts), reverse=True):
+        with suppress(OSError):
+            path.rmdir()
     for name in left:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(partial / NEW / name, folder / name)
     _sync_folders(folder, [*obsolete, *left])
-    (partial / MOVES).unlink()
-    for name in (NEW, EARLIER):
-        shutil.rmtree(partial / name, ignore_errors=True)
-
-
-def _synced(new: Path) -> Iterator[tuple[str, str]]:
-    """Yield name and SHA-256 of every file in a folder; its bytes are then on the disk."""
-    for path in sorted(new.rglob("*")):
-        if not path.is_dir():
-            _sync(path)
-            yield path.relative_to(new).as_posix(), _digest(path)
+    os.replace(partial / FILES, folder / FILES)
+    _sync_folders(folder, [FILES])
+    shutil.rmtree(partial / NEW, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
-
-
-def _write_synced(path: Path, text: str) -> str:
-    """Write a file to the disk; return its SHA-256."""
-    path.write_bytes(text.encode())
-    _sync(path)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _sync_folders(folder: Path, names: Iterable[str]) -> None:
@@ -410,11 +395,3 @@ def _sync_folders(folder: Path, names: Iterable[str]) -> None:
                 os.fsync(descriptor)
             finally:
                 os.close(descriptor)
-
-
-def _remove_empty(folder: Path, names: Iterable[str]) -> None:
-    """Remove the folders inside `folder` that these files leave empty."""
-    above = {path for name in names for path in _above(folder, name)}
-    for path in sorted(above, key=lambda path: len(path.parts), reverse=True):
-        with suppress(OSError):
-            path.rmdir()

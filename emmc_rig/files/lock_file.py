@@ -11,11 +11,12 @@ import json
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from emmc_rig.model.json_text import parse_json
 
@@ -26,11 +27,19 @@ TRIES, WAIT_S = 200, 0.01
 class TakenError(Exception):
     """Another program has the lock; `holder` says which one, `advice` what to do."""
 
-    def __init__(self, path: Path, holder: str, by_file: bool, ended: bool = False) -> None:
-        self.holder = holder or "another program"
+    def __init__(self, path: Path, holder: Mapping[str, Any], by_file: bool) -> None:
+        self.holder = "another program"
+        if holder:
+            self.holder = "`{command}` (process {process} on {host}, since {since})".format(
+                **{"since": "an unknown time", **holder}
+            )
         self.advice = "wait until it ends, or stop it"
         if by_file:
             delete = f"delete {path}, for this disk cannot lock files"
+            here, process = holder.get("host") == socket.gethostname(), holder.get("process")
+            ours = process == os.getpid()
+            can_tell = here and isinstance(process, int) and not ours and os.name != "nt"
+            ended = can_tell and not is_running(int(process or 0))
             self.advice = (
                 f"it has ended: {delete}"
                 if ended
@@ -49,35 +58,28 @@ def take_lock(path: Path) -> Callable[[], None]:
             if not path.parent.is_dir():
                 raise
             continue  # it went between two looks at it
-        kept = False
+        by_file, is_free = False, True
         try:
-            try:
-                _lock(descriptor)
-                is_free = True
-            except BlockingIOError:
-                is_free = False
-            except (OSError, ImportError):
-                by_file, is_free = True, made
-            text = os.read(descriptor, 4096)
-            holder = _holder(text)
-            if holder and (not is_free or holder.get("by_file")):
-                stays = by_file or bool(holder.get("by_file"))
-                raise TakenError(path, _shown(holder), stays, _has_ended(holder))
-            if is_free and _is_named(descriptor, path):
-                if not text:
-                    # On a full disk the lock holds without a name.
-                    with suppress(OSError):
-                        os.write(descriptor, _own_name(by_file))
-                    kept = True
-                    return partial(_release, descriptor, path)
-                # Left by a killed program: its name must not be read any more.
-                os.unlink(path)
-        finally:
-            if not kept:
-                os.close(descriptor)
-        if not is_free:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            is_free = False
+        except (OSError, ImportError):
+            by_file, is_free = True, made
+        holder = _holder(os.read(descriptor, 4096))
+        is_taken = not is_free or bool(holder.get("by_file"))
+        if not is_taken and _is_named(descriptor, path):
+            with suppress(OSError):  # on a full disk the lock holds without a name
+                os.ftruncate(descriptor, 0)  # a killed program's name must not be read any more
+                os.pwrite(descriptor, _own_name(by_file), 0)
+            return partial(_release, descriptor, path)
+        os.close(descriptor)
+        if is_taken and holder:
+            raise TakenError(path, holder, by_file or bool(holder.get("by_file")))
+        if is_taken:
             time.sleep(WAIT_S)
-    raise TakenError(path, "", by_file)
+    raise TakenError(path, {}, by_file)
 
 
 def _opened(path: Path) -> tuple[int, bool]:
@@ -87,12 +89,6 @@ def _opened(path: Path) -> tuple[int, bool]:
         return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666), True
     except FileExistsError:
         return os.open(path, flags), False
-
-
-def _lock(descriptor: int) -> None:
-    import fcntl
-
-    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _release(descriptor: int, path: Path) -> None:
@@ -126,7 +122,7 @@ def _own_name(by_file: bool) -> bytes:
     return json.dumps(name | ({"by_file": True} if by_file else {})).encode()
 
 
-def _holder(data: bytes) -> dict[str, object]:
+def _holder(data: bytes) -> dict[str, Any]:
     """Return who wrote a lock file; empty where it is not written yet."""
     try:
         name = parse_json(data, "the lock", ValueError)
@@ -135,26 +131,9 @@ def _holder(data: bytes) -> dict[str, object]:
     return name if isinstance(name, dict) and {*name} >= {"command", "process", "host"} else {}
 
 
-def _shown(holder: dict[str, object]) -> str:
-    """Return who holds a lock, in words."""
-    if not holder:
-        return ""
-    return "`{command}` (process {process} on {host}, since {since})".format(
-        **{"since": "an unknown time", **holder}
-    )
-
-
-def _has_ended(holder: dict[str, object]) -> bool:
-    """Return whether the holder is known to run no more: it ran on this computer."""
-    process = holder.get("process")
-    here = holder.get("host") == socket.gethostname() and os.name != "nt"
-    ours = process == os.getpid()
-    return here and isinstance(process, int) and not ours and not is_running(process)
-
-
 def is_running(process: int) -> bool:
     """Return whether another process of that number runs; Windows is not asked."""
-    if process == os.getpid() or os.name == "nt":
+    if os.name == "nt":
         return False
     try:
         os.kill(process, 0)
@@ -162,4 +141,4 @@ def is_running(process: int) -> bool:
         return False
     except PermissionError:
         return True
-    return True
+    return process != os.getpid()

@@ -1,4 +1,4 @@
-"""Psi on the disk, read window by window: an HDF5 file, or a Zarr group of shards."""
+"""Folders of frames as `simulate` writes them, and Psi read window by window: HDF5 or Zarr."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.files.frames import PSI
+from emmc_rig.errors import AppError
+from emmc_rig.files.folders import refuse_missing
 from emmc_rig.files.shards import (
     CHUNK,
     SHARD,
@@ -21,11 +22,16 @@ from emmc_rig.files.shards import (
     whole,
 )
 from emmc_rig.model.errors import SensingError
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, checksum_of
 
 PSI_GROUP = "psi.zarr"
 AGAIN = "measure Psi again"
+FRAMES, PSI = "frames.h5", "psi.h5"
+FRAMES_GROUP = "frames.zarr"
+FRAMES_AGAIN = "make the frames again"
+WRITTEN_BY = "name one that `emmc-rig demo`, `simulate` or `capture` wrote"
 
 
 class SavedPsi:
@@ -136,3 +142,22 @@ def save_shards(psi: ImagingMatrix, folder: Path) -> None:
     group.attrs.update(
         format=FORMAT, binning=psi.binning, camera=psi.camera_json, sha256=psi.checksum()
     )
+
+
+def read_frames(folder: Path) -> Frames:
+    """Read the frames of a folder; raises AppError when they are missing, damaged or incomplete."""
+    refuse_missing(folder, WRITTEN_BY)
+    path = folder / FRAMES
+    sharded = (folder / FRAMES_GROUP).is_dir()
+    if sharded:
+        path = folder / FRAMES_GROUP
+    elif not path.is_file():
+        raise AppError(f"{folder}: holds no {FRAMES}; {WRITTEN_BY}")
+    with (stored_shards if sharded else stored_arrays)(path, AppError, FRAMES_AGAIN) as stored:
+        names = ("readings", "deviation", "usable")
+        arrays = [stored.array(name) for name in names]
+    if sharded:
+        arrays = [whole(values, path, AppError, FRAMES_AGAIN) for values in arrays]
+    readings, deviation, usable = arrays
+    usable = usable.astype(bool)
+    return Frames(readings, deviation, usable)

@@ -28,6 +28,8 @@ APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 """How much finer the simulated rig sees a scene than it is reconstructed, along each axis."""
 _DEFAULT_VIEWS, _DEFAULT_SIZE_PX = (5, 5), (192, 256)
 _HDF5_ENDINGS = (".h5", ".hdf5")
+BY_PARALLAX = "@by-parallax"
+"""After the name of a folder or file: its views are put into the order that parallax shows."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,9 @@ def open_scene(
     Args:
         spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a `.zarr` group with
             `light_field`, a built-in name, or what another of `emmc_rig.files.formats` that can
-            be read holds; or the light field itself, an array (v, u, y, x, 3) in [0, 1].
+            be read holds; or the light field itself, an array (v, u, y, x, 3) in [0, 1]. A folder
+            or file whose views lie in another order than named is opened as named, with a
+            ViewOrderWarning; `NAME@by-parallax` puts them right.
         size: rows and columns of pixels: what a built-in scene is rendered at (192x256 by
             default), the middle that is cut from a measured one (all of it by default).
         views: rows and columns of views, likewise (5x5 by default).
@@ -121,7 +125,13 @@ def open_scene(
         )
     light_field, kept = _measured(spec)
     light_field, cut = _middle(light_field, size, views, spec)
-    return Scene(Path(spec).resolve().stem, light_field, None, f"{kept}{cut}")
+    return Scene(path_in(spec).resolve().stem, light_field, None, f"{kept}{cut}")
+
+
+def path_in(spec: str) -> Path:
+    """Return the path that names a measured scene, without BY_PARALLAX."""
+    path = Path(spec)
+    return path if path.exists() else Path(spec.removesuffix(BY_PARALLAX))
 
 
 def zoomed_scene(
@@ -230,7 +240,7 @@ def _described(name: str, views: tuple[int, int], size: tuple[int, int], seed: i
 
 def _measured(spec: str) -> tuple[np.ndarray, str]:
     """The light field in a folder or file, and a sentence about it."""
-    path = Path(spec)
+    path = path_in(spec)
     held = next((form for form in FORMATS.values() if form.holds and form.holds(path)), None)
     if held is not None and held.read is not None:
         light_field = check_light_field(held.read(path), spec)
@@ -254,12 +264,18 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
             f"built in are {', '.join(SCENES)}"
         )
     n_v, n_u, height, width, _ = light_field.shape
-    order, remark = order_of(light_field), ""
-    if order != ViewOrder.AS_NAMED:
-        remark = f": {order.words}, says their parallax; put right"
-        warnings.warn(f"{spec}{remark}", ViewOrderWarning, stacklevel=3)
-    described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels{remark}"
-    return order.arranged(light_field), described
+    described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels"
+    order = order_of(light_field)
+    if order == ViewOrder.AS_NAMED:
+        return light_field, described
+    described += f": {order.words}, says their parallax"
+    if path != Path(spec):
+        return order.arranged(light_field), f"{described}; put right"
+    remedy = f"open it as {spec}{BY_PARALLAX} to put them right"
+    warnings.warn(
+        f"{spec}: {order.words}, says their parallax; {remedy}", ViewOrderWarning, stacklevel=3
+    )
+    return light_field, described
 
 
 def _middle(

@@ -321,9 +321,7 @@ def _descended(
     deviations, correlation = np.full(4, np.inf), 0.0
     for _ in range(STEPS):
         shadow = Shadow(mask, placement)
-        seen, slope = shadow.with_slopes(
-            sample.pixels, sample.channels, board.views_open, board.stage_um, board.shot
-        )
+        seen, slope = shadow.with_slopes(sample.pixels, sample.channels, *board.opening)
         residual, rows = sample.reading.copy(), slope[:, FITTED].copy()
         explained = np.zeros_like(residual)
         for channel in np.unique(sample.channels):

@@ -7,9 +7,12 @@ reconstruction of the frame that it stands still at runs beside, by the same cal
 
 from __future__ import annotations
 
+import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,20 +21,27 @@ from numpy.typing import NDArray
 
 from calibration.bracket import fuse
 from calibration.errors import CalibrationError
-from calibration.frames import dark_at
+from calibration.frames import MeanFrame, SensorGain, dark_at
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
+from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
-from emmc_rig.live.field_pictures import Pictures, disparity_of, export_of
+from emmc_rig.files.psi import PSI
+from emmc_rig.live.server import Picture, Pictured, Query
+from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.measured_psi import Scale
+from emmc_rig.pages.display import PART_PIXELS
+from emmc_rig.pages.viewer import viewer_data
+from emmc_rig.session.measured_psi import Scale, session_scale
+from emmc_rig.session.session import Session
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD
 from reconstruction.preview import Preview
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.missed import missed_readings
+from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
@@ -51,6 +61,12 @@ COMPILING_S = 5.0
 """Without a step, from when on the page says why."""
 
 Solve = Callable[..., tuple[Reconstruction, Verdict]]
+SURE_PX = 0.15
+"""Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
+WINDOW_PX = 7
+CALIBRATION = "calibration.h5"
+MANY = 1_000_000
+"""Frames that an average stands for whose own noise is not known, and is left out."""
 
 
 class _ChangedError(Exception):
@@ -297,3 +313,123 @@ def _exposure_s(frame: RawFrame) -> float:
     if not frame.exposure_s:
         raise AppError("the camera does not say how long its frames were exposed")
     return float(frame.exposure_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """A light field and its maps; each has another number.
+
+    block: how many of the camera's samples, along each axis, one of the light field is.
+    """
+
+    number: int
+    export: Export
+    block: int = 1
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the page needs before it asks for them, as plain data."""
+        return {"number": self.number, "views": list(self.export.light_field.shape[:2])}
+
+    def encoded(self) -> bytes:
+        """Return what the viewer reads, JSON."""
+        data = viewer_data(self.export, most_pixels=PART_PIXELS)
+        data["scale"] = float(str(data["scale"])) / self.block
+        return json.dumps(data, allow_nan=False, separators=(",", ":")).encode()
+
+
+def export_of(
+    light_field: Array, maps: Mapping[str, NDArray], misfit: Array | None = None
+) -> Export:
+    """Return a light field with those of a method's maps that the viewer shows."""
+    disparity, sigma = (maps.get(name) for name in ("disparity", "sigma"))
+    return Export("", "", light_field, None, disparity, sigma, misfit)
+
+
+def field_pictures(
+    newest: Callable[[], Pictures | None],
+) -> dict[str, Pictured]:
+    """Return what a `emmc_rig.live.server.Page` serves of a light field."""
+
+    def light_field(query: Query) -> Picture | None:
+        shown = newest()
+        return shown and Picture("light field", shown.number, shown.encoded, "application/json")
+
+    return {"light-field.json": light_field}
+
+
+def disparity_of(light_field: Array) -> NDArray[np.float32]:
+    """Return the disparity of small views, (y, x), pixels per view step; NaN where not decided.
+
+    light_field: (v, u, y, x, c). Where views are shifted by less than a pixel, brightness stays
+    along lines of slope d: L_u = -d L_x and L_v = -d L_y, solved by least squares over a window
+    and all views (Bolles, Baker and Marimont 1987; as Lucas and Kanade 1981 for flow).
+    """
+    grey = light_field @ np.full(light_field.shape[-1], 1 / light_field.shape[-1], np.float32)
+    by_v, by_u, by_y, by_x = (
+        np.gradient(grey, axis=axis) if grey.shape[axis] > 1 else np.zeros_like(grey)
+        for axis in range(4)
+    )
+
+    def gathered(*products: tuple[Array, Array]) -> Array:
+        summed = sum(np.einsum("vuyx,vuyx->yx", one, other) for one, other in products)
+        return np.asarray(cv2.blur(np.asarray(summed), (WINDOW_PX, WINDOW_PX)), np.float32)
+
+    power = gathered((by_x, by_x), (by_y, by_y))
+    product = gathered((by_u, by_x), (by_v, by_y))
+    change = gathered((by_u, by_u), (by_v, by_v))
+    safe = np.maximum(power, 1e-12)
+    found = -product / safe
+    left = np.maximum(change - product**2 / safe, 0)
+    # Views that differ by interpolation are no independent witnesses: one window of pixels counts.
+    deviation = np.sqrt(left / safe / WINDOW_PX)
+    sure = (deviation < SURE_PX) & (power > 1e-4 * float(power.max() + 1e-12))
+    return np.where(sure, found, np.nan).astype(np.float32)
+
+
+def open_scale(place: Path) -> Scale:
+    """Return Psi and what turns frames into readings.
+
+    place: a session, a folder of `emmc-rig calibrate`, or the file of a Psi. Without the frames of
+    a calibration beside it a Psi is scaled by its camera's noise model, which is coarser. Raises
+    AppError, SensingError or CalibrationError.
+    """
+    if is_session(place):
+        return session_scale(Session(place))
+    file = place / PSI if place.is_dir() else place
+    if not file.is_file():
+        raise AppError(
+            f"{place}: no Psi; name a session, a folder of `emmc-rig calibrate` or psi.h5"
+        )
+    psi = ImagingMatrix.load(file)
+    if not (file.parent / CALIBRATION).is_file():
+        return designed_scale(psi)
+    with stored_arrays(file.parent / CALIBRATION, AppError, "calibrate again") as stored:
+        gain = SensorGain(
+            float(np.asarray(stored.attributes["gain_dn_per_electron"])),
+            float(np.asarray(stored.attributes["dark_variance_dn2"])),
+        )
+        dark_dn, white = stored.array("dark_dn"), stored.array("white_dn_per_s")
+        good = stored.array("good").astype(bool) if "good" in stored else None
+    if white.shape != psi.frames_shape:
+        raise AppError(f"{file}: does not fit the {CALIBRATION} beside it; calibrate again")
+    dark = MeanFrame(dark_dn, gain.dark_variance_dn2, MANY, 0.0)
+    everywhere = np.ones(dark_dn.shape, dtype=bool)
+    return Scale(psi, white, (dark,), gain, everywhere if good is None else good)
+
+
+def designed_scale(psi: ImagingMatrix) -> Scale:
+    """Return the scale of a Psi by its camera's noise model; raises AppError without a camera."""
+    if not psi.camera_json:
+        raise AppError("this Psi does not know its camera: name the folder of its calibration")
+    camera = camera_of(psi)
+    noise, shape = camera.sensor.noise, psi.frames_shape[1:]
+    read_variance = (noise.gain_dn_per_electron * noise.read_noise_electrons) ** 2
+    black = np.full(shape, noise.black_level_dn, dtype=np.float32)
+    white = noise.gain_dn_per_electron * noise.electrons_per_s * pixel_light(camera, psi.size)
+    return Scale(
+        psi,
+        white,
+        (MeanFrame(black, read_variance, MANY, 0.0),),
+        SensorGain(noise.gain_dn_per_electron, read_variance),
+        np.ones(shape, dtype=bool),
+    )

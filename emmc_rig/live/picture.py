@@ -6,22 +6,21 @@ shown is the mean of its tiles, so that nothing needs to be demosaiced.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal, get_args
+from typing import Literal
 
 import cv2
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
+from pydantic import Field
 
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.compiling import njit
+from emmc_rig.model.settings import Settings
 from emmc_rig.pages.frame_view import BAYER, srgb_codes
 
-Kind = Literal["mosaic", "colour"]
-KINDS = get_args(Kind)
 LONGEST_PX = 1600
 SMALLEST_PART = 1 / 256
 BRIGHTEST = 0.999
@@ -36,32 +35,21 @@ CODES = 1 << 14
 FROM_BAYER = {cfa: getattr(cv2, f"COLOR_Bayer{cfa.upper()}2BGR") for cfa in BAYER}
 
 
-@dataclass(frozen=True)
-class View:
+class View(Settings):
     """What part of a frame, and how.
 
-    x, y: the part's centre, and part: its width, as shares of the frame's. longest_px: of the
-    picture made. marked: saturated pixels in red, those clipped at 0 in blue.
+    x, y: the part's centre, and part: its width, as shares of the frame's. px: the longest side of
+    the picture made. marked: saturated pixels in red, those clipped at 0 in blue.
     bright: the brightest thousandth of the part becomes white.
     """
 
-    kind: Kind = "colour"
-    x: float = 0.5
-    y: float = 0.5
-    part: float = 1.0
-    longest_px: int = LONGEST_PX
+    kind: Literal["mosaic", "colour"] = "colour"
+    x: float = Field(default=0.5, ge=0, le=1)
+    y: float = Field(default=0.5, ge=0, le=1)
+    part: float = Field(default=1.0, ge=SMALLEST_PART, le=1)
+    px: int = Field(default=LONGEST_PX, ge=16, le=LONGEST_PX)
     marked: bool = True
     bright: bool = False
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise AppError(f"no view {self.kind!r}: choose one of {', '.join(KINDS)}")
-        if not all(0 <= value <= 1 for value in (self.x, self.y)):
-            raise AppError("the centre of a view lies outside the frame: give x, y from 0 to 1")
-        if not SMALLEST_PART <= self.part <= 1:
-            raise AppError(f"a view of {self.part:g} of the frame: give {SMALLEST_PART:g} to 1")
-        if not 16 <= self.longest_px <= LONGEST_PX:
-            raise AppError(f"a picture of {self.longest_px} pixels: ask for 16 to {LONGEST_PX}")
 
 
 def window(view: View, shape: tuple[int, int]) -> tuple[slice, slice]:
@@ -80,11 +68,11 @@ def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
     mosaic = frame.mosaic[rows, columns]
     black = float(frame.black_level_dn.mean())
     span = max(1.0, frame.white_level_dn - black)
-    step = -(-max(mosaic.shape) // (2 * view.longest_px))
-    if step > 1 or max(mosaic.shape) >= 2 * view.longest_px:
+    step = -(-max(mosaic.shape) // (2 * view.px))
+    if step > 1 or max(mosaic.shape) >= 2 * view.px:
         mixing = _mixing(frame.cfa if view.kind == "colour" else "")
         if view.bright:
-            few = replace(view, longest_px=BRIGHTNESS_PX, bright=False)
+            few = view.model_copy(update={"px": BRIGHTNESS_PX, "bright": False})
             codes = picture(frame, few).max(axis=2)
             # The least linear light of the brightest code there is, so that it becomes white.
             brightest = np.searchsorted(_srgb_table(), np.quantile(codes, BRIGHTEST)) / CODES
@@ -120,7 +108,7 @@ def _shown(
     linear = np.clip((seen - np.float32(black)) / np.float32(span), 0, 1)
     if view.bright:
         linear = np.clip(linear / max(1 / span, float(np.quantile(linear, BRIGHTEST))), 0, 1)
-    resized = _resized(linear, view.longest_px / max(linear.shape[:2]))
+    resized = _resized(linear, view.px / max(linear.shape[:2]))
     shown = _srgb_table()[(resized * np.float32(CODES - 1)).astype(np.uint16)]
     if view.marked:
         # The most of each spot, not the mean: one saturated pixel in a large frame is seen.

@@ -3,8 +3,8 @@
 Every path begins with a random token, and the host must be one of this computer's names for
 itself, so that no other page in the browser can reach it (cross-site requests, DNS rebinding).
 
-States are pushed (server-sent events): each is encoded once and written to all who look, the
-newest only. A request that must not wait has a thread of its own.
+States are pushed (server-sent events), the newest only. A request that must not wait has a thread
+of its own.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import asyncio
 import json
 import secrets
 import socket
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -24,15 +25,14 @@ import uvicorn
 from jinja2 import ChoiceLoader, PackageLoader
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.live.connections import Connections
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.pages.page import ENVIRONMENT, TEMPLATES
 
@@ -43,8 +43,6 @@ LARGEST = 1e12
 LONGEST_BODY = 1 << 17
 PAUSE_S = 0.04
 """At least between two states that are pushed."""
-AT_ONCE = 4
-"""Clients written to between which the loop looks for other requests."""
 MOST_VIEWS = 16
 """Whose last picture is kept; those asked for least recently go first."""
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
@@ -81,27 +79,17 @@ Action = Callable[..., Mapping[str, Any] | None]
 
 
 class Page(Protocol):
-    """What is served; every member may be used by any thread."""
+    """What is served; every member may be used by any thread.
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Files of the package `emmc_rig.live` or templates; the first is the page itself."""
-        ...
+    files: of the package `emmc_rig.live` or templates; the first is the page itself. pictures: by
+    name; each takes a query, and returns None while there is none. actions: by name, what POST
+    does; a mapping returned is part of the answer. urgent: the actions that wait for no other.
+    """
 
-    @property
-    def pictures(self) -> Mapping[str, Pictured]:
-        """By name; each takes a query, and returns None while there is none."""
-        ...
-
-    @property
-    def actions(self) -> Mapping[str, Action]:
-        """By name, what POST does; a mapping returned is part of the answer."""
-        ...
-
-    @property
-    def urgent(self) -> frozenset[str]:
-        """The actions that wait for no other."""
-        ...
+    files: tuple[str, ...]
+    pictures: Mapping[str, Pictured]
+    actions: Mapping[str, Action]
+    urgent: frozenset[str]
 
     @property
     def version(self) -> int:
@@ -116,110 +104,10 @@ class Page(Protocol):
         """Note that the page is being viewed."""
         ...
 
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Let `listener` be called after every change, by whichever thread made it."""
-        ...
-
 
 def new_token() -> str:
     """Return a secret for an address."""
     return secrets.token_urlsafe(18)
-
-
-class _RefusedError(Exception):
-    """A request that is not answered as asked: status and one line."""
-
-    def __init__(self, status: int, why: str) -> None:
-        super().__init__(why)
-        self.status = status
-
-
-class _News:
-    """Wakes those who wait for a newer state; used in the server's loop alone."""
-
-    def __init__(self, page: Page) -> None:
-        self._page = page
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._waiting: list[asyncio.Future[None]] = []
-        self._woken: list[asyncio.Future[None]] = []
-        self._round_planned = self.closed = False
-        self._encoded: tuple[int, bytes] = (-1, b"")
-        page.listen(self._heard)
-
-    def close(self) -> None:
-        """Let nobody wait any longer."""
-        self.closed = True
-        self._begin_round()
-
-    async def newer(self, after: int) -> None:
-        """Return when the state is newer than `after`, or patience ends."""
-        self._loop = asyncio.get_running_loop()
-        if self.closed:
-            return
-        future = self._loop.create_future()
-        self._waiting.append(future)
-        if self._page.version > after:
-            self._plan_round()
-        with suppress(TimeoutError):
-            await asyncio.wait_for(future, PATIENCE_S)
-
-    def state(self, **more: Any) -> tuple[int, bytes]:
-        """Return version and state as JSON, encoded once for all who ask."""
-        self._page.touch()
-        if self._encoded[0] != self._page.version:
-            state = self._page.state()
-            data = json.dumps({**state, **more}, allow_nan=False, separators=(",", ":"))
-            self._encoded = (state["version"], data.encode())
-        return self._encoded
-
-    def _heard(self) -> None:
-        """Plan a round; called by whichever thread changed the state."""
-        loop = self._loop
-        if loop is not None and not self._round_planned:
-            with suppress(RuntimeError):  # the loop has ended, and nobody waits
-                loop.call_soon_threadsafe(self._plan_round)
-
-    def _plan_round(self) -> None:
-        if self._loop is not None and not self._round_planned:
-            self._round_planned = True
-            self._loop.call_later(PAUSE_S, self._begin_round)
-
-    def _begin_round(self) -> None:
-        self._round_planned = False
-        self._woken += self._waiting
-        self._waiting = []
-        self._answer_some()
-
-    def _answer_some(self) -> None:
-        some, self._woken = self._woken[:AT_ONCE], self._woken[AT_ONCE:]
-        for future in some:
-            if not future.done():
-                future.set_result(None)
-        if self._woken and self._loop is not None:
-            self._loop.call_soon(self._answer_some)
-
-
-class _Encoder:
-    """Encodes each picture once for all who ask, of the newest frame when its turn comes."""
-
-    def __init__(self) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="live pictures")
-        self._made: dict[Hashable, tuple[int, asyncio.Future[bytes]]] = {}
-
-    async def of(self, wanted: Picture) -> bytes:
-        """Return a picture as new as it is named, or being encoded now."""
-        known, future = self._made.pop(wanted.key, (-1, None))
-        if future is None or (future.done() and known != wanted.number) or _failed(future):
-            known = wanted.number
-            future = asyncio.get_running_loop().run_in_executor(self._thread, wanted.make)
-        self._made[wanted.key] = known, future
-        while len(self._made) > MOST_VIEWS:
-            del self._made[next(iter(self._made))]
-        return await asyncio.shield(future)
-
-
-def _failed(future: asyncio.Future[bytes]) -> bool:
-    return future.done() and (future.cancelled() or future.exception() is not None)
 
 
 def application(
@@ -233,8 +121,32 @@ def application(
 
     to_act: what somebody has to do who wants to act on a page that is read-only.
     """
-    news, encoder = _News(page), _Encoder()
+    ending, known = asyncio.Event(), (-1, b"")
+    made: dict[Hashable, tuple[int, bytes]] = {}
+    one_picture = ThreadPoolExecutor(1, thread_name_prefix="live pictures")
     at_once = ThreadPoolExecutor(1, thread_name_prefix="live urgent request")
+
+    def encoded_state() -> bytes:
+        """Return the state as JSON, encoded once for all who ask."""
+        nonlocal known
+        page.touch()
+        if known[0] != page.version:
+            told = page.state()
+            data = json.dumps(
+                {**told, "read_only": read_only}, allow_nan=False, separators=(",", ":")
+            )
+            known = told["version"], data.encode()
+        return known[1]
+
+    def encoded_picture(wanted: Picture) -> bytes:
+        """Return a picture, encoded once for all who ask; called in one thread."""
+        number, data = made.pop(wanted.key, (-1, b""))
+        if number != wanted.number:
+            data = wanted.make()
+        made[wanted.key] = wanted.number, data
+        while len(made) > MOST_VIEWS:
+            del made[next(iter(made))]
+        return data
 
     def guarded(
         answer: Callable[[Request], Awaitable[Response]],
@@ -243,10 +155,10 @@ def application(
             try:
                 given = request.path_params.get("token", "")
                 if not secrets.compare_digest(given.encode(), token.encode()):
-                    raise _RefusedError(403, "wrong token: open the address that emmc-rig printed")
+                    raise HTTPException(403, "wrong token: open the address that emmc-rig printed")
                 response = await answer(request)
-            except _RefusedError as refusal:
-                response = PlainTextResponse(f"{refusal}\n", refusal.status)
+            except HTTPException as refusal:
+                response = PlainTextResponse(f"{refusal.detail}\n", refusal.status_code)
             except ERRORS as fault:
                 response = PlainTextResponse(f"{fault}\n", 400)
             except ClientDisconnect:
@@ -261,10 +173,12 @@ def application(
         if name in page.pictures:
             wanted = page.pictures[name](request.query_params)
             if wanted is None:
-                raise _RefusedError(503, "nothing to show yet")
-            return Response(await encoder.of(wanted), media_type=wanted.media_type)
+                raise HTTPException(503, "nothing to show yet")
+            loop = asyncio.get_running_loop()
+            data = await loop.run_in_executor(one_picture, encoded_picture, wanted)
+            return Response(data, media_type=wanted.media_type)
         if name not in page.files:
-            raise _RefusedError(404, f"no page {name!r}")
+            raise HTTPException(404, f"no page {name!r}")
         if name.endswith(".html"):
             text = PARTS.get_template(name).render(poster=None)
         else:
@@ -272,35 +186,36 @@ def application(
         return Response(text, media_type=TYPES[name[name.rindex(".") :]])
 
     async def state(request: Request) -> Response:
-        after = number_of(request.query_params, "after", 0, int)
-        if after > 0:
-            await news.newer(after)
-        return Response(news.state(read_only=read_only)[1], media_type="application/json")
+        return Response(encoded_state(), media_type="application/json")
 
     async def events(request: Request) -> Response:
         async def states() -> AsyncIterator[bytes]:
-            version, data = news.state(read_only=read_only)
-            yield b"data: " + data + b"\n\n"
-            while not news.closed:
-                await news.newer(version)
-                # Also when nobody waits any longer: the last state says how it ended.
-                version, data = news.state(read_only=read_only)
-                yield b"data: " + data + b"\n\n"
+            while True:
+                version = page.version
+                yield b"data: " + encoded_state() + b"\n\n"
+                if ending.is_set():  # also then: the last state says how it ended
+                    return
+                asked_s = time.monotonic()
+                while not ending.is_set() and time.monotonic() - asked_s < PATIENCE_S:
+                    with suppress(TimeoutError):
+                        await asyncio.wait_for(ending.wait(), PAUSE_S)
+                    if page.version > version:
+                        break
 
         return StreamingResponse(states(), media_type="text/event-stream")
 
     async def act(request: Request) -> Response:
         if request.method != "POST":
-            raise _RefusedError(405, "nothing is done by GET: send POST")
+            raise HTTPException(405, "nothing is done by GET: send POST")
         if read_only:
-            raise _RefusedError(403, f"read-only: {to_act} to act")
+            raise HTTPException(403, f"read-only: {to_act} to act")
         origin = request.headers.get("origin")
         page_origin = f"{request.url.scheme}://{request.headers.get('host')}"
         if origin not in (None, page_origin):
-            raise _RefusedError(403, f"not from this page but from {origin}")
+            raise HTTPException(403, f"not from this page but from {origin}")
         name = request.path_params["action"]
         if name not in page.actions:
-            raise _RefusedError(404, f"no action {name!r}: {', '.join(page.actions)}")
+            raise HTTPException(404, f"no action {name!r}: {', '.join(page.actions)}")
         values = await _body(request)
 
         def call() -> Mapping[str, Any]:
@@ -312,25 +227,22 @@ def application(
             else:
                 done = await run_in_threadpool(call)
         except TypeError as fault:
-            raise _RefusedError(400, f"{name}: these are not its values ({fault})") from fault
+            raise HTTPException(400, f"{name}: these are not its values ({fault})") from fault
         return JSONResponse({"done": name, **done})
 
-    async def wrong_token(request: Request) -> Response:
-        raise _RefusedError(403, "wrong token")
-
-    made = Starlette(
+    made_app = Starlette(
         routes=[
             Route("/{token}/state", guarded(state), methods=["GET"]),
             Route("/{token}/events", guarded(events), methods=["GET"]),
             Route("/{token}/do/{action}", guarded(act), methods=["GET", "POST"]),
             Route("/{token}/", guarded(shown), methods=["GET"]),
             Route("/{token}/{name}", guarded(shown), methods=["GET"]),
-            Route("/{rest:path}", guarded(wrong_token), methods=["GET", "POST"]),
+            Route("/{rest:path}", guarded(shown), methods=["GET", "POST"]),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
     )
-    made.state.close = news.close
-    return made
+    made_app.state.ending = ending
+    return made_app
 
 
 def listening_socket(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
@@ -360,23 +272,12 @@ class Server(uvicorn.Server):
                 timeout_graceful_shutdown=1,
             )
         )
-        self._close = app.state.close
-        self._accepting: list[Connections] = []
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Accept connections at these sockets: see `emmc_rig.live.connections`."""
-        await super().startup(sockets=[])
-        self._accepting = [Connections(one, self._connection) for one in sockets or []]
+        self._ending: asyncio.Event = app.state.ending
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End what is pushed, then what else is under way."""
-        self._close()
-        for one in self._accepting:
-            one.close()
+        self._ending.set()
         await super().shutdown(sockets)
-
-    def _connection(self) -> H11Protocol:
-        return H11Protocol(self.config, self.server_state, self.lifespan.state)
 
 
 @contextmanager
@@ -405,27 +306,16 @@ def finite(value: object) -> float:
 async def _body(request: Request) -> dict[str, Any]:
     """Return the JSON object sent; a form of another site cannot send this content type."""
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-        raise _RefusedError(415, "send JSON")
+        raise HTTPException(415, "send JSON")
     data = b""
     async for chunk in request.stream():
         data += chunk
         if len(data) > LONGEST_BODY:
-            raise _RefusedError(413, f"more than {LONGEST_BODY} bytes")
+            raise HTTPException(413, f"more than {LONGEST_BODY} bytes")
     try:
         values = parse_json(data or b"{}", "the request", ValueError)
     except ValueError as fault:
-        raise _RefusedError(400, "not JSON") from fault
+        raise HTTPException(400, "not JSON") from fault
     if not isinstance(values, dict):
-        raise _RefusedError(400, "send a JSON object")
+        raise HTTPException(400, "send a JSON object")
     return values
-
-
-def number_of(query: Mapping[str, str], name: str, default: float, kind: type = float) -> Any:
-    """Return a number of a query; raises AppError for anything else."""
-    try:
-        value = kind(query.get(name, default))
-        if not abs(value) < LARGEST:
-            raise OverflowError
-        return value
-    except (ValueError, OverflowError) as fault:
-        raise AppError(f"{name}={query[name]}: a number is wanted") from fault

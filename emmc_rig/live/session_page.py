@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
@@ -18,7 +16,7 @@ from emmc_rig.acquisition.events import Event, EventWatcher
 from emmc_rig.acquisition.until import light_field_so_far
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
-from emmc_rig.live.field_pictures import Pictures, export_of, field_pictures
+from emmc_rig.live.light_field import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
@@ -44,8 +42,8 @@ class SessionPage(EventWatcher):
     the disk; where the capture itself does (`--until`) its light field is shown.
     """
 
-    files = ("session.html", "session.js", *COMMON_FILES)
-    urgent = frozenset({"pause", "stop"})
+    files: tuple[str, ...] = ("session.html", "session.js", *COMMON_FILES)
+    urgent: frozenset[str] = frozenset({"pause", "stop"})
 
     def __init__(
         self,
@@ -57,7 +55,6 @@ class SessionPage(EventWatcher):
         super().__init__(self._heard, other)
         self._folder, self._control, self._computes = folder, control, computes
         self._changed = threading.Condition()
-        self._listeners: list[Callable[[], None]] = []
         self._frames: dict[str, dict[str, Any]] = {}
         self._small: dict[str, bytes] = {}
         self._newest: tuple[int, RawFrame] | None = None
@@ -90,12 +87,12 @@ class SessionPage(EventWatcher):
             "light_field": None,
             "trouble": {"light field": ""},
         }
-        self.pictures: dict[str, Pictured] = {
+        self.pictures: Mapping[str, Pictured] = {
             "newest.jpg": self._newest_picture,
             "frame.jpg": self._small_picture,
             **field_pictures(lambda: self._pictures),
         }
-        self.actions: dict[str, Action] = {
+        self.actions: Mapping[str, Action] = {
             "pause": lambda: self._wish("pausing after this frame", control.pause),
             "resume": lambda: self._wish("", control.resume),
             "stop": lambda: self._wish("stopping after this frame", control.stop),
@@ -127,10 +124,6 @@ class SessionPage(EventWatcher):
     def touch(self) -> None:
         """Take no notice: the capture goes on whether somebody looks or not."""
 
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Let `listener` be called after every change, by whichever thread made it."""
-        self._listeners.append(listener)
-
     def step(self, name: str, frame: PlannedFrame) -> None:
         """Show what is under way."""
         super().step(name, frame)
@@ -159,8 +152,6 @@ class SessionPage(EventWatcher):
         with self._changed:
             self._state.update(parts)
             self._state["version"] += 1
-        for listener in self._listeners:
-            listener()
 
     def _heard(self, event: Event) -> None:
         with self._changed:
@@ -195,14 +186,13 @@ class SessionPage(EventWatcher):
         for frame in session.frames:
             entry = session.stored.get(frame.id)
             if entry is not None and frame.id not in self._frames:
-                span_dn = entry["white_level_dn"] - float(np.mean(entry["black_level_dn"]))
                 self._frames[frame.id] = {
                     "id": frame.id,
                     "kind": frame.kind,
                     "shot": frame.bench.shot,
-                    "exposure_s": entry["exposure_s"],
-                    "level": entry["figures"]["bright_dn"] / span_dn,
-                    "saturated": entry["figures"]["saturated"],
+                    "exposure_s": entry.exposure_s,
+                    "level": entry.level,
+                    "saturated": entry.figures.saturated,
                     "number": 0,
                     "stored": True,
                 }
@@ -250,7 +240,7 @@ class SessionPage(EventWatcher):
         if newest is None:
             return None
         number, frame = newest
-        return Picture("newest", number, lambda: encoded(picture(frame, View(longest_px=1200))))
+        return Picture("newest", number, lambda: encoded(picture(frame, View(px=1200))))
 
     def _small_picture(self, query: Query) -> Picture | None:
         name = query.get("id", "")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Any
 
 from emmc_rig.errors import AppError
-from emmc_rig.live.field_pictures import field_pictures
-from emmc_rig.live.picture import KINDS, View, encoded, picture
-from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query, finite, number_of
+from emmc_rig.live.light_field import field_pictures
+from emmc_rig.live.picture import View, encoded, picture
+from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query, finite
 from emmc_rig.live.steps import LONGEST_UNASKED_S
 from emmc_rig.live.watch import Watch
+from emmc_rig.model.settings import validated
 
 
 class SetupPage:
@@ -20,16 +20,16 @@ class SetupPage:
     following: the command to go on with once a plan was saved; "": none is known.
     """
 
-    files = ("page.html", "page.js", *COMMON_FILES)
-    urgent = frozenset({"stop", "cancel"})
+    files: tuple[str, ...] = ("page.html", "page.js", *COMMON_FILES)
+    urgent: frozenset[str] = frozenset({"stop", "cancel"})
 
     def __init__(self, watch: Watch, following: str = "") -> None:
         self._watch = watch
-        self.pictures: dict[str, Pictured] = {
+        self.pictures: Mapping[str, Pictured] = {
             "picture.jpg": self._picture,
             **field_pictures(lambda: watch.light_field and watch.light_field.pictures()),
         }
-        self.actions: dict[str, Action] = {
+        self.actions: Mapping[str, Action] = {
             "exposure": lambda seconds: watch.set_exposure_s(finite(seconds)),
             "gain": lambda factor: watch.set_gain(finite(factor)),
             "autoexpose": lambda longest_s=LONGEST_UNASKED_S: watch.auto_expose(finite(longest_s)),
@@ -60,12 +60,8 @@ class SetupPage:
         """Let frames be taken."""
         self._watch.newest()
 
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Let `listener` be called after every change."""
-        self._watch.listen(listener)
-
     def _picture(self, query: Query) -> Picture | None:
-        view = _view(query)
+        view = validated(View, dict(query), "the picture", AppError)
         newest = self._watch.newest()
         if newest is None:
             return None
@@ -75,21 +71,4 @@ class SetupPage:
             assert frame is not None
             return encoded(picture(frame, view))
 
-        return Picture(view, newest.number, make)
-
-
-def _view(query: Query) -> View:
-    kind = query.get("kind", "colour")
-    if kind not in KINDS:
-        raise AppError(f"kind={kind}: choose one of {', '.join(KINDS)}")
-    whole = View()
-    return replace(
-        whole,
-        kind=kind,
-        x=number_of(query, "x", whole.x),
-        y=number_of(query, "y", whole.y),
-        part=number_of(query, "part", whole.part),
-        longest_px=number_of(query, "px", whole.longest_px, int),
-        marked=query.get("marked", "1") != "0",
-        bright=query.get("bright", "0") != "0",
-    )
+        return Picture(view.model_dump_json(), newest.number, make)

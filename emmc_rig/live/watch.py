@@ -26,9 +26,8 @@ from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.live.alignment import MaskGauge, is_dark
-from emmc_rig.live.autofocus import focused
 from emmc_rig.live.driving import Driving
-from emmc_rig.live.focus import FocusMeter, Sharpness, sharpness
+from emmc_rig.live.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.save import Files, Found
 from emmc_rig.live.steps import (
@@ -111,7 +110,6 @@ class Watch:
         self._files = files or Files()
         self._found = Found()
         self._news = threading.Condition()
-        self._listeners: list[Callable[[], None]] = []
         self._shown: Shown | None = None
         self._reference: RawFrame | None = None
         self._focus = FocusMeter()
@@ -202,10 +200,6 @@ class Watch:
     def version(self) -> int:
         """Grows with every change of the state."""
         return self._state["version"]
-
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Let `listener` be called after every change, by whichever thread made it."""
-        self._listeners.append(listener)
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Let the frames that follow be exposed for so long."""
@@ -407,8 +401,6 @@ class Watch:
             self._state["steps"] = self._steps(self._state["hint"])
             self._state["version"] += 1
             self._news.notify_all()
-        for listener in self._listeners:
-            listener()
 
     def _away(self) -> list[str]:
         """Return the axes that stand elsewhere than centred, or not homed."""

@@ -186,13 +186,6 @@ class Camera(Settings):
 
         return self.model_copy(update={"shots": tuple(moved(index) for index in range(count))})
 
-    def with_pattern(self, mask: str, **changes: object) -> Camera:
-        """Return a camera with other settings of one mask's pattern, which are not checked."""
-        one = self.masks[mask]
-        pattern = one.pattern.model_copy(update=changes)
-        masks = {**self.masks, mask: one.model_copy(update={"pattern": pattern})}
-        return self.model_copy(update={"masks": masks})
-
     def psi(self, size: tuple[int, int]) -> ImagingMatrix:
         """Return the imaging matrix for light fields of `size` (rows, columns) samples.
 
@@ -252,15 +245,15 @@ class Camera(Settings):
 
     def warnings(self) -> list[str]:
         """Return what the model neglects although it matters for this camera."""
-        found = []
+        neglected = []
         for name, mask in self.masks.items():
             number = fresnel_number(mask.cell_um, mask.distance_mm)
             if number < 1 and mask.distance_mm < self.lens.distance_mm:
-                found.append(
+                neglected.append(
                     f"mask '{name}': Fresnel number {number:.2g} < 1, diffraction blurs its "
                     "shadow and is not modelled; whiteboard calibration measures it"
                 )
-        return found
+        return neglected
 
 
 def shipped_camera_files() -> dict[str, Path]:

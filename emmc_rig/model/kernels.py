@@ -146,29 +146,6 @@ def back_project(begin, end, weights, colour, frames, binning, light_field):
                                 samples[3 * x + 2] = for_blue[x] * blue[x]
 
 
-@row_kernel("frames", 1)
-def data_step(begin, end, weights, colour, inverse, frames, binning, light_field):
-    """Replace light_field z by z - Psi^T (Psi Psi^T + Lambda)^-1 (Psi z - frames), in place.
-
-    inverse: (shot, shot, pixel_y, pixel_x), the inverted blocks.
-    """
-    shots, views_v, views_u, _, _, width = weights.shape
-    for row in range(begin, end):
-        seen = np.zeros((shots, width), frames.dtype)
-        for shot in range(shots):
-            for part in range(binning):
-                y = row * binning + part
-                gather_row(weights, colour, light_field, y, shot, y, seen[shot])
-        correct_row(inverse, frames, binning, row, seen)
-        for part in range(binning):
-            y = row * binning + part
-            for v in range(views_v):
-                for u in range(views_u):
-                    for shot in range(shots):
-                        lines = light_field[v, u, y]
-                        spread_row(weights, colour, seen[shot], shot, y, v, u, lines)
-
-
 @row_kernel("blocks", 2)
 def gram(begin, end, weights, colour, binning, blocks):
     """Set blocks (shot, shot, pixel_y, pixel_x), float64, to those of Psi Psi^T."""

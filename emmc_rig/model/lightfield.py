@@ -291,6 +291,20 @@ def refocus(lf: np.ndarray, disparity_px: float) -> np.ndarray:
     return total / (lf.shape[0] * lf.shape[1])
 
 
+def small_grey_views(lf: np.ndarray, most_columns: int) -> tuple[np.ndarray, float]:
+    """Return the views (v, u, y, x, 1), grey, at most so many columns wide, and the shrinkage."""
+    shrink = max(1.0, lf.shape[3] / most_columns)
+    grey = lf.mean(axis=4, dtype=np.float32)
+    size = max(2, round(lf.shape[3] / shrink)), max(2, round(lf.shape[2] / shrink))
+    small = np.stack(
+        [
+            cv2.resize(np.ascontiguousarray(grey[place]), size, interpolation=cv2.INTER_AREA)
+            for place in np.ndindex(grey.shape[:2])
+        ]
+    )
+    return small.reshape(*grey.shape[:2], size[1], size[0], 1), shrink
+
+
 def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
     """Estimate where the scene's back, middle and front are, by a plane sweep over the views.
 
@@ -301,22 +315,14 @@ def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
     Returns:
         (back, middle, front) in pixels per view step, ascending.
     """
-    width = lf.shape[3]
-    shrink = max(1.0, width / 256)
-    grey = lf.mean(axis=4, dtype=np.float32)
-    size = max(2, round(width / shrink)), max(2, round(lf.shape[2] / shrink))
-    small = np.stack(
-        [
-            cv2.resize(np.ascontiguousarray(grey[v, u]), size, interpolation=cv2.INTER_AREA)
-            for v, u in np.ndindex(grey.shape[:2])
-        ]
-    ).reshape(*grey.shape[:2], size[1], size[0], 1)
+    small, shrink = small_grey_views(lf, 256)
+    width = small.shape[3]
     slope_y, slope_x = np.gradient(centre_view(small)[..., 0])
     steepness = np.hypot(slope_y, slope_x)
     # Near an edge the sheared views hold nothing of the scene.
     inner = tuple(slice(n // 10, n - n // 10) for n in steepness.shape)
     textured = steepness[inner] >= np.median(steepness[inner])
-    front = 0.04 * size[0]
+    front = 0.04 * width
     back, middle, margin = -front, 0.0, 0.0
     for _ in range(3):
         candidates = np.linspace(back - margin, front + margin, 41)
@@ -339,8 +345,8 @@ def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
     """
     _check_same_shape(estimate, truth)
     squares = 0.0
-    for one, other in zip(estimate, truth, strict=True):
-        error = np.subtract(one, other, dtype=np.float64).ravel()
+    for views, true in zip(estimate, truth, strict=True):
+        error = np.subtract(views, true, dtype=np.float64).ravel()
         squares += float(error @ error)
     if squares == 0:
         return float("inf")
@@ -376,28 +382,6 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     return float(np.mean(means))
 
 
-def save_parallax_animation(path: str | os.PathLike, lf: np.ndarray) -> None:
-    """Write an endless animation that walks in a circle over the outer views.
-
-    Args:
-        path: `.webp` (small, recommended), `.gif` or `.png`.
-        lf: (v, u, y, x, 3).
-
-    Raises:
-        SceneError: a file name with another ending, or the file cannot be written.
-    """
-    path = Path(path)
-    if path.suffix not in (".webp", ".gif", ".png"):
-        raise SceneError(f"{path}: an animation ends in .webp, .gif or .png")
-    _make_folder(path.parent)
-    walk = _circular_walk(lf.shape[0], lf.shape[1])
-    animation = cv2.Animation()
-    animation.frames = [_to_codes(lf[place]) for place in walk]
-    animation.durations = [max(60, 1600 // len(walk))] * len(walk)
-    if not cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, 92]):
-        raise SceneError(f"{path}: cannot be written")
-
-
 def export_pictures(
     folder: str | os.PathLike, lf: np.ndarray, disparities_px: tuple[float, float, float]
 ) -> dict[str, Path]:
@@ -420,7 +404,7 @@ def export_pictures(
     folder = _make_folder(folder)
     n_v, n_u, height, width, _ = lf.shape
     save_views(folder / "views", lf)
-    save_parallax_animation(folder / "parallax.webp", lf)
+    _write_parallax(folder / "parallax.webp", lf)
     pictures = {
         "epi_horizontal": np.repeat(epi_horizontal(lf, n_v // 2, height // 2), 8, axis=0),
         "epi_vertical": np.repeat(epi_vertical(lf, n_u // 2, width // 2), 8, axis=0),
@@ -456,6 +440,16 @@ def read_picture(path: Path) -> np.ndarray:
 def _write_picture(path: Path, picture: np.ndarray) -> None:
     """Write (y, x, 3) as an 8-bit PNG."""
     if not cv2.imwrite(str(path), _to_codes(picture)):
+        raise SceneError(f"{path}: cannot be written")
+
+
+def _write_parallax(path: Path, lf: np.ndarray) -> None:
+    """Write an endless animation that walks in a circle over the outer views of (v, u, y, x, 3)."""
+    walk = _circular_walk(lf.shape[0], lf.shape[1])
+    animation = cv2.Animation()
+    animation.frames = [_to_codes(lf[place]) for place in walk]
+    animation.durations = [max(60, 1600 // len(walk))] * len(walk)
+    if not cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, 92]):
         raise SceneError(f"{path}: cannot be written")
 
 

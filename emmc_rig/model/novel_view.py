@@ -1,8 +1,8 @@
-"""Pictures from where no view was: between the views, by their disparities, and through apertures.
+"""Pictures from where no view was: between the views, by their disparities.
 
 Positions are in view steps: (v, u) = (1.5, 2) lies halfway between two views of column 2. Samples
 between pixels are bilinear, and beyond an edge its last pixel continues. The viewer's shader is
-the twin of `between` and `photograph`: what is changed here is changed in `viewer.js` too.
+the twin of `between`: what is changed here is changed in `viewer.js` too.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from emmc_rig.model.lightfield import centre_view, focus_disparities, shear
+from emmc_rig.model.lightfield import centre_view, focus_disparities, shear, small_grey_views
 
 Array = NDArray[np.floating]
 STEPS = 3
@@ -45,15 +45,7 @@ def estimated_disparity(light_field: Array) -> NDArray[np.float32]:
     that estimate none. Even places have the disparity that happens to agree best there.
     """
     height, width = light_field.shape[2:4]
-    shrink = max(1.0, width / LARGEST_PX)
-    size = max(2, round(width / shrink)), max(2, round(height / shrink))
-    grey = light_field.mean(axis=4, dtype=np.float32)
-    small = np.stack(
-        [
-            cv2.resize(grey[place], size, interpolation=cv2.INTER_AREA)
-            for place in np.ndindex(grey.shape[:2])
-        ]
-    ).reshape(*grey.shape[:2], size[1], size[0], 1)
+    small, shrink = small_grey_views(light_field, LARGEST_PX)
     back, _, front = focus_disparities(light_field)
     margin = max(0.15 * (front - back), 0.1)
     tried = np.linspace(back - margin, front + margin, CANDIDATES) / shrink
@@ -142,41 +134,6 @@ def between(light_field: Array, disparities: Array, v: float, u: float) -> Array
         total += weight[..., None] * colour
         weights += weight
     return total / weights[..., None]
-
-
-def photograph(
-    light_field: Array,
-    disparities: Array,
-    v: float,
-    u: float,
-    focus_px: float,
-    aperture: float,
-    gamma: float = 1.0,
-) -> Array:
-    """Return the picture (y, x, c) through an aperture around a position, focused on a disparity.
-
-    Ng et al. 2005, eq. 5, over the views that the aperture lets through: those nearer than its
-    radius, in view steps, and partly those less than a step further. A closed one is `between`.
-    gamma: of the light field's values; light is averaged, not codes.
-    """
-    y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
-    total = np.zeros(light_field.shape[2:], np.float32)
-    weights = max(0.0, 1.0 - aperture)
-    if weights:
-        pinhole = between(light_field, disparities, v, u)
-        if aperture <= 0:
-            return pinhole
-        total += np.float32(weights) * np.maximum(pinhole, 0) ** np.float32(gamma)
-    for j, i in np.ndindex(light_field.shape[:2]):
-        weight = min(max(aperture - float(np.hypot(j - v, i - u)), 0.0), 1.0)
-        if weight:
-            shift = np.float32(focus_px)
-            seen = sampled(
-                light_field[j, i], y + shift * np.float32(j - v), x + shift * np.float32(i - u)
-            )
-            total += np.float32(weight) * np.maximum(seen, 0) ** np.float32(gamma)
-            weights += weight
-    return (total / np.float32(weights)) ** np.float32(1 / gamma)
 
 
 def centre_disparity(light_field: Array, disparity: Array | None) -> NDArray[np.float32]:

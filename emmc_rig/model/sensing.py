@@ -50,17 +50,6 @@ def rows_of_colours(light_field: Array) -> Array:
     return np.moveaxis(light_field, -1, -2)
 
 
-@dataclass(frozen=True)
-class PixelSolve:
-    """(Psi Psi^T + Lambda)^-1, one block per pixel: `inverse` (shot, shot, pixel_y, pixel_x)."""
-
-    inverse: Array
-
-    def __call__(self, frames: Array) -> Array:
-        """Return the solution for frames (shot, pixel_y, pixel_x)."""
-        return np.einsum("styx,tyx->syx", self.inverse, frames)
-
-
 @dataclass(frozen=True, eq=False)
 class PsiLayout:
     """What a Psi is for, without its coefficients: for sensors whose Psi does not fit into memory.
@@ -185,11 +174,6 @@ class ImagingMatrix:
         return int(np.prod(self.frames_shape)), int(np.prod(self.light_field_shape))
 
     @property
-    def is_colour_blind(self) -> bool:
-        """Whether readings are the same whatever the colours: no filter, no coloured mask."""
-        return self.colour is None and not np.ptp(self.weights, axis=4).any()
-
-    @property
     def colour_map(self) -> NDArray[np.uint8]:
         """The colour map as the kernels take it (a dummy when three colours are stored)."""
         return NO_COLOUR_MAP if self.colour is None else self.colour
@@ -269,8 +253,8 @@ class ImagingMatrix:
         kernels.gram(self.weights, self.colour_map, self.binning, blocks)
         return blocks
 
-    def solver(self, ridge: float | Array) -> PixelSolve:
-        """Return the exact solve of (Psi Psi^T + diag(ridge)).
+    def inverted_blocks(self, ridge: float | Array) -> Array:
+        """Return (Psi Psi^T + diag(ridge))^-1, one block per pixel: (shot, shot, pixel_y, pixel_x).
 
         ridge: a number or an array (shot, pixel_y, pixel_x), at least 0; infinite where a
             measurement is not to be used.
@@ -287,19 +271,11 @@ class ImagingMatrix:
                 f"Psi Psi^T is singular at {failed.sum()} pixels (repeated or dark shots): "
                 "use a ridge above 0"
             )
-        return PixelSolve(inverse)
+        return inverse
 
     def row_norms(self) -> NDArray[np.float64]:
         """Return the Euclidean norm of every row of Psi: (shot, pixel_y, pixel_x)."""
         return np.sqrt(np.einsum("ssyx->syx", self.gram))
-
-    @cached_property
-    def norm(self) -> float:
-        """The operator norm of Psi: the root of the largest eigenvalue of its pixels' blocks."""
-        if self.shots == 1:
-            return float(np.sqrt(self.gram.max()))
-        blocks = self.gram.reshape(self.shots, self.shots, -1).transpose(2, 0, 1)
-        return float(np.sqrt(np.linalg.eigvalsh(blocks)[:, -1].max()))
 
     def light_efficiency(self) -> float:
         """Return the reading from a white light field, averaged over shots and pixels."""

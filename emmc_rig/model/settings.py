@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import warnings
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import ClassVar, TypeGuard, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
@@ -57,44 +57,29 @@ S = TypeVar("S", bound=Settings)
 
 
 def _keys_beside(cls: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Return the valid keys at the place of an unknown key, by walking the JSON schema."""
-    root = cls.model_json_schema()
-    nodes = [root]
+    """Return the valid keys at the place of an unknown key."""
+    kinds: list[object] = [cls]
     for part in location[:-1]:
-        nodes = [child for node in nodes for child in _children(node, part, root)]
-    found = [option for node in nodes for option in (_resolve(node, root), *_options(node, root))]
-    return sorted({key for node in found for key in node.get("properties", {})})
+        kinds = [inner for kind in kinds for inner in _at(kind, part)]
+    models = [part for kind in kinds for part in _parts(kind) if _is_model(part)]
+    return sorted({key for model in models for key in model.model_fields})
 
 
-def _options(node: dict[str, Any], root: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the alternatives of a node: a setting that may be left out is one of null."""
-    node = _resolve(node, root)
-    return [_resolve(option, root) for option in node.get("oneOf", []) + node.get("anyOf", [])]
+def _is_model(kind: object) -> TypeGuard[type[BaseModel]]:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
-def _resolve(node: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:
-    while "$ref" in node:
-        node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
-    return node
-
-
-def _children(node: dict[str, Any], part: int | str, root: dict[str, Any]) -> list[dict[str, Any]]:
-    node = _resolve(node, root)
-    options = _options(node, root)
-    if options:
-        tagged = [o for o in options if part in _tags(o)]
-        return tagged or [child for o in options for child in _children(o, part, root)]
-    if isinstance(part, int):
-        return [node["items"]] if "items" in node else []
-    if part in node.get("properties", {}):
-        return [node["properties"][part]]
-    extra = node.get("additionalProperties")
-    return [extra] if isinstance(extra, dict) else []
-
-
-def _tags(node: dict[str, Any]) -> list[str]:
-    kind = node.get("properties", {}).get("kind", {})
-    return [kind["const"]] if "const" in kind else []
+def _at(kind: object, part: int | str) -> list[object]:
+    """Return the types at a key, an index, or the tag of a union's alternative."""
+    if _is_model(kind):
+        fields = kind.model_fields
+        if part in fields:
+            return [fields[str(part)].annotation]
+        is_tag = "kind" in fields and part in get_args(fields["kind"].annotation)
+        return [kind] if is_tag else []
+    if get_origin(kind) in (dict, tuple, list):
+        return [next(inner for inner in reversed(get_args(kind)) if inner is not Ellipsis)]
+    return [inner for option in get_args(kind) for inner in _at(option, part)]
 
 
 def explain(error: ValidationError, cls: type[BaseModel]) -> str:

@@ -56,13 +56,11 @@ def write_calibration_report(
     path: Path,
     outcome: Outcome,
     metrics: Mapping,
-    truth: Mapping[str, float] | None = None,
     sensor: SensorSheet | None = None,
 ) -> None:
     """Write the page whole or not at all.
 
-    metrics: as `emmc_rig.calibrate` makes them. truth: parameters of a simulated bench, shown
-    beside the fit.
+    metrics: as `emmc_rig.calibrate` makes them.
     """
     unwatched = [one.removeprefix("not measured: ") for one in outcome.unwatched]
     sections = [
@@ -70,11 +68,8 @@ def write_calibration_report(
         *_listed("found", "Found and taken into account", outcome.findings),
         *_listed("unwatched", "Not measured", unwatched),
     ]
-    best = outcome.mixed or outcome.parametric
-    first = outcome.parametric
-    if best is not None and first is not None:
-        body = _fit(metrics, truth or {}, first.fit.history)
-        sections.append(Section("fit", "Fit", body))
+    if outcome.parametric is not None:
+        sections.append(Section("fit", "Fit", _fit(metrics)))
     body = _kinds(outcome.judged[outcome.chosen]) + _residuals(list(outcome.judged.values()))
     sections += [Section("residuals", "Residual maps", body), Section("psi", "Psi", _psi(outcome))]
     if sensor is not None:
@@ -98,18 +93,11 @@ def _head(outcome: Outcome, metrics: Mapping) -> Head:
 
 
 def _use(metrics: Mapping) -> str:
-    if (session := metrics.get("session")) is None:
-        return "plan the whiteboards of a bench of your own: `emmc-rig calibrate --plan`"
-    return f"get the light field with this Psi: `emmc-rig reconstruct {typed(session)}`"
+    return f"get the light field with this Psi: `emmc-rig reconstruct {typed(metrics['session'])}`"
 
 
 def _choice(outcome: Outcome, metrics: Mapping) -> str:
     judged = outcome.judged[outcome.chosen]
-    errors = metrics.get("psi_relative_error", {})
-
-    def known(route: str, form: str) -> str:
-        return "not known" if errors.get(route) is None else format(errors[route], form)
-
     cards = [
         Card("Route", outcome.chosen, "the surest at the noise", "good"),
         Card(
@@ -119,7 +107,6 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
             "good" if judged.chi2 < GOOD_CHI2 else "watch",
         ),
         Card("Frames", str(outcome.frames[outcome.chosen]), "for this route"),
-        Card("Error of Psi", known(outcome.chosen, ".2%"), "against the simulated bench's own"),
         Card("Bad pixels", f"{metrics['bad_pixels']:.2%}", "found and left out"),
     ]
     rows = [
@@ -127,10 +114,7 @@ def _choice(outcome: Outcome, metrics: Mapping) -> str:
             name,
             outcome.frames[name],
             f"{one.chi2:.2f}",
-            f"{one.trimmed:.2f}",
-            f"{one.whiteness:+.3f}",
             f"{one.relative_error:.3%}",
-            known(name, ".3%"),
         )
         for name, one in outcome.judged.items()
     ]
@@ -151,24 +135,16 @@ def _kinds(judged: HeldOut) -> str:
     return fragment("figures.html", heads=heads, rows=rows, pictures={})
 
 
-def _fit(metrics: Mapping, truth: Mapping[str, float], history: Sequence[float]) -> str:
+def _fit(metrics: Mapping) -> str:
     rows = []
     for name, (words, unit) in WORDS.items():
         found = metrics["parameters"][name]
-        row = [words, f"{found['value']:.6g}", f"{found['deviation']:.2g}", unit]
-        known = [f"{truth[name]:.6g}" if name in truth else ""] if truth else []
-        rows.append([*row, *known])
-    figure, (axes,) = sheet(1, 5.2, label="typical residual / noise")
-    axes.plot(np.arange(1, len(history) + 1), history, "o-", color=ACCENT, markersize=3)
-    axes.set_ylim(bottom=0)
-    titled(axes, "Convergence", "step, over widening windows")
-    heads = ["Parameter", "Fitted", "Standard deviation", "Unit"]
+        rows.append([words, f"{found['value']:.6g}", f"{found['deviation']:.2g}", unit])
     return fragment(
         "calibration_fit.html",
         fit=metrics["fit"],
-        heads=[*heads, *(["Simulated bench"] if truth else [])],
+        heads=["Parameter", "Fitted", "Standard deviation", "Unit"],
         rows=rows,
-        picture=data_address(svg_of(figure), ".svg"),
     )
 
 
@@ -224,7 +200,7 @@ def _provenance(metrics: Mapping) -> dict[str, str]:
         "command": metrics["command"],
         "camera": metrics["camera"],
         "size": "x".join(map(str, metrics["size"])),
-        **({"session": metrics["session"]} if "session" in metrics else {"seed": metrics["seed"]}),
+        "session": metrics["session"],
         "seconds to calibrate": f"{metrics['calibration_seconds']:.1f}",
         **metrics["versions"],
     }

@@ -36,7 +36,6 @@ MAPS = {
     "disparity": ("viridis", "disparity, px per view"),
     "sigma": ("magma", "standard deviation"),
     "misfit": ("inferno", "readings missed, times their noise"),
-    "model": ("turbo", "model of each place"),
 }
 HDF5 = (".h5", ".hdf5")
 

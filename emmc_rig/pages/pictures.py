@@ -1,47 +1,14 @@
-"""Small pictures of a light field for figures: views, epipolar images, pieces to enlarge."""
+"""What to show of a light field: lines of epipolar images, pieces to enlarge."""
 
 from __future__ import annotations
 
-import zipfile
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.files import whole_file
-from emmc_rig.model.lightfield import centre_view, epi_horizontal, epi_vertical
-
 Array = NDArray[np.floating]
-
-
-@dataclass(frozen=True, eq=False)
-class Pictures:
-    """corner, centre: views (y, x, c), the top-left and the centre one. across: (u, x, c), along
-    a row of the centre row of views; down: (v, y, c), along a column.
-    """
-
-    corner: Array
-    centre: Array
-    across: Array
-    down: Array
-
-    def save(self, path: Path) -> None:
-        """Write the file, whole or not at all; half precision is finer than a screen."""
-        path.parent.mkdir(exist_ok=True)
-        arrays = {f.name: getattr(self, f.name).astype(np.float16) for f in fields(self)}
-        with whole_file(path) as partial, open(partial, "wb") as file:
-            np.savez(file, **arrays)
-
-    @classmethod
-    def load(cls, path: Path) -> Pictures | None:
-        """Read what `save` wrote; None where there is nothing whole."""
-        try:
-            with open(path, "rb") as stream, np.load(stream) as file:
-                return cls(*(file[f.name].astype(np.float32) for f in fields(cls)))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            return None
 
 
 @dataclass(frozen=True)
@@ -96,14 +63,3 @@ def detailed_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
         found.append(Piece(int(y), int(x), side))
         sums[max(0, y - side) : y + side, max(0, x - side) : x + side] = -1
     return found
-
-
-def pictures_of(light_field: Array, lines: tuple[int, int]) -> Pictures:
-    """Return the pictures of a light field (v, u, y, x, c); lines: row and column."""
-    y, x = lines
-    return Pictures(
-        light_field[0, 0],
-        centre_view(light_field),
-        epi_horizontal(light_field, light_field.shape[0] // 2, y),
-        epi_vertical(light_field, light_field.shape[1] // 2, x),
-    )

@@ -72,12 +72,8 @@ def write_report(path: str | Path, content: ReportContent) -> None:
 def render(content: ReportContent) -> str:
     """Return the page as text."""
     rows, columns, height, width, _ = content.estimate.shape
-    disparity, sigma, model, misfit = (
-        content.maps.get(name) for name in ("disparity", "sigma", "model", "misfit")
-    )
-    export = Export(
-        content.title, "", content.estimate, content.truth, disparity, sigma, model, misfit
-    )
+    disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
+    export = Export(content.title, "", content.estimate, content.truth, disparity, sigma, misfit)
     psi, psi_std = content.psi, content.psi_std
     return fragment(
         "report.html",

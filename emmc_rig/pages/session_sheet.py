@@ -33,7 +33,7 @@ from emmc_rig.pages.page import (
 from emmc_rig.pages.timeline import overlap, run_entries, session_metrics
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.journal import camera_of_first_run, decisions, ended, entry_text, kinds_of
+from emmc_rig.session.journal import DecidedEntry, RetryEntry, ended, of_kind
 from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
@@ -70,17 +70,17 @@ def write_sheet(session: Session, out: Path, pictures: int = MOST_PICTURES) -> N
 
 def quick_pictures(session: Session) -> int:
     """Return how many pictures can be made without reading more than QUICK_BYTES."""
-    largest = max((entry["bytes"] for entry in session.stored.values()), default=1)
+    largest = max((entry.bytes for entry in session.stored.values()), default=1)
     return min(MOST_PICTURES, QUICK_BYTES // largest)
 
 
 def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     """Return the page; of more frames than `pictures` only some of each kind are shown."""
     sections = []
-    taken = decisions(session.journal.entries)
+    taken = of_kind(session.journal.entries, DecidedEntry)
     if taken:
         last = ended(session.journal.entries)
-        body = fragment("session_shots.html", decisions=taken, spared=last and last["spared"])
+        body = fragment("session_shots.html", decisions=taken, spared=last and last.spared)
         title = "Shots: what they gave, and which was next"
         sections.append(Section("decisions", title, body, "Shots"))
     body = fragment("session_events.html", events=events(session))
@@ -125,19 +125,17 @@ def _head(session: Session) -> Head:
 
 
 def _about(session: Session) -> str:
-    camera = camera_of_first_run(session.journal.entries)
-    by = (
-        ""
-        if camera is None
-        else f", by {camera['model'] or 'a camera'} {camera['serial']}".rstrip()
-    )
+    by = ""
+    if session.first_run is not None:
+        camera = session.first_run.camera
+        by = f", by {camera['model'] or 'a camera'} {camera['serial']}".rstrip()
     return f"Session {session.folder.name}, begun {session.header['created']}{by}."
 
 
 def _cards(session: Session) -> list[Card]:
     stored, planned = len(session.stored), len(session.needed)
-    size = sum(entry["bytes"] for entry in session.stored.values())
-    retries = len(kinds_of(session.journal.entries, "retry"))
+    size = sum(entry.bytes for entry in session.stored.values())
+    retries = len(of_kind(session.journal.entries, RetryEntry))
     state = Card("State", "not complete", "resume it", "watch")
     if session.is_complete:
         state = Card("State", "complete", "every frame verified", "good")
@@ -229,7 +227,7 @@ def _picture(session: Session, planned: PlannedFrame, balance: Balance) -> dict[
         return {"id": planned.id, "why": "not captured"}
     try:
         picture = stored_jpeg(session, planned.id, balance)
-        return {**entry, "why": "", "picture": data_address(picture, ".jpg")}
+        return {**entry.model_dump(), "why": "", "picture": data_address(picture, ".jpg")}
     except (AppError, DriverError) as fault:
         return {"id": planned.id, "why": str(fault)}
 
@@ -251,8 +249,7 @@ def small_jpeg(frame: RawFrame, balance: Balance = AS_READ) -> bytes:
 def events(session: Session) -> Iterator[tuple[str, str]]:
     """Yield kind and text of what happened, besides frames that were taken."""
     for entry in session.journal.entries:
-        text = entry_text(entry)
-        if text:
-            yield entry["kind"], text
+        if text := str(entry):
+            yield entry.kind, text
     if session.journal.unreadable:
         yield "torn", f"{session.journal.unreadable} journal line(s) do not count"

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 from emmc_rig.session.exposure import shot_exposures
-from emmc_rig.session.journal import Entry, decisions, kinds_of
+from emmc_rig.session.journal import DecidedEntry, Entry, FrameEntry, RetryEntry, of_kind
 from emmc_rig.session.session import Session
 
 BENCH = ("attend", "move", "settle", "expose", "read back", "check")
@@ -29,29 +29,29 @@ class Overlap:
         return self.hidden_s / self.writing_s if self.writing_s else 0.0
 
 
-def run_entries(entries: Iterable[Entry]) -> list[list[Entry]]:
+def run_entries(entries: Iterable[Entry]) -> list[list[FrameEntry]]:
     """Return the frames' journal lines, run by run, those without any left out."""
-    runs: dict[int, list[Entry]] = {}
-    for entry in kinds_of(entries, "frame"):
-        if "spans_s" in entry:
-            runs.setdefault(entry["run"], []).append(entry)
+    runs: dict[int, list[FrameEntry]] = {}
+    for entry in of_kind(entries, FrameEntry):
+        if entry.spans_s:
+            runs.setdefault(entry.run, []).append(entry)
     return list(runs.values())
 
 
-def overlap(entries: Sequence[Entry]) -> Overlap:
+def overlap(entries: Sequence[FrameEntry]) -> Overlap:
     """Return how much of the writing of one run was hidden behind the bench's work."""
     bench = sorted(
         (span[0], span[1])
         for entry in entries
-        for name, span in entry["spans_s"].items()
+        for name, span in entry.spans_s.items()
         if name in BENCH
     )
-    writes = sorted((span[0], span[1]) for span in (e["spans_s"]["write"] for e in entries))
+    writes = sorted((span[0], span[1]) for span in (e.spans_s["write"] for e in entries))
     ends = [end for _, end in (*bench, *writes)]
     starts = [start for start, _ in (*bench, *writes)]
 
     def spent(name: str) -> float:
-        spans = [entry["spans_s"][name] for entry in entries if name in entry["spans_s"]]
+        spans = [entry.spans_s[name] for entry in entries if name in entry.spans_s]
         return sum(end - start for start, end in spans)
 
     return Overlap(
@@ -70,12 +70,12 @@ def session_metrics(session: Session) -> dict[str, object]:
         "title": session.header["title"],
         "frames": len(needed),
         "spared": len(session.frames) - len(needed),
-        "decided": decisions(entries),
+        "decided": [one.model_dump(mode="json") for one in of_kind(entries, DecidedEntry)],
         "stored": len(session.stored),
         "complete": session.is_complete,
-        "bytes": sum(entry["bytes"] for entry in session.stored.values()),
+        "bytes": sum(entry.bytes for entry in session.stored.values()),
         "exposures": [asdict(one) for one in shot_exposures(session)],
-        "retries": len(kinds_of(entries, "retry")),
+        "retries": len(of_kind(entries, RetryEntry)),
         "runs": [
             {"frames": len(run), **asdict(one), "hidden_share": one.hidden_share}
             for run in run_entries(entries)

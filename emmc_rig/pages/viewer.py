@@ -2,7 +2,7 @@
 
     views and truth   JPEG atlases of all views, as screen codes
     disparity         one PNG atlas of what every view sees, 256 levels
-    overlays          one PNG each, of the centre view: disparity, how sure, model, doubt
+    overlays          one PNG each, of the centre view: disparity, how sure, doubt
 
 `viewer.js` draws with WebGL2, by the formulas of `emmc_rig.model.novel_view`; without it, the
 views themselves by canvas. A pixel between four views takes 12 texture reads where disparity is
@@ -48,17 +48,13 @@ DEPTH = (
     (196, 40, 28),
 )
 """Colours of disparity, far to near."""
-KINDS = ((120, 130, 145), (86, 160, 211), (86, 180, 100), (232, 160, 50), (204, 70, 90))
-"""Colours of the models of `reconstruction.adaptive.method`."""
-MODEL_NAMES = ("flat", "plane", "slanted", "two layers", "free")
 
 
 @dataclass(frozen=True)
 class Overlay:
     """One map (y, x) of the centre view, as the viewer lays it over the picture.
 
-    label, unit: for people. low, high: values at the first and the last colour. names: of the
-    values 0, 1, ... where they are kinds, each with a colour of its own.
+    label, unit: for people. low, high: values at the first and the last colour.
     """
 
     key: str
@@ -68,7 +64,6 @@ class Overlay:
     low: float
     high: float
     colours: Sequence[tuple[int, int, int]] = HEAT
-    names: Sequence[str] = ()
 
 
 def render_viewer(content: Export, lossless: bool = False) -> str:
@@ -146,11 +141,6 @@ def overlays_of(content: Export) -> list[Overlay]:
         values = content.sigma[rows // 2, columns // 2]
         high = round_up(_ends(values)[1])
         found.append(Overlay("sigma", "standard deviation", "", values, 0, high))
-    if content.model is not None:
-        high = len(MODEL_NAMES) - 1
-        found.append(
-            Overlay("model", "model of each place", "", content.model, 0, high, KINDS, MODEL_NAMES)
-        )
     if content.misfit is not None:
         found.append(
             Overlay("doubt", "readings missed", "times their noise", content.misfit, 1.0, 5.0)
@@ -181,8 +171,7 @@ def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
         picture = np.dstack([picture, picture, picture, np.rint(known * 255).astype(np.uint8)])
     return {
         "key": one.key, "label": one.label, "unit": one.unit, "low": one.low, "high": one.high,
-        "colours": one.colours, "names": one.names,
-        "picture": png_of(picture),
+        "colours": one.colours, "picture": png_of(picture),
     }  # fmt: skip
 
 

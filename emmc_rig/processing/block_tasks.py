@@ -1,12 +1,11 @@
 """Blocks of a capture as tasks for workers, each on the disk once it is done.
 
     KEPT/                       see `emmc_rig.files.folders.kept_folder`
-        job.json                what the blocks are of, and what was settled for all of them
-        frames.h5               the frames
-        block-000-001.h5        the arrays of a block's part
-        block-000-001.json      their SHA-256, the block's figures and evidence: the block is done
+        frames.h5               the frames, and what was settled for all blocks
+        block-000-001.h5        the arrays of a block's part, its figures and evidence
 
-A block whose two files agree, and with the job, is not computed again.
+Each appears whole, and says what it is of. A block that is there, of the same capture and as its
+checksums say, is not computed again.
 """
 
 from __future__ import annotations
@@ -27,14 +26,13 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.memory import peak_memory_mib
 from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
-from emmc_rig.processing.memory import task_bytes
+from emmc_rig.processing.memory import peak_memory_mib, task_bytes
 from emmc_rig.processing.pool import Pool
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
@@ -43,10 +41,10 @@ from reconstruction.result import Reconstruction, Status
 from reconstruction.tiles import (
     AXES,
     Block,
+    CaptureSurvey,
     Grid,
     Place,
     SolvedBlock,
-    Survey,
     assembled,
     judged_block,
     multiple_of,
@@ -60,7 +58,7 @@ from reconstruction.verdict.blocks import judged_together
 from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, verdict_from
 
-FRAMES, JOB = "frames.h5", "job.json"
+FRAMES, ABOUT = "frames.h5", "about"
 REMEDY = "the same command computes it again"
 EVERYWHERE = (slice(None),) * 3
 
@@ -104,12 +102,13 @@ class BlockTask:
     """A block of a capture, with what the survey settled for all of them."""
 
     job: BlockJob
-    survey: Survey
+    survey: CaptureSurvey
     block: Block
 
-    def path(self, suffix: str) -> Path:
-        """Return the file of the block with this suffix."""
-        return self.job.kept / f"{self.block.name}.{suffix}"
+    @property
+    def path(self) -> Path:
+        """The file of the block."""
+        return self.job.kept / f"{self.block.name}.h5"
 
 
 def fingerprint_of(
@@ -129,43 +128,30 @@ def fingerprint_of(
     return digest.hexdigest()
 
 
-def _write_json(path: Path, content: object) -> None:
-    with whole_file(path) as partial, open(partial, "w", encoding="utf-8") as file:
-        json.dump(content, file, default=float)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _read_json(path: Path, fingerprint: str) -> dict[str, Any] | None:
-    """Return what a file of a job holds; None where it is missing, damaged or of another job."""
-    try:
-        content = parse_json(path.read_bytes(), path.name, ValueError)
-    except (OSError, ValueError):
-        return None
-    is_ours = isinstance(content, dict) and content.get("fingerprint") == fingerprint
-    return content if is_ours else None
-
-
-def _sha256(path: Path) -> str:
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return ""
-
-
-def _write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> str:
-    """Write arrays as HDF5, whole and on the disk; return the file's SHA-256."""
+def _write(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) -> None:
+    """Write arrays with their checksums, and plain data, as HDF5: whole and on the disk."""
+    text = np.frombuffer(json.dumps(about, default=float).encode(), np.uint8)
     with whole_file(path) as partial:
         with h5py.File(partial, "w") as file:
-            for name, values in arrays.items():
-                file[name] = values
+            for name, values in {**arrays, ABOUT: text}.items():
+                file.create_dataset(name, data=values, fletcher32=True)
         with open(partial, "rb+") as file:
             os.fsync(file.fileno())
-        return _sha256(partial)
 
 
-def survey_task(job: BlockJob) -> Survey:
+def _read(path: Path, fingerprint: str) -> dict[str, Any] | None:
+    """Return what a file says of itself; None where it is missing, damaged or of another job."""
+    try:
+        with stored_arrays(path, AppError, REMEDY) as stored:
+            for name in map(str, stored.file):
+                stored.array(name)
+            about = parse_json(stored.array(ABOUT).tobytes(), path.name, AppError)
+    except AppError:
+        return None
+    return about if about["fingerprint"] == fingerprint else None
+
+
+def survey_task(job: BlockJob) -> CaptureSurvey:
     """Settle in a worker what holds for the whole capture."""
     readings, usable = job.frames(EVERYWHERE)
     return surveyed(
@@ -175,7 +161,7 @@ def survey_task(job: BlockJob) -> Survey:
 
 
 def block_task(task: BlockTask) -> None:
-    """Compute a block in a worker, and write its two files.
+    """Compute a block in a worker, and write its file.
 
     Raises AppError naming the block where it fails, and OSError where it cannot be written.
     """
@@ -189,11 +175,11 @@ def block_task(task: BlockTask) -> None:
             "done are kept"
         ) from fault
     result = solved.result
-    _write_json(
-        task.path("json"),
+    _write(
+        task.path,
+        solved.arrays,
         {
             "fingerprint": task.job.fingerprint,
-            "sha256": _write_arrays(task.path("h5"), solved.arrays),
             "result": {
                 key: getattr(result, key) for key in ("status", "advice", "steps", "parameters")
             },
@@ -234,8 +220,8 @@ class DoneBlock:
 
 def done_block(task: BlockTask) -> DoneBlock | None:
     """Return a block that is done and whole on the disk, else None."""
-    kept = _read_json(task.path("json"), task.job.fingerprint)
-    if kept is None or kept["sha256"] != _sha256(task.path("h5")):
+    kept = _read(task.path, task.job.fingerprint)
+    if kept is None:
         return None
     figures = kept["result"]
     figures["status"] = Status(figures["status"])
@@ -251,30 +237,28 @@ def done_block(task: BlockTask) -> DoneBlock | None:
     return DoneBlock(result, verdict, kept["variance"], kept["peak_mib"])
 
 
-def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> Survey:
+def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> CaptureSurvey:
     """Return what holds for all blocks, from an earlier run where it is of the same capture.
 
     Frames are on the disk then. alone: there is one block, which settles everything by itself.
     """
-    arrays = {"readings": frames.readings, "usable": frames.usable}
-    kept = _read_json(job.kept / JOB, job.fingerprint)
+    kept = _read(job.kept / FRAMES, job.fingerprint)
     if kept is not None:
-        if _sha256(job.kept / FRAMES) != kept["frames"]:
-            _write_arrays(job.kept / FRAMES, arrays)
         known: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in kept["survey"].items()
         }
         known["settings"] = MethodSettings.model_validate(known["settings"])
-        return Survey(**known)
+        return CaptureSurvey(**known)
     for path in job.kept.iterdir():
         path.unlink()
-    sha256 = _write_arrays(job.kept / FRAMES, arrays)
+    arrays = {"readings": frames.readings, "usable": frames.usable}
+    _write(job.kept / FRAMES, arrays, {"fingerprint": ""})
     if alone:
-        survey = Survey.of_one_block(job.settings, len(frames.readings))
+        survey = CaptureSurvey.of_one_block(job.settings, len(frames.readings))
     else:
         ((_, survey),) = pool.run(survey_task, [job])
     plain = {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
-    _write_json(job.kept / JOB, {"fingerprint": job.fingerprint, "frames": sha256, "survey": plain})
+    _write(job.kept / FRAMES, arrays, {"fingerprint": job.fingerprint, "survey": plain})
     return survey
 
 
@@ -287,7 +271,7 @@ class Blocks:
 
     job: BlockJob
     grid: Grid
-    survey: Survey
+    survey: CaptureSurvey
     done: Sequence[DoneBlock]
     seconds: float
     workers: int
@@ -336,7 +320,8 @@ class Blocks:
         every: list[dict[str, tuple[tuple[int, ...], np.dtype]]] = []
         for block in self.grid:
             with stored_arrays(self.job.kept / f"{block.name}.h5", AppError, REMEDY) as stored:
-                parts = {name: stored.dataset(name) for name in map(str, stored.file)}
+                names = (str(name) for name in stored.file if name != ABOUT)
+                parts = {name: stored.dataset(name) for name in names}
                 every.append({name: (part.shape, part.dtype) for name, part in parts.items()})
         whole = {}
         for name, (shape, dtype) in every[0].items():
@@ -391,14 +376,12 @@ def compute_blocks(
     job: BlockJob,
     frames: Frames,
     pool: Pool,
-    group: int | None = None,
     on_block: Callable[[int, int], None] = lambda done, of: None,
 ) -> Blocks:
     """Return the blocks of a capture, computed by a pool, those done before left as they are.
 
-    group: rows and columns in samples of the tiles that are handed out one after another; the
-    blocks in them, and so the light field, are the same for any. on_block: called with the blocks
-    done and their number. Raises WorkersError, AppError, and what a block raises.
+    on_block: called with the blocks done and their number. Raises WorkersError, AppError, and what
+    a block raises.
     """
     started = time.perf_counter()
     psi, dictionary = job.psi, job.opened_dictionary()
@@ -411,15 +394,13 @@ def compute_blocks(
     tasks = [BlockTask(job, survey, block) for block in grid]
     done = {task.block.name: kept for task in tasks if (kept := done_block(task)) is not None}
     left = [task for task in tasks if task.block.name not in done]
-    if group is not None:
-        left.sort(key=lambda task: [part.start // group for part in task.block.inner])
     if done:
         on_block(len(done), len(tasks))
     for task, _ in pool.run(block_task, left):
         computed = done_block(task)
         if computed is None:
             raise AppError(
-                f"{task.path('h5')}: a worker wrote it, but it cannot be read here; put frames, "
+                f"{task.path}: a worker wrote it, but it cannot be read here; put frames, "
                 "Psi and --out on a disk that all workers share"
             )
         done[task.block.name] = computed

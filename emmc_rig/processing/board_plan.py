@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,6 @@ from emmc_rig.acquisition.plan import (
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import Camera
-from emmc_rig.processing.calibration_settings import WATCHES, CalibrateSettings
 
 PLAN = "plan.yaml"
 PLAN_HEAD = """\
@@ -54,6 +53,37 @@ BOARD_LEVEL = 0.7
 """Of the sensor's range, that a whiteboard without masks fills."""
 
 
+WATCHES = {
+    "lamp": "open whiteboards between the others, and the reference again at the end",
+    "response": "references at several exposures",
+    "colours": "references under red, green and blue lamps",
+    "turned": "the white board turned by 90 degrees",
+}
+"""Whiteboards that show errors of other parts than the mask: each may be left out of a plan."""
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """What to plan whiteboards for: camera, size, and the relative error of Psi.
+
+    most_frames: of the plan, None: as many as it takes. leave_out: names of WATCHES that the rig
+    cannot take. few: plan for the fitted mask alone, without the pinhole before every view.
+    """
+
+    camera_name: str
+    camera: Camera
+    size: tuple[int, int]
+    target: float = 0.005
+    most_frames: int | None = None
+    leave_out: frozenset[str] = frozenset()
+    few: bool = False
+
+    def __post_init__(self) -> None:
+        for name in sorted(self.leave_out):
+            if name not in WATCHES:
+                raise AppError(f"--leave-out {name}: use some of {', '.join(WATCHES)}")
+
+
 def plan_light(camera: Camera, mask: ShadowMask) -> Light:
     """Return what the plan counts on: the exposure of a whiteboard, and how many pixels see it."""
     rows, columns = mask.pixel_shape()
@@ -69,7 +99,7 @@ def soft_design(camera: Camera, mask: ShadowMask) -> Placement:
     return replace(designed_placement(camera), blur_um=0.1 * mask.cell_um)
 
 
-def capture_plan(settings: CalibrateSettings, planned: PlannedFrames) -> Plan:
+def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
     """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
     through = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
     repeats = max(through.values(), default=1)
@@ -111,13 +141,13 @@ def camera_colours(camera: Camera) -> bool:
     return camera.sensor.cfa_name != "mono" and camera.sensor.binning == 1
 
 
-def frames_by_kind(settings: CalibrateSettings, planned: PlannedFrames) -> Counter[str]:
+def frames_by_kind(settings: PlanSettings, planned: PlannedFrames) -> Counter[str]:
     """Return how many frames of each kind a capture takes before the shots of the scene."""
     frames = expand(capture_plan(settings, planned), settings.camera, 0.0, 0.0)
     return Counter(frame.kind for frame in frames if frame.kind != "shot")
 
 
-def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
+def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
     """Return the whiteboards for all routes in one: the same number of every view, and open ones.
 
     Raises AppError, with the best there is, where the error asked for cannot be reached with the
@@ -147,7 +177,7 @@ def combined_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -
     return replace(planned, counts={**opened, **planned.counts})
 
 
-def few_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
+def few_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
     """Return the fewest whiteboards for the parametric routes: open ones and parts of the aperture.
 
     Raises AppError, with the best there is, where the error asked for cannot be reached with the
@@ -174,7 +204,7 @@ def few_plan(settings: CalibrateSettings, mask: ShadowMask, light: Light) -> Pla
     return planned
 
 
-def write_plan(settings: CalibrateSettings, folder: Path) -> dict:
+def write_plan(settings: PlanSettings, folder: Path) -> dict:
     """Write plan.yaml, for `emmc-rig capture`, and metrics.json: how many whiteboards of which
     kind reach the target. Raises AppError where none do.
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
 from numbers import Real
@@ -14,30 +15,41 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
-from emmc_rig.errors import AppError
+from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import LIGHT_FIELD, MAPS
-from emmc_rig.files.folders import is_session, kept_folder
-from emmc_rig.files.psi import SavedPsi, open_psi
+from emmc_rig.files.folders import KEPT, is_session, kept_folder, result_folder
+from emmc_rig.files.psi import PSI, SavedPsi, open_psi, psi_beside, read_frames
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
-from emmc_rig.model.arguments import NAMES, numbers_of, refusal, required
+from emmc_rig.model.arguments import NAMES, numbers_of, path_of, refusal, required
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import validated
 from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
-from emmc_rig.processing.exposure import verdict_with_exposure, with_exposure
-from emmc_rig.processing.inputs import stored_frames
+from emmc_rig.processing.memory import (
+    BASE_BYTES,
+    Ceiling,
+    assumed_grid,
+    own_bytes,
+    task_bytes,
+)
 from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures
-from emmc_rig.session.session import Session
+from emmc_rig.session.exposure import UNDEREXPOSED, exposure_reasons, shot_exposures
+from emmc_rig.session.readings import session_readings
+from emmc_rig.session.session import RECONSTRUCTION, Session
+from reconstruction.adaptive.planning import expected_errors
 from reconstruction.dictionary import Dictionary
+from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import check_frames
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
-from reconstruction.result import Progress
+from reconstruction.result import Progress, Reconstruction
 from reconstruction.tiles import reconstruct_in_blocks
+from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
@@ -45,6 +57,9 @@ PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi.from_sc
 FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
 RESULT_GROUP = "result.zarr"
 """Light field and maps, where they are written as Zarr."""
+NEEDED = ("disparity", "disparity_sigma", "texture", "sigma")
+Place = tuple[Path, Path]
+"""A capture's folder, and the folder to write: in a session only the one it has for this."""
 
 
 def reconstruct(
@@ -189,7 +204,6 @@ def reconstruct_folder(
     on_step: OnStep | None = None,
     chosen: str | None = None,
     pool: Pool | None = None,
-    tile: int | None = None,
     as_zarr: bool = False,
 ) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
@@ -198,8 +212,7 @@ def reconstruct_folder(
     what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
-    tile: see `compute_blocks`. as_zarr: write light field and maps as one Zarr group, by the pool,
-    and no pictures.
+    as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
     """
     find_method(method)
     settings = settings or MethodSettings()
@@ -222,7 +235,7 @@ def reconstruct_folder(
                 on_step(Progress(done, None, None, of))
 
         with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
-            blocks = compute_blocks(job, frames, workers, tile, on_block)
+            blocks = compute_blocks(job, frames, workers, on_block)
             if as_zarr:
                 blocks.write_shards(out / RESULT_GROUP, workers)
         further |= blocks.metrics()
@@ -284,3 +297,196 @@ def _compared(light_field: Any, truth: str | None, psi: PsiLayout | SavedPsi) ->
         return {}
     scene = open_scene(truth, size=psi.size, views=psi.views)
     return {"truth": truth, **compared(light_field, np.asarray(scene))}
+
+
+def with_exposure(result: Result, session: Session) -> Result:
+    """Return the result with what speaks against the exposures of its shots in the verdict."""
+    shots = shot_exposures(session)
+    dark = [one for one in shots if one.level < UNDEREXPOSED]
+    gain_db = None
+    if dark:
+        factor = float(np.exp(np.mean([np.log(one.factor) for one in shots])))
+        gain_db = expected_gain_db(result, factor)
+    reasons = exposure_reasons(shots, gain_db)
+    return replace(result, verdict=result.verdict.with_reasons(reasons))
+
+
+def verdict_with_exposure(verdict: Verdict, session: Session) -> Verdict:
+    """Return the verdict with what speaks against the exposures, without what better ones gain."""
+    return verdict.with_reasons(exposure_reasons(shot_exposures(session), None))
+
+
+def expected_gain_db(result: Result, factor: float) -> float | None:
+    """Return what an exposure `factor` times as long is expected to add to the PSNR.
+
+    The method's own deviation says how large the error is. By how much less shot noise lessens it
+    follows from Psi and what the scene was estimated to be made of. None where the method does not
+    estimate that.
+    """
+    solved: Reconstruction = result.solved
+    if any(name not in solved.maps for name in NEEDED):
+        return None
+    views_v, views_u = solved.light_field.shape[:2]
+    every = [tuple(range(result.psi.shots))]
+    variance = result.frames.noise_sigma**2
+    try:
+        now, then = (
+            expected_errors(
+                result.psi,
+                every,
+                solved.maps["disparity"],
+                solved.maps["disparity_sigma"],
+                solved.maps["texture"],
+                solved.light_field[views_v // 2, views_u // 2],
+                one,
+            )[0]
+            for one in (variance, variance / factor)
+        )
+    except ReconstructionError:
+        return None
+    stated = float(np.mean(np.square(solved.maps["sigma"], dtype=np.float64)))
+    # The expectation may lie above what is stated; more light makes nothing worse.
+    remaining = max(stated - (now - then), min(then, stated))
+    return float(10 * np.log10(stated / remaining))
+
+
+def ceiling_for(
+    memory: int,
+    folders: Sequence[Path],
+    psi: Path | None,
+    settings: MethodSettings,
+    as_zarr: bool,
+    compares: bool,
+) -> tuple[Ceiling, int, int]:
+    """Return a ceiling, and how many workers and captures at a time fit below it.
+
+    Workers become fewer where a survey finds larger disparities than assumed here. Raises AppError
+    where not even one worker fits.
+    """  # fmt: skip
+    need = own = 0
+    for folder in folders:
+        if is_session(folder) and psi is None:
+            raise AppError(
+                f"{folder}: --memory needs Psi before the workers start; run `emmc-rig calibrate` "
+                "and give --psi"
+            )
+        saved = open_psi(psi or psi_beside(folder))
+        need = max(need, task_bytes(saved, assumed_grid(saved, settings)))
+        own = max(own, own_bytes(saved, settings, as_zarr, compares))
+    single, double = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))
+    if len(folders) > 1 and double.total - double.own >= 2 * need:
+        return double, double.workers(need), 2
+    return single, single.workers(need), 1
+
+
+def reconstruct_captures(
+    places: Sequence[Place],
+    workers: int | None,
+    cluster: str | None,
+    memory: int | None,
+    on_step: Callable[[Progress], None],
+    **given: Any,
+) -> Iterator[tuple[Place, dict | Exception]]:
+    """Yield each capture with its metrics, or with what it failed by, in the order they are done.
+
+    workers: processes; None and one capture that is one block: this process and its threads.
+    memory: bytes of all processes together, kept by computing less at a time. on_step: called with
+    the progress of a single capture, or with the captures done. given: see `reconstruct_folder`.
+    Raises WorkersError, and AppError for a ceiling that is too low.
+    """
+    alone = len(places) == 1
+    count, ceiling = workers or get_num_threads(), None
+    # One more than the pool computes at a time is read ahead, or written behind.
+    at_a_time = len(places)
+    if memory is not None:
+        ceiling, most, at_a_time = ceiling_for(
+            memory, [folder for folder, _ in places], given.get("psi_path"),
+            given.get("settings") or MethodSettings(), given.get("as_zarr", False),
+            given.get("truth") is not None,
+        )  # fmt: skip
+        count = min(count, most)
+    shared = not alone or workers is not None or cluster is not None or memory is not None
+    with opened_pool(count, cluster, ceiling) if shared else nullcontext() as pool:
+        if pool is None or alone:
+            yield places[0], _outcome(places[0], pool=pool, on_step=on_step, **given)
+            return
+        with ThreadPoolExecutor(min(at_a_time, pool.size + 1)) as threads:
+            futures = {
+                threads.submit(_outcome, place, pool=pool, **given): place for place in places
+            }
+            try:
+                for done, future in enumerate(as_completed(futures), 1):
+                    outcome = future.result()
+                    on_step(Progress(done, None, None, len(places)))
+                    yield futures[future], outcome
+            except BaseException:
+                for future in futures:
+                    future.cancel()
+                pool.end()
+                raise
+
+
+def _outcome(place: Place, **given: Any) -> dict | Exception:
+    """Return a capture's metrics, or what it failed by; raises StoppedError by Ctrl-C."""
+    frames, out = place
+    of_session = frames / RECONSTRUCTION if is_session(frames) else None
+    try:
+        with result_folder(out, "reconstruct", belongs_to=of_session, resumes=True) as folder:
+            try:
+                return reconstruct_folder(frames, folder, **given)
+            except KeyboardInterrupt as stop:
+                if not (folder.parent / KEPT).is_dir():
+                    raise
+                raise StoppedError(
+                    f"stopped by Ctrl-C; blocks that are done are kept in {out}, and the same "
+                    "command goes on"
+                ) from stop
+    except ERRORS as fault:
+        return fault
+
+
+def session_frames(folder: Path) -> tuple[ImagingMatrix, Frames]:
+    """Return a session's shots, and the Psi of its whiteboards that they were normalised by.
+
+    Raises AppError or CalibrationError.
+    """
+    taken = session_readings(Session(folder))
+    return taken.psi, Frames(taken.readings, np.sqrt(taken.variance), taken.usable)
+
+
+def open_frames(folder: str | Path, psi: str | Path | None = None) -> tuple[ImagingMatrix, Frames]:
+    """Return Psi and the frames of a folder: a session, or what `simulate` or `demo` wrote.
+
+    psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, what
+    its whiteboards measure). Raises AppError, SensingError, CalibrationError, or ArgumentError for
+    what is no path.
+    """
+    takes = "the folder of a session, or one that `emmc-rig simulate` or `demo` wrote"
+    folder = path_of(folder, "folder", takes)
+    if psi is not None:
+        psi = path_of(psi, "psi", "the file of an imaging matrix, psi.h5")
+    if folder.is_file():
+        raise AppError(
+            f"{folder}: a file; open_frames takes {takes}; readings of your own are given to "
+            "`reconstruct` as an array (shot, pixel_y, pixel_x)"
+        )
+    if is_session(folder):
+        measured, frames = session_frames(folder)
+        return measured if psi is None else open_psi(Path(psi)).load(), frames
+    return open_psi(Path(psi or psi_beside(folder))).load(), read_frames(folder)
+
+
+def stored_frames(folder: Path, out: Path, psi_path: Path | None) -> tuple[Frames, Path]:
+    """Return the frames of a folder, and the file of their Psi: a session's is written to `out`."""
+    if is_session(folder):
+        measured, frames = session_frames(folder)
+        measured.save(out / PSI)
+        return frames, psi_path or out / PSI
+    return read_frames(folder), psi_path or psi_beside(folder)
+
+
+def load_settings(path: Path | None) -> MethodSettings:
+    """Read method settings from YAML; misspelt keys name the nearest valid one."""
+    if path is None:
+        return MethodSettings()
+    return validated(MethodSettings, read_yaml(path, AppError), str(path), AppError)

@@ -28,7 +28,7 @@ from emmc_rig.model.lightfield import (
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.viewer import render_viewer
 from reconstruction.result import Reconstruction
-from reconstruction.verdict.missed import missed_readings
+from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ class Result:
         return Export(
             self.method, self.verdict.words, self.light_field,
             None if truth is None else np.asarray(truth), self.disparity, self.sigma,
-            self.maps.get("model"), self.misfit, self.metrics(),
+            self.misfit, self.metrics(),
         )  # fmt: skip
 
     @cached_property

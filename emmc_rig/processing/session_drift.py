@@ -22,12 +22,12 @@ from calibration.placement import SCALARS, Placement, with_aperture_mean_one
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import refuse_missing
-from emmc_rig.files.frames import FRAMES, PSI, read_frames
+from emmc_rig.files.psi import FRAMES, PSI, read_frames
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import camera_of, psi_layout
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.stored import CALIBRATION
+from emmc_rig.processing.session_calibration import CALIBRATION_FILE
 
 Array = NDArray[np.floating]
 
@@ -64,11 +64,11 @@ class Known:
 
 def read_calibration(folder: Path) -> Known:
     """Read a folder of `emmc-rig calibrate`; raises AppError when it is none, or damaged."""
-    path = folder / CALIBRATION
+    path = folder / CALIBRATION_FILE
     remedy = "name one that `emmc-rig calibrate` wrote"
     refuse_missing(folder, remedy)
     if not path.is_file() or not (folder / PSI).is_file():
-        raise AppError(f"{folder}: holds no {CALIBRATION} and {PSI}; {remedy}")
+        raise AppError(f"{folder}: holds no {CALIBRATION_FILE} and {PSI}; {remedy}")
     psi = ImagingMatrix.load(folder / PSI)
     camera = camera_of(psi)
     stages, k = shot_stages(camera), psi.binning

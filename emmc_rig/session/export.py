@@ -28,7 +28,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.frame_means import decoded, session_darks
-from emmc_rig.session.journal import camera_of_first_run
+from emmc_rig.session.journal import FrameEntry
 from emmc_rig.session.readings import fused_shot, shot_frames
 from emmc_rig.session.session import CAMERA, RIG, Session
 
@@ -69,7 +69,7 @@ def _write(
     entry["program_name"] = "emmc-rig"
     entry["program_name"].attrs["version"] = session.header["versions"]["emmc-rig"]
     entry["start_time"] = session.header["created"]
-    entry["end_time"] = max(line["wall"] for line in lines)
+    entry["end_time"] = max(line.wall for line in lines)
     instrument = _group(entry, "instrument", "NXinstrument")
     _detector(session, instrument, compress, on_frame)
     for name, axes in AXES.items():
@@ -84,9 +84,9 @@ def _write(
     data["kind"] = _texts([frame.kind for frame in frames])
     data["shot"] = [frame.bench.shot for frame in frames]
     data["masks_in"] = [frame.bench.masks_in for frame in frames]
-    data["plan"] = [line.get("plan", 0) for line in lines]
+    data["plan"] = [line.plan for line in lines]
     data["view"] = [frame.view or (-1, -1) for frame in frames]
-    data["sha256"] = _texts([line["sha256"] for line in lines])
+    data["sha256"] = _texts([line.sha256 for line in lines])
     _fused(session, entry)
     process = _group(entry, "process", "NXprocess")
     process["program"] = "emmc-rig capture"
@@ -106,7 +106,7 @@ def _detector(
     frames = session.needed
     lines = [session.stored[frame.id] for frame in frames]
     detector = _group(instrument, "detector", "NXdetector")
-    shape = tuple(lines[0]["shape"])
+    shape = lines[0].shape
     data = detector.create_dataset(
         "data",
         (len(frames), *shape),
@@ -124,27 +124,29 @@ def _detector(
             raise AppError(f"{session.folder}: frame {planned.id} has another size than the first")
         data[place] = frame.mosaic
         on_frame(planned.id)
-    _values(detector, "count_time", [line["exposure_s"] for line in lines], "s")
-    _values(detector, "gain", [line["gain"] for line in lines], "")
-    _values(detector, "black_level", [line["black_level_dn"] for line in lines], "DN")
-    detector["saturation_value"] = lines[0]["white_level_dn"]
+    _values(detector, "count_time", [line.exposure_s for line in lines], "s")
+    _values(detector, "gain", [line.gain for line in lines], "")
+    _values(detector, "black_level", [line.black_level_dn for line in lines], "DN")
+    detector["saturation_value"] = lines[0].white_level_dn
     detector["saturation_value"].attrs["units"] = "DN"
-    detector["bayer_pattern"] = lines[0]["cfa"]
-    camera = camera_of_first_run(session.journal.entries) or {}
+    detector["bayer_pattern"] = lines[0].cfa
+    camera = {} if session.first_run is None else session.first_run.camera
     for name, key in (("vendor", "maker"), ("model", "model"), ("serial_number", "serial")):
         detector[name] = camera.get(key, "")
 
 
 def _positioner(
-    instrument: Group, name: str, axes: tuple[str, str], lines: list[dict[str, Any]]
+    instrument: Group, name: str, axes: tuple[str, str], lines: list[FrameEntry]
 ) -> None:
     """Write where the axes read to be, and were sent; NaN where a frame did not need them."""
-    if not any(axis in line["read_um"] for line in lines for axis in axes):
+    if not any(axis in line.read_um for line in lines for axis in axes):
         return
     group = _group(instrument, name, "NXpositioner")
     for letter, axis in zip("xy", axes, strict=True):
-        for dataset, key in ((letter, "read_um"), (f"{letter}_commanded", "commanded_um")):
-            _values(group, dataset, [line[key].get(axis, np.nan) for line in lines], "um")
+        read = [line.read_um.get(axis, np.nan) for line in lines]
+        commanded = [line.commanded_um.get(axis, np.nan) for line in lines]
+        _values(group, letter, read, "um")
+        _values(group, f"{letter}_commanded", commanded, "um")
 
 
 def _fused(session: Session, entry: Group) -> None:

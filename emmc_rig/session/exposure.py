@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from calibration.frames import DARK_ELECTRONS_PER_S, dark_current_known
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import FrameEntry
 from emmc_rig.session.session import Session
 from reconstruction.verdict.rules import Reason
 
@@ -47,41 +45,36 @@ class ShotExposure:
 
 def shot_exposures(session: Session) -> list[ShotExposure]:
     """Return how each shot of the scene is exposed whose frames are taken, by its place."""
-    frames: dict[int, list[Entry]] = defaultdict(list)
+    frames: dict[int, list[FrameEntry]] = defaultdict(list)
     for frame in session.needed:
         entry = session.stored.get(frame.id)
         if frame.kind == "shot" and entry is not None:
             frames[frame.bench.shot].append(entry)
     darks_s = [
-        float(session.stored[frame.id]["exposure_s"])
+        session.stored[frame.id].exposure_s
         for frame in session.frames
         if frame.kind == "dark" and frame.id in session.stored
     ]
     gain = session.camera["sensor"]["noise"]["gain_dn_per_electron"]
     return [
-        replace(_of_shot(shot, entries), dark_share=_dark_share(entries, darks_s, gain))
+        ShotExposure(
+            shot,
+            max(one.level for one in entries),
+            min(one.figures.saturated for one in entries),
+            _dark_share(entries, darks_s, gain),
+        )
         for shot, entries in sorted(frames.items())
     ]
 
 
-def _dark_share(entries: Sequence[Entry], darks_s: Sequence[float], gain: float) -> float:
+def _dark_share(entries: Sequence[FrameEntry], darks_s: Sequence[float], gain: float) -> float:
     """Return `ShotExposure.dark_share`; gain: DN per electron. 0 without any dark."""
-    longest = max(entries, key=lambda one: one["exposure_s"])
-    exposure_s = float(longest["exposure_s"])
+    longest = max(entries, key=lambda one: one.exposure_s)
+    exposure_s = longest.exposure_s
     if not darks_s or dark_current_known(darks_s, exposure_s):
         return 0.0
     unknown_dn = gain * DARK_ELECTRONS_PER_S * abs(exposure_s - darks_s[0])
-    return unknown_dn / max(longest["figures"]["bright_dn"], 1.0)
-
-
-def _of_shot(shot: int, entries: Sequence[Entry]) -> ShotExposure:
-    levels = [
-        one["figures"]["bright_dn"] / (one["white_level_dn"] - np.mean(one["black_level_dn"]))
-        for one in entries
-    ]
-    return ShotExposure(
-        shot, float(max(levels)), float(min(one["figures"]["saturated"] for one in entries))
-    )
+    return unknown_dn / max(longest.figures.bright_dn, 1.0)
 
 
 def exposure_reasons(shots: Sequence[ShotExposure], gain_db: float | None = None) -> list[Reason]:

@@ -8,7 +8,6 @@ decoding what would be stored and comparing it with the frame.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,27 +20,26 @@ from drivers.dng import MONO, encode_dng, private_data
 from drivers.errors import DriverError, RawFrameError
 from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
 from emmc_rig.errors import AppError
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import Figures, FrameEntry
 
 STREAMED = ".bin"
 """Frames that the drivers of `drivers.cameras` decode by themselves."""
-CAMERA_DIGEST = "camera_sha256"
-"""In the journal line of a frame whose file is a DNG of the mosaic: digest of the bytes in it."""
+NO_FIGURES = Figures(0.0, 0.0, 0.0)
 UNSTORABLE = "the camera's frame cannot be stored so that it is read back: mend its driver"
 
 
 @dataclass(frozen=True)
 class FrameFile:
-    """What is stored of a frame; facts: what its journal line says of it."""
+    """What is stored of a frame; camera_sha256: see `FrameEntry`."""
 
     suffix: str
     data: bytes
     sha256: str
-    facts: Mapping[str, Any]
+    camera_sha256: str | None = None
 
 
 def frame_facts(frame: RawFrame) -> dict[str, Any]:
-    """Return what a journal keeps of a frame beside its bytes: plain data, for JSON."""
+    """Return what is kept of a frame beside its bytes: plain data, for JSON."""
     return {
         "shape": list(frame.mosaic.shape),
         "cfa": frame.cfa,
@@ -55,48 +53,55 @@ def frame_facts(frame: RawFrame) -> dict[str, Any]:
     }
 
 
+def frame_entry(frame: RawFrame, exposure_s: float, gain: float, **about: Any) -> FrameEntry:
+    """Return what a journal keeps of a frame beside its file, and `about` it.
+
+    exposure_s, gain: the frame's own, or the camera's where it says none.
+    """
+    known = {**frame_facts(frame), "exposure_s": exposure_s, "gain": gain}
+    return FrameEntry(id="", file="", bytes=0, sha256="", **known, **about)
+
+
 def frame_file(frame: RawFrame) -> FrameFile:
     """Return the file from which `decode_frame` returns the frame.
 
     Raises AppError for a frame that no file can hold.
     """
-    facts = frame_facts(frame)
-    own = FrameFile(_suffix_of(frame), frame.original, frame.sha256, facts)
+    own = FrameFile(_suffix_of(frame), frame.original, frame.sha256)
     if _decodes_to(own, frame):
         return own
     data = _dng_of(frame)
-    digest = hashlib.sha256(data).hexdigest()
-    made = FrameFile(".dng", data, digest, {**facts, CAMERA_DIGEST: frame.sha256})
+    made = FrameFile(".dng", data, hashlib.sha256(data).hexdigest(), frame.sha256)
     if not _decodes_to(made, frame):
         raise AppError(f"{UNSTORABLE} (a DNG of it decodes to something else)")
     return made
 
 
-def decode_frame(data: bytes, entry: Entry) -> RawFrame:
+def decode_frame(data: bytes, entry: FrameEntry) -> RawFrame:
     """Return the frame in a session's file; entry: its journal line. Raises a `DriverError`."""
-    if CAMERA_DIGEST in entry:
+    if entry.camera_sha256 is not None:
         frame = replace(
             decode_raw(data),
             # A DNG has whole levels.
-            black_level_dn=np.array(entry["black_level_dn"], np.float64),
-            white_level_dn=entry["white_level_dn"],
-            cfa=entry["cfa"],
+            black_level_dn=np.array(entry.black_level_dn, np.float64),
+            white_level_dn=entry.white_level_dn,
+            cfa=entry.cfa,
             original=private_data(data),
-            sha256=entry[CAMERA_DIGEST],
+            sha256=entry.camera_sha256,
         )
-    elif Path(entry["file"]).suffix == STREAMED:
+    elif Path(entry.file).suffix == STREAMED:
         protocols = (one for one in CAMERAS.values() if one.frame_prefix)
         driver = next((one for one in protocols if data.startswith(one.frame_prefix)), None)
         if driver is None:
             raise RawFrameError(
-                f"{entry['file']} is in a format that only the plug-in of its camera knows: "
+                f"{entry.file} is in a format that only the plug-in of its camera knows: "
                 "emmc-rig 0.2 stored it without its mosaic"
             )
-        black_dn = float(entry["black_level_dn"][0][0])
-        frame = driver.load().decode_frame(data, black_dn, entry["white_level_dn"])
+        black_dn = entry.black_level_dn[0][0]
+        frame = driver.load().decode_frame(data, black_dn, entry.white_level_dn)
     else:
         frame = decode_raw(data)
-    return replace(frame, exposure_s=entry["exposure_s"], gain=entry["gain"])
+    return replace(frame, exposure_s=entry.exposure_s, gain=entry.gain)
 
 
 def _suffix_of(frame: RawFrame) -> str:
@@ -109,7 +114,9 @@ def _suffix_of(frame: RawFrame) -> str:
 
 def _decodes_to(file: FrameFile, frame: RawFrame) -> bool:
     try:
-        back = decode_frame(file.data, {"file": f"frame{file.suffix}", **file.facts})
+        named = {"file": f"frame{file.suffix}", "camera_sha256": file.camera_sha256}
+        entry = frame_entry(frame, 0.0, 1.0, figures=NO_FIGURES)
+        back = decode_frame(file.data, entry.model_copy(update=named))
     except DriverError:
         return False
     return (

@@ -13,7 +13,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import FrameEntry
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
@@ -29,7 +29,7 @@ def decoded(session: Session, frames: Iterable[PlannedFrame]) -> Iterator[tuple[
         entry = session.stored.get(frame.id)
         data = session.read(frame.id)
         assert entry is not None
-        yield decode_frame(data, entry), float(entry["exposure_s"])
+        yield decode_frame(data, entry), entry.exposure_s
 
 
 def stage_um_of(frame: PlannedFrame) -> tuple[float, float]:
@@ -82,7 +82,7 @@ def frame_shape(session: Session) -> tuple[int, int]:
     """Return rows and columns of the frames captured; raises AppError where no dark was."""
     first = darks_of(session)[0]
     exposure_of(session, first)
-    rows, columns = session.stored[first.id]["shape"]
+    rows, columns = session.stored[first.id].shape
     return rows, columns
 
 
@@ -91,24 +91,24 @@ def exposure_of(session: Session, frame: PlannedFrame) -> float:
     entry = session.stored.get(frame.id)
     if entry is None:
         raise AppError(f"{session.folder}: frame {frame.id} was not captured yet; resume it")
-    return float(entry["exposure_s"])
+    return entry.exposure_s
 
 
-def _taken_s(session: Session, entry: Entry) -> float:
+def _taken_s(session: Session, entry: FrameEntry) -> float:
     """Return when a frame was taken, in seconds of the session.
 
     The clock of a run may begin anew with it: then the run follows the one before.
     """
     times: dict[int, list[float]] = defaultdict(list)
     for one in session.stored.values():
-        times[one.get("run", 0)].append(one.get("host_time_s") or 0.0)
+        times[one.run].append(one.host_time_s or 0.0)
     offset = latest = 0.0
     for run in sorted(times):
         offset = max(0.0, latest - min(times[run])) if run != min(times) else 0.0
         latest = max(times[run]) + offset
-        if run == entry.get("run", 0):
+        if run == entry.run:
             break
-    return (entry.get("host_time_s") or 0.0) + offset
+    return (entry.host_time_s or 0.0) + offset
 
 
 def alike_frames(session: Session, frames: list[PlannedFrame]) -> list[PlannedFrame]:
@@ -128,4 +128,4 @@ def mean_of(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
     mosaics = (frame.mosaic for frame, _ in decoded(session, alike))
     taken_s = float(np.mean([_taken_s(session, entry) for entry in entries]))
     first, what, lit = entries[0], alike[0].id, alike[0].kind != "dark"
-    return average(mosaics, first["exposure_s"], first["white_level_dn"], what, taken_s, lit)
+    return average(mosaics, first.exposure_s, first.white_level_dn, what, taken_s, lit)

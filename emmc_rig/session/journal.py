@@ -3,100 +3,309 @@
 A line is on the disk when `append` returns. A line that a crash tore, or whose checksum is wrong,
 counts as never written: its step is done again.
 
-This module alone knows the kinds of entries and what they mean together:
-
-| kind | says |
-|---|---|
-| `created`, `amended` | the plan that holds from here on: digests of its files |
-| `run` | a capture was started: versions, command, devices |
-| `frame`, `discarded` | a frame is stored; it no longer counts |
-| `metered` | by what `exposures_s` each shot is taken, which longer frames are `asked` for |
-| `until` | from now on the wanted PSNR is `target_db` |
-| `decided` | what of `shots` is stated; `next` to take, or which are `spared` and `why` |
-| `paused`, `resumed`, `retry`, `registered`, `refused`, `stopped`, `complete` | how a run went |
-
-After an amendment of the plan metering and shots are decided anew.
+This module alone knows what lines hold, a class for each kind, and what they mean together. What
+came after version 0.2 has a default, so that its journals are read. After an amendment of the plan
+metering and shots are decided anew.
 """
 
 from __future__ import annotations
 
 import json
-import re
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict
 
 from emmc_rig.files.results import shown_seconds
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.session.storage import Disk, read_whole
 
-Entry = dict[str, Any]
-NEEDED: dict[str, dict[str, type]] = {
-    "created": {"sha256": dict, "frames": int},
-    "amended": {"sha256": dict, "frames": int},
-    "frame": {"id": str, "file": str, "bytes": int, "sha256": str},
-    "discarded": {"id": str},
-    "metered": {"exposures_s": dict, "asked": list},
-    "decided": {"shots": list, "spared": list, "spared_frames": int},
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one frame: share of saturated pixels; mean, 99.9th percentile, median above black, DN."""
+
+    saturated: float
+    mean_dn: float
+    bright_dn: float
+    median_dn: float = 0.0
+
+
+class Entry(BaseModel):
+    """A line of the journal; as text what it says for people beside the frames, "" for nothing.
+
+    One of a kind that only later programs know says nothing.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+    kind: str
+
+    def __str__(self) -> str:
+        return ""
+
+
+class CreatedEntry(Entry):
+    """The session was begun: SHA-256 of the frozen files, frames taken whatever metering says."""
+
+    kind: Literal["created"] = "created"
+    format: int = 1
+    sha256: dict[str, str]
+    frames: int
+
+
+class AmendedEntry(Entry):
+    """Another plan holds from here on; kept: frames stored then."""
+
+    kind: Literal["amended"] = "amended"
+    plan: int
+    sha256: dict[str, str]
+    frames: int
+    kept: int = 0
+    changes: list[str] = []
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.wall}: plan {self.plan} holds: {'; '.join(self.changes)}"
+
+
+class RunEntry(Entry):
+    """A capture was started, on these devices."""
+
+    kind: Literal["run"] = "run"
+    wall: str = ""
+    versions: dict[str, Any] = {}
+    command: str = ""
+    resumed: bool = False
+    camera: dict[str, Any]
+    camera_settings: dict[str, Any] = {}
+    stage: dict[str, Any] = {}
+
+    def __str__(self) -> str:
+        return f"{self.wall}: {self.command}"
+
+
+class FrameEntry(Entry):
+    """A frame is stored.
+
+    run: counted from 1. plan: number of the amendment that it was taken by. camera_sha256: of the
+    camera's own bytes, where `file` is a DNG of the mosaic that holds them. spans_s: by step, its
+    begin and end in seconds of the run.
+    """
+
+    kind: Literal["frame"] = "frame"
+    id: str
+    file: str
+    bytes: int
+    sha256: str
+    run: int = 0
+    plan: int = 0
+    shape: tuple[int, int]
+    cfa: str
+    black_level_dn: list[list[float]]
+    white_level_dn: int
+    exposure_s: float
+    gain: float
+    camera_time_s: float | None = None
+    host_time_s: float | None = None
+    metadata: dict[str, Any] = {}
+    camera_sha256: str | None = None
+    lamp: str = ""
+    commanded_um: dict[str, float] = {}
+    read_um: dict[str, float] = {}
+    figures: Figures
+    triggered: bool = False
+    attempts: int = 1
+    wall: str = ""
+    spans_s: dict[str, tuple[float, float]] = {}
+
+    @property
+    def black_dn(self) -> float:
+        """Mean black level."""
+        return sum(map(sum, self.black_level_dn)) / sum(map(len, self.black_level_dn))
+
+    @property
+    def level(self) -> float:
+        """Its brightest readings, 1 at white."""
+        return self.figures.bright_dn / (self.white_level_dn - self.black_dn)
+
+
+class DiscardedEntry(Entry):
+    """A frame no longer counts."""
+
+    kind: Literal["discarded"] = "discarded"
+    id: str
+    reason: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.id}: {self.reason}"
+
+
+class MeteredEntry(Entry):
+    """The scene was metered: exposure by shot, longer frames `asked` for."""
+
+    kind: Literal["metered"] = "metered"
+    exposures_s: dict[int, float]
+    asked: list[str]
+    wall: str = ""
+
+    def __str__(self) -> str:
+        by_exposure: dict[float, list[str]] = {}
+        for shot, exposure_s in self.exposures_s.items():
+            by_exposure.setdefault(exposure_s, []).append(str(shot))
+        exposures = ", ".join(
+            f"shots {', '.join(shots)} by {exposure_s:.3g} s"
+            for exposure_s, shots in by_exposure.items()
+        )
+        longer = f"; {len(self.asked)} longer frames, for the dark parts" if self.asked else ""
+        return f"metered: {exposures}{longer}"
+
+
+class UntilEntry(Entry):
+    """From here on shots are taken until this PSNR is stated."""
+
+    kind: Literal["until"] = "until"
+    target_db: float
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.wall}: shots are taken until {self.target_db:g} dB are stated"
+
+
+class DecidedEntry(Entry):
+    """What the shots so far give, and which follows; next: None where no more are needed."""
+
+    kind: Literal["decided"] = "decided"
+    run: int = 0
+    shots: list[int]
+    stated_db: float
+    target_db: float
+    next: int | None
+    why: str = ""
+    expected_db: dict[int, float] = {}
+    spared: list[int]
+    spared_frames: int
+    method: str = ""
+    advice: str = ""
+    spans_s: dict[str, tuple[float, float]] = {}
+    wall: str = ""
+
+    def __str__(self) -> str:
+        taken = ", ".join(map(str, self.shots))
+        stated = f"shots {taken}: {self.stated_db:.2f} dB stated, {self.target_db:g} wanted"
+        if self.next is None:
+            spared = f", {len(self.spared)} shots spared" if self.spared else ""
+            return f"{stated}; no more, {self.why}{spared}"
+        return f"{stated}; next shot {self.next}, {self.why}"
+
+
+class HaltEntry(Entry):
+    """The capture waits, or a run ended before all was taken."""
+
+    kind: Literal["paused", "stopped"]
+    reason: str = ""
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.wall}: {self.reason}"
+
+
+class ResumedEntry(Entry):
+    """It goes on."""
+
+    kind: Literal["resumed"] = "resumed"
+    seconds: float
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.wall}: after {shown_seconds(self.seconds)}"
+
+
+class RetryEntry(Entry):
+    """A fault, met by another try."""
+
+    kind: Literal["retry"] = "retry"
+    id: str
+    fault: str
+    attempt: int
+    at_s: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.id}, try {self.attempt}: {self.fault}"
+
+
+class ComparedEntry(Entry):
+    """A frame was taken again before going on: the bench is as it was, or that is refused."""
+
+    kind: Literal["registered", "refused"]
+    id: str
+    x_px: float
+    y_px: float
+    likeness: float
+    limit_px: float = 0.0
+
+    def __str__(self) -> str:
+        return (
+            f"{self.id} taken again: shifted by ({self.x_px:+.3f}, {self.y_px:+.3f}) px, "
+            f"likeness {self.likeness:.3f}"
+        )
+
+
+class CompleteEntry(Entry):
+    """Every frame was read back and found good."""
+
+    kind: Literal["complete"] = "complete"
+    frames: int = 0
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.wall}: every frame verified"
+
+
+_KINDS = {
+    "created": CreatedEntry,
+    "amended": AmendedEntry,
+    "run": RunEntry,
+    "frame": FrameEntry,
+    "discarded": DiscardedEntry,
+    "metered": MeteredEntry,
+    "until": UntilEntry,
+    "decided": DecidedEntry,
+    "paused": HaltEntry,
+    "resumed": ResumedEntry,
+    "retry": RetryEntry,
+    "registered": ComparedEntry,
+    "refused": ComparedEntry,
+    "stopped": HaltEntry,
+    "complete": CompleteEntry,
 }
-"""What a line of a kind holds at least, and of which type: one without it counts as damaged."""
 _CHECK = ',"crc32":"'
 _TAIL_CHARACTERS = len(_CHECK) + len('01234567"}')
-_FRAME_HEAD = re.compile(rb'\{"kind":"frame","id":"[^"\\]*","file":"[^"\\]*","bytes":\d+')
+AnyEntry = TypeVar("AnyEntry", bound=Entry)
 
 
 def encode_line(entry: Entry) -> bytes:
     """Return a line with its newline; raises `ValueError` for what JSON cannot say."""
-    body = json.dumps(entry, separators=(",", ":"), allow_nan=False)[:-1]
+    data = entry.model_dump(mode="json")
+    if data.get("camera_sha256", "") is None:
+        del data["camera_sha256"]
+    body = json.dumps(data, separators=(",", ":"), allow_nan=False)[:-1]
     return f'{body}{_CHECK}{zlib.crc32(body.encode()):08x}"}}\n'.encode()
 
 
 def decode_line(line: bytes) -> Entry | None:
     """Return the entry in a line without its newline; None for one that is torn or damaged."""
-    body = _checked(line)
-    entry = None if body is None else _decoded(body)
-    return entry if entry is not None and _whole(entry) else None
-
-
-def _whole(entry: Entry) -> bool:
-    """Whether an entry holds what every reader of its kind takes from it."""
-    return all(
-        isinstance(entry.get(name), kind) for name, kind in NEEDED.get(entry["kind"], {}).items()
-    )
-
-
-def _checked(line: bytes) -> bytes | None:
-    """Return the line before its checksum, None where that is wrong."""
     cut = len(line) - _TAIL_CHARACTERS
     body, tail = line[:cut], line[cut:]
-    right = cut > 0 and tail == b'%s%08x"}' % (_CHECK.encode(), zlib.crc32(body))
-    return body if right else None
-
-
-def _decoded(body: bytes) -> Entry | None:
-    try:
-        entry = parse_json(body + b"}", "an entry", ValueError)
-    except ValueError:
+    if cut <= 0 or tail != b'%s%08x"}' % (_CHECK.encode(), zlib.crc32(body)):
         return None
-    return entry if isinstance(entry, dict) and isinstance(entry.get("kind"), str) else None
-
-
-def heads(data: bytes) -> list[Entry]:
-    """Return the entries of a journal, of a frame only kind, id, file and bytes.
-
-    Ten times as fast as decoding all of them; what is torn or damaged is left out.
-    """
-    found = []
-    for line in data.split(b"\n"):
-        body = _checked(line)
-        if body is None:
-            continue
-        head = _FRAME_HEAD.match(body)
-        entry = _decoded(body if head is None else head[0])
-        if entry is not None and (head is not None or _whole(entry)):
-            found.append(entry)
-    return found
+    try:
+        data = parse_json(body + b"}", "an entry", ValueError)
+        return _KINDS.get(data["kind"], Entry).model_validate(data)
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 class Journal:
@@ -129,126 +338,43 @@ class Journal:
         self.entries.append(entry)
 
 
-def kinds_of(entries: Iterable[Entry], kind: str) -> list[Entry]:
+def of_kind(entries: Iterable[Entry], kind: type[AnyEntry]) -> list[AnyEntry]:
     """Return the entries of a kind, oldest first."""
-    return [entry for entry in entries if entry["kind"] == kind]
+    return [entry for entry in entries if isinstance(entry, kind)]
 
 
-def camera_of_first_run(entries: Iterable[Entry]) -> Mapping[str, Any] | None:
-    """Return what the first run says of its camera; None before any run."""
-    runs = kinds_of(entries, "run")
-    return runs[0]["camera"] if runs else None
-
-
-def count_stored(entries: Iterable[Entry]) -> dict[str, Entry]:
+def count_stored(entries: Iterable[Entry]) -> dict[str, FrameEntry]:
     """Return the journal line of every frame that counts, by its id, oldest first."""
-    found: dict[str, Entry] = {}
+    found: dict[str, FrameEntry] = {}
     for entry in entries:
         count_entry(found, entry)
     return found
 
 
-def count_entry(found: dict[str, Entry], entry: Entry) -> None:
+def count_entry(found: dict[str, FrameEntry], entry: Entry) -> None:
     """Let an entry count among the journal lines of the frames that are stored."""
-    if entry["kind"] == "frame":
-        found[entry["id"]] = entry
-    elif entry["kind"] == "discarded":
-        found.pop(entry["id"], None)
+    if isinstance(entry, FrameEntry):
+        found[entry.id] = entry
+    elif isinstance(entry, DiscardedEntry):
+        found.pop(entry.id, None)
 
 
 def found_complete(entries: Sequence[Entry]) -> bool:
     """Return whether every frame was found good after the last one was stored."""
-    for entry in reversed(entries):
-        if entry["kind"] in ("complete", "frame", "discarded", "amended"):
-            return entry["kind"] == "complete"
-    return False
+    deciding = (CompleteEntry, FrameEntry, DiscardedEntry, AmendedEntry)
+    last = next((entry for entry in reversed(entries) if isinstance(entry, deciding)), None)
+    return isinstance(last, CompleteEntry)
 
 
-def wanted_db(entries: Sequence[Entry], begun_with: float | None) -> float | None:
-    """Return the PSNR at which no further shot is taken; None where all are.
-
-    begun_with: what the session was begun with.
-    """
-    last = next((entry for entry in reversed(entries) if entry["kind"] == "until"), None)
-    return begun_with if last is None else last["target_db"]
-
-
-def decisions(entries: Iterable[Entry]) -> list[Entry]:
-    """Return what was decided, oldest first."""
-    return kinds_of(entries, "decided")
-
-
-def ended(entries: Sequence[Entry]) -> Entry | None:
+def ended(entries: Sequence[Entry]) -> DecidedEntry | None:
     """Return the decision that no more shots are needed; None while there is none, or no longer."""
-    for entry in reversed(entries):
-        if entry["kind"] in ("decided", "until", "amended"):
-            return entry if entry.get("next", 0) is None else None
-    return None
+    deciding = (DecidedEntry, UntilEntry, AmendedEntry)
+    last = next((entry for entry in reversed(entries) if isinstance(entry, deciding)), None)
+    return last if isinstance(last, DecidedEntry) and last.next is None else None
 
 
-def spared_shots(entries: Sequence[Entry]) -> frozenset[int]:
-    """Return the shots that need not be taken."""
-    last = ended(entries)
-    return frozenset(() if last is None else last["spared"])
-
-
-def metered(entries: Sequence[Entry]) -> Entry | None:
+def metered(entries: Sequence[Entry]) -> MeteredEntry | None:
     """Return what metering of the scene asks for; None while that is open."""
-    for entry in reversed(entries):
-        if entry["kind"] in ("metered", "amended"):
-            return entry if entry["kind"] == "metered" else None
-    return None
-
-
-def metered_words(entry: Entry) -> str:
-    """Return what metering asks for, for people."""
-    by_exposure: dict[float, list[str]] = {}
-    for shot, exposure_s in entry["exposures_s"].items():
-        by_exposure.setdefault(exposure_s, []).append(shot)
-    exposures = ", ".join(
-        f"shots {', '.join(shots)} by {exposure_s:.3g} s"
-        for exposure_s, shots in by_exposure.items()
-    )
-    longer = f"; {len(entry['asked'])} longer frames, for the dark parts" if entry["asked"] else ""
-    return f"metered: {exposures}{longer}"
-
-
-def decided_words(entry: Entry) -> str:
-    """Return a decision for people."""
-    taken = ", ".join(str(shot) for shot in entry["shots"])
-    stated = f"shots {taken}: {entry['stated_db']:.2f} dB stated, {entry['target_db']:g} wanted"
-    if entry["next"] is None:
-        spared = f", {len(entry['spared'])} shots spared" if entry["spared"] else ""
-        return f"{stated}; no more, {entry['why']}{spared}"
-    return f"{stated}; next shot {entry['next']}, {entry['why']}"
-
-
-def entry_text(entry: Entry) -> str:
-    """Return what an entry that is no frame says, for people; "" for a frame."""
-    kind = entry["kind"]
-    if kind == "run":
-        return f"{entry['wall']}: {entry['command']}"
-    if kind == "retry":
-        return f"{entry['id']}, try {entry['attempt']}: {entry['fault']}"
-    if kind == "discarded":
-        return f"{entry['id']}: {entry['reason']}"
-    if kind in ("registered", "refused"):
-        return (
-            f"{entry['id']} taken again: shifted by ({entry['x_px']:+.3f}, {entry['y_px']:+.3f}) "
-            f"px, likeness {entry['likeness']:.3f}"
-        )
-    if kind == "stopped":
-        return f"{entry['wall']}: {entry['reason']}"
-    if kind == "until":
-        return f"{entry['wall']}: shots are taken until {entry['target_db']:g} dB are stated"
-    if kind == "paused":
-        return f"{entry['wall']}: {entry['reason']}"
-    if kind == "resumed":
-        return f"{entry['wall']}: after {shown_seconds(entry['seconds'])}"
-    if kind == "decided":
-        return decided_words(entry)
-    if kind == "metered":
-        return metered_words(entry)
-    if kind == "amended":
-        return f"{entry['wall']}: plan {entry['plan']} holds: {'; '.join(entry['changes'])}"
-    return f"{entry['wall']}: every frame verified" if kind == "complete" else ""
+    deciding = (MeteredEntry, AmendedEntry)
+    last = next((entry for entry in reversed(entries) if isinstance(entry, deciding)), None)
+    return last if isinstance(last, MeteredEntry) else None

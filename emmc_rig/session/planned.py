@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
 
 Kind = Literal[
@@ -84,52 +84,17 @@ class PlannedFrame:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, for JSON."""
-        bench = self.bench
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "target": bench.target,
-            "lamp": bench.lamp,
-            "shot": bench.shot,
-            "fitting": bench.fitting,
-            "masks_in": bench.masks_in,
-            "offsets_um": dict(bench.offsets_um),
-            "board_turn_deg": bench.board_turn_deg,
-            "exposure_s": self.exposure_s,
-            "gain": self.gain,
-            "repeat": self.repeat,
-            "view": None if self.view is None else list(self.view),
-            "metered_by": self.metered_by,
-            "light": self.light,
-            "part": self.part,
-            "window": list(self.window),
-        }
+        own = asdict(self)
+        return {"id": own.pop("id"), "kind": own.pop("kind"), **own.pop("bench"), **own}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PlannedFrame:
-        """Return the frame that `as_dict` described; raises `KeyError` or `TypeError`."""
-        bench = Bench(
-            data["target"],
-            data["lamp"],
-            data["shot"],
-            data["fitting"],
-            data["masks_in"],
-            data["offsets_um"],
-            # Sessions of version 0.2 do not have it.
-            data.get("board_turn_deg", 0.0),
-        )
-        view = data["view"]
-        window_x, window_y = data.get("window", (0, 0))
-        return cls(
-            data["id"],
-            data["kind"],
-            bench,
-            data["exposure_s"],
-            data["gain"],
-            data["repeat"],
-            None if view is None else (view[0], view[1]),
-            data["metered_by"],
-            data["light"],
-            data.get("part", 0),
-            (window_x, window_y),
-        )
+        """Return the frame that `as_dict` described; raises `KeyError` or `TypeError`.
+
+        Keys that came after version 0.2 may be missing.
+        """
+        bench = {one.name for one in fields(Bench)}
+        own = {key: value for key, value in data.items() if key not in bench}
+        for name in ("view", "window"):
+            own[name] = tuple(own[name]) if own.get(name) is not None else getattr(cls, name)
+        return cls(bench=Bench(**{key: data[key] for key in bench & data.keys()}), **own)

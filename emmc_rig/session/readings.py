@@ -69,7 +69,7 @@ def fused_shot(
     amplified_gain = SensorGain(
         gain.gain_dn_per_electron * factor, gain.dark_variance_dn2 * factor**2
     )
-    black = np.mean(session.stored[frames[0].id]["black_level_dn"])
+    black = np.mean(session.stored[frames[0].id].black_level_dn)
     lifted = [
         replace(
             dark,

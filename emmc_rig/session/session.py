@@ -53,17 +53,23 @@ from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import parse_yaml
+from emmc_rig.session.frame_file import FrameFile
 from emmc_rig.session.journal import (
+    AmendedEntry,
+    CreatedEntry,
+    DiscardedEntry,
     Entry,
+    FrameEntry,
     Journal,
+    RunEntry,
+    UntilEntry,
     count_entry,
     count_stored,
     encode_line,
+    ended,
     found_complete,
-    kinds_of,
     metered,
-    spared_shots,
-    wanted_db,
+    of_kind,
 )
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.storage import (
@@ -134,12 +140,7 @@ class Session:
         """
         folder = Path(os.path.abspath(folder))
         files = {HEADER: _json({"format": FORMAT, **about}), **_planned_files(frozen)}
-        begun = {
-            "kind": "created",
-            "format": FORMAT,
-            "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
-            "frames": _certain(frozen.frames),
-        }
+        begun = CreatedEntry(format=FORMAT, sha256=_digests(files), frames=_certain(frozen.frames))
         try:
             make_folder_whole(
                 disk, folder, {**files, JOURNAL: encode_line(begun), f"{FRAMES}/": b""}
@@ -161,19 +162,20 @@ class Session:
         for name, data in files.items():
             write_whole(self.disk, self.folder / name, data)
         self.note(
-            "amended",
-            plan=number,
-            sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
-            frames=_certain(frozen.frames),
-            kept=len(self.stored),
-            changes=list(changes),
-            wall=wall_time(),
+            AmendedEntry(
+                plan=number,
+                sha256=_digests(files),
+                frames=_certain(frozen.frames),
+                kept=len(self.stored),
+                changes=list(changes),
+                wall=wall_time(),
+            )
         )
         return Session(self.folder, self.disk)
 
     def forget(self) -> None:
         """Remove a session in which no frame was ever stored, unless it holds other files."""
-        if kinds_of(self.journal.entries, "frame") or self.unexpected_files()[1]:
+        if of_kind(self.journal.entries, FrameEntry) or self.unexpected_files()[1]:
             return
         with suppress(OSError):
             # Whole or not at all: what a crash leaves of it is cleared like one never made.
@@ -183,28 +185,28 @@ class Session:
             self.disk.sync_folder(part.parent)
 
     @cached_property
-    def created(self) -> Entry:
+    def created(self) -> CreatedEntry:
         """The first entry; raises AppError when it is damaged, or of a later program."""
-        first, *_ = kinds_of(self.journal.entries, "created") or [None]
-        if first is None:
+        first = next(iter(self.journal.entries), None)
+        if not isinstance(first, CreatedEntry):
             raise AppError(
                 f"{self.folder / JOURNAL}: its first line is damaged; restore it from a copy"
             )
-        if first["format"] > FORMAT:
+        if first.format > FORMAT:
             raise AppError(f"{self.folder}: made by a later emmc-rig; update this one")
         return first
 
     @property
     def amendments(self) -> int:
         """How often the plan was amended: the number of the plan that holds, from 0."""
-        return len(kinds_of(self.journal.entries, "amended"))
+        return len(of_kind(self.journal.entries, AmendedEntry))
 
     @property
     def digests(self) -> dict[str, str]:
         """The SHA-256 of every frozen file, those of amendments too; raises AppError."""
-        found = dict(self.created["sha256"])
-        for entry in kinds_of(self.journal.entries, "amended"):
-            found |= entry["sha256"]
+        found = dict(self.created.sha256)
+        for entry in of_kind(self.journal.entries, AmendedEntry):
+            found |= entry.sha256
         return found
 
     def frozen_file(self, name: str) -> bytes:
@@ -264,25 +266,31 @@ class Session:
         name = amended_name(ORDER, self.amendments)
         try:
             return tuple(PlannedFrame.from_dict(one) for one in self._data(name))
-        except (KeyError, TypeError, IndexError) as fault:
+        except (AttributeError, KeyError, TypeError) as fault:
             raise AppError(
                 f"{self.folder / name}: is no list of frames; restore it from a copy"
             ) from fault
 
     @cached_property
-    def stored(self) -> dict[str, Entry]:
+    def stored(self) -> dict[str, FrameEntry]:
         """The journal line of every frame that counts, by its id, kept up to date."""
         return count_stored(self.journal.entries)
 
     @property
     def runs(self) -> int:
         """How often a capture was started on it."""
-        return len(kinds_of(self.journal.entries, "run"))
+        return len(of_kind(self.journal.entries, RunEntry))
+
+    @property
+    def first_run(self) -> RunEntry | None:
+        """The first run, which says what camera took the frames; None before any."""
+        return next(iter(of_kind(self.journal.entries, RunEntry)), None)
 
     @property
     def target_db(self) -> float | None:
         """The PSNR at which no further shot is taken; None: every planned shot is."""
-        return wanted_db(self.journal.entries, self.header.get("until_db"))
+        asked = of_kind(self.journal.entries, UntilEntry)
+        return asked[-1].target_db if asked else self.header.get("until_db")
 
     @property
     def needed(self) -> tuple[PlannedFrame, ...]:
@@ -291,9 +299,9 @@ class Session:
         Without those of shots that the scene was found not to need, and longer ones of brackets
         that metering does not ask for.
         """
-        spared = spared_shots(self.journal.entries)
-        decided = metered(self.journal.entries)
-        asked = set() if decided is None else set(decided["asked"])
+        decided, exposed = ended(self.journal.entries), metered(self.journal.entries)
+        spared = () if decided is None else decided.spared
+        asked = () if exposed is None else set(exposed.asked)
         return tuple(
             frame
             for frame in self.frames
@@ -310,9 +318,9 @@ class Session:
         """Whether every frame was found good after the last one was stored; see `verify`."""
         return found_complete(self.journal.entries)
 
-    def path_of(self, entry: Entry) -> Path:
+    def path_of(self, entry: FrameEntry) -> Path:
         """Return where the file of a frame's journal line lies."""
-        return self.folder / FRAMES / entry["file"]
+        return self.folder / FRAMES / entry.file
 
     def read(self, frame_id: str) -> bytes:
         """Return the bytes of a stored frame.
@@ -327,36 +335,34 @@ class Session:
             data = read_whole(self.disk, path)
         except OSError as fault:
             raise AppError(f"{path}: cannot be read ({fault.strerror}); resume it") from fault
-        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+        if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise AppError(f"{path}: is damaged, its SHA-256 is not the journal's; resume it")
         return data
 
-    def store(
-        self,
-        frame: PlannedFrame,
-        suffix: str,
-        data: bytes,
-        sha256: str,
-        facts: Callable[[], Mapping[str, Any]],
-    ) -> None:
+    def store(self, frame: PlannedFrame, file: FrameFile, entry: Callable[[], FrameEntry]) -> None:
         """Keep a frame: its bytes, then its line, are on the disk when this returns.
 
-        sha256: the digest taken when the bytes came from the camera. facts: what the line says
-        besides file, size and digest, asked for when the file is on the disk. Raises `OSError`;
-        AppError when the bytes are no longer those that came.
+        entry: what the line says besides the file, asked for when that is on the disk. Raises
+        `OSError`; AppError when the bytes are no longer those that came from the camera.
         """
-        name = f"{self._places[frame.id]:05d}-{frame.id}{suffix}"
-        write_whole(self.disk, self.folder / FRAMES / name, data)
-        if hashlib.sha256(data).hexdigest() != sha256:
+        name = f"{self._places[frame.id]:05d}-{frame.id}{file.suffix}"
+        write_whole(self.disk, self.folder / FRAMES / name, file.data)
+        if hashlib.sha256(file.data).hexdigest() != file.sha256:
             raise AppError(
                 f"frame {frame.id}: its bytes changed in this computer's memory on the way to the "
                 "disk; test the memory before going on"
             )
-        self.note("frame", id=frame.id, file=name, bytes=len(data), sha256=sha256, **facts())
+        held = {
+            "id": frame.id,
+            "file": name,
+            "bytes": len(file.data),
+            "sha256": file.sha256,
+            "camera_sha256": file.camera_sha256,
+        }
+        self.note(entry().model_copy(update=held))
 
-    def note(self, kind: str, **facts: Any) -> None:
+    def note(self, entry: Entry) -> None:
         """Add a line to the journal; raises `OSError`."""
-        entry = {"kind": kind, **facts}
         self.journal.append(entry)
         count_entry(self.stored, entry)
 
@@ -372,7 +378,7 @@ class Session:
 
     def discard(self, frame_id: str, reason: str) -> None:
         """Count a frame as not taken; its file stays until it is taken again."""
-        self.note("discarded", id=frame_id, reason=reason)
+        self.note(DiscardedEntry(id=frame_id, reason=reason))
 
     def parts(self) -> list[str]:
         """Return the files that a killed program was writing, relative to the folder."""
@@ -389,7 +395,7 @@ class Session:
 
     def unexpected_files(self) -> tuple[list[str], list[str]]:
         """Return leftovers of a crash and files of other programs, relative to the folder."""
-        ours = {entry["file"] for entry in self.stored.values()}
+        ours = {entry.file for entry in self.stored.values()}
         known = {*KNOWN, *self.digests}
         unfinished = {amended_name(name, self.amendments + 1) for name in AMENDED}
         leftovers, foreign = self.parts(), []
@@ -429,6 +435,10 @@ def amended_name(name: str, number: int) -> str:
 def wall_time() -> str:
     """Return the time of day for people; nothing is computed from it."""
     return datetime.now(UTC).astimezone().isoformat(timespec="seconds")
+
+
+def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
+    return {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
 
 
 def _planned_files(frozen: Frozen) -> dict[str, bytes]:

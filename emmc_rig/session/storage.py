@@ -1,8 +1,8 @@
 """Files that are on the disk when a call returns: the only way in which a session is written.
 
 A file appears under its name whole or not at all: it is written under another name, synced,
-renamed, and its folder synced. Everything goes through a `Disk`, so that a simulated one can lose
-its power between any two operations.
+renamed, and its folder synced. Everything goes through a `Disk`, so that one in a test can lose its
+power between any two operations.
 """
 
 from __future__ import annotations
@@ -10,112 +10,58 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import shutil
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from io import BytesIO, FileIO
 from pathlib import Path
-from typing import BinaryIO, Protocol
 
 from emmc_rig.files.lock_file import is_running
 
 PART = ".part"
 
 
-class OpenFile(Protocol):
-    """A file that is being written."""
+class OpenFile:
+    """A file that is being written; what was not synced may be lost."""
 
-    def write(self, data: bytes | memoryview) -> None:
-        """Write all of `data` at the end."""
-        ...
-
-    def sync(self) -> None:
-        """Return when everything written is on the disk."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the file; what was not synced may be lost."""
-        ...
-
-
-class Disk(Protocol):
-    """A file system; every operation raises `OSError`."""
-
-    def create(self, path: Path) -> OpenFile:
-        """Begin an empty file; one of that name is emptied."""
-        ...
-
-    def append(self, path: Path) -> OpenFile:
-        """Begin to write at the end of a file, made where missing."""
-        ...
-
-    def reader(self, path: Path) -> BinaryIO:
-        """Open a file for reading."""
-        ...
-
-    def replace(self, source: Path, target: Path) -> None:
-        """Rename a file or folder; a file of that name is replaced, at no moment missing."""
-        ...
-
-    def remove(self, path: Path) -> None:
-        """Remove a file."""
-        ...
-
-    def make_folder(self, path: Path) -> None:
-        """Make a folder and those above it; one that is there already is left alone."""
-        ...
-
-    def remove_folder(self, path: Path) -> None:
-        """Remove a folder and what is in it."""
-        ...
-
-    def sync_folder(self, path: Path) -> None:
-        """Return when the names in a folder are on the disk."""
-        ...
-
-    def sizes(self, folder: Path) -> dict[str, int]:
-        """Return the size of everything in a folder by name, -1 for anything but a plain file."""
-        ...
-
-    def free_bytes(self, folder: Path) -> int:
-        """Return how much more can be written."""
-        ...
-
-
-class _SystemFile:
     def __init__(self, path: Path, flags: int) -> None:
         flags |= os.O_WRONLY | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
         # A link under the name would lead the bytes out of the session.
         self._descriptor = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
     def write(self, data: bytes | memoryview) -> None:
+        """Write all of `data` at the end."""
         left = memoryview(data).cast("B")
         while left:
             left = left[os.write(self._descriptor, left) :]
 
     def sync(self) -> None:
+        """Return when everything written is on the disk."""
         _sync(self._descriptor)
 
     def close(self) -> None:
+        """Let go of the file."""
         os.close(self._descriptor)
 
 
-class SystemDisk:
-    """The computer's own file system."""
+class Disk:
+    """The computer's file system; every operation raises `OSError`."""
 
     def create(self, path: Path) -> OpenFile:
         """Begin an empty file; one of that name is emptied."""
-        return _SystemFile(path, os.O_TRUNC)
+        return OpenFile(path, os.O_TRUNC)
 
     def append(self, path: Path) -> OpenFile:
         """Begin to write at the end of a file, made where missing."""
-        return _SystemFile(path, os.O_APPEND)
+        return OpenFile(path, os.O_APPEND)
 
-    def reader(self, path: Path) -> BinaryIO:
+    def reader(self, path: Path) -> FileIO | BytesIO:
         """Open a file for reading."""
         return open(path, "rb", buffering=0)
 
     def replace(self, source: Path, target: Path) -> None:
-        """Rename a file or folder."""
+        """Rename a file or folder; a file of that name is replaced, at no moment missing."""
         os.replace(source, target)
 
     def remove(self, path: Path) -> None:
@@ -123,13 +69,11 @@ class SystemDisk:
         os.remove(path)
 
     def make_folder(self, path: Path) -> None:
-        """Make a folder and those above it."""
+        """Make a folder and those above it; one that is there already is left alone."""
         path.mkdir(parents=True, exist_ok=True)
 
     def remove_folder(self, path: Path) -> None:
         """Remove a folder and what is in it."""
-        import shutil
-
         shutil.rmtree(path)
 
     def sync_folder(self, path: Path) -> None:
@@ -152,12 +96,10 @@ class SystemDisk:
 
     def free_bytes(self, folder: Path) -> int:
         """Return how much more this user can write."""
-        import shutil
-
         return shutil.disk_usage(folder).free
 
 
-SYSTEM_DISK = SystemDisk()
+SYSTEM_DISK = Disk()
 
 
 def _sync(descriptor: int) -> None:

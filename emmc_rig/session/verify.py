@@ -1,6 +1,6 @@
 """Verification of a session against its journal: every file is hashed, nothing is repaired.
 
-Files are read in large pieces by a few threads: reading and SHA-256 both let others run, so the
+Files are read by a few threads: reading and SHA-256 both let others run, so the
 slower of disk and processor sets the pace.
 """
 
@@ -12,23 +12,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.session.journal import Entry
+from emmc_rig.session.journal import FrameEntry
 from emmc_rig.session.session import Session
-from emmc_rig.session.storage import Disk
 
-PIECE_BYTES = 1 << 20
 THREADS = min(8, os.cpu_count() or 1)
-
-
-@dataclass(frozen=True)
-class FrameVerdict:
-    """What became of one frame; `fault` is "" for a good one."""
-
-    id: str
-    fault: str
 
 
 @dataclass(frozen=True)
@@ -69,66 +58,47 @@ class Verdict:
         if self.unreadable:
             yield f"{self.unreadable} journal line(s) torn or damaged; their frames do not count"
         if self.leftovers:
-            count = len(self.leftovers)
-            yield f"{count} leftover(s) of a crash; `emmc-rig session prune` removes them"
+            count, shown = len(self.leftovers), ", ".join(self.leftovers)
+            yield f"{count} leftover(s) of a crash, which do not count: {shown}"
         for name in self.foreign:
             yield f"{name}: not of this session, left alone"
 
 
-def digest_file(disk: Disk, path: Path, buffer: bytearray) -> tuple[int, str]:
-    """Return size and SHA-256 of a file, read into `buffer` piece by piece; raises `OSError`."""
-    digest, size = hashlib.sha256(), 0
-    view = memoryview(buffer)
-    with disk.reader(path) as file:
-        while count := file.readinto(buffer):  # type: ignore[attr-defined]
-            digest.update(view[:count])
-            size += count
-    return size, digest.hexdigest()
-
-
 def verify_frames(
     session: Session,
-    entries: Iterable[Entry],
+    entries: Iterable[FrameEntry],
     on_frame: Callable[[str], None] = lambda frame_id: None,
-    threads: int = THREADS,
 ) -> dict[str, str]:
     """Return, by id, what is wrong with the files of journal lines; nothing for good ones."""
 
-    def check(part: list[Entry]) -> list[FrameVerdict]:
-        buffer, verdicts = bytearray(PIECE_BYTES), []
-        for entry in part:
-            verdicts.append(FrameVerdict(entry["id"], _fault(session, entry, buffer)))
-            on_frame(entry["id"])
-        return verdicts
+    def fault_of(entry: FrameEntry) -> tuple[str, str]:
+        fault = _fault(session, entry)
+        on_frame(entry.id)
+        return entry.id, fault
 
-    rows = list(entries)
-    parts = [rows[i::threads] for i in range(min(threads, len(rows)))]
-    if len(parts) < 2:
-        verdicts = check(rows)
-    else:
-        with ThreadPoolExecutor(len(parts), "verify") as pool:
-            verdicts = [one for part in pool.map(check, parts) for one in part]
-    return {one.id: one.fault for one in verdicts if one.fault}
+    with ThreadPoolExecutor(THREADS, "verify") as pool:
+        return {name: fault for name, fault in pool.map(fault_of, entries) if fault}
 
 
-def _fault(session: Session, entry: Entry, buffer: bytearray) -> str:
+def _fault(session: Session, entry: FrameEntry) -> str:
     try:
-        size, digest = digest_file(session.disk, session.path_of(entry), buffer)
+        with session.disk.reader(session.path_of(entry)) as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            size = file.seek(0, os.SEEK_END)
     except FileNotFoundError:
-        return f"{entry['file']} is gone"
+        return f"{entry.file} is gone"
     except OSError as fault:
-        return f"{entry['file']} cannot be read ({fault.strerror})"
-    if size != entry["bytes"]:
-        return f"{entry['file']} has {size} bytes instead of {entry['bytes']}"
-    if digest != entry["sha256"]:
-        return f"{entry['file']} is damaged: its SHA-256 is not the journal's"
+        return f"{entry.file} cannot be read ({fault.strerror})"
+    if size != entry.bytes:
+        return f"{entry.file} has {size} bytes instead of {entry.bytes}"
+    if digest != entry.sha256:
+        return f"{entry.file} is damaged: its SHA-256 is not the journal's"
     return ""
 
 
 def verify(
     session: Session,
     on_frame: Callable[[str], None] = lambda frame_id: None,
-    threads: int = THREADS,
 ) -> Verdict:
     """Return what became of a session; raises AppError when its plan cannot be read at all."""
     frozen = []
@@ -139,7 +109,7 @@ def verify(
             frozen.append(str(fault))
     planned = {frame.id for frame in session.needed}
     stored = {name: entry for name, entry in session.stored.items() if name in planned}
-    damaged = verify_frames(session, stored.values(), on_frame, threads)
+    damaged = verify_frames(session, stored.values(), on_frame)
     leftovers, foreign = session.unexpected_files()
     return Verdict(
         planned=len(planned),

@@ -41,25 +41,15 @@ def described(point: Any) -> dict[str, Any]:
     return to_jsonable_python(values)
 
 
-def csv_text(
-    rows: Sequence[Mapping[str, object]],
-    columns: Sequence[str] = (),
-    form: str = ".6g",
-    forms: Mapping[str, str] | None = None,
-) -> str:
-    """Return rows as CSV: the columns named, or all that any row has; None is an empty field.
-
-    form: of floats, but for the columns that `forms` has.
-    """
-
-    def written(name: str, value: object) -> object:
-        return format(value, (forms or {}).get(name, form)) if isinstance(value, float) else value
-
-    columns = columns or list(dict.fromkeys(name for row in rows for name in row))
+def csv_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
+    """Return rows as CSV: the columns named, floats to six digits, None as an empty field."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n", restval="", extrasaction="ignore")
     writer.writeheader()
-    writer.writerows({name: written(name, value) for name, value in row.items()} for row in rows)
+    for row in rows:
+        writer.writerow(
+            {k: format(v, ".6g") if isinstance(v, float) else v for k, v in row.items()}
+        )
     return text.getvalue()
 
 

@@ -106,7 +106,7 @@ class Capture:
         """Return what its frames depend on, as plain data; of a measured scene its sums as well."""
         content = None
         if not self.is_built_in:
-            content = _sums(self.scene, self.size, self.described.views)
+            content = _sums(self.scene, self.size, self.described.views, self.seed, self.zoom)
         return {
             "scene": self.scene_name,
             "content": content,
@@ -129,8 +129,10 @@ def with_shots(camera: Camera, count: int) -> Camera:
 
 
 @lru_cache
-def _sums(spec: str, size: tuple[int, int] | None, views: tuple[int, int]) -> list[float]:
-    seen = zoomed_scene(spec, size, views).light_field
+def _sums(
+    spec: str, size: tuple[int, int] | None, views: tuple[int, int], seed: int, zoom: int
+) -> list[float]:
+    seen = _opened(spec, size, views, seed, zoom).light_field
     return [float(np.sum(one, dtype=np.float64)) for one in (seen, np.square(seen))]
 
 
@@ -222,45 +224,3 @@ def trial_of(
         # What a pixel reads that is known to be bad says nothing, not even how much at least.
         usable, readings = usable & ~unusable, np.where(unusable, 0, readings)
     return Trial(psi, readings, shots.noise_sigma, usable, truth, scene.disparity_px, real)
-
-
-SEVERAL = 3
-"""Shots that a camera is given where a fault needs several."""
-
-
-SENSOR, MASK, SHOTS = "Light and sensor", "Mask and lens", "Between shots"
-SCENE, DESIGN = "Scene", "Design"
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One way to fail.
-
-    strengths: from harmless to hopeless, in `unit`; a sweep is judged on both sides of its best,
-    as a design has two ends. quick: those that `--fast` measures. repairable: whether better
-    calibration, detection or repair could undo it, rather than physics or the design setting the
-    limit. screened: whether screening the frames is meant to help. shots: fewest that it takes.
-    whole: whether there is nothing between two strengths. clean: whether strength 0 is no fault.
-    """
-
-    name: str
-    title: str
-    unit: str
-    strengths: tuple[float, ...]
-    quick: tuple[float, ...]
-    kind: str
-    make: Callable[[Capture, float], Trial]
-    repairable: bool = False
-    screened: bool = False
-    shots: int = 1
-    whole: bool = False
-    clean: bool = True
-
-    def is_clean(self, strength: float) -> bool:
-        """Whether nothing is wrong at a strength: the trial is then that of any other fault."""
-        return self.clean and strength == 0
-
-    @property
-    def explained(self) -> str:
-        """What happens, in one sentence."""
-        return (self.make.__doc__ or "").strip().partition("\n")[0]

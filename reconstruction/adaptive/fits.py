@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.adaptive import mixture, search
-from reconstruction.adaptive.joint import Scene, solve
+from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey
 from reconstruction.adaptive.sweep import swept
-from reconstruction.adaptive.uncertainty import Deviation, apart, deviation
+from reconstruction.adaptive.uncertainty import apart, deviation
 
 Array = NDArray[np.floating]
 Patches = Callable[[NDArray[np.bool_]], Array]
@@ -32,7 +32,7 @@ class Fits:
 
     light_fields: list[Array]
     residuals: list[Array]
-    scene: Scene
+    scene: FittedScene
     patched: bool
 
 
@@ -97,13 +97,13 @@ def fitted_models(
 
 @dataclass(frozen=True, eq=False)
 class Mean:
-    """light_field: (v, u, y, x, c). shares: of the models, (model, pixel_y, pixel_x). sure: its
+    """light_field: (v, u, y, x, c). shares: of the models, (model, pixel_y, pixel_x). sigma: its
     standard deviation, None with too few held-out readings. over_plain: its mean square residual of
     these beyond their noise, over total variation's; None without any."""
 
     light_field: Array
     shares: NDArray[np.float32]
-    sure: Deviation | None
+    sigma: Array | None
     over_plain: float | None = None
 
 
@@ -124,14 +124,14 @@ def averaged(survey: Survey, fits: Fits) -> Mean:
     spread = mixture.spread(fits.light_fields, light_field, shares, k)
     fits.light_fields.clear()
     residual = np.asarray(sum(s * one for s, one in zip(shares, fits.residuals, strict=True)))
-    sure = deviation(fits.scene, survey.scale, spread, residual, given.noise, held)
+    sigma = deviation(fits.scene, survey.scale, spread, residual, given.noise, held)
     plain = (given.frames - given.psi.forward(survey.plain)).astype(np.float32)
     excess, its_own = (mixture.excess(one, given.noise, held) for one in (residual, plain))
     over_plain = excess / max(its_own, 1e-20)
-    if sure is not None:
+    if sigma is not None:
         # The residuals, on which it is calibrated, show neither.
-        variance = np.square(sure.sigma) + survey.unseen.astype(np.float32)
+        variance = np.square(sigma) + survey.unseen.astype(np.float32)
         share = np.float32(over_plain / (1 + over_plain))
         variance += share * apart(light_field, survey.plain)
-        sure = replace(sure, sigma=np.sqrt(variance))
-    return Mean(light_field, shares, sure, over_plain)
+        sigma = np.sqrt(variance)
+    return Mean(light_field, shares, sigma, over_plain)

@@ -1,7 +1,7 @@
 """The texture of surfaces, and their disparity per pixel, from all frames at once.
 
 Half-quadratic splitting with momentum: with the noise that is still presumed in the texture falling
-from step to step, remove it (`shrinkage`), then fit the frames again (`texture.fitted`). Once the
+from step to step, remove it (`shrinkage`), then fit the frames again (`refine.fitted`). Once the
 texture is nearly known, planes are swept with it (`sweep`), and its residual of the frames sharpens
 the disparity (`refine`).
 """
@@ -18,9 +18,8 @@ from pydantic import Field
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import refined
+from reconstruction.adaptive.refine import fitted, refined
 from reconstruction.adaptive.shrinkage import denoised
-from reconstruction.adaptive.texture import fitted
 from reconstruction.adaptive.visibility import carried
 
 Array = NDArray[np.floating]
@@ -56,7 +55,7 @@ class TextureSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class FittedScene:
     """Surfaces, their texture (c, y, x), the same less its noise (`clean`), and the centre view's
     disparity (y, x), without the margin that the textures have."""
 
@@ -84,7 +83,7 @@ def solve(
     settings: TextureSettings,
     on_step: Callable[[int], None] | None = None,
     again: Callable[[Array, Array, int], Array] | None = None,
-) -> Scene:
+) -> FittedScene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
@@ -140,4 +139,4 @@ def solve(
         if on_step is not None:
             on_step(step + 1)
     inner = np.s_[margin : margin + centre.shape[0], margin : margin + centre.shape[1]]
-    return Scene(surfaces, now, clean, np.ascontiguousarray(padded[inner]))
+    return FittedScene(surfaces, now, clean, np.ascontiguousarray(padded[inner]))

@@ -1,13 +1,13 @@
 """The adaptive method: disparities by evidence, then the texture of the surfaces they make.
 
 1. The disparity of a patch has a likelihood, given its readings (`evidence`, `search`), and
-   patches agree with their neighbours (`labels`).
+   patches agree with their neighbours.
 2. Contrast, disparities and weights are decided once for the whole picture (`survey`).
 3. The centre view's disparity is carried to all views (`visibility`), so that the frames are
    linear in the surfaces' texture (`rays`).
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
-   `texture`, `shrinkage`, `refine`, `sweep`).
+   `shrinkage`, `refine`, `sweep`).
 5. Textures that follow the readings more or less closely, and sparse patches from two shots on or
    total variation, are averaged by how well they predict readings kept from all of them (`fits`,
    `mixture`), which also calibrate the standard deviation of the result (`uncertainty`).
@@ -27,11 +27,9 @@ from numpy.typing import NDArray
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.fits import Fits, Mean, Patches, averaged, fitted_models
-from reconstruction.adaptive.joint import Scene
-from reconstruction.adaptive.readings import checked, checked_disparity
+from reconstruction.adaptive.fits import Patches, averaged, fitted_models
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Survey, surveyed
+from reconstruction.adaptive.survey import checked, checked_disparity, surveyed
 from reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
@@ -42,14 +40,6 @@ middles of group A (96x96, one CFA shot) 11 to 100 % of such patches decide, of 
 MISFIT_WINDOW_PX = 8.0
 """Deviation of the window in which the place of the largest residual is looked for. 2x 0.00, 0.5x
 0.00 dB."""
-MODELS = ("flat", "plane", "slanted", "two layers", "free")
-"""Even colour; texture at one disparity; at a changing one; partly hidden; no surface."""
-SLANTED_PX = 0.01
-"""Change of the disparity per pixel beyond which a surface counts as slanted."""
-NEAR_PX = 2
-"""Samples around a hidden ray that see two layers."""
-MOSTLY = 0.5
-"""Share of a place's mean from which on its model counts as that of the place."""
 
 
 def reconstruct_adaptive(
@@ -59,7 +49,6 @@ def reconstruct_adaptive(
     settings: AdaptiveSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
     disparity: Array | None = None,
     patches: Patches | None = None,
 ) -> Reconstruction:
@@ -71,14 +60,14 @@ def reconstruct_adaptive(
     Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
-    started = clock()
+    started = time.perf_counter()
     total = len(settings.misfits) * settings.texture.steps + 3
     searched_s = 0.0
 
     def report(step: int) -> None:
         nonlocal searched_s
         if step == 2:
-            searched_s = clock() - started
+            searched_s = time.perf_counter() - started
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
@@ -88,10 +77,15 @@ def reconstruct_adaptive(
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches)
     mean = averaged(survey, fits)
     residual = (given.frames - given.psi.forward(mean.light_field)).astype(np.float32)
-    maps = _maps(survey, fits, mean, settings)
+    size, k = psi.size, psi.binning
+    maps = {
+        "disparity": fits.scene.centre,
+        "disparity_sigma": np.sqrt(search.variance_per_pixel(survey.volume, size, k)),
+        "texture": _texture_map(survey.volume, size, k),
+        **({} if mean.sigma is None else {"sigma": mean.sigma}),
+    }
     report(total)
-    shares = np.bincount(maps["model"].ravel(), minlength=len(MODELS)) / maps["model"].size
-    decided, explained = _decided(survey.volume), _explained(survey, fits, settings)
+    decided = _decided(survey.volume)
     return Reconstruction(
         method="adaptive",
         light_field=mean.light_field,
@@ -99,7 +93,7 @@ def reconstruct_adaptive(
         advice="",
         steps=total,
         objective=(),
-        seconds=clock() - started,
+        seconds=time.perf_counter() - started,
         parameters={
             "noise_sigma": given.typical,
             "lowest_px": float(fits.scene.centre.min()),
@@ -111,33 +105,9 @@ def reconstruct_adaptive(
             **misfit(residual, given.noise, given.usable & ~survey.held),
             **({} if decided is None else {"decided": decided}),
             **({} if mean.over_plain is None else {"over_plain": mean.over_plain}),
-            **({} if explained is None else {"explained": explained}),
-            **{
-                f"share_{name.replace(' ', '_')}": float(v)
-                for name, v in zip(MODELS, shares, strict=True)
-            },
         },
         maps=maps,
     )
-
-
-def _maps(survey: Survey, fits: Fits, mean: Mean, settings: AdaptiveSettings) -> dict[str, NDArray]:
-    """Return the maps of a result, see `Reconstruction.maps`."""
-    size, k = survey.given.psi.size, survey.given.psi.binning
-    kinds = _texture_map(survey.volume, size, k)
-    models = _model_map(kinds, fits.scene)
-    free = mean.shares[-1] > MOSTLY
-    models[free.repeat(k, axis=0).repeat(k, axis=1)] = MODELS.index("free")
-    maps = {
-        "disparity": fits.scene.centre,
-        "disparity_sigma": np.sqrt(search.variance_per_pixel(survey.volume, size, k)),
-        "texture": kinds,
-        "hidden": fits.scene.surfaces.hidden.mean(axis=(0, 1), dtype=np.float32),
-        "model": models,
-    }
-    if mean.sure is None:
-        return maps
-    return {**maps, "sigma": mean.sure.sigma}
 
 
 def _texture_map(volume: search.Volume, size: tuple[int, int], binning: int) -> NDArray[np.uint8]:
@@ -147,21 +117,6 @@ def _texture_map(volume: search.Volume, size: tuple[int, int], binning: int) -> 
         for at, length in zip(volume.centres, size, strict=True)
     ]
     return volume.kind[np.ix_(*nearest)].astype(np.uint8)
-
-
-def _model_map(texture: NDArray[np.uint8], scene: Scene) -> NDArray[np.uint8]:
-    """Return the index in MODELS of every sample of the centre view, (y, x), of surfaces.
-
-    texture: see `_texture_map`.
-    """
-    textured = texture > 0
-    down, right = np.gradient(scene.centre)
-    slope = cv2.GaussianBlur(np.hypot(down, right).astype(np.float32), (0, 0), 3.0)
-    around = np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)
-    layered = cv2.dilate(scene.surfaces.hidden.max(axis=(0, 1)), around) > 0
-    chosen = np.where(textured, np.where(slope > SLANTED_PX, 2, 1), 0)
-    chosen[layered] = 3
-    return chosen.astype(np.uint8)
 
 
 def misfit(residual: Array, noise: Array, fitted: NDArray[np.bool_]) -> dict[str, float]:
@@ -175,23 +130,6 @@ def misfit(residual: Array, noise: Array, fitted: NDArray[np.bool_]) -> dict[str
     row, column = np.unravel_index(around.argmax(), around.shape)
     times = float(np.sqrt(relative.sum(dtype=np.float64) / max(int(fitted.sum()), 1)))
     return {"misfit": times, "misfit_row": float(row), "misfit_column": float(column)}
-
-
-def _explained(survey: Survey, fits: Fits, settings: AdaptiveSettings) -> float | None:
-    """Return the share of the smooth picture's residual that the last fit explains, in variance.
-
-    Of the held-out readings, without their noise. None where the smooth picture explains them as
-    well as their noise allows.
-    """
-    held = survey.held
-    if not held.any():
-        return None
-    residual = fits.residuals[len(settings.misfits) - 1] / np.float32(survey.scale)
-    allowed = float(np.mean(survey.bright.noise[held]))
-    before = float(np.mean(np.square(survey.unexplained[held]))) - allowed
-    if before <= 3 * allowed:
-        return None
-    return 1 - (float(np.mean(np.square(residual[held]))) - allowed) / before
 
 
 def _decided(volume: search.Volume) -> float | None:

@@ -1,4 +1,4 @@
-"""What is decided once for a whole scene: its contrast, disparities and weights.
+"""The readings, and what is decided once for a whole scene: contrast, disparities and weights.
 
 All of it needs the whole picture, or is better known from it; a part of the picture is fitted with
 it as it stands (`fits`).
@@ -7,20 +7,22 @@ it as it stands (`fits`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import centre_view
+from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.readings import Readings
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.choices import choose_mu, contrast, smooth_guess
 from reconstruction.colour import unseen_colour
+from reconstruction.errors import ReconstructionError
 from reconstruction.flat import FlatPsi, flat_psi
+from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
@@ -32,21 +34,79 @@ settings are shares of that. Against a mean brightness of 0.25 in its place, on 
 A: buttercup and occlusions +0.1 dB. With 0.2 antinous gains 0.2 dB and they gain nothing. 2x -0.01,
 0.5x 0.00 dB."""
 
+PASSED = 0.5
+"""Share of the light that masks pass for which the settings were chosen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Psi, the frames, their typical deviation, the variance `noise` of each reading, and which are
+    usable, all but Psi (shot, pixel_y, pixel_x)."""
+
+    psi: ImagingMatrix
+    frames: Array
+    typical: float
+    noise: Array
+    usable: NDArray[np.bool_]
+
+    def over(self, scale: float, of_psi: bool = False) -> Readings:
+        """Return the same with readings divided by a scale: of a scene, or of Psi, so much dimmer.
+
+        Psi, frames and noise so many times larger are the same problem.
+        """
+        if scale == 1:
+            return self
+        part = self.frames.dtype.type(scale)
+        psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
+        noise = (self.noise / scale**2).astype(np.float32)
+        return Readings(psi, self.frames / part, self.typical / scale, noise, self.usable)
+
+    def variance(self, misfit: float) -> Array:
+        """Return the variance of the readings, with that of what no model explains."""
+        return self.noise + np.float32(misfit**2)
+
+    def precision(self, held: NDArray[np.bool_], misfit: float) -> Array:
+        """Return the inverse variance of the readings fitted, 0 of the others."""
+        return np.where(self.usable & ~held, 1 / self.variance(misfit), 0).astype(np.float32)
+
+
+def checked(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float | Array,
+    usable: NDArray[np.bool_] | None,
+) -> Readings:
+    """Return the inputs of a method, as if the masks passed half the light.
+
+    Raises ReconstructionError for inputs that do not fit each other.
+    """
+    typical, noise = checked_noise(psi, noise_sigma, usable)
+    frames, usable = checked_inputs(psi, frames, typical, usable)
+    passed = max(psi.light_efficiency(), 1e-12)
+    return Readings(psi, frames, typical, noise, usable).over(passed / PASSED, of_psi=True)
+
+
+def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
+    """Return a known disparity of the centre view as float32; raises ReconstructionError."""
+    if disparity.shape != psi.size or not np.isfinite(disparity).all():
+        raise ReconstructionError(
+            f"a disparity of shape {disparity.shape} is given, Psi needs {psi.size}, all finite"
+        )
+    return np.asarray(disparity, dtype=np.float32)
+
 
 @dataclass(frozen=True, eq=False)
 class Survey:
     """given: what is fitted. scale: of the scene's contrast; bright: `given` over it. held: the
-    readings kept from every fit. unexplained: residual of the smooth picture. volume: beliefs about
-    disparities. unseen: variance by colours that frames do not show, (y, x). plain: light field of
-    total variation. centre, picture: the centre view's disparity (y, x) and picture (y, x, c), over
-    the scale, to begin with.
+    readings kept from every fit. volume: beliefs about disparities. unseen: variance by colours
+    that frames do not show, (y, x). plain: light field of total variation. centre, picture: the
+    centre view's disparity (y, x) and picture (y, x, c), over the scale, to begin with.
     """
 
     given: Readings
     scale: float
     bright: Readings
     held: NDArray[np.bool_]
-    unexplained: Array
     volume: search.Volume
     unseen: Array
     plain: Array
@@ -73,7 +133,7 @@ def surveyed(
     bright = given.over(scale)
     picture = picture / np.float32(scale)
     grey = picture.mean(axis=-1)
-    data = search.Data(
+    data = search.SearchData(
         given.psi,
         (bright.frames - flat.forward(picture)).astype(np.float32),
         bright.variance(settings.misfit),
@@ -85,7 +145,13 @@ def surveyed(
         for length, *finer in (COARSE_PX, settings.lengths_px)
     )
     psi = given.psi
-    volume = _searched(data, coarse, fine, settings, on_searched)
+    smooth = settings.slope_px, settings.jump
+    rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
+    on_searched(1)
+    volume = search.fine(
+        data, fine, rough, settings.stride, settings.step_px, *smooth, settings.interleaved
+    )
+    on_searched(2)
     centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
     held = held_out(given.usable)
     fitted = given.usable & ~held
@@ -96,7 +162,7 @@ def surveyed(
     )
     plain = reconstruct_tv(psi, given.frames, given.typical, start, fitted).light_field
     begun = centre_view(plain) / np.float32(scale)
-    return Survey(given, scale, bright, held, data.readings, volume, unseen, plain, centre, begun)
+    return Survey(given, scale, bright, held, volume, unseen, plain, centre, begun)
 
 
 def contrast_of(
@@ -111,21 +177,3 @@ def contrast_of(
     beyond = max(float(missed - noise[usable].sum(dtype=np.float64)), 0.0)
     rows = np.square(flat.forward(np.ones_like(picture)))[usable].sum(dtype=np.float64)
     return float(np.hypot(contrast(picture), np.sqrt(beyond / max(float(rows), 1e-20))))
-
-
-def _searched(
-    data: search.Data,
-    coarse: TexturePrior,
-    fine: TexturePrior,
-    settings: AdaptiveSettings,
-    on_searched: Callable[[int], None],
-) -> search.Volume:
-    """Return the disparities that patches and their neighbours agree on, coarse to fine."""
-    smooth = settings.slope_px, settings.jump
-    rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
-    on_searched(1)
-    volume = search.fine(
-        data, fine, rough, settings.stride, settings.step_px, *smooth, settings.interleaved
-    )
-    on_searched(2)
-    return volume

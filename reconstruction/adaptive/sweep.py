@@ -25,8 +25,13 @@ from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.assembly import TAPS, cubic
-from reconstruction.adaptive.labels import compatibility, posteriors
-from reconstruction.adaptive.search import Volume, interpolated, places
+from reconstruction.adaptive.search import (
+    Volume,
+    compatibility,
+    interpolated,
+    places,
+    posteriors,
+)
 
 Array = NDArray[np.floating]
 FREEDOM = 3.0

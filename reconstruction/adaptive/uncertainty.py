@@ -22,14 +22,12 @@ unless one plane is the whole scene: its disparity is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from reconstruction.adaptive.joint import Scene
+from reconstruction.adaptive.joint import FittedScene
 from reconstruction.adaptive.refine import slopes
 
 Array = NDArray[np.floating]
@@ -64,7 +62,7 @@ def held_out(
     return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
 
 
-def _parts(scene: Scene, scale: float, noise_variance: float, spread: Array) -> Array:
+def _parts(scene: FittedScene, scale: float, noise_variance: float, spread: Array) -> Array:
     """Return N, B and E of every sample, (3, v, u, y, x)."""
     let_in = np.square(scene.texture - scene.clean).mean(axis=0)
     steep = np.square(slopes(scene.clean)).mean(axis=1).sum(axis=0)
@@ -78,7 +76,7 @@ def _parts(scene: Scene, scale: float, noise_variance: float, spread: Array) -> 
     return parts
 
 
-def _of_readings(scene: Scene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _of_readings(scene: FittedScene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return what parts (part, v, u, y, x) add to the variance of the held-out readings.
 
     (part, reading). The rays of a pixel meet the texture |disparity| apart per view step.
@@ -118,26 +116,17 @@ def apart(light_field: Array, other: Array) -> NDArray[np.float32]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Deviation:
-    """sigma: (v, u, y, x), standard deviation of a value of any colour there. scale, blur, spread:
-    the fitted s, b (a length squared, in pixels) and e."""
-
-    sigma: Array
-    scale: float
-    blur: float
-    spread: float
-
-
 def deviation(
-    scene: Scene,
+    scene: FittedScene,
     scale: float,
     spread: Array,
     residual: Array,
     noise: Array,
     held: NDArray[np.bool_],
-) -> Deviation | None:
-    """Return the standard deviation of a mean of models; None with too few readings held out.
+) -> NDArray[np.float32] | None:
+    """Return the standard deviation of a mean of models, of a value of any colour, (v, u, y, x).
+
+    None with too few readings held out.
 
     scene: the last fit, of a light field over `scale`. spread: variance (v, u, y, x) between
     the models. residual: of the mean; noise: variance of the readings; held: those kept from the
@@ -164,4 +153,4 @@ def deviation(
     scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
     blur, apart = (float(one) for one in np.exp(logs))
     weights = np.array([scale, scale * blur, scale * apart], dtype=np.float32)
-    return Deviation(np.sqrt(np.tensordot(weights, parts, axes=1)), scale, blur, apart)
+    return np.sqrt(np.tensordot(weights, parts, axes=1))

@@ -108,7 +108,6 @@ def reconstruct(
     settings: MethodSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
     estimates: PatchEstimates | None = None,
 ) -> Reconstruction:
     """Return the light field that the method called `name` estimates.
@@ -122,13 +121,13 @@ def reconstruct(
     """
     method = find_method(name)
     settings = settings or MethodSettings()
-    given = Given(psi, frames, noise_sigma, usable, dictionary, estimates, on_step, clock)
+    given = Given(psi, frames, noise_sigma, usable, dictionary, on_step, estimates)
     if not settings.screening:
         return method.solve(given, settings)
-    started = clock()
+    started = time.perf_counter()
     frames, usable = checked_inputs(psi, frames, checked_noise(psi, noise_sigma, usable)[0], usable)
     seen = screened(psi, frames, usable)
-    took = clock() - started
+    took = time.perf_counter() - started
     given = dataclasses.replace(given, frames=seen.frames, usable=seen.usable)
     result = method.solve(given, settings)
     return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.notes)

@@ -26,7 +26,6 @@ def _solve(solver: bpdn.Method, given: Given, settings: MethodSettings) -> Recon
         settings.sparse.model_copy(update={"solver": chosen}),
         given.usable,
         given.on_step,
-        given.clock,
         given.estimates,
     )
 

@@ -15,7 +15,7 @@ from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
 from reconstruction.method import Given, Method, Sensitivity
-from reconstruction.methods import tv_dict
+from reconstruction.methods.variational import solve_tv_dict
 from reconstruction.result import Reconstruction
 from reconstruction.sparse import SparseSettings
 
@@ -62,10 +62,10 @@ def _solve(
         sparse = sparse_patches(settings.sparse, psi.binning)
         unseen = settings.tv.model_copy(update={"objective_every": settings.tv.max_steps + 1})
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
-        return tv_dict.METHODS[0].solve(fitted, quick).light_field
+        return solve_tv_dict(fitted, quick).light_field
 
     result = reconstruct_adaptive(
-        psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step, given.clock,
+        psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step,
         patches=patches if takes_patches(psi, adaptive) else None,
     )  # fmt: skip
     return dataclasses.replace(result, method=name)

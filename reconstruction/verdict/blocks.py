@@ -97,18 +97,18 @@ def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
     evidence = [block.verdict.evidence for block in blocks]
     first = evidence[0]
     same = {key: getattr(first, key) for key in ("method", "status")}
-    left_out = tuple(sorted({shot for one in evidence for shot in one.left_out}))
+    left_out = tuple(sorted({shot for figures in evidence for shot in figures.left_out}))
     figures = {
-        key: _combined(key, [getattr(one, key) for one in evidence], weights)
+        key: _combined(key, [getattr(of_block, key) for of_block in evidence], weights)
         for key in Evidence.__dataclass_fields__
         if key not in (*same, "left_out", "kept", "hole_at", "moved_at")
     }
-    kept = sum(one.kept for one in evidence)
+    kept = sum(of_block.kept for of_block in evidence)
     parameters = {**(figures["parameters"] or {})}
     worst = max(blocks, key=lambda block: block.verdict.evidence.parameters.get("misfit", 0.0))
     if "misfit" in parameters:
-        told = worst.verdict.evidence.parameters
-        row, column = _at(worst, (told["misfit_row"], told["misfit_column"]))
+        of_worst = worst.verdict.evidence.parameters
+        row, column = _at(worst, (of_worst["misfit_row"], of_worst["misfit_column"]))
         parameters |= {"misfit_row": float(row), "misfit_column": float(column)}
     whole = {"hole_at": (0, 0), "moved_at": None, **_places(blocks)}
     figures |= {"parameters": parameters, "changes": figures["changes"] or {}}
@@ -125,8 +125,8 @@ def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:
     for level, limits in (("do not use", REFUSED_SHARE), ("doubt", DOUBTED_SHARE)):
         bad = [block for block in blocks if _rank(block.verdict.level) >= _rank(level)]
         share = len(bad) / len(blocks)
-        found = limits.level(share)
-        if found == "trust" or _rank(level) <= _rank(whole.level) or len(blocks) == 1:
+        level_of_share = limits.level(share)
+        if level_of_share == "trust" or _rank(level) <= _rank(whole.level) or len(blocks) == 1:
             continue
         worst = max(bad, key=lambda block: _rank(block.verdict.level))
         reason = worst.verdict.reasons[0]
@@ -136,11 +136,11 @@ def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:
                 f"{worst.row}, column {worst.column}: {reason.what}",
                 share,
                 reason.remedy,
-                found,
+                level_of_share,
             )
         )
         break
-    reasons.sort(key=lambda one: -_rank(one.level))
+    reasons.sort(key=lambda reason: -_rank(reason.level))
     return replace(whole, level=reasons[0].level if reasons else "trust", reasons=tuple(reasons))
 
 

@@ -132,7 +132,7 @@ class Verdict:
         """The verdict in one line."""
         if not self.reasons:
             return "trust: readings, masks and noise agree with the light field"
-        return f"{self.level}: " + "; ".join(f"{one.what}: {one.remedy}" for one in self.reasons)
+        return f"{self.level}: " + "; ".join(f"{r.what}: {r.remedy}" for r in self.reasons)
 
     def __str__(self) -> str:
         return self.words
@@ -144,24 +144,24 @@ class Verdict:
         """Return the verdict as plain data."""
         return {
             "level": self.level,
-            "reasons": [asdict(one) for one in self.reasons],
+            "reasons": [asdict(reason) for reason in self.reasons],
             "features": asdict(self.evidence),
         }
 
 
 def verdict_from(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
-    found = [
+    reasons = [
         reason
         for rule in (_shots, _coding, _colour, _masks, _pixels, _noise, _search, _misfit, _fit)
         for reason in rule(evidence)
         if reason.level != "trust"
     ]
-    return _of(evidence, found)
+    return _of(evidence, reasons)
 
 
 def _of(evidence: Evidence, reasons: Iterable[Reason]) -> Verdict:
-    gravest = sorted(reasons, key=lambda one: -LEVELS.index(one.level))
+    gravest = sorted(reasons, key=lambda reason: -LEVELS.index(reason.level))
     return Verdict(gravest[0].level if gravest else "trust", tuple(gravest), evidence)
 
 
@@ -184,8 +184,8 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             limits.level(share),
         )
     kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
-    bright = [(one or 0.0) if shot in kept else 1.0 for shot, one in enumerate(e.brightness)]
-    dark = [shot for shot, one in enumerate(bright, 1) if one < DARK]
+    bright = [(b or 0.0) if shot in kept else 1.0 for shot, b in enumerate(e.brightness)]
+    dark = [shot for shot, brightness in enumerate(bright, 1) if brightness < DARK]
     if dark:
         yield Reason(
             f"shot {dark[0]} is dark", bright[dark[0] - 1], "take it again, or leave it out",
@@ -195,7 +195,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
     for shot in kept if len(kept) > 1 else []:
         row = e.other_strengths[shot]
         own = row[shot] or 0.0
-        other, t = max((one or 0.0, t) for t, one in enumerate(row) if t != shot)
+        other, t = max((strength or 0.0, t) for t, strength in enumerate(row) if t != shot)
         if other > ANOTHERS and own < ANOTHERS:
             yield Reason(
                 f"shot {shot + 1} shows the masks of shot {t + 1}",
@@ -204,7 +204,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
                 "do not use",
             )
             return
-    apart = [abs(one - 1) for one in bright]
+    apart = [abs(brightness - 1) for brightness in bright]
     worst = apart.index(max(apart))
     yield Reason(
         f"shot {worst + 1} differs in brightness by {apart[worst]:.1%}",
@@ -242,9 +242,9 @@ def _is_parallax(e: Evidence) -> bool:
 def _strength(e: Evidence) -> tuple[float, float] | None:
     """Return the masks' weakest strength among the shots, and its deviation; None if unknown."""
     known = [
-        (one, error)
-        for one, error in zip(e.strengths, e.strength_errors, strict=True)
-        if one is not None and error is not None
+        (strength, error)
+        for strength, error in zip(e.strengths, e.strength_errors, strict=True)
+        if strength is not None and error is not None
     ]
     return min(known) if known else None
 
@@ -271,7 +271,7 @@ def _coding(e: Evidence) -> Iterator[Reason]:
             "cannot tell",
         )
         return
-    deviation = max(one for one in e.strength_errors if one is not None)
+    deviation = max(error for error in e.strength_errors if error is not None)
     if 4 * deviation > STRENGTH_LOST.doubt * _patience(e, 0.85):
         yield Reason(
             f"the masks' strength is known to {deviation:.1%} only: a Psi that is wrong may pass",
@@ -297,7 +297,7 @@ def _patience(e: Evidence, power: float) -> float:
 
     They set several shots against one another, and mislead methods that assume more than tv.
     """
-    shots = sum(one is not None for one in e.strengths)
+    shots = sum(strength is not None for strength in e.strengths)
     return shots**-power * _sensitivity(e).psi
 
 
@@ -308,7 +308,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
         return
     lost = 1 - weakest[0] - 2 * weakest[1]
     moved = (e.displaced_px or 0.0) / max(weakest[0], LEAST_STRENGTH)
-    changes = {name: one for name, one in e.changes.items() if None not in one}
+    changes = {name: change for name, change in e.changes.items() if None not in change}
     likeliest = max(changes, key=lambda name: changes[name][2] or 0, default="")
     drift = "run `emmc-rig calibrate --drift`, or take one whiteboard"
     weak = STRENGTH_LOST.times(_patience(e, 0.85)).level(lost)

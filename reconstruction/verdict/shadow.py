@@ -139,7 +139,7 @@ def tiles(size: tuple[int, ...]) -> list[tuple[slice, slice]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Shadow:
+class ShadowStrength:
     """How strongly the masks are seen: 1 where Psi is right.
 
     strength, error: of every shot, and its standard deviation. relief: root mean square of what
@@ -151,14 +151,14 @@ class Shadow:
     relief: float
 
 
-def shadow(found: Relief) -> Shadow:
+def shadow(found: Relief) -> ShadowStrength:
     """Return how strongly the masks are seen in the readings."""
     strength, error = zip(
         *(_slope(found.masks[s], found.seen[s], found.weight[s]) for s in range(len(found.masks))),
         strict=True,
     )
     added = found.masks[found.good]
-    return Shadow(
+    return ShadowStrength(
         np.array(strength),
         np.array(error),
         float(np.sqrt(np.mean(np.square(added)))) if added.size else 0.0,

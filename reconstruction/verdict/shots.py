@@ -25,7 +25,7 @@ SAME_VIEWPOINT = 0.1
 
 
 @dataclass(frozen=True)
-class Motion:
+class ShotMotion:
     """The worst in any tile between a shot and the first, beyond two deviations.
 
     size_px: how far. effect: what it changes, over the mean reading. shot; tile: rows, columns.
@@ -54,17 +54,17 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Shots:
+class ShotAgreement:
     """brightness: of every shot over their mean. masks: (read, said), how strongly each shot's
     readings show each shot's masks. motion: None where it cannot be measured.
     """
 
     brightness: NDArray[np.float64]
     masks: NDArray[np.float64]
-    motion: Motion | None
+    motion: ShotMotion | None
 
 
-def compared(psi: ImagingMatrix, found: Relief) -> Shots:
+def compared(psi: ImagingMatrix, found: Relief) -> ShotAgreement:
     """Return how the shots agree."""
     kept = np.flatnonzero(found.good.any(axis=(1, 2)))
     common = found.good[kept].all(axis=0)
@@ -80,7 +80,9 @@ def compared(psi: ImagingMatrix, found: Relief) -> Shots:
         detail = (1 + found.read) / np.maximum(1 + found.masks, 0.05)
         detail = np.where(found.good, detail, 1) / np.maximum(ratio, 1e-3)[:, None, None]
         motion = _motion(detail, found, kept)
-    return Shots(ratio / ratio[kept].mean() if len(kept) else ratio, cross_strength(found), motion)
+    return ShotAgreement(
+        ratio / ratio[kept].mean() if len(kept) else ratio, cross_strength(found), motion
+    )
 
 
 def _viewpoints_apart(psi: ImagingMatrix) -> float:
@@ -95,13 +97,13 @@ def _viewpoints_apart(psi: ImagingMatrix) -> float:
     return float(np.linalg.norm(middle[:, None] - middle[None], axis=-1).max())
 
 
-def _motion(detail: Array, found: Relief, kept: NDArray[np.intp]) -> Motion:
+def _motion(detail: Array, found: Relief, kept: NDArray[np.intp]) -> ShotMotion:
     """Return the worst motion of the detail (shot, y, x) against the first of the shots kept."""
     rows, columns = detail.shape[1:]
     grey = found.picture.mean(axis=-1)
     grey = cv2.resize(grey, (columns, rows), interpolation=cv2.INTER_AREA)
     mean = max(float(grey.mean()), 1e-12)
-    worst = Motion()
+    worst = ShotMotion()
     # What is saturated in one shot only would leave a spot in the others.
     common = np.asarray(found.good[kept].all(axis=0))
     # A bad pixel stands in every shot, but behind dark cells of the mask it seems far brighter.
@@ -118,7 +120,7 @@ def _motion(detail: Array, found: Relief, kept: NDArray[np.intp]) -> Motion:
             for y, x in tiles((rows, columns)):
                 size, steepness = _moved(slope_y[y, x], slope_x[y, x], change[y, x], blur)
                 if size * steepness / mean > worst.effect:
-                    worst = Motion(size, size * steepness / mean, shot, (y, x))
+                    worst = ShotMotion(size, size * steepness / mean, shot, (y, x))
     return worst
 
 

@@ -37,6 +37,7 @@ from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.session.journal import ComparedEntry, FrameEntry, RetryEntry, RunEntry, of_kind
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
@@ -111,15 +112,15 @@ def test_a_session_holds_every_frame_that_the_plan_asks_for(undisturbed):
 def test_the_journal_records_where_everything_stood_and_by_what_it_was_taken(undisturbed):
     session, _ = undisturbed
     entry = session.stored["board-s1-v0-u4-white-r0"]
-    assert entry["commanded_um"]["mask_x"] == 270
-    assert entry["read_um"]["aperture_x"] == pytest.approx(2 * 5000, abs=0.5)
-    assert entry["lamp"] == "white"
-    assert entry["shape"] == list(SIZE)
-    assert set(entry["spans_s"]) >= {"attend", "move", "expose", "read back", "check", "write"}
-    run = next(e for e in session.journal.entries if e["kind"] == "run")
-    assert run["camera"]["serial"] == "S1"
-    assert run["stage"]["mask_x"]["zero_um"] == 12_700
-    assert "numpy" in run["versions"]
+    assert entry.commanded_um["mask_x"] == 270
+    assert entry.read_um["aperture_x"] == pytest.approx(2 * 5000, abs=0.5)
+    assert entry.lamp == "white"
+    assert entry.shape == SIZE
+    assert set(entry.spans_s) >= {"attend", "move", "expose", "read back", "check", "write"}
+    run = next(iter(of_kind(session.journal.entries, RunEntry)))
+    assert run.camera["serial"] == "S1"
+    assert run.stage["mask_x"]["zero_um"] == 12_700
+    assert "numpy" in run.versions
 
 
 def test_references_are_exposed_where_metering_aims(undisturbed):
@@ -127,9 +128,9 @@ def test_references_are_exposed_where_metering_aims(undisturbed):
     for frame in session.frames:
         if frame.kind in ("reference", "whiteboard"):
             entry = session.stored[frame.id]
-            level = entry["figures"]["bright_dn"] / (65_535 - 256)
+            level = entry.figures.bright_dn / (65_535 - 256)
             assert 0.55 < level < 0.8
-            assert entry["figures"]["saturated"] == 0
+            assert entry.figures.saturated == 0
 
 
 def test_the_lamp_is_off_when_a_capture_ends(undisturbed):
@@ -176,10 +177,11 @@ def test_a_resume_agrees_with_the_last_whiteboard_under_other_noise(undisturbed)
     again = Session(session.folder, session.disk)
     Sequencer(again, plan, rig).run()
     assert again.read("shot-0-e0-r0") != contents(undisturbed[0])["shot-0-e0-r0"]
-    entry = next(e for e in again.journal.entries if e["kind"] == "registered")
-    assert entry["id"].startswith("board")
-    assert np.hypot(entry["x_px"], entry["y_px"]) < 0.05
-    assert entry["likeness"] > 0.9
+    entry = next(iter(of_kind(again.journal.entries, ComparedEntry)))
+    assert entry.kind == "registered"
+    assert entry.id.startswith("board")
+    assert np.hypot(entry.x_px, entry.y_px) < 0.05
+    assert entry.likeness > 0.9
 
 
 def test_a_resume_refuses_a_bench_whose_mask_has_slipped():
@@ -190,7 +192,7 @@ def test_a_resume_refuses_a_bench_whose_mask_has_slipped():
     with pytest.raises(AppError, match="no longer as it was"):
         Sequencer(again, plan, slipped).run()
     assert len(again.stored) == 10
-    assert any(entry["kind"] == "refused" for entry in again.journal.entries)
+    assert any(entry.kind == "refused" for entry in again.journal.entries)
 
 
 def test_a_shift_is_registered_to_a_tenth_of_a_pixel():
@@ -247,7 +249,7 @@ def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
         Sequencer(session, plan, rig, Impatient()).run()
     assert rig.attendant.lamp == "off"
     assert rig.stage.stops == 1
-    assert session.journal.entries[-1]["kind"] == "stopped"
+    assert session.journal.entries[-1].kind == "stopped"
     assert not verify(session).damaged
     assert 0 < len(session.stored) < len(session.frames)
 
@@ -307,9 +309,9 @@ def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
                 pushed.append(frame.id)
 
     assert Sequencer(session, plan, rig, Clumsy()).run().complete
-    retry = next(e for e in session.journal.entries if e["kind"] == "retry")
-    assert retry["id"] == pushed[0]
-    assert "off its place" in retry["fault"] or "home" in retry["fault"]
+    retry = next(iter(of_kind(session.journal.entries, RetryEntry)))
+    assert retry.id == pushed[0]
+    assert "off its place" in retry.fault or "home" in retry.fault
     assert contents(session) == contents(undisturbed[0])
 
 
@@ -319,7 +321,7 @@ def test_a_stage_that_moves_for_ever_stops_the_capture_with_a_reason():
     rig.chain.faults.inject("busy_forever", skip=5)
     with pytest.raises(GaveUpError, match="still moves after"):
         Sequencer(session, plan, rig).run()
-    assert session.journal.entries[-1]["kind"] == "stopped"
+    assert session.journal.entries[-1].kind == "stopped"
     assert not verify(session).damaged
 
 
@@ -351,7 +353,7 @@ def test_an_emergency_stop_is_never_argued_with():
     rig.chain.faults.inject("emergency_stop", skip=40)
     with pytest.raises(GaveUpError, match="emergency"):
         Sequencer(session, plan, rig).run()
-    assert not any(e["kind"] == "retry" and e["attempt"] > 1 for e in session.journal.entries)
+    assert not any(e.attempt > 1 for e in of_kind(session.journal.entries, RetryEntry))
 
 
 def test_what_has_to_be_mended_follows_from_the_fault():
@@ -412,7 +414,7 @@ def test_a_camera_that_repeats_itself_once_costs_a_try():
 
     wire.capture = repeating
     assert Sequencer(session, plan, rig).run().complete
-    faults = [e["fault"] for e in session.journal.entries if e["kind"] == "retry"]
+    faults = [e.fault for e in of_kind(session.journal.entries, RetryEntry)]
     assert len(faults) == 1
     assert "bit by bit" in faults[0]
     assert len(set(contents(session).values())) == 3
@@ -456,9 +458,9 @@ def test_a_clock_that_jumps_back_changes_no_span_and_no_order():
     outcome = Sequencer(session, plan, rig, wall=lambda: f"day {next(days)}").run()
     assert outcome.complete
     for entry in session.stored.values():
-        for began_s, ended_s in entry["spans_s"].values():
+        for began_s, ended_s in entry.spans_s.values():
             assert 0 <= began_s <= ended_s
-    names = [e["id"] for e in session.journal.entries if e["kind"] == "frame"]
+    names = [e.id for e in of_kind(session.journal.entries, FrameEntry)]
     assert names == [frame.id for frame in session.frames]
 
 

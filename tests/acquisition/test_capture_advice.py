@@ -33,9 +33,10 @@ from emmc_rig.acquisition.retries import HOPELESS
 from emmc_rig.bench.rig_config import AskingAttendant, opened_rig
 from emmc_rig.session import session as session_module
 from emmc_rig.session.board_sets import whiteboards
+from emmc_rig.session.journal import RetryEntry, of_kind
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
-from emmc_rig.session.storage import SystemDisk
+from emmc_rig.session.storage import Disk
 from emmc_rig.session.verify import verify
 
 HOUSE = Path(emmc_rig.__file__).parent
@@ -404,7 +405,7 @@ def a_shot_that_is_too_bright(bench):
     line = bench.refused()
     assert "lower shots.1.exposure_s in the plan" in line
     before = Session(bench.session)
-    assert not [e for e in before.journal.entries if e["kind"] == "retry" and e["attempt"] > 1]
+    assert not [e for e in of_kind(before.journal.entries, RetryEntry) if e.attempt > 1]
     yield line
     bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.002}])
     code, out, err = bench.run(*CAPTURE)
@@ -415,7 +416,7 @@ def a_shot_that_is_too_bright(bench):
     assert "plan 0       9 frames, by plan.yaml" in out
     assert "plan 1       1 frames, by amended-1-plan.yaml" in out
     after = Session(bench.session)
-    assert after.stored[AGAIN]["exposure_s"] == 0.002
+    assert after.stored[AGAIN].exposure_s == 0.002
     assert all(after.stored[name] == entry for name, entry in before.stored.items())
 
 
@@ -486,8 +487,8 @@ def a_board_that_was_moved(bench):
 @walk("its bytes changed in this computer's memory")
 def memory_that_loses_bits(bench):
     class Spoilt(Session):
-        def store(self, frame, suffix, data, sha256, facts):
-            super().store(frame, suffix, data, sha256[::-1], facts)
+        def store(self, frame, file, entry):
+            super().store(frame, replace(file, sha256=file.sha256[::-1]), entry)
 
     bench.patch.setattr(command, "Session", Spoilt)
     yield bench.refused()
@@ -581,7 +582,7 @@ def a_journal_that_cannot_be_read(bench):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "reader", refuse)
+        patch.setattr(Disk, "reader", refuse)
         line = bench.refused()
     yield line
 
@@ -592,7 +593,7 @@ def a_folder_that_cannot_be_made(bench):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "make_folder", refuse)
+        patch.setattr(Disk, "make_folder", refuse)
         line = bench.refused()
     yield line
 
@@ -623,7 +624,7 @@ def another_program_at_work(bench):
 @walk(" are free; make room, or name another --out")
 def a_small_disk(bench):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "free_bytes", lambda disk, folder: 1000)
+        patch.setattr(Disk, "free_bytes", lambda disk, folder: 1000)
         line = bench.refused()
     assert not bench.session.exists()
     yield line
@@ -631,7 +632,7 @@ def a_small_disk(bench):
 
 @walk(", then run the same command to go on; ")
 def a_disk_that_fills(bench):
-    honest = SystemDisk.create
+    honest = Disk.create
 
     def filling(disk, path):
         if AGAIN in path.name:
@@ -639,7 +640,7 @@ def a_disk_that_fills(bench):
         return honest(disk, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SystemDisk, "create", filling)
+        patch.setattr(Disk, "create", filling)
         line = bench.refused()
     assert "9 of 10 frames are safe" in line
     yield line
@@ -818,8 +819,8 @@ def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
         line = bench.refused()
         assert str(fault) in line
         assert "9 frames are kept: mend it, then run the same command" in line
-        retries = [e for e in Session(bench.session).journal.entries if e["kind"] == "retry"]
-        assert retries[-1]["attempt"] == (1 if isinstance(fault, HOPELESS) else 2)
+        retries = of_kind(Session(bench.session).journal.entries, RetryEntry)
+        assert retries[-1].attempt == (1 if isinstance(fault, HOPELESS) else 2)
     bench.light.faults.clear()
     assert bench.run(*CAPTURE)[0] == 0
     assert verify(Session(bench.session)).is_complete

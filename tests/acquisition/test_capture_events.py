@@ -18,6 +18,7 @@ from emmc_rig.acquisition.plan import Suspender, load_plan
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.suspend import suspended_by
 from emmc_rig.errors import AppError
+from emmc_rig.session.journal import metered
 
 PLAN = {
     "camera": "rgbw-bayer-2shots",
@@ -101,7 +102,7 @@ def test_a_condition_out_of_range_pauses_the_run_before_the_next_frame_and_resum
     ]
     taken = [event.name for event in heard[: names.index("pause")]].count("frame.taken")
     assert taken == 2
-    kinds = [entry["kind"] for entry in session.journal.entries]
+    kinds = [entry.kind for entry in session.journal.entries]
     assert kinds.index("paused") < kinds.index("resumed")
 
 
@@ -181,13 +182,13 @@ def test_the_estimate_knows_metered_exposures_from_the_last_session_of_the_same_
     assert earlier.folder == first.folder
     pace = Pace({}, 0.0, 1000)
     frames = [frame for frame in first.frames if not frame.is_optional]
-    unknown = pace.estimate(frames, known_exposures(Exposures(planned), {}, []))
+    unknown = pace.estimate(frames, known_exposures(Exposures(planned), {}, None))
     assert unknown.guessed == sum(frame.exposure_s is None for frame in frames)
-    truly_s = sum(entry["exposure_s"] for entry in first.stored.values())
-    by_earlier = pace.estimate(frames, known_exposures(Exposures(planned, earlier), {}, []))
-    entries = first.journal.entries
-    metered = known_exposures(Exposures(planned), first_meterings(first), entries)
-    for reported in (by_earlier, pace.estimate(frames, metered)):
+    truly_s = sum(entry.exposure_s for entry in first.stored.values())
+    by_earlier = pace.estimate(frames, known_exposures(Exposures(planned, earlier), {}, None))
+    decided = metered(first.journal.entries)
+    by_metering = known_exposures(Exposures(planned), first_meterings(first), decided)
+    for reported in (by_earlier, pace.estimate(frames, by_metering)):
         assert reported.guessed == 0
         assert reported.exposing_s == pytest.approx(truly_s, rel=0.02)
     assert unknown.exposing_s < truly_s / 2

@@ -20,9 +20,9 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.processing.exposure import expected_gain_db
+from emmc_rig.processing.reconstructing import expected_gain_db
 from emmc_rig.session.exposure import ShotExposure, exposure_reasons, shot_exposures
-from emmc_rig.session.journal import metered
+from emmc_rig.session.journal import Figures, metered
 from emmc_rig.session.verify import verify
 from simulators.clock import ManualClock
 
@@ -73,13 +73,13 @@ def test_metered_shots_reach_the_level_alike_and_nothing_speaks_against_them(ses
     shots = shot_exposures(session)
     assert [one.shot for one in shots] == [0, 1, 2]
     assert all(0.55 < one.level < 0.9 for one in shots)
-    assert len({session.stored[f"shot-{shot}-e0-r0"]["exposure_s"] for shot in range(3)}) == 1
+    assert len({session.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)}) == 1
     assert exposure_reasons(shots) == []
     assert not any(frame.is_optional for frame in session.needed)
 
 
 def test_what_metering_asks_for_is_journalled_before_the_first_shot(session):
-    kinds = [(e["kind"], e.get("id", "")) for e in session.journal.entries]
+    kinds = [(e.kind, getattr(e, "id", "")) for e in session.journal.entries]
     decided = kinds.index(("metered", ""))
     assert [name for _, name in kinds[:decided] if name.startswith("shot")] == []
     assert ("frame", "meter-shot-0") in kinds[:decided]
@@ -97,19 +97,19 @@ def test_the_level_is_reached_in_dim_and_bright_scenes(brightness):
 def test_shots_with_other_masks_are_metered_each_and_exposed_alike_unless_asked_otherwise():
     both, _ = captured(FILTERS)
     assert {f.id for f in both.frames if f.kind == "metering"} == {"meter-shot-0", "meter-shot-1"}
-    alike = [both.stored[f"shot-{shot}-e0-r0"]["exposure_s"] for shot in range(3)]
+    alike = [both.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)]
     assert alike[0] == alike[1] != alike[2] == 0.02
     own, _ = captured(FILTERS + "metering: {alike: false}\n")
     asked = metered(own.journal.entries)
     assert asked is not None
-    assert set(asked["exposures_s"]) == {"0", "1"}
-    assert min(asked["exposures_s"].values()) == pytest.approx(alike[0], rel=0.05)
+    assert set(asked.exposures_s) == {0, 1}
+    assert min(asked.exposures_s.values()) == pytest.approx(alike[0], rel=0.05)
 
 
 def test_a_scene_with_a_bright_spot_is_bracketed_and_its_dark_part_read_with_less_noise():
     session, outcome = captured(brightness=0.05, spot=8.0)
     assert outcome.complete
-    taken_s = {name: entry["exposure_s"] for name, entry in session.stored.items()}
+    taken_s = {name: entry.exposure_s for name, entry in session.stored.items()}
     assert taken_s["shot-0-e1-r0"] == pytest.approx(
         BRACKET_STEP * taken_s["shot-0-e0-r0"], rel=0.01
     )
@@ -122,7 +122,7 @@ def test_a_scene_with_a_bright_spot_is_bracketed_and_its_dark_part_read_with_les
 def test_no_exposure_is_longer_than_the_plan_allows():
     text = AUTO + "metering: {longest_s: 0.02}\n"
     session, _ = captured(text)
-    assert session.stored["shot-0-e0-r0"]["exposure_s"] == pytest.approx(0.02)
+    assert session.stored["shot-0-e0-r0"].exposure_s == pytest.approx(0.02)
     (reason,) = exposure_reasons(shot_exposures(session))
     assert reason.level == "doubt"
 
@@ -130,8 +130,10 @@ def test_no_exposure_is_longer_than_the_plan_allows():
 def test_a_dark_scene_is_refused_with_what_to_do():
     with pytest.raises(GaveUpError, match=r"meter-shot-0 is black.*metering\.longest_s"):
         captured(brightness=0.0)
-    entry = {"figures": {"bright_dn": 0.2}, "black_level_dn": 0.0, "white_level_dn": 100}
-    frames = [frame for frame in captured()[0].frames if frame.kind == "shot"]
+    session = captured()[0]
+    dark = {"figures": Figures(0.0, 0.1, 0.2)}
+    entry = session.stored["meter-shot-0"].model_copy(update=dark)
+    frames = [frame for frame in session.frames if frame.kind == "shot"]
     with pytest.raises(CameraSettingError, match="dark"):
         asked_of_scene(frames, {"meter-shot-0": entry}, Metering(), (1e-3, 1.0))
 
@@ -157,10 +159,10 @@ def test_a_capture_that_goes_on_exposes_as_it_was_decided_before(last):
     rig = rig_for(AUTO, brightness=0.06, spot=9.6)
     assert Sequencer(session, plan, rig).run().complete
     whole, _ = captured(brightness=0.05, spot=8.0)
-    assert {name: e["exposure_s"] for name, e in session.stored.items()} == {
-        name: e["exposure_s"] for name, e in whole.stored.items()
+    assert {name: e.exposure_s for name, e in session.stored.items()} == {
+        name: e.exposure_s for name, e in whole.stored.items()
     }
-    assert sum(entry["kind"] == "metered" for entry in session.journal.entries) == 1
+    assert sum(entry.kind == "metered" for entry in session.journal.entries) == 1
 
 
 def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
@@ -175,7 +177,7 @@ def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
     assert edit is not None
     session = session.amend(_frozen(request_for(Path("/disk"), text), edit.frames), edit.changes)
     assert Sequencer(session, edited, rig).run().complete
-    taken_s = [session.stored[f"shot-{shot}-e0-r0"]["exposure_s"] for shot in range(3)]
+    taken_s = [session.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)]
     assert taken_s[1] == taken_s[2] == pytest.approx(taken_s[0] / 2, rel=0.02)
 
 

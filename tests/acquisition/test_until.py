@@ -21,7 +21,7 @@ from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.session_sheet import events, sheet
-from emmc_rig.session.journal import decisions
+from emmc_rig.session.journal import DecidedEntry, UntilEntry, of_kind
 from emmc_rig.session.listing import summary
 from emmc_rig.session.session import JOURNAL, Session
 from emmc_rig.session.verify import verify
@@ -61,9 +61,9 @@ def contents(session):
 
 def decided(session):
     """What was decided, without when."""
-    timed = ("spans_s", "wall", "run")
-    entries = decisions(session.journal.entries)
-    return [{key: value for key, value in e.items() if key not in timed} for e in entries]
+    when = {"spans_s": {}, "wall": "", "run": 0}
+    decisions = of_kind(session.journal.entries, DecidedEntry)
+    return [entry.model_copy(update=when) for entry in decisions]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -110,9 +110,9 @@ def every(tmp_path_factory):
 
 def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
     session = Session(enough)
-    (only,) = decisions(session.journal.entries)
-    assert only["stated_db"] >= only["target_db"] == 12
-    assert (only["shots"], only["next"], only["spared"]) == ([0], None, [1, 2])
+    (only,) = of_kind(session.journal.entries, DecidedEntry)
+    assert only.stated_db >= only.target_db == 12
+    assert (only.shots, only.next, only.spared) == ([0], None, [1, 2])
     assert session.is_complete
     assert not session.missing()
     assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
@@ -130,7 +130,7 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
     code, out, _ = program("session", "show", enough)
     assert "shot         1 of 1" in out
     assert "12 wanted; no more, the target is reached" in out
-    reported = summary(enough)
+    reported = summary(Session(enough))
     assert (reported.state, reported.stored) == ("complete", reported.planned)
     verdict = verify(Session(enough))
     assert (verdict.is_complete, verdict.missing, verdict.spared) == (True, (), 2)
@@ -168,11 +168,12 @@ def test_it_is_calibrated_reconstructed_and_exported_with_the_shots_it_has(enoug
 
 def test_every_next_shot_is_the_one_expected_to_help_most(every):
     taken = decided(Session(every))
-    assert [len(one["shots"]) for one in taken] == [1, 2, 3]
+    assert [len(one.shots) for one in taken] == [1, 2, 3]
     for one, after in pairwise(taken):
-        assert one["next"] == int(max(one["expected_db"], key=one["expected_db"].get))
-        assert after["shots"] == [*one["shots"], one["next"]]
-        assert one["expected_db"][str(one["next"])] > one["stated_db"]
+        assert one.next == max(one.expected_db, key=lambda shot: one.expected_db[shot])
+        assert one.next is not None
+        assert after.shots == [*one.shots, one.next]
+        assert one.expected_db[one.next] > one.stated_db
 
 
 def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, tmp_path):
@@ -228,8 +229,8 @@ def test_a_stop_while_the_next_shot_is_chosen_keeps_what_was_taken(every, tmp_pa
     with pytest.raises(KeyboardInterrupt):
         Sequencer(session, plan, rig, choose=Until(session, Impatient())).run()
     again = Session(copy)
-    assert again.journal.entries[-1]["kind"] == "stopped"
-    assert not decisions(again.journal.entries)
+    assert again.journal.entries[-1].kind == "stopped"
+    assert not of_kind(again.journal.entries, DecidedEntry)
     assert "shot-0-e0-r0" in again.stored
 
 
@@ -244,7 +245,7 @@ def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_
     assert code == 0
     assert "1 taken" in out
     assert path.read_bytes() == good
-    assert len(decisions(Session(copy).journal.entries)) == 1
+    assert len(of_kind(Session(copy).journal.entries, DecidedEntry)) == 1
 
 
 @pytest.mark.parametrize(
@@ -317,11 +318,11 @@ def test_what_a_session_needs_follows_from_the_last_instruction(tmp_path: Path):
     assert shots == {0, 1}
     assert session.target_db is None
     reported = {"shots": [0], "stated_db": 31.0, "target_db": 30.0, "why": "", "spared_frames": 1}
-    session.note("until", target_db=30.0)
-    session.note("decided", next=1, spared=[], **reported)
+    session.note(UntilEntry(target_db=30.0))
+    session.note(DecidedEntry(next=1, spared=[], **reported))
     assert session.needed == session.frames
-    session.note("decided", next=None, spared=[1], **reported)
+    session.note(DecidedEntry(next=None, spared=[1], **reported))
     assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
-    session.note("until", target_db=33.0)
+    session.note(UntilEntry(target_db=33.0))
     assert session.needed == session.frames
     assert session.target_db == 33.0

@@ -11,8 +11,7 @@ import emmc_rig as emmc
 from calibration import frames
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.board_plan import PLAN, write_plan
-from emmc_rig.processing.calibration_settings import CalibrateSettings
+from emmc_rig.processing.board_plan import PLAN, PlanSettings, write_plan
 
 NAME, SIZE = "rgbw-bayer-1shot", (48, 64)
 
@@ -20,7 +19,7 @@ NAME, SIZE = "rgbw-bayer-1shot", (48, 64)
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drawn")
-    write_plan(CalibrateSettings(NAME, find_camera(NAME), SIZE), folder)
+    write_plan(PlanSettings(NAME, find_camera(NAME), SIZE), folder)
     rig = emmc.rig("simulated", scene="near-planar", size=SIZE, rays=128)
     return emmc.capture(folder / PLAN, rig, out=folder / "session")
 

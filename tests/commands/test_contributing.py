@@ -28,7 +28,7 @@ def test_the_method_reconstructs_with_its_own_settings():
     (method,) = names["METHODS"]
     psi = build_imaging_matrix(find_camera("rgbw-mono"), (8, 8))
     frames = np.full(psi.frames_shape, 0.2, dtype=np.float32)
-    given = Given(psi, frames, 0.01, None, None, None, None, lambda: 0.0)
+    given = Given(psi, frames, 0.01, None, None, None, None)
 
     class Settings:
         def of(self, kind):

@@ -91,7 +91,7 @@ def _fitted_once():
     fit, known = measured_psi.session_outcome, {}
 
     def remembered(session, routes=None, *more):
-        key = routes, *sorted((name, one["sha256"]) for name, one in session.stored.items())
+        key = routes, *sorted((name, one.sha256) for name, one in session.stored.items())
         if key not in known:
             known[key] = fit(session, routes, *more)
         return known[key]

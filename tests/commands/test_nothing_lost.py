@@ -25,28 +25,24 @@ RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
 ONE_FILE = {
     "capture --new",
     "session export",
-    "devices scale",
     "devices serve",
 }
 WRITERS = {
     "cameras": ("rgbw-mono",),
     "capture": ("other.yaml", *RIG),
     "capture --new": ("rgbw-mono",),
-    "calibrate": (*SIZE,),
     "calibrate SESSION": ("made-session",),
     "calibrate --drift": ("frames", "--known", "frames"),
     "calibrate --plan": (*SIZE,),
     "chart": ("--fast",),
     "demo": (*SIZE,),
     "design": (),
-    "devices scale": ("mask_x", 5000, "--stage", "simulated:zaber", "--yes"),
     "devices serve": ("zaber",),
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
     "figure": ("scene.h5",),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
-    "reconstruct --tile": (8, "frames"),
     "session export": ("made-session",),
     "session sheet": ("made-session",),
     "simulate": (*SIZE,),
@@ -55,8 +51,8 @@ WRITERS = {
 }  # fmt: skip
 READERS = {
     "devices camera", "devices conform", "devices home", "devices info", "devices jog",
-    "devices list", "devices probe", "devices udev-rule", "live", "session compare", "session list",
-    "session prune", "session show", "session verify",
+    "devices list", "devices probe", "devices udev-rule", "live", "session list",
+    "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
     "chart": "points.jsonl",
@@ -109,7 +105,7 @@ def world(tmp_path_factory):
 
 def edited(folder, typed):
     """Make a result of the command that somebody edited."""
-    command = typed.removesuffix(" SESSION").replace(" --theory", "").replace(" --tile", "")
+    command = typed.removesuffix(" SESSION").replace(" --theory", "")
     with result_folder(folder, command, belongs_to=folder, adds=True) as new:
         for name in ("metrics.json", "report.html"):
             (new / name).write_text("{}")
@@ -214,8 +210,8 @@ def test_a_rerun_replaces_its_own_files_and_keeps_all_others(tmp_path, monkeypat
     assert not list(tmp_path.rglob(".*"))
 
 
-AT_ONCE = {"capture --new", "devices scale", "devices serve"}
-"""Done at once, shown by what they print; `devices scale` is given no stage here."""
+AT_ONCE = {"capture --new", "devices serve"}
+"""Done at once, shown by what they print."""
 
 
 @pytest.mark.slow

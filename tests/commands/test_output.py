@@ -32,7 +32,6 @@ RESULTS = {
     "session show": ("session", "show", "session"),
     "session verify": ("session", "verify", "session"),
     "session export": ("session", "export", "session", "--out", "session.h5"),
-    "session prune": ("session", "prune", "session"),
     "session sheet": ("session", "sheet", "session"),
     "session list": ("session", "list"),
 }  # fmt: skip

@@ -15,7 +15,7 @@ from drivers.dng import encode_dng
 from drivers.folder import FolderCamera
 from drivers.ptp import PtpCamera, PtpSession
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.u3v import open_u3v
+from drivers.u3v import open_camera
 from drivers.usb import open_device
 from emmc_rig.conformance.cameras import *  # noqa: F403
 from simulators.clock import ManualClock
@@ -52,7 +52,7 @@ def folder_camera(folder):
 def u3v_camera(folder):
     clock = ManualClock()
     bus = SimulatedUsb(clock, U3vCameraSimulator(see, clock, SHAPE, CFA))
-    return open_u3v(backend=bus, clock=clock)
+    return open_camera("", clock, bus)
 
 
 class DumpCamera(RawFileCamera):

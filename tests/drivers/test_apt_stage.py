@@ -174,15 +174,6 @@ def test_updates_that_nobody_asked_this_driver_for_do_no_harm(bench):
         assert bench.device.position_um() == pytest.approx(target_um, abs=3.1)
 
 
-def test_automatic_updates_end_when_nobody_acknowledges_them():
-    device = AptController(ManualClock())
-    device.feed(codec.encode(Id.HW_START_UPDATEMSGS, codec.USB_UNIT))
-    device._clock.sleep(60.0)
-    assert len(device.due()) == 50 * 20
-    device._clock.sleep(60.0)
-    assert device.due() == b""
-
-
 def test_a_speed_reaches_the_controller_in_its_own_units(bench):
     stage = bench.stage()
     stage.set_speed_um_s("x", 1000.0)
@@ -211,16 +202,3 @@ def test_a_tolerance_finer_than_half_a_count_is_refused(bench):
 def test_actuators_have_the_travel_of_their_names():
     assert ACTUATORS["z812"].travel_um == 12_000.0
     assert ACTUATORS["mts50-z8"].travel_um == 50_000.0
-
-
-def test_a_stop_at_once_and_a_profiled_one_both_report(bench):
-    bench.homed()
-    move = codec.encode_position(1, round(20_000 * 34.304))
-    for mode in (1, codec.STOP_PROFILED):
-        bench.device.feed(codec.encode(Id.MOT_MOVE_ABSOLUTE, codec.USB_UNIT, data=move))
-        bench.clock.sleep(1.0)
-        reported = bench.device.feed(codec.encode(Id.MOT_MOVE_STOP, codec.USB_UNIT, 1, mode))
-        bench.clock.sleep(2.0)
-        reported += bench.device.due()
-        assert reported[:2] == Id.MOT_MOVE_STOPPED.to_bytes(2, "little")
-    assert 0 < bench.device.position_um() < 19_000.0

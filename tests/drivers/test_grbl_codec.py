@@ -13,7 +13,6 @@ from drivers.grbl_codec import (
     Ok,
     Refusal,
     Setting,
-    StartupLine,
     Status,
     decode_line,
     encode_line,
@@ -34,7 +33,7 @@ from drivers.grbl_codec import (
         # "Interface", Grbl $ Settings Message
         (b"$10=255\r\n", Setting(10, 255.0)),
         (b"$110=500.000\r\n", Setting(110, 500.0)),
-        (b"$N0=G54\r\n", StartupLine("$N0=G54")),
+        (b"$N0=G54\r\n", None),
         # "Interface", Feedback Messages
         (b"[MSG:Reset to continue]\r\n", Feedback("MSG", "Reset to continue")),
         (b"[MSG:'$H'|'$X' to unlock]\r\n", Feedback("MSG", "'$H'|'$X' to unlock")),
@@ -46,7 +45,7 @@ from drivers.grbl_codec import (
         (b"[OPT:VL]\r\n", Feedback("OPT", "VL")),
         (b"[PRB:0.000,0.000,0.000:0]\r\n", Feedback("PRB", "0.000,0.000,0.000:0")),
         # "Interface", Startup Line Execution
-        (b">G54G20:ok\r\n", StartupLine(">G54G20:ok")),
+        (b">G54G20:ok\r\n", None),
         (b"\r\n", None),
     ],
 )
@@ -68,7 +67,7 @@ def test_every_kind_of_message_is_read(line, message):
         ),
         (
             b"<Hold:1|MPos:0.000,0.000,0.000|F:500|Pn:PZ|Ov:100,100,100|A:SFM>\r\n",
-            Status("Hold", 1, (0.0, 0.0, 0.0), None, None, "PZ"),
+            Status("Hold", 1, (0.0, 0.0, 0.0), None, None),
         ),
         (
             b"<Door:3|MPos:1.000,2.000,3.000,4.000|Ln:99999>\r\n",

@@ -49,13 +49,6 @@ def bench():
     return Bench()
 
 
-def test_it_starts_locked_until_it_is_homed(bench):
-    assert "Grbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]" in bench.say(b"")
-    assert bench.say(b"G0X-5\n") == "error:9\r\n"
-    assert bench.say(b"$J=X-5F100\n") == "error:8\r\n"
-    assert bench.say(b"?").startswith("<Alarm|MPos:0.000,0.000,0.000|FS:0,0|WCO:")
-
-
 def test_ok_means_accepted_and_not_arrived(bench):
     bench.homed()
     assert bench.say(b"$J=G53X-5.000F480\n") == "ok\r\n"
@@ -297,49 +290,3 @@ def test_a_tolerance_finer_than_its_reports_is_refused(bench):
 
 def test_it_says_what_it_is(bench):
     assert identify(bench.transport, bench.clock) == ("version 1.1h.20190825:, options VH,15,128")
-
-
-@pytest.mark.parametrize(
-    ("line", "answer"),
-    [
-        (b"\n", "ok\r\n"),
-        (
-            b"$\n",
-            "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]\r\nok\r\n",
-        ),
-        (b"$I\n", "[VER:1.1h.20190825:]\r\n[OPT:VH,15,128]\r\nok\r\n"),
-        (b"$N\n", "$N0=\r\n$N1=\r\nok\r\n"),
-        (b"$999=1\n", "error:3\r\n"),
-        (b"$110=-5\n", "error:4\r\n"),
-        (b"X" * 100 + b"\n", "error:11\r\n"),
-        (b"$X\n", "[MSG:Caution: Unlocked]\r\nok\r\n"),
-        (b"$X\n$J=X1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:22\r\n"),
-        (b"$X\n$J=F100\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:26\r\n"),
-        (b"$X\n$JX1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:16\r\n"),
-        (b"$X\n$J=M5F1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:16\r\n"),
-        (b"$X\n$J=X-99F100\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:15\r\n"),
-        (b"$X\nG1X-1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:22\r\n"),
-        (b"$X\nG2X1\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:20\r\n"),
-        (b"$X\nG0 X\n", "[MSG:Caution: Unlocked]\r\nok\r\nerror:2\r\n"),
-        (b"$X\n(a comment) M5 ; more\n", "[MSG:Caution: Unlocked]\r\nok\r\nok\r\n"),
-    ],
-)
-def test_the_firmware_answers_as_its_documentation_says(line, answer):
-    device = GrblController(ManualClock())
-    device.due()
-    assert device.feed(line).decode("ascii") == answer
-
-
-def test_work_offset_and_overrides_come_in_some_reports_only(bench):
-    bench.homed()
-    reports = [bench.say(b"?") for _ in range(40)]
-    assert sum("WCO:" in report for report in reports) == 4
-    assert sum("Ov:" in report for report in reports) == 4
-    assert not any("WCO:" in report and "Ov:" in report for report in reports)
-
-
-def test_settings_are_reported_line_by_line(bench):
-    lines = bench.say(b"$$\n").splitlines()
-    assert "$110=480.000" in lines
-    assert "$130=25.400" in lines
-    assert lines[-1] == "ok"

@@ -30,7 +30,6 @@ from simulators.ptp import ANY_EXPOSURE, FAULTS, PtpCameraSimulator, PtpUsbFunct
 from simulators.usb import SimulatedUsb
 
 SHAPE = (60, 80)
-LACKS = {True: (), False: (Operation.GET_PARTIAL_OBJECT,)}
 
 
 class Bench:
@@ -162,22 +161,19 @@ def test_the_camera_reports_its_time_and_battery(bench):
     assert camera.battery_percent == 87
 
 
-@pytest.mark.parametrize("partial", [True, False])
 @pytest.mark.parametrize("packet_size", [64, 512, 1024])
-def test_pictures_arrive_whole_with_or_without_parts(partial, packet_size):
-    bench = Bench(PtpSettings(part_bytes=1000), packet_size, lacks=LACKS[partial])
+def test_pictures_arrive_whole(packet_size):
+    bench = Bench(packet_size=packet_size)
     bench.snap_is_good(bench.open())
 
 
 def test_progress_is_reported_to_the_end(bench):
     seen = []
-    bench.settings = PtpSettings(part_bytes=4000)
     camera = bench.open()
     camera.on_progress = lambda done, size: seen.append((done, size))
     frame = camera.snap()
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
     assert seen[-1] == (len(frame.original), len(frame.original))
-    assert len(seen) == -(-len(frame.original) // 4000)
 
 
 def test_of_a_pair_the_raw_file_is_taken():
@@ -225,17 +221,13 @@ CURED = {
     "drop_complete": 1,
     "stall_in_download": 1,
     "lost_bytes": 1,
-    "short_part": 5,
     "silent": 0,
 }
 
 
 @pytest.mark.parametrize(("fault", "times"), [(f, n) for f, n in CURED.items() if n])
-@pytest.mark.parametrize("partial", [True, False])
-def test_the_driver_makes_up_for(fault, times, partial):
-    if fault == "short_part" and not partial:
-        pytest.skip("there are no parts")
-    bench = Bench(PtpSettings(part_bytes=3000), lacks=LACKS[partial])
+def test_the_driver_makes_up_for(fault, times):
+    bench = Bench()
     camera = bench.open()
     bench.faults.inject(fault, times)
     bench.snap_is_good(camera)
@@ -254,16 +246,12 @@ def test_the_driver_makes_up_for(fault, times, partial):
         ("garbled_header", 1, CameraFormatError, "garbled"),
         ("card_full", 1, CardFullError, "full or missing"),
         ("lost_bytes", math.inf, DownloadError, "still on the card"),
-        ("short_part", math.inf, DownloadError, "the camera sent nothing"),
         ("stall_in_download", math.inf, DownloadError, "stalled"),
     ],
 )
 def test_a_fault_is_one_clear_line_and_the_camera_is_good_again(fault, times, error, message):
-    bench = Bench(PtpSettings(part_bytes=1 << 20))
+    bench = Bench()
     camera = bench.open(shape=SHAPE)
-    if fault in ("stall_in_download", "short_part"):
-        # Each time half of what is left comes before the fault: the last packets never do.
-        camera.session.settings = PtpSettings(part_bytes=1 << 20, attempts=1)
     bench.faults.inject(fault, times)
     started_s = bench.clock.now_s()
     with pytest.raises(error, match=message) as caught:
@@ -288,11 +276,9 @@ def test_a_picture_that_comes_too_late_does_not_pass_for_the_next(bench):
     assert frame.metadata["name"] == "EMMC0002.DNG"
 
 
-@pytest.mark.parametrize("parts", range(4))
-def test_a_camera_unplugged_in_the_middle_is_gone_and_works_when_it_is_back(parts):
-    bench = Bench(PtpSettings(part_bytes=3000))
+def test_a_camera_unplugged_in_the_middle_is_gone_and_works_when_it_is_back(bench):
     camera = bench.open()
-    bench.faults.inject("unplug_in_download", skip=parts)
+    bench.faults.inject("unplug_in_download")
     with pytest.raises(UsbGoneError, match="plug it in"):
         camera.snap()
     with pytest.raises(UsbGoneError):
@@ -318,10 +304,8 @@ def test_an_exchange_that_an_earlier_program_left_in_the_pipes_is_cleared(bench)
     bench.snap_is_good(bench.open())
 
 
-@pytest.mark.parametrize("partial", [True, False])
-@pytest.mark.parametrize("at", [0, 1, 3])
-def test_ctrl_c_in_a_download_leaves_a_usable_camera(partial, at):
-    bench = Bench(PtpSettings(part_bytes=3000), lacks=LACKS[partial])
+@pytest.mark.parametrize("at", [0, 1])
+def test_ctrl_c_in_a_download_leaves_a_usable_camera(bench, at):
     camera = bench.open()
     calls = []
 
@@ -331,8 +315,6 @@ def test_ctrl_c_in_a_download_leaves_a_usable_camera(partial, at):
             raise KeyboardInterrupt
 
     camera.on_progress = interrupt
-    if not partial and at == 3:
-        pytest.skip("so small a picture comes in fewer pieces")
     with pytest.raises(KeyboardInterrupt):
         camera.snap()
     camera.on_progress = lambda done, size: None

@@ -65,7 +65,6 @@ def test_a_heard_device_says_who_it_is():
     assert (info.maker, info.model, info.version, info.serial) == ("GP", "VC", "2.5.11", "0.1")
     assert info.vendor_extension_text == "G-V: 1.0;"
     assert Operation.INITIATE_CAPTURE in info.operations
-    assert Operation.GET_PARTIAL_OBJECT not in info.operations
     assert codec.Property.EXPOSURE_TIME in info.properties
 
 

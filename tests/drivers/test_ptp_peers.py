@@ -1,20 +1,15 @@
-"""PTP against an independent program: libgphoto2 as the camera, and libgphoto2 as the host.
+"""PTP against an independent program: libgphoto2's virtual camera; as the host: test_gphoto.py.
 
-Both need the extra `peers` (the gphoto2 wheel brings libgphoto2 with its virtual camera).
+Needs the extra `peers` (the gphoto2 wheel brings libgphoto2 with its virtual camera).
 """
 
 import ctypes
 import hashlib
-import json
-import os
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from ptpip_server import PtpIpServer
 
 from drivers.clock import SystemClock
 from drivers.dng import encode_dng
@@ -24,7 +19,7 @@ from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
 from drivers.raw import decode_raw
 from drivers.usb import INTERRUPT, open_device
 from simulators.clock import ManualClock
-from simulators.ptp import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpCameraSimulator
+from simulators.ptp import BULK_IN, BULK_OUT, INTERRUPT_IN
 from simulators.usb import (
     DeviceSpec,
     EndpointSpec,
@@ -167,88 +162,3 @@ def test_our_driver_sets_the_shutter_of_libgphoto2s_camera(session):
     shutter = session.describe(Property.EXPOSURE_TIME)
     for units in (1000, 25):
         assert session.write(shutter, units) == units
-
-
-INITIATOR = """
-import hashlib, json, sys
-import gphoto2 as gp
-
-camera = gp.Camera()
-abilities = gp.CameraAbilitiesList()
-abilities.load()
-camera.set_abilities(abilities[abilities.lookup_model("PTP/IP Camera")])
-ports = gp.PortInfoList()
-ports.load()
-camera.set_port_info(ports[ports.lookup_path(sys.argv[1])])
-camera.init()
-reported = {"summary": str(camera.get_summary()), "pictures": []}
-for choice in sys.argv[2:]:
-    config = camera.get_config()
-    config.get_child_by_name("shutterspeed").set_value(choice)
-    camera.set_config(config)
-    path = camera.capture(gp.GP_CAPTURE_IMAGE)
-    file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
-    data = memoryview(file.get_data_and_size())
-    reported["pictures"].append([path.name, len(data), hashlib.sha256(data).hexdigest()])
-camera.exit()
-print(json.dumps(reported))
-"""
-
-
-def initiator(server, home, *shutters):
-    """What libgphoto2 tells of one session with the server, with a picture for each shutter."""
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            INITIATOR,
-            f"ptpip:127.0.0.1:{server.port}:{server.port}",
-            *shutters,
-        ],
-        env=os.environ | {"HOME": str(home)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "sessions",
-    [
-        [(), ("0.0080s",), ("0.0333s",)],
-        [("0.0080s", "0.0333s"), (), ("0.0080s",)],
-    ],
-    ids=["summary first", "summary between"],
-)
-def test_libgphoto2_captures_and_downloads_from_our_camera_session_after_session(
-    tmp_path, sessions
-):
-    exposed_s = []
-
-    def see(exposure_s):
-        exposed_s.append(exposure_s)
-        return MOSAIC
-
-    camera = PtpCameraSimulator(see, SystemClock())
-    pictures = []
-    with PtpIpServer(camera) as server:
-        for shutters in sessions:
-            reported = initiator(server, tmp_path, *shutters)
-            assert "EMMC simulated camera" in reported["summary"]
-            assert len(reported["pictures"]) == len(shutters)
-            pictures += reported["pictures"]
-    stored = [
-        [info.name, len(data), hashlib.sha256(data).hexdigest()]
-        for info, data in camera.objects.values()
-        if info.format == Format.DNG
-    ]
-    assert pictures == stored
-    wanted_s = [float(shutter.rstrip("s")) for shutters in sessions for shutter in shutters]
-    assert exposed_s == pytest.approx(wanted_s)
-    for _, data in camera.objects.values():
-        if data:
-            np.testing.assert_array_equal(decode_raw(data).mosaic, MOSAIC)

@@ -13,7 +13,7 @@ import subprocess
 import numpy as np
 import pytest
 import tifffile
-from test_raw_frames import BLACK_DN, noise, rewritten
+from test_raw_frames import BLACK_DN, noise
 
 from drivers.dng import encode_dng
 from drivers.errors import RawFrameError
@@ -21,6 +21,29 @@ from drivers.raw import decode_raw
 
 LOSSLESS_JPEG = 7
 PANASONIC_BLOCK = 0x4000
+
+
+def rewritten(data, extratags):
+    """The same DNG written anew, with more tags."""
+    out = io.BytesIO()
+    own = (270, 271, 272, 274, 305, *range(33421, 60000))
+    with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        page = tiff.pages.first
+        tags = [
+            (tag.code, tag.dtype, tag.count, tag.value, True)
+            for tag in page.tags
+            if tag.code in own
+        ]
+        with tifffile.TiffWriter(out) as writer:
+            writer.write(
+                page.asarray(),
+                photometric=32803,
+                planarconfig=1,
+                metadata=None,
+                software=False,
+                extratags=[*tags, *extratags],
+            )
+    return out.getvalue()
 
 
 def lossless_jpeg(mosaic):

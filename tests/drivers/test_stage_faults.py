@@ -35,6 +35,13 @@ def in_memory(request, opened, tmp_path):  # noqa: F811
     return RIGS[request.param]("memory", opened, tmp_path)
 
 
+def homed(rig, **settings):
+    """A stage that was homed, and the name of its first axis."""
+    stage = rig.make_stage(**settings)
+    stage.home()
+    return stage, stage.axes[0]
+
+
 def test_an_axis_is_really_where_it_reads_to_be_from_either_side(simulated):
     stage = simulated.make_stage()
     stage.home()
@@ -48,9 +55,7 @@ def test_an_axis_is_really_where_it_reads_to_be_from_either_side(simulated):
 
 
 def test_without_the_approach_a_downward_move_is_off_by_the_backlash(simulated):
-    stage = simulated.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated, approach_um=0.0)
     target_um = middle_um(stage, axis)
     stage.move_to_um({axis: target_um + 2000.0})
     stage.move_to_um({axis: target_um})
@@ -58,9 +63,7 @@ def test_without_the_approach_a_downward_move_is_off_by_the_backlash(simulated):
 
 
 def test_a_move_takes_the_time_of_its_distance_and_speed(simulated):
-    stage = simulated.make_stage(approach_um=0.0, settle_s=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated, approach_um=0.0, settle_s=0.0)
     stage.set_speed_um_s(axis, 1000.0)
     stage.move_to_um({axis: middle_um(stage, axis)})
     start_s = simulated.clock.now_s()
@@ -82,9 +85,7 @@ def test_nothing_is_returned_while_the_stage_still_moves(simulated):
 def test_a_stop_from_elsewhere_ends_a_move_in_an_error_and_keeps_the_position(
     simulated, monkeypatch
 ):
-    stage = simulated.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated)
     start_um = stage.move_to_um({axis: middle_um(stage, axis)})[axis]
     sleep, stops = simulated.clock.sleep, []
 
@@ -158,9 +159,7 @@ def test_an_interrupt_during_homing_stops_it_and_leaves_the_axis_unknown(simulat
 
 @pytest.mark.parametrize("fault", [*REPLY_FAULTS, "drop_command"])
 def test_a_query_survives_a_message_that_goes_wrong(in_memory, fault):
-    stage = in_memory.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(in_memory)
     here_um = stage.move_to_um({axis: middle_um(stage, axis) for axis in stage.axes})[axis]
     in_memory.device.faults.inject(fault)
     assert stage.position_um(axis) == pytest.approx(here_um, abs=TOLERANCE_UM)
@@ -171,9 +170,7 @@ def test_a_query_survives_a_message_that_goes_wrong(in_memory, fault):
 
 @pytest.mark.parametrize("fault", REPLY_FAULTS)
 def test_a_move_whose_answers_go_wrong_is_sent_once_and_arrives(in_memory, fault):
-    stage = in_memory.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(in_memory, approach_um=0.0)
     target_um = middle_um(stage, axis)
     moves = count_moves(in_memory)
     in_memory.device.faults.inject(fault, when=in_memory.is_move)
@@ -187,9 +184,7 @@ def test_a_move_whose_answers_go_wrong_is_sent_once_and_arrives(in_memory, fault
 @pytest.mark.parametrize("fault", REPLY_FAULTS)
 @pytest.mark.parametrize("nth", [0, 1, 4])
 def test_one_bad_answer_while_it_moves_does_not_end_the_wait_early(in_memory, fault, nth):
-    stage = in_memory.make_stage(settle_s=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(in_memory, settle_s=0.0)
     target_um = middle_um(stage, axis)
     in_memory.device.faults.inject(
         fault, skip=nth, when=lambda occasion: not in_memory.is_move(occasion)
@@ -202,18 +197,14 @@ def test_one_bad_answer_while_it_moves_does_not_end_the_wait_early(in_memory, fa
 
 @pytest.mark.parametrize("fault", ["drop_reply", "garble_reply"])
 def test_a_lost_answer_on_any_wire_is_asked_for_again(simulated, fault):
-    stage = simulated.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated)
     here_um = stage.move_to_um({axis: middle_um(stage, axis)})[axis]
     simulated.device.faults.inject(fault)
     assert stage.position_um(axis) == pytest.approx(here_um, abs=TOLERANCE_UM)
 
 
 def test_a_move_that_never_reached_the_device_is_an_error_and_not_repeated(simulated):
-    stage = simulated.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated, approach_um=0.0)
     here_um = simulated.true_um(axis)
     moves = count_moves(simulated)
     simulated.device.faults.inject("drop_command", when=simulated.is_move)
@@ -225,9 +216,7 @@ def test_a_move_that_never_reached_the_device_is_an_error_and_not_repeated(simul
 
 
 def test_a_move_whose_bytes_were_lost_never_counts_as_arrived(simulated):
-    stage = simulated.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated, approach_um=0.0)
     target_um = middle_um(stage, axis) + 123.4
     simulated.device.faults.inject("lose_command_byte", when=simulated.is_move)
     with suppress(DriverError):
@@ -238,9 +227,7 @@ def test_a_move_whose_bytes_were_lost_never_counts_as_arrived(simulated):
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["drop_reply", "drop_command", "garble_reply"])
 def test_a_device_that_never_answers_well_is_an_error_within_its_time_limit(simulated, fault):
-    stage = simulated.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated)
     simulated.device.faults.inject(fault, times=math.inf)
     start_s = simulated.clock.now_s()
     with pytest.raises((TransportTimeoutError, GarbledReplyError)) as caught:
@@ -253,9 +240,7 @@ def test_a_device_that_never_answers_well_is_an_error_within_its_time_limit(simu
 
 
 def test_a_busy_flag_that_sticks_is_an_error_after_the_time_of_distance_and_speed(simulated):
-    stage = simulated.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated, approach_um=0.0)
     simulated.device.faults.inject("busy_forever")
     target_um = stage.position_um(axis) + (1000.0 if stage.limits_um(axis)[0] >= 0 else -1000.0)
     start_s = simulated.clock.now_s()
@@ -269,9 +254,7 @@ def test_a_busy_flag_that_sticks_is_an_error_after_the_time_of_distance_and_spee
 
 
 def test_a_stall_is_reported_where_it_can_be_felt_and_homing_puts_it_right(simulated):
-    stage = simulated.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated)
     target_um = middle_um(stage, axis)
     simulated.device.faults.inject("stall")
     if simulated.senses_stalls:
@@ -299,9 +282,7 @@ def test_a_stall_while_homing_leaves_the_axis_unknown(simulated):
 
 
 def test_silent_drift_is_invisible_to_the_counter_and_homing_puts_it_right(simulated):
-    stage = simulated.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated)
     target_um = middle_um(stage, axis)
     simulated.device.faults.inject("drift")
     read_um = stage.move_to_um({axis: target_um})[axis]
@@ -313,9 +294,7 @@ def test_silent_drift_is_invisible_to_the_counter_and_homing_puts_it_right(simul
 
 
 def test_power_lost_and_back_means_home_again(simulated):
-    stage = simulated.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated)
     stage.move_to_um({axis: middle_um(stage, axis)})
     simulated.device.power_cycle()
     with pytest.raises(DriverError, match="home it"):
@@ -328,9 +307,7 @@ def test_power_lost_and_back_means_home_again(simulated):
 
 
 def test_power_lost_during_a_move_is_not_success(simulated, monkeypatch):
-    stage = simulated.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated, approach_um=0.0)
     sleep, cycled = simulated.clock.sleep, []
 
     def sleep_and_lose_power(duration_s):
@@ -347,9 +324,7 @@ def test_power_lost_during_a_move_is_not_success(simulated, monkeypatch):
 
 @pytest.mark.parametrize("power_lost", [False, True])
 def test_unplugged_in_a_move_then_replugged_it_works_again_after_homing(simulated, power_lost):
-    stage = simulated.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated)
     stage.set_speed_um_s(axis, 1500.0)
     simulated.device.faults.inject("unplug", when=simulated.is_move)
     with pytest.raises(PortGoneError, match="plug it in, reconnect, then home") as caught:
@@ -412,18 +387,14 @@ def test_a_closed_stage_says_that_its_port_is_gone(simulated):
 
 
 def test_an_axis_that_begins_late_is_waited_for(in_memory):
-    stage = in_memory.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(in_memory, approach_um=0.0)
     target_um = middle_um(stage, axis)
     in_memory.device.faults.inject("slow_start")
     assert stage.move_to_um({axis: target_um})[axis] == pytest.approx(target_um, abs=1.0)
 
 
 def test_an_answer_that_came_late_is_not_left_for_the_next_question(in_memory):
-    stage = in_memory.make_stage()
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(in_memory)
     in_memory.device.faults.inject("late_reply", when=in_memory.is_question)
     stage.position_um(axis)
     in_memory.clock.sleep(2.0)
@@ -434,9 +405,7 @@ def test_an_answer_that_came_late_is_not_left_for_the_next_question(in_memory):
 
 
 def test_an_axis_that_has_not_begun_is_waited_for_only_so_long(simulated):
-    stage = simulated.make_stage(approach_um=0.0)
-    stage.home()
-    axis = stage.axes[0]
+    stage, axis = homed(simulated, approach_um=0.0)
     simulated.device.faults.inject("drop_command", when=simulated.is_move)
     start_s = simulated.clock.now_s()
     with pytest.raises(PositionMismatchError):

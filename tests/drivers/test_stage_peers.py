@@ -95,18 +95,6 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
 
 
 @pytest.mark.slow
-def test_zaber_motion_follows_moves_by_alerts():
-    with zaber_peer("pty") as (chain, devices):
-        devices[0].connection.enable_alerts()
-        for device in devices:
-            device.all_axes.home()
-        axis = devices[1].get_axis(1)
-        for target in (40_000, 10, 90_000):
-            axis.move_absolute(target)
-            assert chain.position_um(2, 1) == pytest.approx(target * QUICK.microstep_um, abs=3.1)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("wire", [PtyServer, TcpServer])
 def test_zaber_motion_finds_the_axis_where_its_last_session_left_it(wire):
     ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")

@@ -34,7 +34,8 @@ from drivers.errors import (
     UsbTransferError,
 )
 from drivers.transport import QUERY_ATTEMPTS
-from drivers.u3v import UNZIPPED_LIMIT, decode_frame, open_u3v
+from drivers.u3v import UNZIPPED_LIMIT, decode_frame
+from drivers.u3v import open_camera as open_u3v
 from drivers.u3v_codec import CONTROL
 from drivers.u3v_control import BUSY_LIMIT_S
 from drivers.u3v_stream import plan_sizes
@@ -63,8 +64,8 @@ class Bench:
         self.exposures.append(exposure_s)
         return self.mosaic
 
-    def open(self, **settings):
-        return open_u3v(backend=self.bus, clock=self.clock, **settings)
+    def open(self, serial=""):
+        return open_u3v(serial, self.clock, self.bus)
 
 
 @pytest.fixture
@@ -103,18 +104,8 @@ def test_sixteen_bits_reach_the_mosaic_whole():
     assert frame.white_level_dn == 65535
 
 
-def test_the_deepest_format_is_chosen_unless_one_is_named(bench):
-    camera = bench.open()
-    assert camera.pixel_format == "BayerRG12p"
-    camera.close()
-    assert bench.open(pixel_format="BayerRG10p").pixel_format == "BayerRG10p"
-
-
-def test_a_format_that_the_camera_lacks_is_refused_with_those_it_offers(bench):
-    with pytest.raises(CameraSettingError, match=r"offers BayerRG8, .*, not BayerRG16"):
-        bench.open(pixel_format="BayerRG16")
-    with pytest.raises(CameraSettingError, match="RGB8 is none that can be read here"):
-        bench.open(pixel_format="RGB8")
+def test_the_deepest_format_is_chosen(bench):
+    assert bench.open().pixel_format == "BayerRG12p"
 
 
 def test_opening_makes_an_automatic_triggered_camera_manual(bench):
@@ -282,10 +273,6 @@ def test_recorded_bytes_of_another_format_or_size_are_refused(bench):
     struct.pack_into("<II", original, 28, 0x010C0059, 60_000)
     with pytest.raises(RawFrameError, match="bytes are not the"):
         decode_frame(bytes(original))
-
-
-def test_a_black_level_may_be_given(bench):
-    assert bench.open(black_level_dn=12.5).snap().black_level_dn[0, 0] == 12.5
 
 
 SIZES = [(2, 2), (38, 46), (40, 48), (200, 514)]
@@ -706,7 +693,7 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
     clock = ManualClock()
     noisy = Noise(lambda exposure_s: mosaic, clock, mosaic.shape, zipped=False)
     bus = SimulatedUsb(clock, noisy)
-    opened = open_u3v(backend=bus, clock=clock)
+    opened = open_u3v("", clock, bus)
 
     @settings(max_examples=cases, deadline=None, database=None)
     @given(SEEDS)
@@ -722,7 +709,7 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
         try:
             if act == "open":
                 opened.close()
-                opened = open_u3v(backend=bus, clock=clock)
+                opened = open_u3v("", clock, bus)
             elif act == "set":
                 opened.set_exposure_s(0.01)
                 opened.set_gain(1.0)
@@ -748,7 +735,7 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
             # What was damaged may be what the driver remembers: a new start must cure it.
             opened.close()
             noisy.plugged()
-            opened = open_u3v(backend=bus, clock=clock)
+            opened = open_u3v("", clock, bus)
             np.testing.assert_array_equal(opened.snap().mosaic, mosaic)
 
     check()

@@ -305,11 +305,6 @@ def test_a_device_that_never_falls_silent_is_an_error(bus, echo):
         pipe.drain(most=1 << 20)
 
 
-def test_a_reset_starts_the_device_anew(bus, echo):
-    open_device(KIND, backend=bus).reset()
-    assert echo.powered == 2
-
-
 def test_a_closed_device_is_gone_and_may_be_closed_again(bus):
     device, pipe, _ = pipes(bus)
     device.close()

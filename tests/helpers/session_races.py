@@ -21,10 +21,10 @@ from emmc_rig.acquisition import command
 from emmc_rig.errors import AppError
 from emmc_rig.pages import session_sheet
 from emmc_rig.processing import session_calibration as calibrate_session
-from emmc_rig.session import export, prune
+from emmc_rig.session import export
 from emmc_rig.session.board_sets import whiteboards
 
-LOADED_BEFORE = (session_sheet, export, prune)
+LOADED_BEFORE = (session_sheet, export)
 FAILED = 99
 
 

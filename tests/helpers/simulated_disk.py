@@ -18,6 +18,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from emmc_rig.session.storage import Disk, OpenFile
+
 
 class PowerCutError(BaseException):
     """The power went; no program can catch that, so this is no `Exception`."""
@@ -58,8 +60,8 @@ def _apply(entries: dict[str, _File | _Folder], names: dict[str, _File | _Folder
             entries[name] = node
 
 
-class SimulatedDisk:
-    """An `emmc_rig.session.storage.Disk`.
+class SimulatedDisk(Disk):
+    """A `Disk` in memory.
 
     before: called with number and name of every operation that writes, before it; what it raises
     is what the operation raises. capacity_bytes: more than that gives `ENOSPC`, half written.
@@ -189,7 +191,7 @@ class SimulatedDisk:
         return node
 
 
-class _Writer:
+class _Writer(OpenFile):
     """A file open for writing."""
 
     def __init__(self, disk: SimulatedDisk, file: _File) -> None:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from programs import exit_code
+from pydantic import ValidationError
 
 from drivers.camera import CameraIdentity
 from drivers.errors import (
@@ -58,7 +59,7 @@ def frame_of(mosaic, cfa="rggb"):
 @pytest.mark.parametrize("cfa", ["rggb", "bggr", "grbg", "gbrg"])
 def test_a_red_scene_is_shown_red_whatever_the_colour_phase(cfa):
     tile = np.array([3000.0 if letter == "r" else BLACK for letter in cfa]).reshape(2, 2)
-    shown = picture(frame_of(np.tile(tile, (16, 16)), cfa), View(longest_px=32))
+    shown = picture(frame_of(np.tile(tile, (16, 16)), cfa), View(px=32))
     blue, green, red = shown[8:-8, 8:-8].reshape(-1, 3).mean(axis=0)
     assert red > 200
     assert max(blue, green) < 10
@@ -69,17 +70,17 @@ def test_one_saturated_pixel_of_a_large_frame_is_seen():
     mosaic = np.full((1200, 1600), 1000)
     mosaic[601, 801] = WHITE
     mosaic[3, 5] = 0
-    shown = picture(frame_of(mosaic), View(kind="mosaic", longest_px=200))
+    shown = picture(frame_of(mosaic), View(kind="mosaic", px=200))
     assert (shown == SATURATED_BGR).all(axis=2).sum() in (1, 2, 4)
     assert (shown == CLIPPED_BGR).all(axis=2).sum() in (1, 2, 4)
-    plain = picture(frame_of(mosaic), View(kind="mosaic", longest_px=200, marked=False))
+    plain = picture(frame_of(mosaic), View(kind="mosaic", px=200, marked=False))
     assert not (plain == SATURATED_BGR).all(axis=2).any()
 
 
 def test_a_zoomed_view_shows_its_part_pixel_by_pixel():
     mosaic = np.full((64, 64), BLACK)
     mosaic[40:44, 20:24] = WHITE - 1
-    view = View(kind="mosaic", x=22 / 64, y=42 / 64, part=1 / 16, longest_px=64)
+    view = View(kind="mosaic", x=22 / 64, y=42 / 64, part=1 / 16, px=64)
     assert window(view, (64, 64)) == (slice(40, 44), slice(20, 24))
     shown = picture(frame_of(mosaic), view)
     assert shown.shape == (64, 64, 3)
@@ -91,7 +92,7 @@ def test_a_dark_view_is_brightened_until_its_brightest_part_is_white():
     mosaic = np.full((64, 64), BLACK)
     mosaic[:, 32:] = BLACK + 40
     dark, bright = (
-        picture(frame_of(mosaic), View(kind="mosaic", longest_px=64, bright=chosen))
+        picture(frame_of(mosaic), View(kind="mosaic", px=64, bright=chosen))
         for chosen in (False, True)
     )
     assert dark[:, 40:].max() < 40
@@ -107,10 +108,10 @@ def test_views_stay_inside_the_frame_and_refuse_nonsense():
         {"x": float("nan")},
         {"part": 0.0},
         {"part": 3.0},
-        {"longest_px": 10**6},
+        {"px": 10**6},
     )
     for wrong in wrongs:
-        with pytest.raises(AppError):
+        with pytest.raises(ValidationError):
             View(**wrong)
 
 
@@ -566,6 +567,7 @@ def served(watch, **options):
         return answer.status, answer.headers, data
 
     with serving(application(SetupPage(watch), TOKEN, **options)) as port:
+        ask.port = port
         yield ask
 
 
@@ -646,7 +648,7 @@ def test_read_only_shows_and_does_nothing():
     assert camera.exposure_s == 0.01
 
 
-def test_a_stop_is_carried_out_while_a_hundred_requests_wait_for_news():
+def test_a_stop_is_carried_out_while_a_hundred_pages_follow():
     stage, camera = SlowStage(), FakeCamera()
     with watching(camera, stage) as watch, served(watch) as ask:
         until(watch, lambda state: state["frame"])
@@ -654,17 +656,52 @@ def test_a_stop_is_carried_out_while_a_hundred_requests_wait_for_news():
         until(watch, lambda state: "no news" in state["trouble"]["camera"])
         watch.jog("mask_x", 1.0)
         assert stage.moving.wait(PATIENCE_S)
-        waiting = [
-            threading.Thread(target=ask, args=("GET", f"/{TOKEN}/state?after={10**9}"), daemon=True)
+        pages = [
+            threading.Thread(target=ask, args=("GET", f"/{TOKEN}/events"), daemon=True)
             for _ in range(100)
         ]
-        for one in waiting:
+        for one in pages:
             one.start()
         assert ask("POST", f"/{TOKEN}/do/stop", "{}")[0] == 200
         assert stage.stops
-        assert any(one.is_alive() for one in waiting)
-        for one in waiting:
-            one.join(PATIENCE_S)
+        assert all(one.is_alive() for one in pages)
+    for one in pages:
+        one.join(PATIENCE_S)
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [
+        ("http://127.0.0.1:{port}", 200),
+        ("https://127.0.0.1:{port}", 403),
+        ("ftp://127.0.0.1:{port}", 403),
+        ("http://127.0.0.1:1{port}", 403),
+        ("http://localhost:{port}", 403),
+        ("127.0.0.1:{port}", 403),
+        ("null", 403),
+    ],
+)
+def test_only_the_page_itself_by_scheme_host_and_port_may_act(origin, status):
+    with watching(FakeCamera()) as watch, served(watch) as ask:
+        given = {"Origin": origin.format(port=ask.port)}
+        body = json.dumps({"seconds": 0.05})
+        assert ask("POST", f"/{TOKEN}/do/exposure", body, given)[0] == status
+
+
+def test_who_goes_in_the_middle_of_a_request_leaves_no_traceback(capfd):
+    with watching(FakeCamera()) as watch, served(watch) as ask:
+        for half in (
+            b"",
+            b"GET /secret/st",
+            b"POST /secret/do/exposure HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99\r\n"
+            b"Content-Type: application/json\r\n\r\n{",
+            b"GET /secret/page.css HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET /secret/page.js HTT",
+        ):
+            with socket.create_connection(("127.0.0.1", ask.port), PATIENCE_S) as link:
+                link.sendall(half)
+                ask("GET", f"/{TOKEN}/state")
+        ask("GET", f"/{TOKEN}/state")
+    assert capfd.readouterr().err == ""
 
 
 def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
@@ -683,7 +720,7 @@ def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
         for _ in range(5):
             assert ask("GET", f"/{TOKEN}/picture.jpg?px=64")[0] == 200
         assert ask("GET", f"/{TOKEN}/picture.jpg?px=32")[0] == 200
-    assert [view.longest_px for view in made] == [64, 32]
+    assert [view.px for view in made] == [64, 32]
 
 
 def test_there_are_no_views_without_a_light_field():

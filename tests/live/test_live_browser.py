@@ -10,8 +10,7 @@ from emmc_rig.acquisition.control import Control
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.live.light_field import LiveLightField
-from emmc_rig.live.scale import designed_scale
+from emmc_rig.live.light_field import LiveLightField, designed_scale
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
 from emmc_rig.live.setup_page import SetupPage

@@ -10,9 +10,7 @@ from test_live_alignment import frame_of
 import emmc_rig as emmc
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
-from emmc_rig.live.field_pictures import disparity_of
-from emmc_rig.live.light_field import LiveLightField
-from emmc_rig.live.scale import designed_scale, open_scale
+from emmc_rig.live.light_field import LiveLightField, designed_scale, disparity_of, open_scale
 from emmc_rig.model.lightfield import psnr_db, shifted
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError

@@ -73,8 +73,8 @@ def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_wh
     )
     session, outcome = page.run(plan)
     assert outcome.complete
-    lines = [e for e in session.journal.entries if e.get("id") == "shot-1-e0-r0"]
-    assert [one["kind"] for one in lines] == ["frame", "discarded", "frame"]
+    lines = [e for e in session.journal.entries if getattr(e, "id", "") == "shot-1-e0-r0"]
+    assert [one.kind for one in lines] == ["frame", "discarded", "frame"]
     assert page.reasons == [ALL_TAKEN, ALL_TAKEN]
     state = page.state()
     assert state["done"] == state["planned"] == len(session.needed)
@@ -90,8 +90,8 @@ def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan
     assert set(shown) == set(session.stored)
     assert all(one["stored"] for one in state["frames"])
     entry = session.stored["shot-1-e0-r0"]
-    span = entry["white_level_dn"] - np.mean(entry["black_level_dn"])
-    assert shown["shot-1-e0-r0"]["level"] == pytest.approx(entry["figures"]["bright_dn"] / span)
+    span = entry.white_level_dn - np.mean(entry.black_level_dn)
+    assert shown["shot-1-e0-r0"]["level"] == pytest.approx(entry.figures.bright_dn / span)
     assert state["verdict"]["level"] == "doubt"
     assert state["end"]["complete"]
     for name in ("shot-0-e0-r0", "shot-1-e0-r0"):

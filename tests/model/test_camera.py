@@ -76,12 +76,6 @@ def test_a_valid_description_is_read(tmp_path):
     assert Camera.model_validate_json(camera.model_dump_json()) == camera
 
 
-def test_a_description_cannot_be_changed_once_read():
-    camera = Camera.model_validate(VALID)
-    with pytest.raises(ValueError, match="frozen"):
-        camera.title = "other"  # type: ignore[misc]
-
-
 @pytest.mark.parametrize(
     ("path", "key", "near"),
     [
@@ -119,32 +113,22 @@ def test_a_key_of_another_pattern_is_not_offered(tmp_path):
     ("path", "value", "complaint"),
     [
         (("lens", "distance_mm"), float("nan"), "lens.distance_mm: input should be a finite"),
-        (("lens", "distance_mm"), float("inf"), "lens.distance_mm: input should be a finite"),
-        (("masks", "near", "cell_um"), float("nan"), "masks.near.cell_um: input should be a"),
         (("shots", 0, "offset_um", "near"), [float("nan"), 0], "finite"),
         (("lens", "distance_mm"), 0, "greater than 0"),
         (("lens", "distance_mm"), "far", "lens.distance_mm: input should be a number"),
-        (("lens", "aperture_fill"), 1.5, "less than or equal to 1"),
         (("masks", "near", "distance_mm"), -1, "masks.near.distance_mm: input should be greater"),
-        (("masks", "near", "cell_um"), 0, "greater than 0"),
         (("masks",), [1, 2], "masks: input should be a mapping"),
-        (("views",), [3], "views"),
         (("views",), [0, 3], "'views' needs at least one row and one column"),
         (("views",), [2.5, 3], "views.0: input should be a whole number"),
         (("shots",), [], "at least 1 item"),
         (("shots", 0, "filter"), "violet", "shots.0.filter: input should be 'none', 'red'"),
-        (("shots", 1, "exposure_s"), 0, "greater than 0"),
-        (("total_exposure_s",), -0.1, "greater than 0"),
         (("sensor", "cfa"), "rgbx", "sensor: unknown CFA 'rgbx': use one of mono, rggb"),
         (("sensor", "cfa"), ["RG", "B"], "sensor: CFA tile"),
-        (("sensor", "binning"), 0, "greater than or equal to 1"),
         (("sensor", "noise", "black_level_dn"), 65535, "black_level_dn must be below"),
         (("masks", "near", "pattern"), {"kind": "lace"}, "'open'"),
-        (("masks", "near", "pattern"), {}, "kind"),
         (("masks", "near", "pattern"), {"kind": "mura", "prime": 9}, "9 is not prime"),
         (("masks", "near", "pattern"), {"kind": "tile", "cells": [[2]]}, "must lie in [0, 1]"),
         (("masks", "near", "pattern"), {"kind": "tile", "cells": [[{}]]}, "not numbers"),
-        (("masks", "near", "pattern", "open_probability"), 0, "greater than 0"),
     ],
 )
 def test_a_value_that_cannot_be_is_refused(tmp_path, path, value, complaint):

@@ -4,11 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from emmc_rig.model.lightfield import centre_view, refocus
+from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import (
     between,
     estimated_disparity,
-    photograph,
     view_disparities,
 )
 
@@ -101,19 +100,3 @@ def test_a_plane_s_disparity_is_estimated():
         np.float32,
     )
     assert np.median(np.abs(estimated_disparity(light_field) - 0.8)) < 0.1
-
-
-def test_a_full_aperture_is_the_mean_of_the_sheared_views(scene):
-    light_field, disparities = scene
-    opened = photograph(light_field, disparities, 2, 2, 2.0, aperture=10)
-    np.testing.assert_allclose(opened[INNER], refocus(light_field, 2.0)[INNER], atol=1e-5)
-
-
-def test_a_closed_aperture_is_a_view_and_light_not_codes_is_averaged(scene):
-    light_field, disparities = scene
-    pinhole = photograph(light_field, disparities, 1.5, 2, 0.0, aperture=0, gamma=2.2)
-    np.testing.assert_array_equal(pinhole, between(light_field, disparities, 1.5, 2))
-    flat = np.zeros((*VIEWS, 4, 4, 3), np.float32)
-    flat[0] = 1
-    mixed = photograph(flat, np.zeros((*VIEWS, 4, 4), np.float32), 2, 2, 0.0, 10, gamma=2.0)
-    np.testing.assert_allclose(mixed, np.sqrt(1 / 5), rtol=1e-5)

@@ -63,14 +63,18 @@ def test_without_parallax_names_are_believed(truth: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("order", WRONG)
-def test_a_folder_in_another_order_is_put_right(
+def test_a_folder_in_another_order_is_told_and_put_right_by_its_option(
     tmp_path: Path, truth: np.ndarray, order: ViewOrder
 ) -> None:
     stored = order.named(truth)
     save_views(tmp_path / "views", stored)
     with pytest.warns(ViewOrderWarning, match=order.words):
-        scene = emmc.scene(str(tmp_path / "views"))
-    assert order.words in scene.provenance
+        as_named = emmc.scene(str(tmp_path / "views"))
+    assert np.abs(as_named.light_field - stored).max() <= 0.5 / 255 + 1e-6
+    scene = emmc.scene(f"{tmp_path / 'views'}@by-parallax")
+    assert scene.name == "views"
+    for one in (as_named, scene):
+        assert order.words in one.provenance
     assert np.abs(scene.light_field - truth).max() <= 0.5 / 255 + 1e-6
     assert np.abs(load_views(tmp_path / "views") - stored).max() <= 0.5 / 255 + 1e-6
 
@@ -80,8 +84,7 @@ def test_files_named_column_by_column_are_put_right(tmp_path: Path, truth: np.nd
     for row, column in np.ndindex(5, 5):
         codes = np.round(255 * truth[row, column, ..., ::-1]).astype(np.uint8)
         cv2.imwrite(str(tmp_path / f"view_{column}_{row}.png"), codes)
-    with pytest.warns(ViewOrderWarning, match="interchanged"):
-        scene = emmc.scene(str(tmp_path))
+    scene = emmc.scene(f"{tmp_path}@by-parallax")
     assert np.abs(scene.light_field - truth).max() <= 0.5 / 255 + 1e-6
 
 
@@ -98,7 +101,7 @@ def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def test_real_views_move_along_their_rows_by_optical_flow() -> None:
     folders = [one for one in Path(os.environ["EMMC_LIGHTFIELDS"]).iterdir() if one.is_dir()]
     for folder in folders:
-        lf = emmc.scene(str(folder), views=(5, 5)).light_field
+        lf = emmc.scene(f"{folder}@by-parallax", views=(5, 5)).light_field
         along_row, along_column = _flow(lf[2, 2], lf[2, 4]), _flow(lf[2, 2], lf[4, 2])
         within = np.square(along_row[0]) + np.square(along_column[1])
         across = np.square(along_row[1]) + np.square(along_column[0])
@@ -112,7 +115,8 @@ def test_a_file_in_order_is_left_alone(tmp_path: Path, truth: np.ndarray) -> Non
         file["light_field"] = truth
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert np.array_equal(emmc.scene(str(tmp_path / "scene.h5")).light_field, truth)
+        for spec in (tmp_path / "scene.h5", f"{tmp_path / 'scene.h5'}@by-parallax"):
+            assert np.array_equal(emmc.scene(spec).light_field, truth)
 
 
 def test_commands_say_it_in_a_line(tmp_path: Path, truth: np.ndarray) -> None:
@@ -123,3 +127,6 @@ def test_commands_say_it_in_a_line(tmp_path: Path, truth: np.ndarray) -> None:
     said = [line for line in errors.splitlines() if ViewOrder.TRANSPOSED.words in line]
     assert len(said) == 1
     assert said[0].startswith("note:")
+    assert f"open it as {scene}@by-parallax" in " ".join(errors.split()).replace("- ", "-")
+    code, _, errors = program("simulate", "--scene", f"{scene}@by-parallax", "--out", out)
+    assert (code, ViewOrder.TRANSPOSED.words in errors) == (0, False)

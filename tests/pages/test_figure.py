@@ -12,7 +12,7 @@ from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.pages.paper_figure import FRAMES, CloseUp, Row, Tile, draw_tiles
-from emmc_rig.pages.pictures import Piece
+from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
 from emmc_rig.pages.result_figure import FigureSettings, draw_results
 
 SIZE = (36, 48)
@@ -136,3 +136,18 @@ def test_a_place_that_is_no_place_is_wrong_usage(tmp_path, typed):
     code, _, complaint = program("figure", "near-planar", *typed, "--out", tmp_path / "out")
     assert code == 2, complaint
     assert not (tmp_path / "out").exists()
+
+
+def test_the_most_telling_piece_is_where_the_texture_is():
+    picture = np.full((60, 80, 3), 0.5, np.float32)
+    picture[30:42, 50:62] = np.random.default_rng(0).random((12, 12, 3))
+    (piece,) = detailed_pieces(picture, 16)
+    assert 26 <= piece.y <= 32
+    assert 46 <= piece.x <= 52
+
+
+def test_epipolar_lines_are_taken_where_views_differ():
+    lf = np.zeros((5, 5, 20, 30, 3), np.float32)
+    lf[:, -1, 11] = 1
+    lf[-1, :, :, 17] += 0.5
+    assert epipolar_lines(lf) == (11, 17)

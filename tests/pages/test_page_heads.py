@@ -27,7 +27,7 @@ def head_of(page):
 @pytest.mark.parametrize(
     "page",
     [
-        lambda: tables_page([], [], [], {}),
+        lambda: tables_page([], {}, [], {}),
         lambda: chart_page(NOT_ASKED, [], {}, {}),
         lambda: stability_page([], [], NOT_ASKED, []),
     ],

@@ -11,7 +11,7 @@ from browsers import MARKS, complaints, open_browser
 
 from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
-from emmc_rig.model.novel_view import between, photograph
+from emmc_rig.model.novel_view import between, sampled
 from emmc_rig.pages.viewer import render_viewer
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
@@ -42,7 +42,6 @@ def written(tmp_path_factory):
         truth=scene.light_field,
         disparity=scene.disparity_px,
         sigma=np.full(scene.light_field.shape[:4], 0.03, np.float32),
-        model=rng.integers(0, 5, scene.size),
         misfit=np.ones(scene.size, np.float32),
     )
     path.write_text(render_viewer(content, lossless=True), encoding="utf-8")
@@ -114,6 +113,30 @@ def test_a_view_between_views_is_that_of_numpy(page, twin, v, u):
     assert np.abs(shown(page, v=v, u=u, aperture=0) - expected).max() <= 1
 
 
+def photograph(light_field, disparities, v, u, focus_px, aperture, gamma):
+    """Return the picture (y, x, c) through an aperture around a position, focused on a disparity.
+
+    Ng et al. 2005, eq. 5, over the views that the aperture lets through: those nearer than its
+    radius, in view steps, and partly those less than a step further. Light is averaged, not codes.
+    """
+    y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
+    total = np.zeros(light_field.shape[2:], np.float32)
+    weights = max(0.0, 1.0 - aperture)
+    if weights:
+        pinhole = between(light_field, disparities, v, u)
+        total += np.float32(weights) * np.maximum(pinhole, 0) ** np.float32(gamma)
+    for j, i in np.ndindex(light_field.shape[:2]):
+        weight = min(max(aperture - float(np.hypot(j - v, i - u)), 0.0), 1.0)
+        if weight:
+            shift = np.float32(focus_px)
+            seen = sampled(
+                light_field[j, i], y + shift * np.float32(j - v), x + shift * np.float32(i - u)
+            )
+            total += np.float32(weight) * np.maximum(seen, 0) ** np.float32(gamma)
+            weights += weight
+    return (total / np.float32(weights)) ** np.float32(1 / gamma)
+
+
 @pytest.mark.parametrize(("focus", "aperture"), [(-1.0, 6.0), (0.7, 6.0), (0.25, 2.5), (0.0, 0.6)])
 def test_a_refocused_picture_is_that_of_numpy(page, twin, focus, aperture):
     estimate, _, disparities, gamma = twin
@@ -168,13 +191,12 @@ def test_keys_reach_everything(page):
 
 def test_every_overlay_changes_the_picture_and_is_read_under_the_pointer(page):
     bare = shown(page, overlay=-1)
-    for number in "1234":
+    for number in "123":
         page.find_element(By.ID, "viewer-picture").send_keys(number)
         assert np.abs(shown(page) - bare).mean() > 5
     for word in (
         "disparity",
         "standard deviation 0.03",
-        "model of each place: ",
         "readings missed",
     ):
         assert word in state(page)

@@ -25,7 +25,7 @@ from usbfs import mock  # noqa: E402
 from drivers.clock import SYSTEM_CLOCK  # noqa: E402
 from drivers.genapi import Features  # noqa: E402
 from drivers.pixel_formats import BY_CODE, unpack  # noqa: E402
-from drivers.u3v import open_u3v  # noqa: E402
+from drivers.u3v import open_camera  # noqa: E402
 from drivers.u3v_codec import CONTROL  # noqa: E402
 from drivers.usb import list_devices  # noqa: E402
 from simulators.u3v import U3vCameraSimulator  # noqa: E402
@@ -112,7 +112,7 @@ def with_driver():
     listings = list_devices(CONTROL)
     frames = []
     for _ in range(SESSIONS):
-        camera = open_u3v("U1")
+        camera = open_camera("U1", SYSTEM_CLOCK)
         camera.set_exposure_s(0.005)
         frames += [camera.snap(), *itertools.islice(camera.stream(), FRAMES)]
         camera.close()

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import yaml
 from programs import exit_code
+from simulated_calibration import CalibrateSettings, rig_to_calibrate, true_psi
 
 from emmc_rig.acquisition.plan import load_plan
 from emmc_rig.bench.hardware import NO_FLAWS
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.calibration_settings import CalibrateSettings
-from emmc_rig.processing.simulated import rig_to_calibrate, true_psi
 from emmc_rig.session.frame_means import camera_of
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import Session
@@ -156,6 +155,8 @@ def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, caps
     capsys.readouterr()
     assert exit_code("calibrate", out, "--route", "mixed") == 0
     assert capsys.readouterr().out.count("not measured") == 4
+    assert exit_code("calibrate", out, "--route", "best") == 1
+    assert "use one of auto, parametric, mixed, free" in capsys.readouterr().err.replace("\n", " ")
     assert exit_code("calibrate", out, "--sensor", "--out", tmp_path / "sheet") == 1
     assert "two references at each of four (it has" in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "sheet").exists()

@@ -28,7 +28,7 @@ from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.stability_run import run_stability
 from emmc_rig.study.stability.stability_study import stability_settings
 from reconstruction.methods import BlockSettings, MethodSettings
-from reconstruction.tiles import Grid, Survey
+from reconstruction.tiles import CaptureSurvey, Grid
 from reconstruction.tv import TVSettings
 
 pytestmark = pytest.mark.timing("workers that answer late are taken for lost")
@@ -94,9 +94,7 @@ def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_shares_the_trials_of_a_sweep(cluster, tmp_path, monkeypatch):
-    chosen = stability_settings(
-        True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",), screening="off"
-    )
+    chosen = stability_settings(True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",))
     monkeypatch.setattr(stability_run, "_write", lambda *_: None)
     ran = [
         run_stability(chosen, tmp_path / name, Silent(), cluster=address).curves
@@ -135,14 +133,14 @@ def test_a_full_disk_on_one_worker_is_one_line_and_the_same_command_goes_on(
         "reconstruct", frames, "--method", "tv", "--settings", settings, "--out", tmp_path / "out",
         "--cluster", cluster.scheduler_address,
     )  # fmt: skip
-    written, first = block_tasks._write_arrays, threading.Lock()
+    written, first = block_tasks._write, threading.Lock()
 
-    def write_arrays(path, arrays):
+    def write_arrays(path, arrays, about):
         if path.name.startswith("block-") and first.acquire(blocking=False):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return written(path, arrays)
+        return written(path, arrays, about)
 
-    monkeypatch.setattr(block_tasks, "_write_arrays", write_arrays)
+    monkeypatch.setattr(block_tasks, "_write", write_arrays)
     code, _, err = program(*given)
     assert (code, "No space left" in err, "Traceback" in err) == (1, True, False), err
     assert not (tmp_path / "out/light_field.h5").exists()
@@ -188,5 +186,7 @@ def test_arrays_do_not_travel_with_the_tasks():
     """A task is names and numbers: what 64 workers ask a scheduler for stays small."""
     job = BlockJob(Path("/kept"), Path("/psi.h5"), "adaptive", None, SETTINGS, 0.01, "0" * 64)
     block = Grid((8000, 6000), 2, 40, MethodSettings().blocks).block(3, 4)
-    assert len(pickle.dumps(BlockTask(job, Survey.of_one_block(SETTINGS, 3), block))) < 10_000
+    assert (
+        len(pickle.dumps(BlockTask(job, CaptureSurvey.of_one_block(SETTINGS, 3), block))) < 10_000
+    )
     assert np.prod([part.stop - part.start for part in block.outer]) > 10**5

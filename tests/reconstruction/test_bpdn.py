@@ -74,17 +74,6 @@ def test_the_gap_bounds_the_distance_from_the_least_objective(method):
         assert value - least <= (code.gap + 1e-6) * value
 
 
-def test_lars_ends_where_every_used_atom_correlates_with_the_residual_by_the_penalty():
-    atoms, data, _ = problem(300, 45, noise=0.3)
-    eta = 0.1 * np.abs(atoms @ data).max()
-    weights = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=eta)).weights
-    pull = atoms @ (data - weights.astype(float) @ atoms)
-    used = weights != 0
-    assert 1 < used.sum() <= 45
-    np.testing.assert_allclose(pull[used], eta * np.sign(weights[used]), rtol=1e-4)
-    assert np.abs(pull[~used]).max() <= eta * (1 + 1e-5)
-
-
 def test_atoms_leave_the_lasso_path_again():
     """Correlated atoms change sign along the path; the end must be the minimiser all the same."""
     rng = np.random.default_rng(3)
@@ -226,26 +215,6 @@ def test_the_inverse_is_that_of_the_gram_matrix_with_its_ridge(count):
     np.testing.assert_allclose(ridge_inverse(atoms, 0.7), expected, atol=1e-5)
     with pytest.raises(np.linalg.LinAlgError):
         ridge_inverse(np.zeros((5, 20), np.float32), 0.0)
-
-
-@pytest.mark.slow
-def test_matching_pursuit_agrees_with_scikit_learn():
-    linear_model = pytest.importorskip("sklearn.linear_model", exc_type=ImportError)
-    atoms, data, _ = problem(300, 45, sparsity=12)
-    atoms /= np.linalg.norm(atoms, axis=1, keepdims=True)
-    theirs = linear_model.orthogonal_mp(atoms.T, data, n_nonzero_coefs=8)
-    ours = solve_bpdn(atoms, data, settings=BPDNSettings(method="omp", atoms=8)).weights
-    np.testing.assert_allclose(ours, theirs, atol=2e-5)
-
-
-def test_lars_agrees_with_scikit_learn():
-    linear_model = pytest.importorskip("sklearn.linear_model", exc_type=ImportError)
-    atoms, data, _ = problem(300, 45, noise=0.3)
-    eta = 0.05 * np.abs(atoms @ data).max()
-    model = linear_model.LassoLars(alpha=eta / data.size, fit_intercept=False)
-    theirs = model.fit(atoms.T, data).coef_
-    ours = solve_bpdn(atoms, data, settings=BPDNSettings(method="lars", penalty=eta)).weights
-    np.testing.assert_allclose(ours, theirs, atol=2e-4)
 
 
 def plain_admm(atoms, data, eta, rho, steps):

@@ -78,29 +78,13 @@ def test_unknown_kinds_are_refused_with_the_known_ones(some):
     assert {Dictionary(some.atoms, kind).kind for kind in KINDS} == set(KINDS)
 
 
-def test_a_fitting_dictionary_is_passed_on(some):
-    assert some.checked(VIEWS, PATCH, 3) is some
-
-
-@pytest.mark.parametrize(
-    ("views", "patch", "colours", "reported"),
-    [
-        ((2, 3), PATCH, 3, "3x2 views, not 2x3"),
-        (VIEWS, (5, 5), 3, "4x5 pixels, not 5x5"),
-        (VIEWS, PATCH, 1, "3 colour(s), not 1"),
-    ],
-)
-def test_a_dictionary_of_other_patches_names_what_differs(some, views, patch, colours, reported):
-    with pytest.raises(ReconstructionError) as fault:
-        some.checked(views, patch, colours)
-    assert reported in str(fault.value)
-    assert str(fault.value).count("not") == 1
-    assert "train" in str(fault.value)
-
-
-def test_everything_that_differs_is_named_at_once(some):
-    with pytest.raises(DictionaryError, match=r"views.*pixels.*colour"):
-        some.checked((9, 9), (8, 8), 4)
+def test_a_dictionary_of_other_views_or_colours_is_refused(some):
+    some.check_views(VIEWS)
+    with pytest.raises(ReconstructionError, match=r"3x2 views of 3 .*not 2x3 of 3: train"):
+        some.check_views((2, 3))
+    grey = Dictionary.normalised(random_atoms(shape=(*SHAPE[:4], 1)), "ksvd")
+    with pytest.raises(DictionaryError, match=r"3x2 views of 1 colour\(s\)"):
+        grey.check_views(VIEWS)
 
 
 def test_a_file_gives_back_the_same_dictionary(some, tmp_path):
@@ -190,19 +174,6 @@ def test_the_default_cosines_are_orthonormal_and_hold_the_flat_patches():
         np.testing.assert_allclose(matrix.T @ (matrix @ flat), flat, atol=1e-5)
 
 
-def test_more_cosines_than_samples_are_an_overcomplete_set():
-    plain = dct_dictionary(VIEWS, PATCH, (3, 2, 4, 5), colours=1)
-    more = dct_dictionary(VIEWS, PATCH, (3, 2, 8, 5), colours=1)
-    assert (plain.size, more.size) == (120, 240)
-    y = np.arange(4) + 0.5
-    second = np.cos(np.pi * y / 8)
-    np.testing.assert_allclose(
-        more.atoms.reshape(3, 2, 8, 5, *more.patch_shape)[0, 0, 1, 0, 0, 0, :, 0, 0],
-        second / np.linalg.norm(second) / np.sqrt(3 * 2 * 5),
-        rtol=1e-5,
-    )
-
-
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
@@ -215,12 +186,6 @@ def test_more_cosines_than_samples_are_an_overcomplete_set():
 def test_cosines_of_nothing_are_refused(arguments, reported):
     with pytest.raises(DictionaryError, match=reported):
         dct_dictionary(*arguments)
-
-
-@pytest.mark.parametrize("make", [dct_dictionary, lambertian_dictionary])
-def test_two_colours_are_refused(make):
-    with pytest.raises(DictionaryError, match="2 colours"):
-        make((3, 3), (6, 6), colours=2)
 
 
 @pytest.mark.parametrize("disparity", [-1, 0, 1, 2])
@@ -266,8 +231,8 @@ def test_no_two_lambertian_atoms_are_nearly_the_same():
 
 
 def test_more_disparities_hold_fewer_ones_luminance_atoms():
-    few = lambertian_dictionary((3, 3), (6, 6), [0, 1], colours=1).matrix
-    many = lambertian_dictionary((3, 3), (6, 6), [-1, 0, 0.5, 1], colours=1).matrix
+    few = lambertian_dictionary((3, 3), (6, 6), [0, 1]).matrix
+    many = lambertian_dictionary((3, 3), (6, 6), [-1, 0, 0.5, 1]).matrix
     assert (np.abs(few @ many.T).max(axis=1) > 0.99).all()
 
 
@@ -282,7 +247,7 @@ def test_planes_are_one_pixel_apart_in_the_outermost_view():
 @pytest.mark.parametrize(("views", "patch"), [((2, 2), (4, 6)), ((7, 7), (8, 8)), ((9, 9), (3, 3))])
 def test_the_defaults_fit_any_views_and_patch(views, patch):
     for make in (dct_dictionary, lambertian_dictionary):
-        assert make(views, patch).checked(views, patch, 3).size > 3
+        assert make(views, patch).patch_shape == (*views, *patch, 3)
 
 
 @pytest.mark.parametrize("disparities", [[], [np.nan], [0, np.inf], [5]])

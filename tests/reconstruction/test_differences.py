@@ -6,8 +6,9 @@ from math import comb, factorial
 import numba
 import numpy as np
 import pytest
-from full_splitting import AXIS, adjoint, gradient, variation
+from variation import AXIS, adjoint, gradient, variation
 
+from emmc_rig.model.camera import Camera, build_imaging_matrix
 from reconstruction import kernels
 from reconstruction.differences import (
     fitting_indices,
@@ -183,8 +184,8 @@ def swept(psi, usable, frames, light_field, dual, order, bands, pull=None, count
     kind = np.float32
     weight = np.zeros(psi.size) if pull is None else pull[0]
     pixels = weight[:: psi.binning, :: psi.binning]
-    inverse = psi.solver(np.where(usable, 1 / gamma + pixels, np.inf)).inverse
-    data = kernels.Data(psi.weights, psi.colour_map, inverse, frames, psi.binning)
+    inverse = psi.inverted_blocks(np.where(usable, 1 / gamma + pixels, np.inf))
+    data = kernels.FrameFit(psi.weights, psi.colour_map, inverse, frames, psi.binning)
     if pull is not None:
         share = 1 / (1 + gamma * weight)
         pulled = np.swapaxes(pull[1], -1, -2) * (1 - share)[:, None, :]
@@ -224,12 +225,20 @@ def begin(psi, order, seed=0):
         (2, "mono", 2, 2, (2, 2)),
         (3, "rggb", 2, 2, (2, 2)),
         (3, "mono", 1, 1, (1, 4)),
+        (1, "mono", 1, 3, (1, 1)),
+        (1, "rggb", 2, 1, (3, 1)),
+        (1, "filters", 1, 3, (2, 2)),
     ],
 )
 def test_the_fused_sweep_is_the_plain_primal_dual_step(
     coded_psi, order, cfa, binning, shots, views, with_pull
 ):
-    psi = coded_psi(cfa, binning, shots, size=(6, 4), views=views)
+    if cfa == "filters":
+        seen = [{"filter": "red"}, {"filter": "green"}, {"filter": "blue"}]
+        filtered = Camera.model_validate({"title": "filters", "views": views, "shots": seen})
+        psi = build_imaging_matrix(filtered, (6, 4))
+    else:
+        psi = coded_psi(cfa, binning, shots, size=(6, 4), views=views)
     frames, light_field, dual, usable, pull = begin(psi, order)
     pull = pull if with_pull else None
     found, found_dual, moved = swept(psi, usable, frames, light_field, dual, order, 2, pull)

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from full_splitting import from_patches
 from scipy import sparse
+from variation import from_patches
 
-from reconstruction.errors import ReconstructionError
-from reconstruction.patch_term import PatchTerm
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 SHAPE = (2, 3, 7, 9, 3)
@@ -86,45 +84,26 @@ def test_samples_that_no_patch_covers_have_no_weight_and_no_influence():
     assert term.value(changed) == term.value(light_field)
 
 
-@pytest.mark.parametrize(
-    ("target", "weight", "complaint"),
-    [
-        (np.zeros((2, 3, 4, 5)), np.ones((4, 5)), "a patch target of shape"),
-        (np.zeros((2, 3, 4, 5, 3)), np.ones((5, 4)), r"patch weights of shape \(5, 4\)"),
-        (np.zeros((2, 3, 4, 5, 3)), np.full((4, 5), -0.1), "must be at least 0"),
-        (np.zeros((2, 3, 4, 5, 3)), np.full((4, 5), np.inf), "weights hold values that are not"),
-        (np.full((2, 3, 4, 5, 3), np.nan), np.ones((4, 5)), "target has values that are not"),
-    ],
-)
-def test_a_term_that_makes_no_sense_is_refused(target, weight, complaint):
-    with pytest.raises(ReconstructionError, match=complaint):
-        PatchTerm(target.astype(np.float32), weight.astype(np.float32))
+def test_a_large_rho_gives_the_patches_and_none_ignores_them(coded_psi):
+    psi = coded_psi("rggb", 1, 1, (4, 6), (2, 2))
+    truth = 0.2 + 0.5 * np.random.default_rng(0).random(psi.light_field_shape)
+    frames = psi.forward(truth)
+    term = from_patches([(0, 0)], [truth], None, truth.shape)
+    near = reconstruct_tv(psi, frames, 0.01, TVSettings(rho=1e4), patch_term=term)
+    np.testing.assert_allclose(near.light_field, truth, atol=1e-3)
+    ignored = reconstruct_tv(psi, frames, 0.01, TVSettings(rho=0), patch_term=term)
+    alone = reconstruct_tv(psi, frames, 0.01)
+    np.testing.assert_array_equal(ignored.light_field, alone.light_field)
+    assert (near.method, ignored.method) == ("tv-patch", "tv")
 
 
-def test_pixels_of_several_samples_need_one_weight_each(coded_psi):
-    psi = coded_psi(binning=2)
-    frames = np.full(psi.frames_shape, 0.3, np.float32)
-    shape = psi.light_field_shape
-    whole = from_patches([(2, 4)], [np.full((*shape[:2], 4, 2, 3), 0.3)], None, shape)
-    once = TVSettings(max_steps=1)
-    assert reconstruct_tv(psi, frames, 0.01, once, patch_term=whole).steps == 1
-    uneven = from_patches([(1, 4)], [np.full((*shape[:2], 4, 2, 3), 0.3)], None, shape)
-    with pytest.raises(ReconstructionError, match="corners and sizes that are multiples of 2"):
-        reconstruct_tv(psi, frames, 0.01, once, patch_term=uneven)
-
-
-def test_patches_and_starts_of_another_size_are_refused(coded_psi):
-    psi = coded_psi()
-    frames = np.full(psi.frames_shape, 0.3, np.float32)
-    other = np.zeros((2, 3, 6, 9, 3))
-    with pytest.raises(ReconstructionError, match="patches for a light field of shape"):
-        reconstruct_tv(
-            psi,
-            frames,
-            0.01,
-            patch_term=PatchTerm(other.astype(np.float32), np.ones((6, 9), np.float32)),
-        )
-    with pytest.raises(ReconstructionError, match="a start of shape"):
-        reconstruct_tv(psi, frames, 0.01, start=other)
-    with pytest.raises(ReconstructionError, match="the start holds values that are not finite"):
-        reconstruct_tv(psi, frames, 0.01, start=np.full(psi.light_field_shape, np.nan))
+def test_a_light_field_that_explains_everything_stays(coded_psi):
+    """A constant light field, its frames and itself as patches: nothing pulls at it."""
+    for order in (1, 2, 3):
+        psi = coded_psi("rggb", 2, 2, (6, 8), (2, 3))
+        grey = np.full(psi.light_field_shape, 0.4, np.float32)
+        term = from_patches([(0, 0)], [grey], None, grey.shape)
+        settings = TVSettings(order=order, mu=1e-3, max_steps=20)
+        found = reconstruct_tv(psi, psi.forward(grey), 0.01, settings, patch_term=term)
+        np.testing.assert_allclose(found.light_field, 0.4, atol=1e-5)
+        assert found.method == ("tv-patch", "dv2-patch", "dv3-patch")[order - 1]

@@ -10,10 +10,9 @@ from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.frames import read_frames
+from emmc_rig.files.psi import read_frames
 from emmc_rig.model.lightfield import load_hdf5
-from emmc_rig.processing.inputs import load_settings
-from emmc_rig.processing.reconstructing import reconstruct_folder
+from emmc_rig.processing.reconstructing import load_settings, reconstruct_folder
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
@@ -119,9 +118,7 @@ def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames,
     assert shapes == {
         "disparity": SIZE,
         "disparity_sigma": SIZE,
-        "hidden": SIZE,
         "misfit": SIZE,
-        "model": SIZE,
         "texture": SIZE,
         "sigma": (5, 5, *SIZE),
     }

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.bpdn import BPDNSettings
@@ -167,37 +166,13 @@ def test_what_does_not_fit_is_refused(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     frames = psi.forward(truth)
-    broken = frames.copy()
-    broken[0, 3, 4] = np.nan
-    with pytest.raises(ReconstructionError, match="not finite"):
-        reconstruct_sparse(psi, broken, 0.0, dictionary)
     with pytest.raises(ReconstructionError, match="frames of shape"):
         reconstruct_sparse(psi, frames[:, 1:], 0.0, dictionary)
-    with pytest.raises(ReconstructionError, match="noise level"):
-        reconstruct_sparse(psi, frames, -1.0, dictionary)
     with pytest.raises(DictionaryError, match="2x2 views"):
         reconstruct_sparse(psi, frames, 0.0, random_atoms(views=(2, 2)))
-    with pytest.raises(ReconstructionError, match="no usable pixel"):
-        reconstruct_sparse(psi, frames, 0.0, dictionary, usable=np.zeros(frames.shape, bool))
     small = random_psi(1, VIEWS, (5, 30))
     with pytest.raises(ReconstructionError, match="do not fit"):
         reconstruct_sparse(small, np.zeros(small.frames_shape), 0.0, dictionary)
-
-
-def test_a_shipped_camera_reconstructs_with_a_dictionary(random_psi, scene):
-    dictionary, truth = scene
-    camera = Camera.model_validate(
-        {
-            "title": "test",
-            "views": [3, 3],
-            "masks": {
-                "mask": {"distance_mm": 0.12, "cell_um": 36, "pattern": {"kind": "random_rgbw"}}
-            },
-        }
-    )
-    psi = build_imaging_matrix(camera.with_shots(1), truth.shape[2:4])
-    result = reconstruct_sparse(psi, psi.forward(truth), 0.0, dictionary, settings())
-    assert psnr_db(result.light_field, truth) > 20
 
 
 @pytest.mark.slow
@@ -214,11 +189,6 @@ def test_every_method_runs_by_its_name_and_says_so(random_psi, scene, name):
     assert method.assumes
     assert method.cost
     assert method.when
-
-
-def test_a_misspelt_method_names_the_nearest():
-    with pytest.raises(ReconstructionError, match="did you mean 'dict-admm'"):
-        find_method("dict-adm")
 
 
 def test_a_missing_dictionary_says_how_to_make_one(random_psi):

@@ -56,15 +56,15 @@ def solved(method):
 print(json.dumps({name: for_each_number_of_threads(lambda: solved(name)) for name in sys.argv[1:]}))
 """
 ROUTES = """
-from emmc_rig.processing.calibration_settings import CalibrateSettings
-from emmc_rig.processing.simulated import calibrate_simulated
+from simulated_calibration import CalibrateSettings, calibrate_simulated
 from emmc_rig.model.camera import Camera
 
 camera = Camera.model_validate_json(sys.argv[1])
 
 def calibrated():
     run = calibrate_simulated(CalibrateSettings("small", camera, (32, 40), rays=64)).found
-    stated = {name: value for name, value in run.metrics.items() if "seconds" not in name}
+    figures = {name: value for name, value in run.metrics.items() if "seconds" not in name}
+    stated = {name: value for name, value in figures.items() if name != "session"}
     return {"stated": repr(stated)} | {
         name: digests(one.psi.weights, one.deviation) for name, one in
         run.outcome.calibrations.items()
@@ -79,7 +79,8 @@ def printed(program, *arguments):
     eight = {"NUMBA_NUM_THREADS": "8", "OPENBLAS_NUM_THREADS": "8"}
     done = subprocess.run(
         [sys.executable, "-c", BEGIN + program, *arguments],
-        capture_output=True, text=True, env={**os.environ, **eight},
+        capture_output=True, text=True,
+        env={**os.environ, **eight, "PYTHONPATH": os.pathsep.join(sys.path)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

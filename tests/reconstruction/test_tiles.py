@@ -11,12 +11,14 @@ from emmc_rig.model.lightfield import psnr_db
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
+from reconstruction.result import Reconstruction, Status
 from reconstruction.sparse import SparseSettings
 from reconstruction.tiles import (
+    CaptureSurvey,
     Grid,
-    in_few_words,
     reconstruct_in_blocks,
     samples,
+    summed_up,
     surveyed,
     within,
 )
@@ -79,9 +81,7 @@ def settings_of(method, **more):
 def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step=None):
     settings = settings_of(method, blocks=blocks)
     usable = np.ones(frames.shape, dtype=bool) if usable is None else usable
-    return reconstruct_in_blocks(
-        method, psi, frames, 0.01, dictionary, settings, usable, on_step, lambda: 0.0
-    )
+    return reconstruct_in_blocks(method, psi, frames, 0.01, dictionary, settings, usable, on_step)
 
 
 @pytest.mark.slow
@@ -243,19 +243,12 @@ def test_places_are_those_of_the_whole(blocks):
     assert evidence.hole_at in (hole, (hole[0] + 50, hole[1] + 60))
 
 
-def test_what_many_blocks_say_is_one_line_with_the_range_of_its_numbers():
-    flat = "the evidence is flat: {}% of the patches, beyond 24 px"
-    said = [[flat.format(82), "grey"], [], [flat.format(100)], [flat.format(9.5)]]
-    assert in_few_words(said, 5) == [
-        "the evidence is flat: 9.5 to 100% of the patches, beyond 24 px, in 3 of 5 blocks",
-        "grey, in 1 of 5 blocks",
-    ]
-    assert in_few_words([], 5) == []
-
-
-def test_what_two_reasons_share_is_said_once_and_a_remedy_stays_with_its_reason():
-    said = [["flat: 82%; more shots; far: 24 px"], ["far: 24 px"], ["flat: 90%; more shots"]]
-    assert in_few_words(said, 3) == [
-        "flat: 82 to 90%; more shots, in 2 of 3 blocks",
-        "far: 24 px, in 2 of 3 blocks",
-    ]
+@pytest.mark.parametrize(
+    ("advice", "expected"),
+    [(("", "raise it: 3 %", "raise it: 4 %"), "2 of 3 blocks, the first: raise it: 3 %"), ((), "")],
+)
+def test_the_advice_of_blocks_is_the_first_s_and_how_many_have_any(advice, expected):
+    empty = np.empty((0, 0, 0, 0, 3), np.float32)
+    results = [Reconstruction("tv", empty, Status.STEP_LIMIT, a, 1, (), 0, {}) for a in advice]
+    survey = CaptureSurvey.of_one_block(MethodSettings(), 1)
+    assert summed_up("tv", results, survey, 0.0).advice == expected

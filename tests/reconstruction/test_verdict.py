@@ -24,12 +24,12 @@ from reconstruction.screening import screened
 from reconstruction.tv import TVSettings
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
-from reconstruction.verdict.kept import compare_held_out, kept_readings
+from reconstruction.verdict.kept import compare_held_out, kept_readings, missed_readings
 from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
 from reconstruction.verdict.shadow import relief, shadow
-from reconstruction.verdict.shots import Motion, compared
+from reconstruction.verdict.shots import ShotMotion, compared
 
 SIZE = (48, 64)
 SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")
@@ -179,6 +179,33 @@ def test_readings_kept_tell_what_is_explained_and_what_is_noise(three):
     assert compare_held_out(frames, frames - clean, sigma, few, smooth)["explained"] is None
 
 
+def test_readings_are_missed_where_the_light_field_is_wrong_and_nowhere_else():
+    psi = emmc.camera("rgbw-bayer-1shot").psi((48, 64))
+    rng = np.random.default_rng(3)
+    light_field = rng.uniform(0.3, 0.6, psi.light_field_shape).astype(np.float32)
+    readings = psi.forward(light_field)
+    noise = 0.01
+    noisy = (readings + rng.normal(0, noise, readings.shape)).astype(np.float32)
+    usable = np.ones(readings.shape, bool)
+    right = missed_readings(psi, light_field, noisy, noise, usable)
+    assert right.shape == (48, 64)
+    # 81 readings: the root mean square of normal values is within 5 sqrt(1 / 162) of 1.
+    assert np.abs(right - 1)[4:-4, 4:-4].max() < 5 * np.sqrt(1 / 162)
+    wrong = light_field.copy()
+    wrong[:, :, 20:30, 30:40] += 0.2
+    missed = missed_readings(psi, wrong, noisy, noise, usable)
+    assert missed[22:28, 32:38].min() > 3
+    np.testing.assert_array_equal(missed[:, :20], right[:, :20])
+
+
+def test_places_without_usable_readings_count_as_explained():
+    psi = emmc.camera("rgbw-bayer-1shot").psi((24, 32))
+    nothing = np.zeros(psi.frames_shape, np.float32)
+    unusable = np.zeros(psi.frames_shape, bool)
+    dark = np.zeros(psi.light_field_shape, np.float32)
+    np.testing.assert_array_equal(missed_readings(psi, dark, nothing, 0.1, unusable), 1)
+
+
 def test_few_readings_are_kept_and_the_same_each_time(three):
     usable = everywhere(three)
     usable[0, :20] = False
@@ -242,16 +269,8 @@ def test_a_capture_without_a_fault_is_trusted(scene, camera):
 
 
 def clean_evidence(three):
-    empty = Reconstruction(
-        "tv",
-        np.full(three.light_field_shape, 0.5, np.float32),
-        Status.CONVERGED,
-        "",
-        1,
-        (),
-        0.0,
-        {},
-    )
+    even = np.full(three.light_field_shape, 0.5, np.float32)
+    empty = Reconstruction("tv", even, Status.CONVERGED, "", 1, (), 0.0, {})
     usable = everywhere(three)
     read = Read(grey(three), usable, kept_readings(usable), np.zeros(three.frames_shape))
     return gathered(three, read, 1e-3, empty)
@@ -441,7 +460,7 @@ def test_bad_pixels_behind_dark_cells_do_not_pass_for_motion():
 
 
 def test_what_a_light_field_leaves_of_a_moved_place_is_beyond_noise():
-    moved = Motion(1.0, 0.2, 1, (slice(10, 30), slice(40, 60)))
+    moved = ShotMotion(1.0, 0.2, 1, (slice(10, 30), slice(40, 60)))
     assert moved.place == (20, 50)
     residual = np.full((3, 64, 80), 5.0)
     residual[:, 10:30, 40:60] = np.random.default_rng(0).normal(0, 0.05, (3, 20, 20))
@@ -486,22 +505,13 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     right, wrong = folders
     settings = tmp_path / "settings.yaml"
     settings.write_text("tv: {max_steps: 40}\n")
+    options = ["--method", "tv", "--settings", str(settings), "--strict"]
     results = {}
     for name, folder in (("right", right), ("wrong", wrong)):
         out = tmp_path / name
         reported = CliRunner().invoke(
             app,
-            [
-                "reconstruct",
-                str(folder),
-                "--method",
-                "tv",
-                "--settings",
-                str(settings),
-                "--strict",
-                "--out",
-                str(out),
-            ],
+            ["reconstruct", str(folder), *options, "--out", str(out)],
         )
         metrics = json.loads((out / "metrics.json").read_text())
         results[name] = (

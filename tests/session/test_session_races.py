@@ -15,6 +15,7 @@ import pytest
 from capture_rigs import frame_bytes
 from programs import line_server
 
+from emmc_rig.session.journal import FrameEntry, of_kind
 from emmc_rig.session.session import FRAMES, Session
 from emmc_rig.session.storage import part_of
 from emmc_rig.session.verify import verify
@@ -28,7 +29,6 @@ darks: {repeats: 2}
 """
 CAPTURE = ["capture", "plan.yaml", "--rig", "simulated", "--out", "s"]
 GO_ON = ["capture", "s"]
-PRUNE = ["session", "prune", "s"]
 EXPORT = ["session", "export", "s", "--out", "s.h5"]
 CALIBRATE = ["calibrate", "s", "--out", "c"]
 NOTHING, PARTLY, COMPLETE = "nothing", "partly", "complete"
@@ -36,9 +36,7 @@ MEETINGS = {
     "create/create": (NOTHING, CAPTURE, CAPTURE, 0.02),
     "capture/capture": (NOTHING, CAPTURE, CAPTURE, 1.0),
     "capture/capture that goes on": (PARTLY, GO_ON, GO_ON, 1.0),
-    "capture/prune": (PARTLY, GO_ON, PRUNE, 1.0),
-    "prune/capture": (PARTLY, PRUNE, GO_ON, 0.1),
-    "export/prune": (COMPLETE, EXPORT, PRUNE, 1.0),
+    "export/capture": (COMPLETE, EXPORT, GO_ON, 1.0),
     "calibrate/capture": (PARTLY, CALIBRATE, GO_ON, 1.0),
 }
 """What is there before, who comes first and second, and the longest offset as a share of the
@@ -116,11 +114,11 @@ def assert_nothing_is_doubled_or_torn(folder, meet):
     assert verdict.is_complete
     assert not verdict.leftovers
     assert not verdict.foreign
-    names = [entry["id"] for entry in session.journal.entries if entry["kind"] == "frame"]
+    names = [entry.id for entry in of_kind(session.journal.entries, FrameEntry)]
     assert sorted(names) == sorted(frame.id for frame in session.frames)
-    assert not [e for e in session.journal.entries if e["kind"] in ("retry", "discarded")]
+    assert not [e for e in session.journal.entries if e.kind in ("retry", "discarded")]
     for name, entry in session.stored.items():
-        assert session.read(name) == frame_bytes(name, entry["exposure_s"])
+        assert session.read(name) == frame_bytes(name, entry.exposure_s)
     hidden = [path for path in folder.rglob("*") if path.name.startswith(".")]
     assert not hidden
     assert not (folder / "s" / "session.lock").exists()

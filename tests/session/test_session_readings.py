@@ -1,6 +1,5 @@
 """From a session to readings: brackets, gains, and plans without whiteboards."""
 
-import json
 from contextlib import closing
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from capture_rigs import begun
 from simulated_disk import SimulatedDisk
 
 from drivers.errors import DriverError
+from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import NO_FLAWS, open_camera, simulated_rig
@@ -27,7 +27,7 @@ from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
-from emmc_rig.session.frame_file import decode_frame, frame_file
+from emmc_rig.session.frame_file import NO_FIGURES, decode_frame, frame_entry, frame_file
 from emmc_rig.session.readings import session_readings
 from simulators.clock import ManualClock
 from simulators.effects import Flaws
@@ -180,8 +180,10 @@ def test_a_streamed_frame_comes_back_from_its_file_as_it_was_taken():
         frame = camera.snap()
     file = frame_file(frame)
     assert (file.suffix, file.data) == (".bin", frame.original)
-    entry = json.loads(json.dumps({"file": f"00000-x{file.suffix}", **file.facts}))
-    back = decode_frame(file.data, entry)
+    assert frame.exposure_s is not None
+    assert frame.gain is not None
+    entry = frame_entry(frame, frame.exposure_s, frame.gain, figures=NO_FIGURES)
+    back = decode_frame(file.data, entry.model_copy(update={"file": "00000-x.bin"}))
     np.testing.assert_array_equal(back.mosaic, frame.mosaic)
     np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
     assert (back.cfa, back.white_level_dn) == (frame.cfa, frame.white_level_dn)
@@ -189,6 +191,8 @@ def test_a_streamed_frame_comes_back_from_its_file_as_it_was_taken():
 
 
 def test_a_plug_in_s_bytes_stored_by_version_0_2_are_said_to_be_undecodable():
-    entry = {"file": "00003-shot-0.bin", "black_level_dn": [[0, 0], [0, 0]], "white_level_dn": 255}
+    mosaic = np.zeros((2, 2), np.uint16)
+    frame = RawFrame(mosaic, np.zeros((2, 2)), 255, "rggb", None, b"", "")
+    entry = frame_entry(frame, 0.01, 1.0, figures=NO_FIGURES)
     with pytest.raises(DriverError, match=r"00003-shot-0\.bin is in a format that only"):
-        decode_frame(bytes(2000), entry)
+        decode_frame(bytes(2000), entry.model_copy(update={"file": "00003-shot-0.bin"}))

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import begun, still_rig
+from capture_rigs import SIZE, begun, still_rig
 from rich.console import Console
 from simulated_disk import SimulatedDisk
 
 from drivers.dng import encode_dng
-from drivers.raw import decode_raw
+from drivers.raw import RawFrame, decode_raw
 from emmc_rig.acquisition.checks import figures
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -21,6 +21,8 @@ from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.pages.frame_view import thinned
 from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.timeline import overlap, run_entries
+from emmc_rig.session.frame_file import NO_FIGURES, frame_entry
+from emmc_rig.session.journal import RetryEntry
 from emmc_rig.session.session import Session
 from emmc_rig.session.storage import SYSTEM_DISK
 from simulators.still import StillStage
@@ -28,9 +30,10 @@ from simulators.still import StillStage
 ROOT = Path("/disk")
 
 
-def entry(name, run=1, **spans):
-    spans_s = {key.replace("_", " "): list(span) for key, span in spans.items()}
-    return {"kind": "frame", "id": name, "run": run, "spans_s": spans_s}
+def entry(name, run=1, **spans_s):
+    frame = RawFrame(np.zeros(SIZE, np.uint16), np.zeros((2, 2)), 255, "rggb", 0.01, b"", "")
+    taken = frame_entry(frame, 0.01, 1.0, figures=NO_FIGURES, run=run, spans_s=spans_s)
+    return taken.model_copy(update={"id": name})
 
 
 def test_writing_counts_as_hidden_only_while_the_bench_works():
@@ -48,8 +51,12 @@ def test_writing_counts_as_hidden_only_while_the_bench_works():
 
 
 def test_runs_are_kept_apart_and_other_lines_passed_over():
-    entries = [entry("a", 1, write=(0, 1)), {"kind": "retry"}, entry("b", 2, write=(0, 1))]
-    assert [[e["id"] for e in run] for run in run_entries(entries)] == [["a"], ["b"]]
+    entries = [
+        entry("a", 1, write=(0, 1)),
+        RetryEntry(id="a", fault="x", attempt=1),
+        entry("b", 2, write=(0, 1)),
+    ]
+    assert [[e.id for e in run] for run in run_entries(entries)] == [["a"], ["b"]]
 
 
 @pytest.fixture
@@ -97,7 +104,7 @@ def test_the_report_of_a_reconstructed_session_has_its_verdict(captured):
 
 
 def test_a_page_shows_names_as_text(captured):
-    captured.note("retry", id="<b>", fault="<script>alert(1)</script>", attempt=1, at_s=0.0)
+    captured.note(RetryEntry(id="<b>", fault="<script>alert(1)</script>", attempt=1))
     page = sheet(captured)
     assert "<script>" not in page
     assert "&lt;script&gt;" in page

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,9 +24,17 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.session.frame_means import decoded
-from emmc_rig.session.journal import Journal, decode_line, encode_line, heads
+from emmc_rig.session.journal import (
+    FrameEntry,
+    Journal,
+    RetryEntry,
+    RunEntry,
+    count_stored,
+    decode_line,
+    encode_line,
+    of_kind,
+)
 from emmc_rig.session.lock import held
-from emmc_rig.session.prune import prune
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
@@ -134,10 +143,10 @@ def test_a_power_cut_at_any_operation_loses_and_doubles_nothing(undisturbed, see
         assert_whole(survived, expected)
         # What was said to be safe before the cut was not taken again.
         entries = Session(ROOT / "s", survived).journal.entries
-        lines = [entry["id"] for entry in entries if entry["kind"] == "frame"]
+        lines = [entry.id for entry in of_kind(entries, FrameEntry)]
         assert all(lines.count(name) == 1 for name in promised.frames), cut
         if promised.frames:
-            runs = [entry["resumed"] for entry in entries if entry["kind"] == "run"]
+            runs = [entry.resumed for entry in of_kind(entries, RunEntry)]
             assert runs == [False, True], cut
 
 
@@ -234,29 +243,68 @@ def test_bytes_not_synced_may_be_lost_and_synced_ones_never_are():
     assert any(data and data != b"loose" for data in outcomes)
 
 
+RETRY = RetryEntry(id="a", fault='\u00e9"', attempt=1)
+FRAME_OF_0_2 = {
+    "kind": "frame",
+    "id": "a",
+    "file": "00000-a.dng",
+    "bytes": 12,
+    "sha256": "0",
+    "shape": [24, 32],
+    "cfa": "rggb",
+    "black_level_dn": [[100, 100], [100, 100]],
+    "white_level_dn": 4000,
+    "exposure_s": 0.01,
+    "gain": 1.0,
+    "figures": {"saturated": 0.0, "mean_dn": 70.0, "bright_dn": 2050.0},
+}
+"""What every program since 0.2 writes."""
+
+
+def checked(entry):
+    """Return an entry as a line of the journal, with its checksum."""
+    body = json.dumps(entry)[:-1]
+    return f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}'.encode()
+
+
 def test_a_line_that_is_torn_anywhere_does_not_count():
-    line = encode_line({"kind": "retry", "id": "a", "x": 1.5})
-    assert decode_line(line[:-1]) == {"kind": "retry", "id": "a", "x": 1.5}
+    line = encode_line(RETRY)
+    assert decode_line(line[:-1]) == RETRY
     for length in range(len(line) - 1):
         assert decode_line(line[:length]) is None
+
+
+def test_a_frame_that_version_0_2_journalled_counts():
+    entry = decode_line(checked(FRAME_OF_0_2))
+    assert isinstance(entry, FrameEntry)
+    assert count_stored([entry]) == {"a": entry}
+    assert entry.level == pytest.approx(2050 / 3900)
+    assert (entry.camera_sha256, entry.triggered) == (None, False)
+    assert decode_line(encode_line(entry)[:-1]) == entry
 
 
 @pytest.mark.parametrize(
     "entry",
     [
-        {"kind": "frame", "id": "a", "file": "a.dng", "bytes": 12},
-        {"kind": "frame", "id": "a", "file": 3, "bytes": 12, "sha256": "0"},
+        {key: value for key, value in FRAME_OF_0_2.items() if key != "sha256"},
+        FRAME_OF_0_2 | {"file": 3},
         {"kind": "created", "frames": 3},
         {"kind": 3},
         {"id": "a"},
     ],
 )
 def test_a_line_without_what_its_kind_needs_does_not_count(entry):
-    assert decode_line(encode_line(entry)[:-1]) is None
+    assert decode_line(checked(entry)) is None
+
+
+def test_a_line_of_a_kind_that_only_later_programs_know_says_nothing():
+    entry = decode_line(checked({"kind": "cleaned", "by": "hand"}))
+    assert entry is not None
+    assert (entry.kind, str(entry)) == ("cleaned", "")
 
 
 def test_a_line_with_any_flipped_bit_does_not_count():
-    line = encode_line({"kind": "retry", "id": "a"})[:-1]
+    line = encode_line(RETRY)[:-1]
     for place in range(len(line)):
         for bit in range(8):
             damaged = bytearray(line)
@@ -264,30 +312,13 @@ def test_a_line_with_any_flipped_bit_does_not_count():
             assert decode_line(bytes(damaged)) is None
 
 
-def test_the_heads_of_a_journal_agree_with_all_of_it():
-    """Lines with awkward names, torn and damaged ones among them."""
-    entries = [
-        {"kind": "created", "frames": 3, "sha256": {}},
-        {"kind": "frame", "id": "a", "file": "a.dng", "bytes": 12, "sha256": "0", "x": [1, 2.5]},
-        {"kind": "frame", "id": 'b"\\', "file": "\u00e9.dng", "bytes": 0, "sha256": "1"},
-        {"kind": "retry", "id": "a", "fault": "x"},
-    ]
-    data = b"".join(encode_line(entry) for entry in entries)
-    data += b"torn\n" + encode_line(entries[1]).replace(b"12", b"13") + encode_line(entries[3])
-    keys = ("kind", "id", "file", "bytes")
-    found = [decode_line(line) for line in data.split(b"\n")]
-    expected = [{k: e[k] for k in keys if k in e} for e in found if e]
-    assert [{k: e[k] for k in keys if k in e} for e in heads(data)] == expected
-    assert len(expected) == 5
-
-
 def test_a_line_after_a_torn_one_is_read(tmp_path):
     path = tmp_path / "j"
-    one, two, three = ({"kind": "retry", "n": n} for n in (1, 2, 3))
+    one, two, three = (RetryEntry(id="a", fault="x", attempt=n) for n in (1, 2, 3))
     path.write_bytes(encode_line(one) + encode_line(two)[:-9])
     Journal(SYSTEM_DISK, path).append(three)
     again = Journal(SYSTEM_DISK, path)
-    assert [entry["n"] for entry in again.entries] == [1, 3]
+    assert again.entries == [one, three]
     assert again.unreadable == 1
 
 
@@ -362,25 +393,21 @@ def test_a_foreign_file_is_named_and_left_alone(on_disk, tmp_path):
     assert verdict.foreign == ("frames/IMG_0001.DNG", "notes.txt")
     assert verdict.is_complete
     run_on(SYSTEM_DISK, tmp_path)
-    prune(Session(on_disk.folder))
     assert notes.read_text() == "mine"
     assert stray.read_bytes() == b"mine too"
 
 
-def test_pruning_removes_leftovers_and_nothing_else(on_disk):
+def test_leftovers_are_named_and_go_with_the_next_capture(on_disk, tmp_path):
     entry = on_disk.stored["dark-0-r0"]
     on_disk.discard("dark-0-r0", "for the test")
     part = part_of(on_disk.folder / FRAMES / "x.dng")
     part.write_bytes(b"half")
-    before = set((on_disk.folder / FRAMES).iterdir())
-    opened = Session(on_disk.folder)
-    names, size = prune(opened, dry_run=True)
-    assert set((on_disk.folder / FRAMES).iterdir()) == before
-    assert names == sorted([f"{FRAMES}/{part.name}", f"{FRAMES}/{entry['file']}"])
-    assert size == 4 + entry["bytes"]
-    prune(opened)
-    gone = before - set((on_disk.folder / FRAMES).iterdir())
-    assert {path.name for path in gone} == {part.name, entry["file"]}
+    named = (f"{FRAMES}/{part.name}", f"{FRAMES}/{entry.file}")
+    assert verify(Session(on_disk.folder)).leftovers == tuple(sorted(named))
+    verdict = verify(run_on(SYSTEM_DISK, tmp_path))
+    assert verdict.is_complete
+    assert not verdict.leftovers
+    assert not part.exists()
 
 
 def test_a_folder_of_frames_that_somebody_removed_is_filled_again(on_disk, tmp_path, undisturbed):

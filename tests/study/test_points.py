@@ -12,7 +12,7 @@ import pytest
 from emmc_rig.errors import AppError
 from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
 from emmc_rig.progress import Silent
-from emmc_rig.study.points import NotApplicableError, Study, StudyStopped
+from emmc_rig.study.points import Journal, NotApplicableError, Study, StudyStopped, study_folder
 from emmc_rig.study.rows import csv_text, plain
 
 
@@ -127,14 +127,57 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
         Squares(None, tmp_path / "missing").run([1], Silent())
 
 
+def test_a_torn_line_is_ignored_and_the_next_one_stands_alone(tmp_path):
+    path = tmp_path / "points.jsonl"
+    journal = Journal(path)
+    journal.add("a", {}, {"psnr_db": 1.0})
+    journal.add("b", {}, {"psnr_db": 2.0})
+    path.write_bytes(path.read_bytes()[:-9])
+    torn = Journal(path)
+    assert (torn.get("a"), torn.get("b")) == ({"psnr_db": 1.0}, None)
+    torn.add("c", {}, {"psnr_db": 3.0})
+    assert Journal(path).get("c") == {"psnr_db": 3.0}
+    assert Journal(path).get("a") == {"psnr_db": 1.0}
+
+
+def test_a_full_disk_is_reported_and_nothing_is_lost(tmp_path, monkeypatch):
+    add = Journal.add
+
+    def filling(self, *arguments):
+        if len(self) == 2:
+            raise OSError(28, "No space left on device")
+        add(self, *arguments)
+
+    study = Squares(None, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Journal, "add", filling)
+        with pytest.raises(AppError, match=r"No space left.*run the same command again"):
+            study.run(range(4), Silent())
+    assert len(Journal(tmp_path / "points.jsonl")) == 2
+    assert len(study.run(range(4), Silent())) == 4
+
+
+def test_two_runs_may_share_a_folder(tmp_path):
+    one, other = (Squares(None, tmp_path) for _ in range(2))
+    assert one.run([1, 2], Silent()) == other.run([1, 2], Silent())
+    assert other.calls == []
+
+
+def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "cat.jpg").write_text("meow")
+    for place, why in ((tmp_path, "something else"), (tmp_path / "cat.jpg", "a file of that name")):
+        with pytest.raises(AppError, match=why), study_folder(place, "cells.jsonl", "tables"):
+            pytest.fail("taken")
+    assert [path.name for path in tmp_path.iterdir()] == ["cat.jpg"]
+
+
 def test_rows_of_csv_are_quoted_and_unknown_values_are_empty():
     rows = [{"name": 'a "b", c', "db": 1 / 3, "on": True}, {"db": None, "more": 2.0}]
-    read = list(csv.DictReader(io.StringIO(csv_text(rows, form=".2f", forms={"more": "g"}))))
+    read = list(csv.DictReader(io.StringIO(csv_text(rows, ["name", "db", "more"]))))
     assert read == [
-        {"name": 'a "b", c', "db": "0.33", "on": "True", "more": ""},
-        {"name": "", "db": "", "on": "", "more": "2"},
+        {"name": 'a "b", c', "db": "0.333333", "more": ""},
+        {"name": "", "db": "", "more": "2"},
     ]
-    assert csv_text(rows, ["db"]).splitlines() == ["db", "0.333333", '""']
 
 
 def test_a_result_is_kept_as_json_gives_it_back():

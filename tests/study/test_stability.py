@@ -20,13 +20,12 @@ from emmc_rig.study.points import StudyStopped
 from emmc_rig.study.stability import stability_page, stability_run
 from emmc_rig.study.stability.curves import (
     POOLED,
-    Span,
     below_best,
     below_view,
     breaking_rows,
+    crossing,
     curves,
-    span,
-    span_words,
+    place_words,
     strength_at,
 )
 from emmc_rig.study.stability.faults import FAULTS, Point
@@ -45,7 +44,7 @@ SIZE = (24, 32)
 
 
 def quick(**more):
-    chosen = {"methods": ("tv",), "faults": ("flicker",), "screening": "on", **more}
+    chosen = {"methods": ("tv",), "faults": ("flicker",), **more}
     return stability_settings(True, chosen.pop("scenes", ["dark"]), SIZE, **chosen)
 
 
@@ -54,8 +53,7 @@ def few_steps(monkeypatch):
     """Total variation of a few steps: the same path, sooner done."""
 
     def solved(name, psi, readings, sigma, dictionary, settings, usable):
-        few = {"tv": {"max_steps": 3}, "screening": settings.screening}
-        chosen = MethodSettings.model_validate(few)
+        chosen = MethodSettings.model_validate({"tv": {"max_steps": 3}})
         return reconstruct(name, psi, readings, sigma, dictionary, chosen, usable)
 
     monkeypatch.setattr(trial, "reconstruct", solved)
@@ -67,33 +65,29 @@ def undrawn(monkeypatch):
     monkeypatch.setattr(stability_run, "_write", lambda *_: None)
 
 
-def ends(found):
-    return None if found is None else (found.low, found.high)
-
-
 def test_a_curve_breaks_where_its_line_crosses_three_decibels_below_the_best():
     # From 29 to 26 the line crosses 27 after two thirds of the way.
-    assert ends(below_best([30, 29, 26, 10])) == (None, pytest.approx(1 + 2 / 3))
-    assert ends(below_best([30, 29, 28])) == (None, None)
-    assert ends(below_best([10, 30, 10])) == pytest.approx((0.85, 1.15))
-    assert below_best([None, None]) is None
+    assert below_best([30, 29, 26, 10]) == pytest.approx(1 + 2 / 3)
+    assert below_best([30, 29, 28]) is None
+    assert below_best([10, 30, 10]) == pytest.approx(1.15)
+    assert below_best([None, None]) == 0
 
 
 def test_a_curve_breaks_where_it_crosses_the_copied_view():
-    assert ends(below_view([24, 20, 16], [18, 18, 18])) == (None, pytest.approx(1.5))
-    assert below_view([24, 20, 16], [26, 22, 18]) is None
-    assert ends(below_view([20, 24, 20], [22, 20, 22])) == pytest.approx((1 / 3, 5 / 3))
+    assert below_view([24, 20, 16], [18, 18, 18]) == pytest.approx(1.5)
+    assert below_view([24, 20, 16], [26, 22, 18]) == 0
+    assert below_view([20, 24, 20], [22, 20, 22]) == pytest.approx(5 / 3)
     # A flat scene is its centre view, which nothing exceeds.
-    assert ends(below_view([30, 30, 30], [None, 25, 20])) == (0, None)
+    assert below_view([30, 30, 30], [None, 25, 20]) is None
 
 
 def test_a_method_that_fails_is_broken_from_there_on():
-    assert below_best([30, 29, None]) == Span(None, 2.0)
-    assert span([1, 1, -1], whole=True) == Span(None, 2.0)
+    assert below_best([30, 29, None]) == 2
+    assert crossing([1, 1, -1], whole=True) == 2
 
 
 def test_nothing_lies_between_one_shot_and_two():
-    assert below_best([30, 20, 10], whole=True) == Span(None, 1.0)
+    assert below_best([30, 20, 10], whole=True) == 1
 
 
 @pytest.mark.parametrize(
@@ -104,13 +98,12 @@ def test_strengths_are_interpolated_in_ratios_but_from_zero(strengths, place, ex
     assert strength_at(strengths, place) == pytest.approx(expected)
 
 
-def test_breaking_points_in_words():
-    strengths = (0.1, 1, 10, 1000)
-    assert span_words(None, strengths) == "already at the mildest"
-    assert span_words(Span(None, None), strengths) == "never"
-    assert span_words(Span(None, 2.5), strengths) == "100"
-    assert span_words(Span(0.5, None), strengths) == "before 0.32"
-    assert span_words(Span(1.0, 2.0), strengths) == "before 1, from 10"
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [(0, "already at the mildest"), (None, "never"), (2.5, "100"), (0.5, "0.32"), (1.0, "1")],
+)
+def test_breaking_points_in_words(place, words):
+    assert place_words(place, (0.1, 1, 10, 1000)) == words
 
 
 def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
@@ -130,8 +123,8 @@ def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
     assert [curve.levels for curve in pooled] == [(25, 19, 12), (30, None)]
     rows, methods = breaking_rows(found, POOLED)
     assert methods == ("tv",)
-    assert [row.title for row in rows] == ["Mask shift", "Occlusion density"]
-    assert rows[1].cells == ("10 / 10",)
+    assert [fault.title for fault, _ in rows] == ["Mask shift", "Occlusion density"]
+    assert rows[1][1] == ["10 / 10"]
 
 
 def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
@@ -142,13 +135,9 @@ def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
         ("flicker", "dict-omp"): (30, 20, 10),
     }
     results: dict[Point, dict] = {
-        Point(Capture("a", "cam"), fault, strength, method, screened): {
-            "psnr_db": level,
-            "view_db": 5,
-        }
+        Point(Capture("a", "cam"), fault, strength, method): {"psnr_db": level, "view_db": 5}
         for (fault, method), row in levels.items()
-        for screened in ((True, False) if fault == "flicker" else (True,))
-        for strength, level in zip((0, 1, 4), row if screened else (30, 29, 28), strict=True)
+        for strength, level in zip((0, 1, 4), row, strict=True)
     }
     head = stability_page._head(curves(results))
     assert head.level == "tv"
@@ -156,15 +145,10 @@ def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
     assert any("compare dict-omp: under 2 of 2" in line for line in head.next)
 
 
-def test_screening_is_compared_where_it_should_matter():
-    points = planned(quick(faults=("flicker", "mask-shift"), screening="both"))
-    bare = {point.fault for point in points if not point.screened}
-    assert bare == {"flicker"}
-    assert {point.screened for point in planned(quick(screening="off"))} == {False}
-    names = {point.fault for point in planned(stability_settings(False, [], None))}
-    assert names == set(FAULTS)
-    full = {point.method for point in planned(stability_settings(False, [], None))}
-    assert full <= set(METHODS)
+def test_a_full_sweep_is_of_all_faults():
+    points = planned(stability_settings(False, [], None))
+    assert {point.fault for point in points} == set(FAULTS)
+    assert {point.method for point in points} <= set(METHODS)
 
 
 @pytest.mark.slow
@@ -172,9 +156,7 @@ def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_
     monkeypatch.setattr(drawing, "PNG_DPI", 40)
     shed = tmp_path / "shed"
     save_views(shed, render("near-planar", size=(30, 36)).light_field)
-    chosen = quick(
-        scenes=["dark", str(shed)], faults=("flicker", "disparity-range"), screening="both"
-    )
+    chosen = quick(scenes=["dark", str(shed)], faults=("flicker", "disparity-range"))
     outcome = run_stability(chosen, tmp_path / "out", Silent())
     folder = tmp_path / "out"
     assert outcome.curves[0].scene == POOLED
@@ -183,10 +165,10 @@ def test_a_sweep_holds_every_point_with_its_picture(few_steps, monkeypatch, tmp_
         rows = list(csv.DictReader(file))
     with open(folder / BREAKS_CSV, newline="") as file:
         breaks = list(csv.DictReader(file))
-    # Flicker twice, screened and not, in two scenes and both together; disparity in one.
+    # Flicker in two scenes and both together; disparity in one.
     quick_counts = [len(FAULTS[name].quick) for name in ("flicker", "disparity-range")]
-    assert len(rows) == 4 * quick_counts[0] + quick_counts[1]
-    assert len(breaks) == len(outcome.curves) == 6 + 2
+    assert len(rows) == 2 * quick_counts[0] + quick_counts[1]
+    assert len(breaks) == len(outcome.curves) == 3 + 2
     page = Page((folder / "stability.html").read_text())
     assert not page.foreign
     assert len(page.ids) == len(set(page.ids))
@@ -260,7 +242,7 @@ def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
     outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Silent())
     (curve,) = outcome.curves
     assert curve.levels[1:] == (None, None)
-    assert span_words(curve.below_best(), curve.strengths) == "1"
+    assert place_words(curve.below_best(), curve.strengths) == "1"
     assert any("no light in shot 3" in line for line in outcome.left_out)
 
 
@@ -284,7 +266,6 @@ def test_the_command_prints_the_table(few_steps, command):
     )
     assert code == 0
     assert "Lamp flicker" in out
-    assert "not screened" in " ".join(out.split())
     assert "stability.html" in out
 
 

@@ -22,9 +22,9 @@ class Export:
     """What is written: a light field (v, u, y, x, c), linear, in [0, 1], and its maps if any.
 
     disparity: (y, x) of the centre view, pixels per view step. sigma: standard deviation
-    (v, u, y, x). model: (y, x), indices of `emmc_rig.pages.viewer.MODEL_NAMES`. misfit: (y, x),
-    readings missed, in deviations of their noise. truth: as light_field. caption: one line.
-    metrics: what metrics.json says of a result. source: what was opened, as typed.
+    (v, u, y, x). misfit: (y, x), readings missed, in deviations of their noise. truth: as
+    light_field. caption: one line. metrics: what metrics.json says of a result. source: what was
+    opened, as typed.
     """
 
     title: str
@@ -33,7 +33,6 @@ class Export:
     truth: Array | None = None
     disparity: Array | None = None
     sigma: Array | None = None
-    model: NDArray | None = None
     misfit: Array | None = None
     metrics: Mapping[str, object] = field(default_factory=dict)
     source: str = ""

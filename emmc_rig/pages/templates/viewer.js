@@ -350,8 +350,7 @@ function reading() {
     const at = 4 * (y * width + x), level = overlayLevels[k].data[at] / 255;
     if (!overlayLevels[k].data[at + 3]) { here.push(`${one.label} unknown`); return; }
     const value = one.low + level * (one.high - one.low);
-    here.push(one.names.length ? `${one.label}: ${one.names[Math.round(value)]}`
-      : `${one.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${one.unit}`.trimEnd());
+    here.push(`${one.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${one.unit}`.trimEnd());
   });
   return here.join(", ");
 }
@@ -375,9 +374,8 @@ function drawEpi() {
   other.fillRect(0, state.y, rows, 1);
 }
 
-function colourOf(colours, at, kinds) {
+function colourOf(colours, at) {
   const last = colours.length - 1, place = at * last;
-  if (kinds) return colours[Math.round(place)];
   const k = Math.min(Math.floor(place), last - 1);
   return [0, 1, 2].map((c) => Math.round(colours[k][c] + (place - k) * (colours[k + 1][c] - colours[k][c])));
 }
@@ -391,30 +389,21 @@ function choose(overlay) {
   legend.replaceChildren();
   if (one) {
     const levels = overlayLevels[state.overlay], coloured = new ImageData(width, height);
-    const table = Array.from({ length: 256 }, (_, i) => colourOf(one.colours, i / 255, one.names.length));
+    const table = Array.from({ length: 256 }, (_, i) => colourOf(one.colours, i / 255));
     for (let i = 0; i < coloured.data.length; i += 4) {
       const [r, g, b] = table[levels.data[i]];
       coloured.data.set([r, g, b, levels.data[i + 3]], i);
     }
     renderer.lay(coloured);
-    const add = (to, kind, text, name) => {
+    const add = (to, kind, text) => {
       const made = to.appendChild(document.createElement(kind));
       made.textContent = text;
-      if (name) made.className = name;
       return made;
     };
-    if (one.names.length)
-      one.names.forEach((name, k) => {
-        const row = add(legend, "div", "", "kind");
-        add(row, "i", "").style.background = `rgb(${one.colours[k]})`;
-        add(row, "span", name);
-      });
-    else {
-      add(legend, "i", "").style.background = `linear-gradient(90deg,${one.colours.map((c) => `rgb(${c})`)})`;
-      const ends = add(legend, "div", "");
-      add(ends, "span", one.low.toPrecision(2));
-      add(ends, "span", `${one.high.toPrecision(2)} ${one.unit}`);
-    }
+    add(legend, "i", "").style.background = `linear-gradient(90deg,${one.colours.map((c) => `rgb(${c})`)})`;
+    const ends = add(legend, "div", "");
+    add(ends, "span", one.low.toPrecision(2));
+    add(ends, "span", `${one.high.toPrecision(2)} ${one.unit}`);
   }
   changed();
 }

@@ -4,56 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.chart_points import Point
 from emmc_rig.study.chart.measure import Job, Worker
-from emmc_rig.study.points import NotApplicableError, Results, Study
-from emmc_rig.study.rows import available_cores, dictionary_identity, digest_of, machine
-from reconstruction.methods import METHODS
-
-PICTURES = "pictures"
+from emmc_rig.study.pictured import PicturedStudy
+from emmc_rig.study.points import Results
+from emmc_rig.study.rows import available_cores
 
 
 @dataclass
-class ChartStudy(Study[Point]):
+class ChartStudy(PicturedStudy[Point]):
     """The points of a chart; settings: ChartSettings."""
 
-    revision = 3
+    revision = 4
 
-    def picture(self, point: Point) -> Path:
-        """Return where the picture of a point is kept."""
-        return self.folder / PICTURES / f"{self.digest(point)}.webp"
-
-    def truth_picture(self, point: Point) -> Path:
-        """Return where the picture of a point's truth is kept."""
-        digest = digest_of(point.capture.identity())
-        return self.folder / PICTURES / f"{digest}-truth.webp"
+    def trial_inputs(self, point: Point) -> dict[str, object]:
+        """Return what a point's truth depends on, as plain data."""
+        return point.capture.identity()
 
     def inputs(self, point: Point) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
-        configuration, settings = point.configuration, self.settings
-        method = METHODS[configuration.method]
-        if not method.installed:
-            raise NotApplicableError(f"{method.name} needs {method.package}: not installed")
+        settings = self.settings
         return {
-            "machine": machine(),
+            **self.method_inputs(point.configuration.method),
             "capture": point.capture.identity(),
-            "method": method.name,
-            "settings": configuration.settings.model_dump(mode="json"),
-            "dictionary": (
-                dictionary_identity(settings.dictionary) if method.needs_dictionary else None
-            ),
+            "settings": point.configuration.settings.model_dump(mode="json"),
             "cores": available_cores(),
             "repeats": settings.repeats,
             "enough_s": settings.enough_s,
             "limit_s": settings.limit_s,
         }
-
-    def is_whole(self, point: Point, result: dict) -> bool:
-        """Return whether a point that has figures has its picture."""
-        return "failed" in result or self.picture(point).is_file()
 
     def group(self, point: Point) -> Hashable:
         """All points are measured by the same process."""
@@ -61,7 +42,6 @@ class ChartStudy(Study[Point]):
 
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the points' figures, those of one capture after the other."""
-        (self.folder / PICTURES).mkdir(exist_ok=True)
         settings = self.settings
         with Worker(settings.limit_s) as worker:
             for point in points:

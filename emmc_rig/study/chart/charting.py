@@ -25,7 +25,6 @@ from emmc_rig.pages.drawing import (
     sheet,
     titled,
 )
-from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import (
     Head,
     Section,
@@ -39,6 +38,7 @@ from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.chart_points import ChartSettings, Point, charted_points
 from emmc_rig.study.chart.chart_study import ChartStudy
 from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts
+from emmc_rig.study.pictured import ShownMark, marks_data
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import (
     available_cores,
@@ -188,7 +188,7 @@ def _means(results: Sequence[dict]) -> dict[str, str]:
 
 def _shown(study: ChartStudy, mark: Mark) -> ShownMark:
     pairs = [
-        ShownPair(
+        (
             f"{point.capture.scene_name}: {study.results[point]['psnr_db']:.2f} dB",
             study.picture(point),
             study.truth_picture(point),

@@ -19,11 +19,10 @@ from pathlib import Path
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
 from emmc_rig.errors import AppError
-from emmc_rig.files.memory import forget_peak, peak_memory_mib
 from emmc_rig.model.errors import ModelError
-from emmc_rig.pages.pictures import epipolar_lines
-from emmc_rig.pages.thumbnails import save_thumbnail
+from emmc_rig.processing.memory import forget_peak, peak_memory_mib
 from emmc_rig.study.chart.chart_points import Point
+from emmc_rig.study.pictured import save_pair
 from emmc_rig.study.rows import available_cores, plain
 from emmc_rig.study.scores import scored
 from emmc_rig.study.trial import Trial, trial_of
@@ -74,10 +73,7 @@ def measured(job: Job) -> dict:
     scores = scored(
         result.light_field, trial.truth, trial.disparity_px, result.maps.get("disparity")
     )
-    lines = epipolar_lines(trial.truth)
-    save_thumbnail(job.picture, result.light_field, lines)
-    if not job.truth_picture.exists():
-        save_thumbnail(job.truth_picture, trial.truth, lines)
+    save_pair(job.picture, job.truth_picture, result.light_field, trial.truth)
     return plain(
         {
             **asdict(scores),

@@ -1,4 +1,4 @@
-"""Measured points as curves, one per fault, method and screening; where each of them breaks.
+"""Measured points as curves, one per fault and method; where each of them breaks.
 
 A place on a sweep is an index into its strengths, with a fraction between two of them.
 """
@@ -11,45 +11,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emmc_rig.study.stability.fault import Fault
 from emmc_rig.study.stability.faults import FAULTS, Point
-from emmc_rig.study.trial import Fault
 
 LOST_DB = 3.0
+POOLED = "all scenes"
+Levels = Sequence[float | None]
+"""PSNR in dB by strength; None where a method failed."""
+BreakingRow = tuple[Fault, list[str]]
+"""A fault, and where each method breaks under it, in words."""
 
 
-@dataclass(frozen=True)
-class Span:
-    """Between which places a curve stays above its limit; None: to the end of the sweep.
-
-    low: towards the harmless end, which is where a design may break too. high: towards the
-    hopeless end.
-    """
-
-    low: float | None
-    high: float | None
+def below_best(levels: Levels, whole: bool = False) -> float | None:
+    """Return the place beyond their best where levels fall LOST_DB below it; see `crossing`."""
+    best = max((level for level in levels if level is not None), default=0.0)
+    return crossing([None if v is None else v - best + LOST_DB for v in levels], whole)
 
 
-def known_levels(levels: Sequence[float | None]) -> tuple[list[int], list[float]]:
-    """Return places and levels where there are such."""
-    pairs = [(i, level) for i, level in enumerate(levels) if level is not None]
-    return [i for i, _ in pairs], [level for _, level in pairs]
-
-
-def below_best(levels: Sequence[float | None], whole: bool = False) -> Span | None:
-    """Return where levels (dB, None where a method failed) fall LOST_DB below their best.
-
-    None where there is no level at all. whole: see `span`.
-    """
-    known = [level for level in levels if level is not None]
-    if not known:
-        return None
-    return span([None if v is None else v - max(known) + LOST_DB for v in levels], whole)
-
-
-def below_view(
-    levels: Sequence[float | None], views: Sequence[float | None], whole: bool = False
-) -> Span | None:
-    """Return where levels fall below those of the copied centre view; None: they never exceed it.
+def below_view(levels: Levels, views: Levels, whole: bool = False) -> float | None:
+    """Return the place where levels fall below those of the copied centre view; see `crossing`.
 
     Where the copied view is exact (None or infinite) nothing exceeds it.
     """
@@ -57,30 +37,27 @@ def below_view(
         None if level is None or view is None or math.isinf(view) else level - view
         for level, view in zip(levels, views, strict=True)
     ]
-    return span(margins, whole)
+    return crossing(margins, whole)
 
 
-def span(margins: Sequence[float | None], whole: bool = False) -> Span | None:
-    """Return how far around the largest margin the margins stay at 0 or above.
+def crossing(margins: Levels, whole: bool = False) -> float | None:
+    """Return the first place beyond the largest margin where margins fall below 0.
 
-    Crossings are interpolated linearly between the measured places; whole: there is nothing
-    between them, so the first one beyond counts. None where no margin reaches 0.
+    None where they do not; 0 where no margin reaches 0. Between the measured places margins are
+    linear; whole: there is nothing between them, so the first one beyond counts.
     """
     values = [-math.inf if margin is None else margin for margin in margins]
     start = max(range(len(values)), key=values.__getitem__)
     if not values[start] >= 0:
-        return None
-    return Span(_crossing(values, start, -1, whole), _crossing(values, start, 1, whole))
-
-
-def _crossing(values: Sequence[float], start: int, step: int, whole: bool) -> float | None:
-    at = start
-    while 0 <= at + step < len(values):
-        if values[at + step] < 0:
-            if whole or math.isinf(values[at + step]):
-                return float(at + step)
-            return at + step * values[at] / (values[at] - values[at + step])
-        at += step
+        return 0.0
+    for at in range(start + 1, len(values)):
+        if values[at] < 0:
+            before = values[at - 1]
+            return (
+                float(at)
+                if whole or math.isinf(values[at])
+                else (at - 1 + before / (before - values[at]))
+            )
     return None
 
 
@@ -96,64 +73,41 @@ def strength_at(strengths: Sequence[float], place: float) -> float:
     return first + (last - first) * part
 
 
-def span_words(found: Span | None, strengths: Sequence[float]) -> str:
-    """Return a span in words, for the table."""
-    if found is None:
+def place_words(place: float | None, strengths: Sequence[float]) -> str:
+    """Return a breaking point in words, for the table: two digits and no exponent."""
+    if place is None:
+        return "never"
+    if place == 0:
         return "already at the mildest"
-    words = []
-    if found.low is not None:
-        words.append(f"before {_plain(strength_at(strengths, found.low))}")
-    if found.high is not None:
-        from_there = _plain(strength_at(strengths, found.high))
-        words.append(f"from {from_there}" if words else from_there)
-    return ", ".join(words) or "never"
-
-
-def _plain(strength: float) -> str:
-    """Return a strength with two digits and no exponent: 0.042, 12, 340."""
-    rounded = float(f"{strength:.2g}")
+    rounded = float(f"{strength_at(strengths, place):.2g}")
     return f"{rounded:.0f}" if rounded >= 10 else f"{rounded:g}"
-
-
-POOLED = "all scenes"
 
 
 @dataclass(frozen=True)
 class Curve:
     """PSNR by strength. scene: a scene's name, or POOLED: the mean over those with the fault.
 
-    levels: dB, None where the method failed. views: the copied centre view of the truth; None
-    where it is exact. points: those of each strength, one a scene.
+    views: the copied centre view of the truth; None where it is exact. points: those of each
+    strength, one a scene.
     """
 
     scene: str
     fault: Fault
     method: str
-    screened: bool
     strengths: tuple[float, ...]
     levels: tuple[float | None, ...]
     views: tuple[float | None, ...]
     points: tuple[tuple[Point, ...], ...]
 
-    @property
-    def label(self) -> str:
-        """The method, and whether it got the frames as they were."""
-        return self.method if self.screened else f"{self.method}, not screened"
-
-    @property
-    def key(self) -> str:
-        """Unique among the curves of one scene."""
-        return f"{self.fault.name}-{self.method}{'' if self.screened else '-bare'}"
-
     def mark_name(self, index: int) -> str:
         """Return the name of a measured point in the drawing, unique on the page."""
-        return f"mark-{self.scene.replace(' ', '-')}-{self.key}-{index}"
+        return f"mark-{self.scene.replace(' ', '-')}-{self.fault.name}-{self.method}-{index}"
 
-    def below_best(self) -> Span | None:
+    def below_best(self) -> float | None:
         """Return where it breaks by the first measure: 3 dB below its best."""
         return below_best(self.levels, self.fault.whole)
 
-    def below_view(self) -> Span | None:
+    def below_view(self) -> float | None:
         """Return where it breaks by the second: below the copied centre view."""
         return below_view(self.levels, self.views, self.fault.whole)
 
@@ -161,33 +115,31 @@ class Curve:
 def curves(results: Mapping[Point, dict]) -> list[Curve]:
     """Return the curves of every scene, those of all scenes first where there are several."""
     scenes = list(dict.fromkeys(point.scene_name for point in results))
-    kinds = list(dict.fromkeys((str(p.fault), p.method, p.screened) for p in results))
-    found = []
+    kinds = list(dict.fromkeys((str(p.fault), p.method) for p in results))
+    groups = [(scene, [scene]) for scene in scenes]
     if len(scenes) > 1:
-        found += [_curve(POOLED, scenes, kind, results) for kind in kinds]
-    for scene in scenes:
-        found += [_curve(scene, [scene], kind, results) for kind in kinds]
-    return [curve for curve in found if curve is not None]
+        groups.insert(0, (POOLED, scenes))
+    every = (_curve(name, some, *kind, results) for name, some in groups for kind in kinds)
+    return [curve for curve in every if curve is not None]
 
 
 def _curve(
-    name: str, scenes: Sequence[str], kind: tuple[str, str, bool], results: Mapping[Point, dict]
+    name: str, scenes: Sequence[str], fault: str, method: str, results: Mapping[Point, dict]
 ) -> Curve | None:
     """Return one curve; of several scenes those that have every strength that any has."""
     by_scene = {
         scene: {
             point.strength: point
             for point in results
-            if point.scene_name == scene and (point.fault, point.method, point.screened) == kind
+            if (point.scene_name, point.fault, point.method) == (scene, fault, method)
         }
         for scene in scenes
     }
-    most = max(len(found) for found in by_scene.values())
-    whole = [found for found in by_scene.values() if len(found) == most]
+    most = max(len(some) for some in by_scene.values())
+    whole = [some for some in by_scene.values() if len(some) == most]
     if most < 2:
         return None
-    fault, method, screened = kind
-    points = tuple(tuple(found[s] for found in whole) for s in whole[0])
+    points = tuple(tuple(some[s] for some in whole) for s in whole[0])
 
     def mean(key: str) -> tuple[float | None, ...]:
         means = []
@@ -197,67 +149,38 @@ def _curve(
         return tuple(means)
 
     return Curve(
-        name, FAULTS[fault], method, screened, tuple(whole[0]), mean("psnr_db"), mean("view_db"),
-        points,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class BreakingRow:
-    """One line of the table "method x fault -> breaking point"; cells: one per method."""
-
-    fault: Fault
-    title: str
-    unit: str
-    cells: tuple[str, ...]
+        name, FAULTS[fault], method, tuple(whole[0]), mean("psnr_db"), mean("view_db"), points
+    )
 
 
 def breaking_rows(curves: Sequence[Curve], scene: str) -> tuple[list[BreakingRow], tuple[str, ...]]:
-    """Return the table of one scene, or of all together, and the methods of its columns.
-
-    A fault that was measured with and without screening has two rows.
-    """
-    of_scene = [curve for curve in curves if curve.scene == scene]
-    methods = tuple(dict.fromkeys(curve.method for curve in of_scene))
+    """Return the table of one scene, or of all together: cells by fault; and their methods."""
+    of_scene = {(c.fault.name, c.method): c for c in curves if c.scene == scene}
+    methods = tuple(dict.fromkeys(method for _, method in of_scene))
     rows = []
     for fault in FAULTS.values():
-        kinds = {curve.screened for curve in of_scene if curve.fault == fault}
-        for screened in sorted(kinds, reverse=True):
-            some = {
-                curve.method: curve
-                for curve in of_scene
-                if curve.fault == fault and curve.screened is screened
-            }
-            title = fault.title + (", not screened" if len(kinds) > 1 and not screened else "")
-            cells = tuple(_cell(some[name]) if name in some else "-" for name in methods)
-            rows.append(BreakingRow(fault, title, fault.unit, cells))
+        some = [of_scene.get((fault.name, method)) for method in methods]
+        if any(some):
+            rows.append((fault, ["-" if curve is None else _cell(curve) for curve in some]))
     return rows, methods
 
 
 def _cell(curve: Curve) -> str:
-    return " / ".join(
-        span_words(span, curve.strengths) for span in (curve.below_best(), curve.below_view())
-    )
+    places = curve.below_best(), curve.below_view()
+    return " / ".join(place_words(place, curve.strengths) for place in places)
 
 
 def break_row(curve: Curve) -> dict[str, object]:
     """Return where a curve breaks, in its fault's unit."""
-    best, view = curve.below_best(), curve.below_view()
-    known = [level for level in curve.levels if level is not None]
-
-    def ends(name: str, span: Span | None) -> dict[str, object]:
-        places = (None, None) if span is None else (span.low, span.high)
-        low, high = (None if p is None else strength_at(curve.strengths, p) for p in places)
-        return {f"{name}_from": low, f"{name}_to": high, name: span_words(span, curve.strengths)}
-
-    return {
+    row: dict[str, object] = {
         "scene": curve.scene,
         "fault": curve.fault.name,
         "unit": curve.fault.unit,
         "repairable": curve.fault.repairable,
         "method": curve.method,
-        "screened": curve.screened,
-        "best_db": max(known, default=None),
-        **ends("below_best", best),
-        **ends("below_view", view),
+        "best_db": max((level for level in curve.levels if level is not None), default=None),
     }
+    for name, place in (("below_best", curve.below_best()), ("below_view", curve.below_view())):
+        row[f"{name}_to"] = None if place is None else strength_at(curve.strengths, place)
+        row[name] = place_words(place, curve.strengths)
+    return row

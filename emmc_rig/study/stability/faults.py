@@ -6,16 +6,11 @@ from dataclasses import dataclass, replace
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import nearest_of
-from emmc_rig.study.stability import (
-    design_faults,
-    mask_faults,
-    scene_faults,
-    sensor_faults,
-    shot_faults,
-)
-from emmc_rig.study.trial import Capture, Fault, Trial, trial_of, with_shots
+from emmc_rig.study.stability import mask_faults, scene_faults, sensor_faults, shot_faults
+from emmc_rig.study.stability.fault import Fault
+from emmc_rig.study.trial import Capture, Trial, trial_of, with_shots
 
-KINDS = (sensor_faults, mask_faults, shot_faults, scene_faults, design_faults)
+KINDS = (sensor_faults, mask_faults, shot_faults, scene_faults)
 FAULTS = {fault.name: fault for module in KINDS for fault in module.FAULTS}
 
 
@@ -30,14 +25,13 @@ def find_fault(name: str) -> Fault:
 class Point:
     """A method on a capture with a fault of some strength; fault None: nothing is wrong.
 
-    screened: whether the frames are screened first. method "": what all methods get.
+    method "": what all methods get.
     """
 
     capture: Capture
     fault: str | None
     strength: float
     method: str = ""
-    screened: bool = True
 
     @property
     def scene_name(self) -> str:
@@ -45,25 +39,21 @@ class Point:
         return self.capture.scene_name
 
     @property
-    def condition(self) -> str:
-        """What is wrong, in words."""
-        if self.fault is None:
-            return "nothing wrong"
-        fault = FAULTS[self.fault]
-        return f"{fault.title} {self.strength:g} {fault.unit}"
-
-    @property
     def label(self) -> str:
         """In words."""
-        words = (self.scene_name, self.capture.camera_name, self.condition, self.method)
-        return ", ".join(filter(None, words)) + ("" if self.screened else ", not screened")
+        condition = "nothing wrong"
+        if self.fault is not None:
+            fault = FAULTS[self.fault]
+            condition = f"{fault.title} {self.strength:g} {fault.unit}"
+        words = (self.scene_name, self.capture.camera_name, condition, self.method)
+        return ", ".join(filter(None, words))
 
     @property
     def same_trial(self) -> Point:
-        """What all points of one trial have in common; a strength that is no fault is none."""
-        if self.fault and FAULTS[self.fault].is_clean(self.strength):
+        """What all points of one trial have in common; a strength 0 is no fault."""
+        if self.fault and self.strength == 0:
             return Point(enough_shots(self.capture, FAULTS[self.fault]), None, 0.0)
-        return replace(self, method="", screened=True)
+        return replace(self, method="")
 
     def trial(self) -> Trial:
         """Return what a method gets, and the truth.
@@ -72,12 +62,11 @@ class Point:
         pixels are those given to the method. Raises NotApplicableError where the fault does not
         apply to the scene or the camera, and what the layers below do.
         """
-        if self.fault is None:
-            return trial_of(self.capture)
-        fault = FAULTS[self.fault]
-        capture = enough_shots(self.capture, fault)
-        clean = fault.is_clean(self.strength)
-        return trial_of(capture) if clean else fault.make(capture, self.strength)
+        point = self.same_trial
+        if point.fault is None:
+            return trial_of(point.capture)
+        fault = FAULTS[point.fault]
+        return fault.make(enough_shots(point.capture, fault), point.strength)
 
 
 def enough_shots(capture: Capture, fault: Fault) -> Capture:

@@ -15,7 +15,8 @@ from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.points import NotApplicableError
-from emmc_rig.study.trial import MASK, Capture, Fault, Trial, trial_of
+from emmc_rig.study.stability.fault import MASK, Fault
+from emmc_rig.study.trial import Capture, Trial, trial_of
 from simulators.flaws import OpticsFlaws
 
 

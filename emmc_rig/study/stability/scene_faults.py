@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from emmc_rig.study.trial import SCENE, Capture, Fault, Trial, trial_of
+from emmc_rig.study.stability.fault import SCENE, Fault
+from emmc_rig.study.trial import Capture, Trial, trial_of
 from simulators import changes
 from simulators.scenes import SCENES
 

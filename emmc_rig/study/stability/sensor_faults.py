@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.camera import pixel_light
 from emmc_rig.model.noise import SensorNoise
-from emmc_rig.study.trial import SENSOR, Array, Capture, Fault, Trial, trial_of
+from emmc_rig.study.stability.fault import SENSOR, Fault
+from emmc_rig.study.trial import Array, Capture, Trial, trial_of
 from simulators.flaws import SensorFlaws
 
 DEAD_RESPONSE = 0.02
@@ -126,7 +127,7 @@ FAULTS = (
     Fault(
         "bad-pixels", "Bad pixels, not marked", "% of pixels",
         (0, 0.1, 0.3, 1, 3, 10, 30), (0, 0.3, 3, 20),
-        SENSOR, bad_pixels, repairable=True, screened=True,
+        SENSOR, bad_pixels, repairable=True,
     ),
     Fault(
         "masked-pixels", "Bad pixels, masked", "% of pixels",

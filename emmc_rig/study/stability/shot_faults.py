@@ -10,7 +10,8 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
 from emmc_rig.study.points import NotApplicableError
-from emmc_rig.study.trial import SEVERAL, SHOTS, Array, Capture, Fault, Trial, trial_of
+from emmc_rig.study.stability.fault import SEVERAL, SHOTS, Fault
+from emmc_rig.study.trial import Array, Capture, Trial, trial_of
 from simulators import changes
 from simulators.raycaster import World
 
@@ -116,7 +117,7 @@ FAULTS = (
     Fault(
         "flicker", "Lamp flicker between shots", "%",
         (0, 1, 2, 5, 10, 20, 40, 80), (0, 2, 10, 40),
-        SHOTS, flicker, repairable=True, screened=True, shots=SEVERAL,
+        SHOTS, flicker, repairable=True, shots=SEVERAL,
     ),
     Fault(
         "scene-motion", "Scene motion", "px a shot",
@@ -131,13 +132,13 @@ FAULTS = (
     Fault(
         "missing-shot", "Missing shots", "shots",
         (0, 1, 2), (0, 1, 2),
-        SHOTS, missing_shot, repairable=True, screened=True, shots=SEVERAL,
+        SHOTS, missing_shot, repairable=True, shots=SEVERAL,
         whole=True,
     ),
     Fault(
         "repeated-shot", "Repeated shots", "shots",
         (0, 1, 2), (0, 1, 2),
-        SHOTS, repeated_shot, repairable=True, screened=True, shots=SEVERAL,
+        SHOTS, repeated_shot, repairable=True, shots=SEVERAL,
         whole=True,
     ),
 )  # fmt: skip

@@ -7,18 +7,18 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from emmc_rig.pages.drawing import FAINT, INK, legend_below, save_drawing, sheet, titled
-from emmc_rig.pages.marks import ShownMark, ShownPair, marks_data
 from emmc_rig.pages.page import Head, Section, fragment, framed, inline_svg, number
-from emmc_rig.study.stability.curves import LOST_DB, Curve, Span, breaking_rows, known_levels
+from emmc_rig.study.pictured import ShownMark, marks_data
+from emmc_rig.study.stability.curves import LOST_DB, Curve, Levels, breaking_rows
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.stability.stability_study import StabilityStudy
 
-DASHED = (0, (3, 2))
 PANEL_INCHES = (3.9, 2.75)
 FLOOR_DB = 6.0
 """Below the least of the copied centre view: further down, a curve says nothing more."""
@@ -43,30 +43,21 @@ def draw_curves(
 def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None:
     fault, strengths = curves[0].fault, curves[0].strengths
     views = next((c.views for c in curves if None not in c.views), curves[0].views)
-    mixed = _is_mixed(curves)
-    axes.plot(*known_levels(views), ":", color=FAINT, linewidth=1.2, zorder=1)
-    for curve in curves:
-        colour = colours[curve.method]
-        places, levels = known_levels(curve.levels)
-        axes.plot(
-            places, levels,
-            linestyle=DASHED if mixed and not curve.screened else "-", color=colour, linewidth=1.5,
-            zorder=2,
-        )  # fmt: skip
-        for i, level in zip(places, levels, strict=True):
-            (dot,) = axes.plot(
-                i, level, "o", markersize=3.6, color=colour, zorder=3,
-                markerfacecolor="white" if mixed and not curve.screened else colour,
-            )  # fmt: skip
-            dot.set_gid(curve.mark_name(i))
+    axes.plot(*_known(views), ":", color=FAINT, linewidth=1.2, zorder=1)
     floor = _limit(axes, curves)
     for curve in curves:
         colour = colours[curve.method]
-        for place, level, mark in _breaks(curve):
-            level = max(level, floor)
+        places, levels = _known(curve.levels)
+        axes.plot(places, levels, "-", color=colour, linewidth=1.5, zorder=2)
+        for i, level in zip(places, levels, strict=True):
+            (dot,) = axes.plot(i, level, "o", markersize=3.6, color=colour, zorder=3)
+            dot.set_gid(curve.mark_name(i))
+        place = curve.below_best()
+        if place is not None and levels:
+            level = max(float(np.interp(place, places, levels)), floor)
             axes.plot(
-                place, level, mark, color=colour, markersize=9,
-                markerfacecolor="none", markeredgewidth=1.4, zorder=4, clip_on=False,
+                place, level, "x", color=colour, markersize=9, markeredgewidth=1.4, zorder=4,
+                clip_on=False,
             )  # fmt: skip
     axes.set_xticks(range(len(strengths)), [shown(strength) for strength in strengths])
     axes.set_xlim(-0.25, len(strengths) - 0.75)
@@ -74,29 +65,10 @@ def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None
     titled(axes, fault.title, fault.unit)
 
 
-def _breaks(curve: Curve) -> list[tuple[float, float, str]]:
-    """Return place, level and mark of every breaking point."""
-    found = []
-    for span, mark in ((curve.below_best(), "x"), (curve.below_view(), "D")):
-        for place in () if span is None else (span.low, span.high):
-            level = None if place is None else _level_at(curve.levels, place)
-            if place is not None and level is not None:
-                found.append((place, level, mark))
-    return found
-
-
-def _level_at(levels: Sequence[float | None], place: float) -> float | None:
-    index = min(int(place), len(levels) - 1)
-    part = place - index
-    first, last = levels[index], levels[min(index + 1, len(levels) - 1)]
-    if first is None or (part and last is None):
-        return None
-    return first if not part or last is None else first + part * (last - first)
-
-
-def _is_mixed(curves: Sequence[Curve]) -> bool:
-    """Whether some of the curves are of screened frames and some are not."""
-    return len({curve.screened for curve in curves}) > 1
+def _known(levels: Levels) -> tuple[list[int], list[float]]:
+    """Return places and levels where there are such."""
+    pairs = [(i, level) for i, level in enumerate(levels) if level is not None]
+    return [i for i, _ in pairs], [level for _, level in pairs]
 
 
 def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
@@ -124,13 +96,8 @@ def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) ->
     methods = dict.fromkeys(curve.method for curve in curves)
     lines = [Line2D([], [], color=colours[name], marker="o", markersize=4) for name in methods]
     names = list(methods)
-    if _is_mixed(curves):
-        lines.append(Line2D([], [], color=INK, linestyle=DASHED, marker="o", markersize=4,
-                            markerfacecolor="white"))  # fmt: skip
-        names.append("frames not screened")
-    for mark, name in (("x", f"{LOST_DB:g} dB below its best"), ("D", "below the copied view")):
-        lines.append(Line2D([], [], color=INK, linestyle="", marker=mark, markerfacecolor="none"))
-        names.append(name)
+    lines.append(Line2D([], [], color=INK, linestyle="", marker="x"))
+    names.append(f"{LOST_DB:g} dB below its best")
     lines.append(Line2D([], [], color=FAINT, linestyle=":"))
     names.append("copied true centre view")
     legend_below(figure, lines, names, 5)
@@ -164,11 +131,8 @@ def _head(curves: Sequence[Curve]) -> Head:
     """Return the method that breaks under the fewest faults; curves: pooled first."""
     first = [curve for curve in curves if curve.scene == curves[0].scene]
     faults = len({curve.fault.name for curve in first})
-    # Not screened are only the faults that screening is for: no number to compare with.
-    shown = [curve for curve in first if curve.screened] or first
-    broken = Counter({curve.label: 0 for curve in shown})
-    never = Span(None, None)
-    broken.update(curve.label for curve in shown if curve.below_best() != never)
+    broken = Counter({curve.method: 0 for curve in first})
+    broken.update(curve.method for curve in first if curve.below_best() is not None)
     if not broken:
         why = "no method ran under any of the faults"
         return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
@@ -205,15 +169,18 @@ def _marks(study: StabilityStudy, curves: Iterable[Curve]) -> dict[str, ShownMar
         for index, (strength, level, points) in enumerate(measured):
             if level is not None:
                 label = f"{curve.fault.title}, {shown(strength)} {curve.fault.unit}"
-                pairs = [_pair(study, point) for point in points]
-                words = f"{curve.label}: {level:.2f} dB"
+                pairs = [
+                    (_words(study, point), study.picture(point), study.truth_picture(point))
+                    for point in points
+                ]
+                words = f"{curve.method}: {level:.2f} dB"
                 marks[curve.mark_name(index)] = ShownMark(label, words, pairs)
     return marks
 
 
-def _pair(study: StabilityStudy, point: Point) -> ShownPair:
+def _words(study: StabilityStudy, point: Point) -> str:
     result = study.results[point]
     words = f"{point.scene_name}: {number(result['psnr_db'], '.2f')} dB"
-    if result["view_db"] is not None:
-        words += f", copied centre view {result['view_db']:.2f} dB"
-    return ShownPair(words, study.picture(point), study.truth_picture(point))
+    if result["view_db"] is None:
+        return words
+    return f"{words}, copied centre view {result['view_db']:.2f} dB"

@@ -34,17 +34,15 @@ from reconstruction.methods import METHODS
 DRAWN = "charts"
 POINTS_CSV, BREAKS_CSV, PAGE = "points.csv", "breaking.csv", "stability.html"
 POINT_COLUMNS = (
-    "scene", "fault", "unit", "strength", "method", "screened", "psnr_db", "view_db",
-    "angular_db", "usable", "noise_sigma", "psi_error", "status", "advice", "screening",
+    "scene", "fault", "unit", "strength", "method", "psnr_db", "view_db", "angular_db",
+    "usable", "noise_sigma", "psi_error", "status", "advice", "screening",
     "failed",
 )  # fmt: skip
 BREAK_COLUMNS = (
-    "scene", "fault", "unit", "repairable", "method", "screened", "best_db",
-    "below_best_from", "below_best_to", "below_best", "below_view_from", "below_view_to",
-    "below_view",
+    "scene", "fault", "unit", "repairable", "method", "best_db", "below_best_to", "below_best",
+    "below_view_to", "below_view",
 )  # fmt: skip
-"""`..._to`: the strength from which on it is broken, towards the hopeless end; `..._from`: the one
-towards the other end below which it is; empty: not within the sweep. The last says it in words."""
+"""`..._to`: the strength from which on it is broken; empty: not within the sweep. Then in words."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ def _write(study: StabilityStudy, folder: Path, outcome: StabilityOutcome) -> No
     breaks = [break_row(curve) for curve in found]
     text = stability_page(_about(study, outcome.left_out), sections, study, found)
     rows = [_row(*pair) for pair in study.results.items()]
-    write_text(folder / POINTS_CSV, csv_text(rows, POINT_COLUMNS, forms={"strength": "g"}))
+    write_text(folder / POINTS_CSV, csv_text(rows, POINT_COLUMNS))
     write_text(folder / BREAKS_CSV, csv_text(breaks, BREAK_COLUMNS))
     write_text(folder / PAGE, text)
     metrics = {
@@ -148,7 +146,6 @@ def _row(point: Point, result: dict) -> dict[str, object]:
         "unit": FAULTS[str(point.fault)].unit,
         "strength": float(point.strength),
         "method": point.method,
-        "screened": point.screened,
     }
 
 

@@ -7,26 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
-from emmc_rig.pages.pictures import epipolar_lines
-from emmc_rig.pages.thumbnails import save_thumbnail
 from emmc_rig.progress import Watcher
-from emmc_rig.study.points import NotApplicableError, Results, Study
-from emmc_rig.study.rows import (
-    check_scene_names,
-    check_size,
-    described,
-    dictionary_identity,
-    digest_of,
-    machine,
-)
+from emmc_rig.study.pictured import PicturedStudy, save_pair
+from emmc_rig.study.points import Results
+from emmc_rig.study.rows import check_scene_names, check_size, described
 from emmc_rig.study.scores import angular_snr_db
 from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.trial import Capture, Trial
@@ -45,11 +35,7 @@ FAST_SIZE, FAST_ZOOM = (36, 48), 4
 
 
 class StabilitySettings(Settings):
-    """What to sweep. faults, methods: names; empty takes all. zoom: see `zoomed_scene`.
-
-    screening: whether the frames are screened for bad pixels and shots before they are
-    reconstructed; "both" measures without too, for the faults that screening is for.
-    """
+    """What to sweep. faults, methods: names; empty takes all. zoom: see `zoomed_scene`."""
 
     scenes: tuple[str, ...]
     camera: str = CAMERA
@@ -58,7 +44,6 @@ class StabilitySettings(Settings):
     fast: bool = False
     faults: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
-    screening: Literal["on", "off", "both"] = "both"
     dictionary: str | None = None
     seed: int = Field(default=0, ge=0)
 
@@ -99,35 +84,24 @@ def planned(settings: StabilitySettings) -> list[Point]:
     check_size(settings.size)
     check_scene_names(settings.scenes)
     methods = chosen_methods(settings)
-    both = settings.screening == "both"
     return [
-        Point(capture, fault.name, strength, method, screened)
+        Point(capture, fault.name, strength, method)
         for capture in settings.captures
         for fault in [find_fault(name) for name in settings.faults] or FAULTS.values()
         for strength in (fault.quick if settings.fast else fault.strengths)
         for method in methods
-        for screened in (
-            (True, False) if both and fault.screened else (settings.screening != "off",)
-        )
     ]
 
 
-PICTURES = "pictures"
-
-
 @dataclass
-class StabilityStudy(Study[Point]):
+class StabilityStudy(PicturedStudy[Point]):
     """The points; settings: StabilitySettings."""
 
-    revision = 1
+    revision = 2
 
-    def picture(self, point: Point) -> Path:
-        """Return where the picture of a point is kept."""
-        return self.folder / PICTURES / f"{self.digest(point)}.webp"
-
-    def truth_picture(self, point: Point) -> Path:
-        """Return where the picture of what should have been reconstructed is kept."""
-        return self.folder / PICTURES / f"{digest_of(described(point.same_trial))}-truth.webp"
+    def trial_inputs(self, point: Point) -> dict[str, object]:
+        """Return what a point's trial depends on, as plain data."""
+        return described(point.same_trial)
 
     def unmeasured(self) -> list[str]:
         """Return a line for what could not be measured, and why."""
@@ -147,40 +121,26 @@ class StabilityStudy(Study[Point]):
 
     def inputs(self, point: Point) -> dict[str, object]:
         """Return everything that a point's figures depend on, as plain data."""
-        method = METHODS[point.method]
-        if not method.installed:
-            raise NotApplicableError(f"{method.name} needs {method.package}: not installed")
         return {
-            **described(replace(point.same_trial, method=point.method)),
-            "machine": machine(),
-            "settings": _settings(point).model_dump(mode="json"),
-            "dictionary": (
-                dictionary_identity(self.settings.dictionary) if method.needs_dictionary else None
-            ),
+            **self.trial_inputs(point),
+            **self.method_inputs(point.method),
+            "settings": _settings().model_dump(mode="json"),
         }
-
-    def is_whole(self, point: Point, result: dict) -> bool:
-        """Return whether a point that has figures has its picture."""
-        return "failed" in result or self.picture(point).is_file()
 
     def group(self, point: Point) -> Hashable:
         """Return what all methods of one trial have in common."""
-        return replace(point, method="", screened=True)
+        return replace(point, method="")
 
     def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
         """Yield the methods' figures on one trial."""
         made = points[0].trial()
-        truth = self.truth_picture(points[0])
-        truth.parent.mkdir(exist_ok=True)
-        if not truth.is_file():
-            save_thumbnail(truth, made.truth, epipolar_lines(made.truth))
         for point in points:
             yield self._measured(point, made)
 
     def _measured(self, point: Point, made: Trial) -> dict:
         view_db = made.psnr_db(replicate_centre(made.truth))
         try:
-            settings = _settings(point, made.psi.binning)
+            settings = _settings(made.psi.binning)
             result = made.solved(point.method, settings, self.settings.dictionary)
         except MemoryError:
             return {"failed": "not enough memory", "keep": False}
@@ -192,7 +152,7 @@ class StabilityStudy(Study[Point]):
         estimate = result.light_field
         if not np.isfinite(estimate).all():
             return {"failed": "the estimate is not finite", "view_db": view_db}
-        save_thumbnail(self.picture(point), estimate, epipolar_lines(made.truth))
+        save_pair(self.picture(point), self.truth_picture(point), estimate, made.truth)
         return {
             "psnr_db": made.psnr_db(estimate),
             "view_db": view_db,
@@ -206,8 +166,7 @@ class StabilityStudy(Study[Point]):
         }
 
 
-def _settings(point: Point, binning: int = 1) -> MethodSettings:
-    """Return the settings of a point: the default ones, patches placed on whole pixels."""
+def _settings(binning: int = 1) -> MethodSettings:
+    """Return the default settings, patches placed on whole pixels."""
     stride = SparseSettings().stride
-    sparse = SparseSettings(stride=max(stride // binning * binning, binning))
-    return MethodSettings(screening=point.screened, sparse=sparse)
+    return MethodSettings(sparse=SparseSettings(stride=max(stride // binning * binning, binning)))

@@ -1,11 +1,10 @@
-"""The cells of each table and figure: scenes, captures and methods."""
+"""The cells of each table: scenes, setups and methods, and the paper's number for each."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, shipped_cameras
@@ -14,36 +13,26 @@ from emmc_rig.model.masks import AnyPattern, GaussianColour, RandomBinary, Rando
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.paper import Scenario
 
-METHODS = ("dict-admm", "tv-dict", "tv")
-METHOD_TITLES = {"dict-admm": "Dict-ADMM", "tv-dict": "TV-Dict", "tv": "TV alone"}
+METHODS = {"dict-admm": "Dict-ADMM", "tv-dict": "TV-Dict", "tv": "TV alone"}
 SCENARIOS: dict[Scenario, str] = {"i": "RGB", "ii": "CFA", "iii": "mono"}
 CAMERAS = {"i": "scenario-i-rgb", "ii": "scenario-ii-cfa", "iii": "scenario-iii-mono"}
 _MASK_SEED = 1
-MASKS: dict[str, AnyPattern] = {
-    "rgbw": RandomRGBW(kind="random_rgbw", seed=_MASK_SEED),
-    "binary": RandomBinary(kind="random_binary", seed=_MASK_SEED),
-    "uniform": UniformColour(kind="uniform_colour", seed=_MASK_SEED),
-    "gaussian": GaussianColour(kind="gaussian_colour", seed=_MASK_SEED),
+MASKS: dict[str, tuple[str, AnyPattern]] = {
+    "rgbw": ("RGBW", RandomRGBW(kind="random_rgbw", seed=_MASK_SEED)),
+    "binary": ("random binary", RandomBinary(kind="random_binary", seed=_MASK_SEED)),
+    "uniform": ("uniform colour", UniformColour(kind="uniform_colour", seed=_MASK_SEED)),
+    "gaussian": ("Gaussian colour", GaussianColour(kind="gaussian_colour", seed=_MASK_SEED)),
 }
-MASK_TITLES = {
-    "rgbw": "RGBW",
-    "binary": "random binary",
-    "uniform": "uniform colour",
-    "gaussian": "Gaussian colour",
-}
+"""Title and pattern by name."""
 
-
-@cache
-def _shipped() -> dict[str, Camera]:
-    return shipped_cameras()
+_shipped = cache(shipped_cameras)
 
 
 @dataclass(frozen=True)
-class Capture:
+class Setup:
     """How a scene is measured, always with the same total exposure.
 
-    shots: of (i), three make one full-colour image. binning: k, r = 1/k^2. demosaiced: the CFA
-    frame is interpolated to full colour first, and reconstructed as scenario (i).
+    shots: of (i), three make one full-colour image. binning: k, r = 1/k^2.
     """
 
     scenario: Scenario
@@ -51,16 +40,13 @@ class Capture:
     binning: int = 1
     noisy: bool = False
     mask: str = "rgbw"
-    demosaiced: bool = False
 
     @property
     def label(self) -> str:
-        """In words, such as "(ii) CFA x 2, r = 1/4, noisy"."""
+        """In words, such as "(ii) CFA × 2, r = 1/4, noisy"."""
         parts = [f"({self.scenario}) {SCENARIOS[self.scenario]} × {self.shots}"]
-        if self.demosaiced:
-            parts.append("demosaiced first")
         if self.mask != "rgbw":
-            parts.append(f"{MASK_TITLES[self.mask]} mask")
+            parts.append(f"{MASKS[self.mask][0]} mask")
         if self.binning > 1:
             parts.append(f"r = 1/{self.binning**2}")
         parts.append("noisy" if self.noisy else "noise-free")
@@ -71,14 +57,10 @@ class Capture:
         camera = _shipped()[CAMERAS[self.scenario]].with_shots(self.shots)
         sensor = camera.sensor.model_copy(update={"binning": self.binning})
         masks = {
-            name: mask.model_copy(update={"pattern": MASKS[self.mask]})
+            name: mask.model_copy(update={"pattern": MASKS[self.mask][1]})
             for name, mask in camera.masks.items()
         }
         return camera.model_copy(update={"sensor": sensor, "masks": masks})
-
-    def solved_as(self) -> Capture:
-        """Return the capture whose Psi the frames are reconstructed with."""
-        return Capture("i", 3, mask=self.mask, noisy=self.noisy) if self.demosaiced else self
 
 
 @dataclass(frozen=True)
@@ -86,124 +68,120 @@ class Cell:
     """One reconstruction."""
 
     scene: str
-    capture: Capture
+    setup: Setup
     method: str
 
     @property
     def label(self) -> str:
         """In words."""
-        return f"{self.scene}, {self.capture.label}, {METHOD_TITLES[self.method]}"
+        return f"{self.scene}, {self.setup.label}, {METHODS[self.method]}"
 
     @property
     def paper_psnr_db(self) -> float | None:
-        """What the paper prints for this scene, capture and method; None where it does not."""
-        capture, scene = self.capture, paper.known_as(self.scene)
-        if scene is None or capture.mask != "rgbw" or capture.demosaiced:
+        """What the paper prints for this scene, setup and method; None where it does not."""
+        setup, scene = self.setup, paper.known_as(self.scene)
+        if scene is None or setup.mask != "rgbw":
             return None
-        place = paper.Printed(
-            scene, capture.scenario, capture.shots, capture.binning, capture.noisy, self.method
-        )
-        return paper.PSNR_DB.get(place)
+        place = (scene, setup.scenario, setup.shots, setup.binning, setup.noisy, self.method)
+        return paper.PSNR_DB.get(paper.Printed(*place))
 
 
 @dataclass(frozen=True)
 class Part:
-    """A table, or a figure that compares. scenes: of those given; "shown": one of them only."""
+    """A table or a part of one: setups beside each other.
+
+    name: as --only takes it. synthetic: whether about the paper's synthetic scenes, or the others.
+    """
 
     name: str
     title: str
-    scenes: Literal["synthetic", "other", "shown synthetic", "shown other"]
-    captures: tuple[Capture, ...]
-    methods: tuple[str, ...] = METHODS
+    synthetic: bool
+    setups: tuple[Setup, ...]
+
+    @property
+    def columns(self) -> list[str]:
+        """What heads the columns: in what the setups differ."""
+        if self.name == "figure8":
+            return [MASKS[setup.mask][0] for setup in self.setups]
+        return [setup.label.partition(",")[0] for setup in self.setups]
 
 
-_SCENARIOS_OF_TABLE_2 = (Capture("i", 3), Capture("ii", 1), Capture("iii", 3))
-_NOISY = tuple(replace(capture, noisy=True) for capture in _SCENARIOS_OF_TABLE_2)
-PARTS = {
-    part.name: part
-    for part in (
-        Part(
-            "table2",
-            "Table II: three scenarios at equal total exposure, without and with noise",
-            "synthetic",
-            (*_SCENARIOS_OF_TABLE_2, *_NOISY),
+_THREE = (Setup("i", 3), Setup("ii", 1), Setup("iii", 3))
+PARTS = (
+    Part("table2", "Table II, noise-free: three scenarios at equal total exposure", True, _THREE),
+    Part(
+        "table2",
+        "Table II, with noise: three scenarios at equal total exposure",
+        True,
+        tuple(replace(setup, noisy=True) for setup in _THREE),
+    ),
+    Part(
+        "table3",
+        "Table III: scenarios and numbers of shots, noise-free",
+        False,
+        (
+            Setup("i", 3),
+            *(Setup("ii", shots) for shots in (1, 2, 3)),
+            *(Setup("iii", shots) for shots in (1, 2, 3)),
         ),
-        Part(
-            "table3",
-            "Table III: scenarios and numbers of shots, noise-free",
-            "other",
-            (
-                Capture("i", 3),
-                *(Capture("ii", shots) for shots in (1, 2, 3)),
-                *(Capture("iii", shots) for shots in (1, 2, 3)),
-            ),
-        ),
+    ),
+    *(
         Part(
             "table4",
-            "Table IV: pixels of 2x2 samples (r = 1/4) and numbers of shots, noise-free",
-            "other",
-            (
-                *(Capture("i", shots, 2) for shots in (3, 6, 9, 12)),
-                *(Capture("ii", shots, 2) for shots in (1, 2, 3, 4)),
-                *(Capture("iii", shots, 2) for shots in (1, 2, 3, 4)),
-            ),
-        ),
-        Part(
-            "figure6",
-            "Figure 6: a colour filter array, and demosaiced first",
-            "shown synthetic",
-            (Capture("ii", 1), Capture("ii", 1, demosaiced=True)),
-            ("tv-dict",),
-        ),
-        Part(
-            "figure8",
-            "Figure 8: mask patterns before a CFA sensor, with noise",
-            "synthetic",
-            tuple(Capture("ii", 1, noisy=True, mask=mask) for mask in MASKS),
-        ),
-    )
-}
+            f"Table IV, ({scenario}) {title}: pixels of 2x2 samples (r = 1/4), noise-free",
+            False,
+            tuple(Setup(scenario, shots, 2) for shots in numbers),
+        )
+        for (scenario, title), numbers in zip(
+            SCENARIOS.items(), ((3, 6, 9, 12), (1, 2, 3, 4), (1, 2, 3, 4)), strict=True
+        )
+    ),
+    Part(
+        "figure8",
+        "Figure 8: mask patterns before a CFA sensor, with noise",
+        True,
+        tuple(Setup("ii", 1, noisy=True, mask=mask) for mask in MASKS),
+    ),
+)
 
 
 def chosen_parts(only: str | None) -> tuple[Part, ...]:
-    """Return the parts named in a list with commas, all without one, in the paper's order.
+    """Return the parts of the tables named in a list with commas, all without one.
 
     Raises AppError naming the nearest for a name that is not known.
     """
+    known = list(dict.fromkeys(part.name for part in PARTS))
     if only is None:
-        return tuple(PARTS.values())
+        return PARTS
     names = [name.strip().lower() for name in only.split(",") if name.strip()]
     for name in names:
-        if name not in PARTS:
-            raise AppError(f"--only {name}: {nearest_of(name, PARTS)}")
+        if name not in known:
+            raise AppError(f"--only {name}: {nearest_of(name, known)}")
     if not names:
-        raise AppError(f"--only names nothing: known are {', '.join(PARTS)}")
-    return tuple(part for part in PARTS.values() if part.name in names)
+        raise AppError(f"--only names nothing: known are {', '.join(known)}")
+    return tuple(part for part in PARTS if part.name in names)
 
 
 def scenes_of(part: Part, scenes: Sequence[str]) -> list[str]:
-    """Return which of the given scenes a part is about.
+    """Return which of the given scenes a part is about, in the paper's order.
 
-    Table II's four and the rest; either kind stands in for the other where it is missing.
+    The paper's synthetic scenes or the rest; either kind stands in for the other where it is
+    missing.
     """
     synthetic = [scene for scene in scenes if paper.known_as(scene) in paper.SYNTHETIC]
     other = [scene for scene in scenes if scene not in synthetic]
-    kind = part.scenes.removeprefix("shown ")
-    found = (synthetic or other) if kind == "synthetic" else (other or synthetic)
-    found.sort(key=lambda scene: (_rank(scene), scene))
-    return found[:1] if part.scenes.startswith("shown ") else found
-
-
-def _rank(scene: str) -> int:
-    known = paper.known_as(scene)
-    return len(paper.TITLES) if known is None else list(paper.TITLES).index(known)
+    chosen = (synthetic or other) if part.synthetic else (other or synthetic)
+    order = {name: rank for rank, name in enumerate(paper.TITLES)}
+    return sorted(
+        chosen, key=lambda scene: (order.get(paper.known_as(scene) or "", len(order)), scene)
+    )
 
 
 def cells_of(part: Part, scenes: Sequence[str]) -> list[Cell]:
-    """Return the cells of a part, all methods of a capture one after the other."""
+    """Return the cells of a part, all methods of a setup one after the other."""
     return [
-        Cell(scene, capture, method)
+        Cell(scene, setup, method)
         for scene in scenes_of(part, scenes)
-        for capture in part.captures
-        for method in part.methods
+        for setup in part.setups
+        for method in METHODS
     ]

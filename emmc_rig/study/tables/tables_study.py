@@ -1,30 +1,44 @@
-"""The cells of the tables, reconstructed one by one."""
+"""The scenes of the tables, the dictionary, which must not have seen them, and the cells' figures.
+
+Frames are made with the Psi that reconstructs them, as the paper does: an inverse crime, which
+`emmc-rig demo` avoids.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Hashable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.errors import AppError
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
 from emmc_rig.study.points import Results, Study
-from emmc_rig.study.rows import dictionary_identity, digest_of
-from emmc_rig.study.scores import colour_scored
-from emmc_rig.study.tables.cells import Capture, Cell, Part, cells_of
-from emmc_rig.study.tables.shots import Shots, shots_of
-from emmc_rig.study.tables.table_scenes import VIEWS, Array, Scenes, Size, check_dictionary
-from emmc_rig.study.trial import open_dictionary_once
+from emmc_rig.study.rows import SMALLEST_PX, dictionary_identity
+from emmc_rig.study.scores import scored
+from emmc_rig.study.tables import paper
+from emmc_rig.study.tables.cells import Cell, Part, Setup, cells_of
+from emmc_rig.study.trial import Capture, Trial, open_dictionary_once, trial_of
+from reconstruction import methods as solvers
 from reconstruction.bpdn import BPDNSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs
-from reconstruction.methods import METHODS, MethodSettings, reconstruct
+from reconstruction.methods import MethodSettings
 from reconstruction.sparse import PatchEstimates, SparseSettings, estimate_patches
 from reconstruction.tv import TVSettings
+from simulators.scenes import SCENES
 
-PAPERS_SOLVER = BPDNSettings(method="admm")
+Size = tuple[int, int] | None
+VIEWS = (5, 5)
+_ENDINGS = (".h5", ".hdf5")
+UNTRAINED = ("dct", "lambertian")
+"""Kinds of dictionaries that are made by formula."""
 
 
 class TablesSettings(Settings):
@@ -36,20 +50,19 @@ class TablesSettings(Settings):
 
     size: Size = None
     binned_size: Size = None
-    methods: MethodSettings = MethodSettings(sparse=SparseSettings(solver=PAPERS_SOLVER))
+    methods: MethodSettings = MethodSettings(
+        sparse=SparseSettings(solver=BPDNSettings(method="admm"))
+    )
     binned_stride: int = Field(default=4, ge=2, multiple_of=2)
     dictionary: str | None = None
     seed: int = Field(default=0, ge=0)
 
-    def of(self, method: str, capture: Capture) -> MethodSettings:
-        """Return the settings of a capture's reconstruction; the parts of others are default."""
-        sparse = self.methods.sparse
-        if capture.binning > 1:
-            sparse = sparse.model_copy(update={"stride": self.binned_stride})
-        return MethodSettings(
-            tv=self.methods.tv if method.startswith("tv") else TVSettings(),
-            sparse=sparse if METHODS[method].needs_dictionary else SparseSettings(),
-        )
+    def of(self, setup: Setup) -> MethodSettings:
+        """Return the settings of a setup's reconstructions."""
+        if setup.binning == 1:
+            return self.methods
+        sparse = self.methods.sparse.model_copy(update={"stride": self.binned_stride})
+        return self.methods.model_copy(update={"sparse": sparse})
 
 
 FAST = TablesSettings(
@@ -63,114 +76,190 @@ FAST = TablesSettings(
 """Crops: all tables on nine scenes in minutes."""
 
 
+def scene_specs(folder: Path | None) -> dict[str, str]:
+    """Return what `open_scene` calls each scene of a folder, by name; the built-in ones for None.
+
+    Raises AppError for no such folder, one without scenes, and scenes of the same name.
+    """
+    if folder is None:
+        return {name: name for name in SCENES}
+    if not folder.is_dir():
+        raise AppError(f"--scenes {folder}: no such folder")
+    if any(folder.glob("view_*_*.png")):
+        raise AppError(
+            f"--scenes {folder}: is itself a scene; give the folder that holds it and others"
+        )
+    specs: dict[str, str] = {}
+    for path in sorted(folder.iterdir()):
+        is_folder = path.is_dir() and any(path.glob("view_*_*.png"))
+        if not is_folder and not (path.is_file() and path.suffix.lower() in _ENDINGS):
+            continue
+        name = path.name if is_folder else path.stem
+        if name in specs:
+            raise AppError(f"--scenes {folder}: two scenes are called '{name}'; rename one")
+        specs[name] = str(path.resolve())
+    if not specs:
+        raise AppError(
+            f"--scenes {folder}: no scenes; needed is a folder of view_ROW_COL.png, or an HDF5 "
+            "light field, for each"
+        )
+    return specs
+
+
+def middle(light_field: NDArray, size: Size, multiple: int = 1) -> NDArray:
+    """Return the middle of a light field (v, u, y, x, c), down to a multiple of so many pixels.
+
+    size: rows and columns at most; None takes all.
+    """
+    has = light_field.shape[2:4]
+    kept = [min(w, n) // multiple * multiple for w, n in zip(size or has, has, strict=True)]
+    starts = [(whole - part) // 2 for whole, part in zip(has, kept, strict=True)]
+    rows, columns = (slice(s, s + n) for s, n in zip(starts, kept, strict=True))
+    return np.ascontiguousarray(light_field[:, :, rows, columns])
+
+
+def check_dictionary(
+    dictionary: Dictionary, spec: str, scenes: Sequence[str], binning: int
+) -> None:
+    """Raise AppError for a dictionary that does not fit the pixels, saw one of the scenes that it
+    shall score, or does not say what it saw.
+    """
+    rows, columns = dictionary.patch_shape[2:4]
+    if rows % binning or columns % binning:
+        raise AppError(
+            f"--dictionary {spec}: pixels of {binning}x{binning} samples (r = 1/{binning**2}) need "
+            f"patches that are a multiple of {binning}, these are {rows}x{columns}; leave those "
+            "tables out with --only"
+        )
+    names = _trained_on(dictionary)
+    if names is None:
+        raise AppError(
+            f"--dictionary {spec}: does not say which scenes it was trained on, so nothing can be "
+            "scored with it; train it with benchmarks/train_dictionary.py"
+        )
+    trained = {paper.known_as(name) or name.lower() for name in names}
+    for scene in scenes:
+        if (paper.known_as(scene) or scene.lower()) in trained:
+            raise AppError(
+                f"--dictionary {spec}: was trained on '{scene}', which is to be scored; train "
+                "without it, or leave --dictionary out"
+            )
+
+
+def _trained_on(dictionary: Dictionary) -> list[str] | None:
+    """Return the names of the scenes that a dictionary learned from; None when it does not say."""
+    if dictionary.kind in UNTRAINED:
+        return []
+    try:
+        scenes = parse_json(dictionary.provenance, "provenance", ValueError)["scenes"]
+        names = [scene["name"] if isinstance(scene, dict) else scene for scene in scenes]
+        return [Path(name).stem for name in names] or None
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
 @dataclass
 class TablesStudy(Study[Cell]):
-    """The cells of some tables; settings: TablesSettings."""
+    """The cells of some tables; settings: TablesSettings. scenes: see `scene_specs`."""
 
     parts: tuple[Part, ...]
-    scenes: Scenes
+    scenes: dict[str, str]
     journal = "cells.jsonl"
     noun = "cells"
     stage = "reconstruct"
-    revision = 1
+    revision = 2
 
     @property
     def cells(self) -> list[Cell]:
         """All cells of the parts, each once."""
-        every = (cell for part in self.parts for cell in cells_of(part, self.scenes.names))
+        every = (cell for part in self.parts for cell in cells_of(part, list(self.scenes)))
         return list(dict.fromkeys(every))
-
-    def truth(self, cell: Cell) -> Array:
-        """Return the light field that a cell reconstructs."""
-        k = cell.capture.binning
-        size = self.settings.size if k == 1 else self.settings.binned_size
-        return self.scenes.light_field(cell.scene, size, k)
 
     def dictionary(self, binning: int) -> Dictionary:
         """Return the dictionary for pixels of so many samples; raises as `check_dictionary`."""
         spec = self.settings.dictionary
         opened = open_dictionary_once(spec, VIEWS, binning)
-        scored = sorted({cell.scene for cell in self.cells})
-        check_dictionary(opened, spec or opened.kind, scored, binning)
+        check_dictionary(
+            opened, spec or opened.kind, sorted({cell.scene for cell in self.cells}), binning
+        )
         return opened
 
     def measure(self, watcher: Watcher) -> dict[Cell, dict]:
-        """Return the results of all cells, those in the folder not done again.
-
-        Raises StudyStopped at Ctrl-C and AppError when the folder cannot be written, both after
-        which the cells done are kept; and the errors of the layers below.
-        """
-        if any(METHODS[cell.method].needs_dictionary for cell in self.cells):
-            for binning in {cell.capture.binning for cell in self.cells}:
-                self.dictionary(binning)
+        """Return the results of all cells; raises as `run` does, and for wrong input before it."""
+        for binning in {cell.setup.binning for cell in self.cells}:
+            self.dictionary(binning)
+        for cell in {cell.scene: cell for cell in self.cells}.values():
+            rows, columns = self.capture(cell).scene_seen().size
+            if min(rows, columns) < SMALLEST_PX:
+                raise AppError(
+                    f"{cell.scene}: {rows}x{columns} pixels, needs {SMALLEST_PX}x{SMALLEST_PX} or "
+                    "more; leave the scene out"
+                )
         return self.run(self.cells, watcher)
+
+    def capture(self, cell: Cell) -> Capture:
+        """Return the capture of a cell, of the whole scene."""
+        setup = cell.setup
+        noise = None if setup.noisy else 0.0
+        return Capture(
+            self.scenes[cell.scene], setup.camera(), seed=self.settings.seed, noise=noise
+        )
+
+    def trial(self, cell: Cell) -> Trial:
+        """Return what a cell's method gets, of the middle of the scene, and the truth."""
+        capture, k = self.capture(cell), cell.setup.binning
+        size = self.settings.size if k == 1 else self.settings.binned_size
+        whole = capture.scene_seen()
+        scene = replace(whole, light_field=middle(whole.light_field, size, k), disparity_px=None)
+        return trial_of(capture, scene=scene)
 
     def inputs(self, point: Cell) -> dict[str, object]:
         """Return everything that a cell's result depends on, as plain data."""
-        capture, settings = point.capture, self.settings
-        needed = METHODS[point.method].needs_dictionary
+        settings, needed = self.settings, solvers.METHODS[point.method].needs_dictionary
         return {
-            "scene": point.scene,
-            "content": self.scenes.identity(point.scene),
-            "size": settings.size if capture.binning == 1 else settings.binned_size,
-            "capture": asdict(capture),
-            "camera": digest_of(capture.camera().model_dump(mode="json")),
-            "seed": settings.seed if capture.noisy else None,
+            "capture": self.capture(point).identity(),
+            "size": settings.size if point.setup.binning == 1 else settings.binned_size,
             "method": point.method,
-            "settings": settings.of(point.method, capture).model_dump(mode="json"),
+            "settings": settings.of(point.setup).model_dump(mode="json"),
             "dictionary": dictionary_identity(settings.dictionary) if needed else None,
         }
 
     def group(self, point: Cell) -> Hashable:
         """Return what all methods on the same shots have in common."""
-        return point.scene, point.capture
+        return point.scene, point.setup
 
     def measured(self, points: Sequence[Cell], watcher: Watcher) -> Results:
-        """Yield the methods' results on the same shots."""
-        scene, capture = points[0].scene, points[0].capture
-        truth = self.truth(points[0])
-        shots = shots_of(capture, truth, scene, self.settings.seed)
-        first = None
+        """Yield the methods' results on the same shots; patches are coded once."""
+        setup, made = points[0].setup, self.trial(points[0])
+        settings = self.settings.of(setup)
+        patches: PatchEstimates | None = None
+        coding_s = 0.0
         for cell in points:
-            settings = self.settings.of(cell.method, capture)
-            if METHODS[cell.method].needs_dictionary and first is None:
-                first = _first_stage(shots, self.dictionary(capture.binning), settings.sparse)
-            used = first if METHODS[cell.method].needs_dictionary else None
-            result = reconstruct(
-                cell.method,
-                shots.psi,
-                shots.frames,
-                shots.noise_sigma,
-                used.dictionary if used else None,
-                settings,
-                shots.usable,
-                estimates=used.estimates if used else None,
-            )
+            dictionary = None
+            if solvers.METHODS[cell.method].needs_dictionary:
+                dictionary = self.dictionary(setup.binning)
+                if patches is None:
+                    started = time.perf_counter()
+                    patches = _coded(made, dictionary, settings.sparse)
+                    coding_s = time.perf_counter() - started
+            result = solvers.reconstruct(
+                cell.method, made.psi, made.readings, made.noise_sigma, dictionary, settings,
+                made.usable, estimates=patches if dictionary else None,
+            )  # fmt: skip
             yield {
-                **asdict(colour_scored(result.light_field, truth)),
-                "sensor_psnr_db": shots.sensor_psnr_db,
-                "noise_sigma": shots.noise_sigma,
-                "rows": truth.shape[2],
-                "columns": truth.shape[3],
-                "seconds": result.seconds + (used.seconds if used else 0),
+                **asdict(scored(result.light_field, made.truth)),
+                "noise_sigma": made.noise_sigma,
+                "rows": made.truth.shape[2],
+                "columns": made.truth.shape[3],
+                "seconds": result.seconds + (coding_s if dictionary else 0.0),
                 "steps": result.steps,
                 "status": result.status,
                 "advice": result.advice,
             }
 
 
-@dataclass(frozen=True, eq=False)
-class _FirstStage:
-    """Dict-ADMM's patches, from which TV-Dict goes on, and what they took."""
-
-    dictionary: Dictionary
-    estimates: PatchEstimates
-    seconds: float
-
-
-def _first_stage(shots: Shots, dictionary: Dictionary, settings: SparseSettings) -> _FirstStage:
-    started = time.perf_counter()
-    sigma = shots.noise_sigma
-    frames, usable = checked_inputs(shots.psi, shots.frames, sigma, shots.usable)
-    estimates = estimate_patches(shots.psi, frames, sigma, dictionary, settings, usable)
-    return _FirstStage(dictionary, estimates, time.perf_counter() - started)
+def _coded(made: Trial, dictionary: Dictionary, settings: SparseSettings) -> PatchEstimates:
+    """Return the patches of Dict-ADMM, from which TV-Dict goes on."""
+    sigma = made.noise_sigma
+    frames, usable = checked_inputs(made.psi, made.readings, sigma, made.usable)
+    return estimate_patches(made.psi, frames, sigma, dictionary, settings, usable)

@@ -1,42 +1,36 @@
-"""Sessions of the simulated rig, whose truth is known: captured, calibrated, compared with it."""
+"""Sessions of the simulated rig, calibrated and compared with the Psi of its own rays."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from calibration.shadow import shadow_mask
 from calibration.whiteboard import Calibration
-from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import Figures
-from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
+from emmc_rig.acquisition.command import CaptureRequest, planned_frames
 from emmc_rig.acquisition.expand import mask_offsets_um
 from emmc_rig.acquisition.plan import Plan
-from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Rig, simulated_rig
-from emmc_rig.bench.rig_config import SIMULATED
-from emmc_rig.errors import AppError
+from emmc_rig.demo import simulated_session
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.board_plan import capture_plan, combined_plan, few_plan, plan_light
-from emmc_rig.processing.calibration_settings import ROUTES, CalibrateSettings
+from emmc_rig.processing.board_plan import (
+    PlanSettings,
+    capture_plan,
+    combined_plan,
+    few_plan,
+    plan_light,
+)
 from emmc_rig.processing.session_calibration import SessionCalibration, calibrate
 from emmc_rig.progress import Silent, Watcher
-from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.session import Session
 from simulators.bench import Bench
-from simulators.effects import Flaws
+from simulators.effects import ORDINARY, Flaws, flawed
 
 Array = NDArray[np.floating]
 PINHOLE_REPEATS = 2
@@ -44,30 +38,20 @@ GREY = 0.5
 """Of the scene that a calibration's shots show."""
 
 
-class FrameSteps(CaptureWatcher):
-    """A capture shown as steps of a stage, one a frame."""
-
-    def __init__(self, watcher: Watcher) -> None:
-        self._watcher = watcher
-
-    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """Count a frame."""
-        self._watcher.step(planned.id)
+ORDINARY_BENCH = flawed(Flaws(), [ORDINARY])
 
 
-@contextmanager
-def simulated_session(plan: Plan, camera: Camera, rig: Rig, watcher: Watcher) -> Iterator[Session]:
-    """Yield the session that the sequencer captures on a rig; its folder is gone afterwards.
+@dataclass(frozen=True)
+class CalibrateSettings(PlanSettings):
+    """What to plan for, and the simulated bench: what is wrong with it, rays per view and pixel.
 
-    camera: as planned. Raises AppError or a `DriverError`.
+    route: of `emmc_rig.calibrate`.
     """
-    text = yaml.safe_dump(plan.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
-    with TemporaryDirectory(prefix="emmc-rig-") as name:
-        folder = Path(name) / "session"
-        request = CaptureRequest(folder, plan, text, camera, folder, {"kind": SIMULATED})
-        session = new_session(request, planned_frames(request, rig))
-        Sequencer(session, plan, rig, FrameSteps(watcher)).run()
-        yield session
+
+    route: str = "auto"
+    seed: int = 0
+    flaws: Flaws = ORDINARY_BENCH
+    rays: int = 512
 
 
 def place_masks(rig: Rig, camera: Camera, shot: int) -> None:
@@ -160,15 +144,6 @@ class SimulatedCalibration:
     true: NDArray[np.float32]
 
 
-def place_rig(rig: Rig, frame: PlannedFrame) -> None:
-    """Bring a simulated bench to how it stands for a frame."""
-    bench = frame.bench
-    rig.attendant.place(bench.target, bench.board_turn_deg)
-    rig.attendant.fit_masks(bench.fitting, bench.masks_in)
-    rig.attendant.set_lamp(bench.lamp)
-    rig.stage.move_to_um({axis: rig.zero_um[axis] + um for axis, um in bench.offsets_um.items()})
-
-
 def rig_to_calibrate(settings: CalibrateSettings, scene: Array | None = None) -> tuple[Rig, Bench]:
     """Return the simulated rig, homed; scene: see `simulated_rig` (default: grey)."""
     rows, columns = settings.size
@@ -214,8 +189,6 @@ def calibrate_simulated(
     """
     watcher = watcher or Silent()
     camera, route = settings.camera, settings.route
-    if route not in ROUTES:
-        raise AppError(f"--route {route}: use one of {', '.join(ROUTES)}")
     watcher.begin("plan", None)
     plan = simulated_plan(settings)
     rig, bench = rig_to_calibrate(settings)
@@ -234,7 +207,7 @@ def calibrate_simulated(
     known, good = outcome.calibrations, outcome.good
     design = build_imaging_matrix(camera, settings.size)
     metrics = {
-        **{name: value for name, value in found.metrics.items() if name != "session"},
+        **found.metrics,
         "camera": settings.camera_name,
         "psi_relative_error": {
             name: true_error(one.psi, true, good) for name, one in known.items()
@@ -254,9 +227,9 @@ def run_calibrate(
 ) -> dict:
     """Calibrate the simulated rig into an existing folder and return the metrics.
 
-    Writes what `SessionCalibration.write` does; the report shows the true parameters too.
+    Writes what `SessionCalibration.write` does.
     """
     found = calibrate_simulated(settings, watcher).found
-    found.write(folder, true_parameters(settings.flaws))
+    found.write(folder)
     write_metrics(folder, found.metrics)
     return found.metrics

@@ -1,24 +1,20 @@
 """An axis whose scale is unknown, or contradicted, never moves; one that is known goes there."""
 
-import io
 from dataclasses import replace
 
 import pytest
 import yaml
 
 from drivers.apt import ACTUATORS
-from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import ScaleError, SpeedLimitError
 from drivers.grbl import FACTORY_STEPS_PER_MM, GrblStage
 from drivers.stage import StageSettings
 from drivers.zaber import ZaberStage
 from emmc_rig.bench.hardware import open_stage
 from emmc_rig.bench.stage_config import parse_stage
-from emmc_rig.commands.stage_scale import fit_step_length, measure, scale_settings
 from emmc_rig.errors import AppError
 from simulators.clock import ManualClock
 from simulators.grbl import BENCH_AXES, GrblController
-from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
 COARSE = AxisSpec(travel_um=150_000.0, microstep_um=0.49609375, backlash_um=0.0)
@@ -50,7 +46,7 @@ def test_an_unknown_model_is_refused_before_any_byte_of_motion():
     sent = []
     feed = device.feed
     device.feed = lambda data: sent.append(data) or feed(data)
-    with pytest.raises(ScaleError, match=r"device id 65535.*resolution 64.*devices scale"):
+    with pytest.raises(ScaleError, match=r"device id 65535.*resolution 64.*Zaber Launcher"):
         stage(device)
     assert sent
     assert all(b" get " in data or b" set comm." in data for data in sent)
@@ -70,7 +66,6 @@ def test_a_known_model_goes_where_it_is_sent_at_any_resolution(spec, identity, r
     device = chain(spec, **identity)
     device.feed(b"/1 1 set resolution %d\n" % resolution)
     opened = stage(device)
-    assert opened.resolution("x") == resolution
     is_sent_home_and_to(device, opened, 5_000.0)
 
 
@@ -170,75 +165,3 @@ def test_settings_behind_a_port_are_those_of_a_file(tmp_path):
     assert parse_stage("zaber:p,microstep_um=0.5,settle_s=1") == parse_stage(
         str(tmp_path / "rig.yaml")
     )
-
-
-def test_a_ruler_measures_the_step_that_nobody_knew():
-    device = chain(COARSE)
-    opened = stage(device, in_microsteps=True)
-    opened.home(["x"])
-    steps, readings = measure(opened, "x", 20_000, 5, lambda _: device.position_um(1, 1) + 77.0)
-    assert max(steps) - min(steps) == pytest.approx(20_000, abs=1)
-    found = fit_step_length(steps, readings)
-    assert found.um_per_step == pytest.approx(COARSE.microstep_um, rel=1e-5)
-    assert not found.reversed
-    assert scale_settings(parse_stage("zaber:p"), opened, "x", found.um_per_step) == {
-        "microstep_um": {"x": pytest.approx(0.496094)},
-        "resolution": {"x": 64},
-    }
-
-
-@pytest.mark.parametrize(
-    ("steps", "readings", "reported"),
-    [
-        ([0, 100], [0, 1], "read at least 3"),
-        ([5, 5, 5], [0, 1, 2], "do not differ"),
-        ([0, 100, 200], [0, float("nan"), 2], "no number"),
-        ([0, 100, 200, 300], [3, 0, 2, 1], "do not follow the axis"),
-    ],
-)
-def test_readings_that_measure_nothing_are_refused(steps, readings, reported):
-    with pytest.raises(AppError, match=reported):
-        fit_step_length(steps, readings)
-
-
-@pytest.fixture
-def quick_port():
-    spec = replace(COARSE, travel_um=25_000.0, max_speed_um_s=90_000.0, acceleration_um_s2=1e7)
-    with PtyServer(ZaberChain(SYSTEM_CLOCK, {(1, 1): spec})) as server:
-        yield server.port
-
-
-@pytest.mark.slow
-def test_the_command_asks_then_measures_and_writes_a_file_that_opens_the_stage(
-    run, quick_port, monkeypatch, tmp_path
-):
-    port = f"zaber:{quick_port}"
-    assert run("devices", "info", "--stage", port)[0] == 1
-    monkeypatch.setattr("sys.stdin", io.StringIO("n\n"))
-    assert run("devices", "scale", "1.1", 10_000, "--stage", port)[0] == 1
-    answers = ["y", *(f"{100 + 2480.47 * number:.0f}" for number in range(3))]
-    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
-    command = ("scale", "1.1", 10_000, "--stage", port, "--places", 3, "--out", "rig.yaml")
-    code, out, err = run("devices", *command)
-    assert code == 0, err
-    assert "0.4961 um a count" in out
-    written = yaml.safe_load((tmp_path / "rig.yaml").read_text())
-    assert written["microstep_um"] == {"1.1": 0.4961}
-    assert written["resolution"] == {"1.1": 64}
-    assert run("devices", "info", "--stage", "rig.yaml")[0] == 0
-    code, _, err = run("devices", *command)
-    assert (code, "exists: name another file" in err) == (1, True)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "reported"),
-    [
-        (["1.1", 5], 1, "too few"),
-        (["1.1", 10**9, "--yes"], 1, "counts of travel"),
-        (["mask_x", 500, "--yes"], 1, "use one of 1.1"),
-    ],
-)
-def test_a_wrong_call_of_scale_is_one_line(run, quick_port, arguments, code, reported):
-    result = run("devices", "scale", *arguments, "--stage", f"zaber:{quick_port}")
-    assert result[0] == code
-    assert reported in result[2]
