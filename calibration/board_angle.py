@@ -14,7 +14,7 @@ if the aperture let so much through. `leaning` says how large it is, if it is sm
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,9 +56,9 @@ class BoardAngle:
     radiance: NDArray[np.float64]
     deviation: NDArray[np.float64]
     significance: float
-    sense: int = 1
-    moved_um: Mapping[float, tuple[float, float, float]] | None = None
-    disagreement: tuple[float, float] = (0.0, 0.0)
+    sense: int
+    moved_um: Mapping[float, tuple[float, float, float]]
+    disagreement: tuple[float, float]
 
     @property
     def uneven(self) -> bool:
@@ -134,7 +134,7 @@ def board_over_angle(
     apart = max(float(np.ptp(one @ flat)) for one in left)
     return BoardAngle(
         radiance / radiance.mean(),
-        deviation,
+        deviation.astype(np.float64),
         float(np.sqrt(single @ inverse @ single / size)),
         sense,
         {turn: one.moved_um for turn, one in seen.items()},
@@ -190,7 +190,7 @@ def _turned(psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None
         covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) * max(squares, 1.0)
         moved_deviation = float(np.sqrt(np.diag(covariance)[size : size + 2].max()))
     moved_um = float(move[0]), float(move[1]), moved_deviation
-    return _Turned(solution[:size], information, moved_um, squares)
+    return _Turned(solution[:size].astype(np.float64), information, moved_um, squares)
 
 
 def take_out(board: BoardAngle, known: Calibration) -> None:
@@ -204,17 +204,20 @@ def take_out(board: BoardAngle, known: Calibration) -> None:
         weights[shot, v, u], deviation[shot, v, u] = even, np.sqrt(spread)
 
 
-def leaning(fit: Fit, mask: ShadowMask) -> NDArray[np.float64]:
-    """Return what of the views' light is smooth over the aperture, (v, u): 0 where it is not sure.
+def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> NDArray[np.float64]:
+    """Return what of the views' light lamp or board may make, (v, u): 0 where nothing is sure.
 
-    Lenses let as much through on either side, and less outside by the cosine law at most twice;
-    more than that may be lamp or board as well, and no turn of the board tells them apart.
+    It is smooth over the aperture, but for one that falls or rises from its middle. board: what the
+    turned boards showed, which is not counted again. Lenses let as much through on either side, and
+    less outside by the cosine law at most twice; more than that may be lamp or board as well, and
+    no turn of the board tells them apart.
     """
     views = np.shape(fit.placement.aperture)
     v, u = (np.linspace(-1, 1, count) if count > 1 else np.zeros(1) for count in views)
     far = (v[:, None] ** 2 + u**2) / max(float((v[:, None] ** 2 + u**2).max()), 1e-12)
     through = 1 + fit.placement.falloff * far
-    weights = (np.array(fit.placement.aperture) * through).ravel()
+    sent = board.radiance if board is not None and board.uneven else np.ones(views)
+    weights = (np.array(fit.placement.aperture) * through / sent).ravel()
     weights = weights / weights.mean()
     smooth = [np.broadcast_to(one, views).ravel() for one in (u[None, :], v[:, None], far)]
     columns = np.stack([one - one.mean() for one in smooth], axis=1)
@@ -238,6 +241,9 @@ def leaning(fit: Fit, mask: ShadowMask) -> NDArray[np.float64]:
     if columns.shape[1] == len(smooth) and NATURAL * natural <= solution[-1] <= 0:
         sure[-1] = False
     found = columns[:, sure] @ solution[sure]
+    if columns.shape[1] == len(smooth) and sure[-1]:
+        # No lens is known to fall off so: lobes of gloss, and edges of a board, have any shape.
+        found = weights - 1
     return (found if np.ptp(found) > LEAST_LEANING else np.zeros(weights.size)).reshape(views)
 
 
@@ -246,12 +252,3 @@ def less_sure(known: Calibration, by_view: Array) -> None:
     for shot, v, u in np.ndindex(*known.psi.weights.shape[:3]):
         more = np.square(by_view[v, u] * known.psi.weights[shot, v, u])
         known.deviation[shot, v, u] = np.sqrt(np.square(known.deviation[shot, v, u]) + more)
-
-
-def turned_moves(board: BoardAngle) -> Sequence[tuple[float, float, float]]:
-    """Return (degrees, um, deviation) of the masks' moves before turned boards, largest first."""
-    moves = [
-        (turn, float(np.hypot(x, y)), deviation)
-        for turn, (x, y, deviation) in (board.moved_um or {}).items()
-    ]
-    return sorted(moves, key=lambda one: -one[1])

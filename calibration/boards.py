@@ -139,6 +139,7 @@ class Board:
     views_open: NDArray[np.bool_]
     stage_um: tuple[float, float]
     shot: int
+    taken_s: float = 0.0
 
     @property
     def opening(self) -> Opening:
@@ -240,6 +241,7 @@ def _board(
         views_open(layout.views, one.pinhole, one.window),
         one.stage_um,
         one.shot,
+        frame.taken_s,
     )
 
 

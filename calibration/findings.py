@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import BoardAngle, turned_moves
+from calibration.board_angle import BoardAngle
 from calibration.fit import Fit
 from calibration.levels import Levels
 from calibration.placement import Placement
@@ -107,13 +107,18 @@ def unwatched(missing: Sequence[str]) -> list[str]:
 def angle_findings(board: BoardAngle) -> list[str]:
     """Return how uneven the white board is over angle, and whether the mask moved meanwhile."""
     found = []
-    for turn_deg, moved_um, deviation in turned_moves(board)[:1]:
-        if moved_um > max(LEAST_MOVE_UM, SIGNIFICANT * deviation):
-            found.append(
-                f"the mask moved by {moved_um:.1f} +- {deviation:.1f} um before the board turned "
-                f"by {turn_deg:g} degrees: taken out of what is said of the board; let the mount "
-                "settle, and capture the turned boards next to the others"
-            )
+    moved = [
+        (turn_deg, float(np.hypot(x, y)), deviation)
+        for turn_deg, (x, y, deviation) in board.moved_um.items()
+        if np.hypot(x, y) > max(LEAST_MOVE_UM, SIGNIFICANT * deviation)
+    ]
+    if moved:
+        turn_deg, moved_um, deviation = min(moved)
+        found.append(
+            f"the mask moved by {moved_um:.2f} +- {deviation:.2f} um before the board turned by "
+            f"{turn_deg:g} degrees: taken out of what is said of the board; let the mount settle, "
+            "and capture the turned boards next to the others"
+        )
     if not board.uneven:
         return found
     words = (
@@ -139,8 +144,8 @@ def leaning_findings(leans: NDArray[np.floating], turned: bool) -> list[str]:
         return []
     board = "the lamp (from one side, or its gloss)" if turned else "lamp or board"
     return [
-        f"the views' light differs by {np.ptp(leans):.1%} smoothly over the aperture, more than "
-        f"lenses make: it may be {board}, or a board that does not fill the aperture, and counts "
+        f"the views' light differs by {np.ptp(leans):.1%} over the aperture, more than lenses "
+        f"make: it may be {board}, or a board that does not fill the aperture, and counts "
         "in Psi's deviation; take the whiteboards again with the lamp moved: what stays is the "
         "camera's"
     ]

@@ -71,6 +71,8 @@ BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
 MOVES_UM = np.geomspace(0.01, 10.0, 11)
 """Widths of the whiteboards' own that are tried."""
 WIDTH_ROUNDS = 2
+SURE_MOVE = 5.0
+"""Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
 TAUS_UM = np.geomspace(0.002, 0.2, 6)
@@ -98,8 +100,8 @@ class FitSettings(Settings):
 class BoardCheck:
     """How one whiteboard agrees with the fit of all: brightness and where its mask stood.
 
-    chi2: mean squared residual over the noise, of the pixels that are no outliers. outliers:
-    their share.
+    taken_s: when, on the clock of the capture. chi2: mean squared residual over the noise, of the
+    pixels that are no outliers. outliers: their share.
     """
 
     name: str
@@ -107,6 +109,7 @@ class BoardCheck:
     brightness_deviation: float
     moved_um: tuple[float, float]
     moved_deviation_um: float
+    taken_s: float
     chi2: float
     outliers: float
 
@@ -118,9 +121,10 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`. chi2: mean squared
     residual over the noise without outliers. undecided: names of parameters that the prior decides
     more than the whiteboards; more_boards: how many more of the same kinds would decide them
-    (MOST_MORE_BOARDS: no number of them). brightness_spread, moved_spread_um: by which whiteboards
-    differ among themselves; the references differ by the first as well, which the covariance does
-    not count.
+    (MOST_MORE_BOARDS: no number of them). brightness_spread: by
+    which whiteboards differ among themselves; so do the references, which the covariance does not
+    count. moved_um: how far the mask stands from its place; so it may in the shots of a scene,
+    which the covariance counts.
     """
 
     placement: Placement
@@ -135,7 +139,7 @@ class Fit:
     more_boards: int
     boards: tuple[BoardCheck, ...]
     brightness_spread: float = 0.0
-    moved_spread_um: float = 0.0
+    moved_um: float = 0.0
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -453,6 +457,8 @@ def fit_placement(
     lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE_BOARDS))
     kept = max(normal.kept, 1)
+    moved_um = _farthest_um(widths[1], checks)
+    covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement,
         covariance,
@@ -466,8 +472,21 @@ def fit_placement(
         more,
         checks,
         float(widths[0]),
-        float(widths[1]),
+        moved_um,
     )
+
+
+def _farthest_um(width_um: float, boards: Sequence[BoardCheck]) -> float:
+    """Return how far from the fitted place the mask may stand, um: 0 where it seems to stand still.
+
+    The largest move that is sure, as the width of all takes the one that stayed away for chance.
+    """
+    sure = [
+        float(np.hypot(*one.moved_um))
+        for one in boards
+        if np.hypot(*one.moved_um) > SURE_MOVE * one.moved_deviation_um
+    ]
+    return max([width_um if width_um > MOVES_UM[0] else 0.0, *sure])
 
 
 def shares_of_prior(
@@ -604,6 +623,7 @@ def _check(mask: ShadowMask, at: _State, sample: _Sample, index: int) -> BoardCh
         float(deviation[0]),
         (float(found[1]), float(found[2])),
         float(deviation[1:].max()),
+        board.taken_s,
         float(np.mean(residual[inside] ** 2)),
         float(1 - inside.mean()),
     )

@@ -38,10 +38,10 @@ from calibration.findings import (
     mask_findings,
     unwatched,
 )
-from calibration.fit import MOST_MORE_BOARDS, SOFT_EDGES, Fit, fit_placement
+from calibration.fit import MOST_MORE_BOARDS, OFFSETS, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
-from calibration.misfit import Misfit, combined, measured_misfit
+from calibration.misfit import Misfit, beyond_chance, combined, measured_misfit
 from calibration.openings import views_open
 from calibration.parametric import (
     Parametric,
@@ -77,6 +77,8 @@ LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
 LARGEST_MOVE_UM = 1.0
+FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
+"""Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 REGISTERED_MISS = 3.0
 """Times what a fitted mask misses: what one that is but registered does."""
 
@@ -217,6 +219,8 @@ def calibrate(
             frames["combined"] = few.exposures
     for name, one in calibrations.items():
         _make_less_sure(one, _unsteady(name, sets, parametric))
+        if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
+            _count_moves(one, parametric, layout, shot_stages(camera))
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > LARGEST_CHI2:
@@ -241,6 +245,7 @@ def calibrate(
         assert by is not None
         others = other_colours(by, plain, seen_colours, layout, shot_stages(camera))
         calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
+    board = None
     if turned:
         boards = {turn: as_readings(one, layout, good)[0] for turn, one in turned.items()}
         by = mixed or parametric
@@ -252,7 +257,7 @@ def calibrate(
             for one in calibrations.values():
                 take_out(board, one)
     if parametric is not None:
-        leans = leaning(parametric.fit, parametric.mask)
+        leans = leaning(parametric.fit, parametric.mask, board)
         findings += leaning_findings(leans, bool(turned))
         for one in calibrations.values():
             less_sure(one, leans)
@@ -362,13 +367,14 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     """
     shadow = one.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
-    for board in seen:
-        count = int(board.views_open.sum())
-        if count == board.views_open.size:
-            continue
+    of_few = [board for board in seen if not board.views_open.all()]
+    misfits = []
+    for board in of_few:
         predicted = predicted_by_shadow(shadow, board)
         squares = (board.reading - predicted) ** 2
-        misfit = measured_misfit(squares, board.variance, predicted, board.usable)
+        misfits.append(measured_misfit(squares, board.variance, predicted, board.usable))
+    for board, misfit in zip(of_few, beyond_chance(misfits), strict=True):
+        count = int(board.views_open.sum())
         for v, u in np.argwhere(board.views_open).tolist():
             found[v, u].append((count, Misfit(misfit.level / count, misfit.per_slope)))
     if not found:
@@ -448,6 +454,14 @@ def _make_less_sure(known: Calibration, missed: float) -> None:
     for place in np.ndindex(*known.deviation.shape[:3]):
         more = np.square(missed * known.psi.weights[place])
         known.deviation[place] = np.sqrt(np.square(known.deviation[place]) + more)
+
+
+def _count_moves(known: Calibration, one: Parametric, layout: PsiLayout, stages: Stages) -> None:
+    """Count in a measured Psi's deviation that the mask may stand elsewhere: models have it."""
+    covariance = np.zeros_like(one.fit.covariance)
+    covariance[OFFSETS, OFFSETS] = np.eye(2) * one.fit.moved_um**2
+    moved = psi_deviation(one.shadow, layout, stages, covariance)
+    np.sqrt(np.square(known.deviation) + np.square(moved), out=known.deviation)
 
 
 def _calibration(
@@ -532,13 +546,7 @@ def fit_advice(fit: Fit) -> list[str]:
             f"{worst_of.name}: {worst_of.brightness - 1:+.1%} in brightness against the others"
             f"{others}; the lamp is not steady, let it warm up and capture it again"
         )
-    for one in fit.boards:
-        moved = float(np.hypot(*one.moved_um))
-        if moved > LARGEST_MOVE_UM and moved > 5 * one.moved_deviation_um:
-            found.append(
-                f"{one.name}: the mask stands {moved:.1f} um from where the stage says "
-                f"({one.moved_um[0]:+.1f}, {one.moved_um[1]:+.1f}); capture it again"
-            )
+    found += _moves(fit)
     if fit.undecided:
         shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
         more = (
@@ -551,3 +559,31 @@ def fit_advice(fit: Fit) -> list[str]:
             f"the design: {more}; `emmc-rig calibrate --plan` says which"
         )
     return found
+
+
+def _moves(fit: Fit) -> list[str]:
+    """Return in words that the mask stands elsewhere than the stage says, if that matters."""
+    moved = [
+        one
+        for one in fit.boards
+        if np.hypot(*one.moved_um) > max(LARGEST_MOVE_UM, 5 * one.moved_deviation_um)
+    ]
+    if not moved:
+        return []
+    worst = max(moved, key=lambda one: float(np.hypot(*one.moved_um)))
+    words = (
+        f"the mask stands elsewhere than the stage says in {len(moved)} of {len(fit.boards)} "
+        f"whiteboards, farthest by ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
+        f"{worst.name}, which Psi's deviation counts: "
+    )
+    times_s = np.array([one.taken_s for one in fit.boards])
+    places_um = np.array([one.moved_um for one in fit.boards])
+    times_s, places_um = times_s - times_s.mean(), places_um - places_um.mean(axis=0)
+    rate = times_s @ places_um / max(float(times_s @ times_s), 1e-12)
+    left = np.square(places_um - times_s[:, None] * rate).sum() / np.square(places_um).sum()
+    if len(fit.boards) >= FEWEST_FOR_DRIFT and left < DRIFT_LEAVES:
+        per_minute = 60 * float(np.hypot(*rate))
+        words += f"it drifts by {per_minute:.2g} um/min; fasten it, let the bench settle"
+    else:
+        words += "let the stage approach every place from the same side, and settle"
+    return [words + ", and capture again"]

@@ -21,7 +21,7 @@ TRUE = {
 }
 
 
-def sheet_of(flats_s=FLATS_S, course=None, falls_off=0.0, seed=3, **sensor):
+def sheet_of(flats_s=FLATS_S, course=None, falls_off=0.0, seed: int = 3, **sensor):
     bench = Bench(
         np.ones((1, 1)), SIZE, Optics(views=(1, 1)), Sensor(**(SENSOR | sensor)),
         Course(**(course or {})), seed,
