@@ -151,6 +151,10 @@ class Board:
         """Which pixels count, (pixel_y, pixel_x)."""
         return np.isfinite(self.variance)
 
+    def without(self, pixels: NDArray[np.bool_]) -> Board:
+        """Return the board, of which these pixels, (pixel_y, pixel_x), do not count."""
+        return replace(self, variance=np.where(pixels, np.float32(np.inf), self.variance))
+
 
 def gain_of(boards: BoardSet) -> SensorGain:
     """Return the sensor's gain from the dark and the first reference frames."""

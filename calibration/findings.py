@@ -149,3 +149,12 @@ def leaning_findings(leans: NDArray[np.floating], turned: bool) -> list[str]:
         "in Psi's deviation; take the whiteboards again with the lamp moved: what stays is the "
         "camera's"
     ]
+
+
+def dust_finding(dusty: NDArray[np.bool_]) -> str:
+    """Return in words that pixels, (pixel_y, pixel_x), lie under dust that moved."""
+    return (
+        f"{int(dusty.sum())} pixels ({dusty.mean():.1%}) read another share of the light in every "
+        "whiteboard than in the references: dust moved on the sensor in between; they do not "
+        "count; clean the sensor, and capture all again"
+    )

@@ -88,12 +88,12 @@ def measured_misfit(
 def beyond_chance(misfits: Sequence[Misfit]) -> list[Misfit]:
     """Return the views' misfits, none where noise alone explains them.
 
-    No estimate is below zero, so that those of half the views are above it by chance.
+    No estimate is below zero, so that those of half the views are above it by chance. The noise's
+    own variance, alike for all, is as sure as the squares of one view are.
     """
-    together = sum(one.evidence for one in misfits) / np.sqrt(max(len(misfits), 1))
-    if together > SURE:
+    if np.mean([one.evidence for one in misfits]) > SURE:
         return list(misfits)
-    return [one if one.evidence > SURE else Misfit() for one in misfits]
+    return [one if one.evidence > SURE * np.sqrt(2) else Misfit() for one in misfits]
 
 
 def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> Calibration:

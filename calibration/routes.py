@@ -30,9 +30,11 @@ from calibration.choice import (
 )
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
 from calibration.defects import View, find_defects, loss_variance
+from calibration.dust import moved_dust
 from calibration.errors import CalibrationError
 from calibration.findings import (
     angle_findings,
+    dust_finding,
     leaning_findings,
     level_findings,
     mask_findings,
@@ -180,6 +182,12 @@ def calibrate(
         fit = fit_placement(seen, camera, mask)
         advice += fit_advice(fit)
         refuse_odd_fit(fit, seen)
+        dusty = moved_dust(Shadow(mask, fit.placement), seen)
+        if dusty.any():
+            findings.append(dust_finding(dusty))
+            good = good & ~dusty
+            seen, judges = ([one.without(dusty) for one in some] for some in (seen, judges))
+            fit = fit_placement(seen, camera, mask, start=fit.placement)
         parametric = with_misfit(Parametric(fit, mask), seen)
         if {"mixed", "combined"} & set(routes) and layout.binning == 1:
             on_stage("defects of the mask")

@@ -1,5 +1,7 @@
 """The sensor sheet of the outside bench: right within three deviations, or marked as a bound."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from outside_bench import Bench, Course, Optics, Sensor
@@ -21,7 +23,7 @@ TRUE = {
 }
 
 
-def sheet_of(flats_s=FLATS_S, course=None, falls_off=0.0, seed: int = 3, **sensor):
+def sheet_of(flats_s=FLATS_S, course=None, falls_off=0.0, seed=3, **sensor: Any):
     bench = Bench(
         np.ones((1, 1)), SIZE, Optics(views=(1, 1)), Sensor(**(SENSOR | sensor)),
         Course(**(course or {})), seed,
