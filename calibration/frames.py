@@ -14,6 +14,8 @@ Frame = NDArray[np.floating] | NDArray[np.integer]
 BAND_PIXELS = 2**20
 """Worked on at once: a dozen temporary arrays of them take 100 MB."""
 LARGEST_CLIPPED_SHARE = 1e-3
+NEARLY_WHITE = 0.7
+"""Of white, that a pixel reads beside one that light saturates."""
 LARGEST_FLICKER = 0.02
 LARGEST_ROLLING = 0.007
 """Of the brightness: standard deviation of rows against their frame, between repeats."""
@@ -77,8 +79,8 @@ def average(
 ) -> MeanFrame:
     """Return the mean of repeated frames (y, x), uint16; lit: they are no darks.
 
-    Raises CalibrationError when there are none, when they differ in size, when more than
-    LARGEST_CLIPPED_SHARE of the pixels of one are saturated, and when their brightness differs by
+    Raises CalibrationError when there are none, when they differ in size, when light saturates
+    more than LARGEST_CLIPPED_SHARE of the pixels of one, and when their brightness differs by
     more than LARGEST_FLICKER of the brightest, or that of their rows by LARGEST_ROLLING, and more
     than noise explains.
     """
@@ -87,7 +89,7 @@ def average(
     levels: list[float] = []
     rows: list[NDArray[np.float64]] = []
     for frame in frames:
-        clipped = float(np.mean(frame >= white_level_dn))
+        clipped = _saturated_share(frame, white_level_dn)
         if clipped > LARGEST_CLIPPED_SHARE:
             raise CalibrationError(
                 f"{what}: {clipped:.1%} of the pixels are saturated; shorten the exposure "
@@ -200,6 +202,19 @@ def _check_steady(levels: list[float], noise: float, what: str, lit: bool) -> No
         raise CalibrationError(
             f"{what}: repeats differ by {difference / most:.1%} in brightness; {why}"
         )
+
+
+def _saturated_share(frame: NDArray[np.uint16], white_level_dn: int) -> float:
+    """Return the share of pixels that light saturates: hot ones among dark neighbours do not count.
+
+    Of pixels of the same colour, which lie two apart in a Bayer mosaic.
+    """
+    saturated = frame >= white_level_dn
+    if not saturated.any():
+        return 0.0
+    bright = np.pad(frame >= NEARLY_WHITE * white_level_dn, 2)
+    sides = (bright[:-4, 2:-2], bright[4:, 2:-2], bright[2:-2, :-4], bright[2:-2, 4:])
+    return float(np.mean(saturated & np.logical_or.reduce(sides)))
 
 
 def _check_rows(rows: NDArray[np.float64], noise_dn2: float, what: str) -> None:

@@ -93,10 +93,11 @@ def test_rows_that_flicker_make_dsnu_less_sure_and_not_less():
 
 
 def test_bounds_hold_and_are_named_in_the_table():
-    for changes, words in (
+    bounds: list[tuple[dict[str, Any], str]] = [
         ({"black_dn": 0.0}, "at least (the darks are clipped at 0 DN"),
         ({"gain": 0.05, "read_noise": 1.0}, "at most (below the steps of the converter"),
-    ):
+    ]
+    for changes, words in bounds:
         true, sheet = sheet_of(**changes)
         rows = {row[0].split(",")[0]: row for row in sheet.rows()}
         for name, truth in (("Temporal dark noise", true.read_noise), ("DSNU", true.dsnu)):
