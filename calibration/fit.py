@@ -68,8 +68,10 @@ OWN = 3
 """Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
 FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
 BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
-MOVES_UM = np.geomspace(0.01, 10.0, 11)
+MOVES_UM = np.geomspace(0.002, 10.0, 12)
 """Widths of the whiteboards' own that are tried."""
+CLEARLY_LIKELIER = 2.0
+"""Difference of log evidence: the better explanation is seven times as likely."""
 WIDTH_ROUNDS = 2
 SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
@@ -384,7 +386,12 @@ def _widths(normal: _Normal, at: _State, placement: Array, centre: Array) -> tup
         own = precision[len(placement) :]
         return float(0.5 * seen @ seen - np.log(np.diag(factor)).sum() + 0.5 * np.log(own).sum())
 
-    return max(product(BRIGHTNESSES, MOVES_UM), key=evidence)
+    found = {widths: evidence(widths) for widths in product(BRIGHTNESSES, MOVES_UM)}
+    best = max(found, key=lambda widths: found[widths])
+    # One that is hardly likelier than none is none.
+    still = found[best[0], MOVES_UM[0]] > found[best] - CLEARLY_LIKELIER
+    steady = found[BRIGHTNESSES[0], best[1]] > found[best] - CLEARLY_LIKELIER
+    return BRIGHTNESSES[0] if steady else best[0], MOVES_UM[0] if still else best[1]
 
 
 @one_blas_thread()

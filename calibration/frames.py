@@ -64,9 +64,11 @@ class MeanFrame:
             return np.zeros(len(self.mean_dn))
         light = (self.mean_dn - dark_dn).astype(np.float64)
         mean, columns = light.mean(axis=1), light.shape[1]
-        alike = self.row_variance_dn2 - self.variance_dn2 / columns
-        # A pixel that is brighter than its row changes by more.
-        return alike * np.square(light).mean(axis=1) / np.maximum(mean**2, 1e-12)
+        alike = float(np.sum(self.row_variance_dn2 - self.variance_dn2 / columns))
+        # A pixel that is brighter than others changes by more. Rows that see no light, as under a
+        # lamp of another colour, tell nothing.
+        relative = alike / max(float(np.sum(np.square(mean))), 1e-12)
+        return relative * np.square(light).mean(axis=1)
 
 
 def average(

@@ -39,6 +39,7 @@ class Evidence:
     the light field removes; noise_share: share of its own that is noise.
     colour_error: root mean square by colours that frames do not show, over the brightness. short:
     share of the readings that only say that there was at least so much light, and are needed.
+    gains: by which the shots' brightness was evened.
     """
 
     method: str
@@ -69,6 +70,7 @@ class Evidence:
     colour_error: float | None = None
     motion_left: float | None = None
     short: float = 0.0
+    gains: tuple[float, ...] = ()
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -94,7 +96,8 @@ class Read:
     excluded: what the pixels read that were not usable to begin with, 0 elsewhere. left_out: shots
     that screening left out, for being dark or for repeating others. bad: share of the pixels that
     it left out, for differing from their neighbours. short: share of the readings that are
-    saturated and that a light field fitted without them falls short of.
+    saturated and that a light field fitted without them falls short of. gains: by which screening
+    divided the shots.
     """
 
     frames: Array
@@ -104,6 +107,7 @@ class Read:
     left_out: tuple[int, ...] = ()
     bad: float = 0.0
     short: float = 0.0
+    gains: tuple[float, ...] = ()
 
     @property
     def clipped(self) -> NDArray[np.bool_]:
@@ -149,6 +153,7 @@ def gathered(
             key: result.parameters[key] for key in REPORTED_PARAMETERS if key in result.parameters
         },
         short=read.short,
+        gains=read.gains,
     )
 
 

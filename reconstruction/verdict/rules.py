@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+import numpy as np
+
 from reconstruction.method import Sensitivity
 from reconstruction.methods import METHODS
 from reconstruction.verdict.evidence import Evidence
@@ -204,6 +206,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
                 "do not use",
             )
             return
+    yield from _evened(e, kept)
     apart = [abs(brightness - 1) for brightness in bright]
     worst = apart.index(max(apart))
     yield Reason(
@@ -227,6 +230,26 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             "hold scene and camera still, or reconstruct one shot by adaptive",
             MOTION.level(e.motion_effect) if e.motion_px > LEAST_MOTION_PX else "trust",
         )
+
+
+def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
+    """What evening the shots' brightness leaves open; kept: shots that were not left out."""
+    gains = {shot: e.gains[shot] for shot in kept if e.gains}
+    if len(gains) < 2:
+        return
+    worst = max(gains, key=lambda shot: abs(np.log(max(gains[shot], 1e-6))))
+    apart = abs(gains[worst] - 1)
+    darker = f"{apart:.1%} {'darker' if gains[worst] < 1 else 'brighter'}"
+    words = f"shot {worst + 1} is {darker} than the others, and was evened to them"
+    if len(gains) == 2:
+        words = f"the two shots differ in brightness by {np.ptp(list(gains.values())):.1%}: which "
+        words += "is right is not known, and the light field has their mean"
+    yield Reason(
+        words,
+        apart,
+        "steady the lamp, or normalise the frames by a reference",
+        "doubt" if apart > FLICKER.doubt else "trust",
+    )
 
 
 def _is_parallax(e: Evidence) -> bool:

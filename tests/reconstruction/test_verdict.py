@@ -260,6 +260,22 @@ def test_many_shots_that_screening_left_out_are_reported_and_few_are_not():
     assert judged_trial("missing-shot", 1).level == "trust"
 
 
+@pytest.mark.parametrize("share", [0.7, 0.9])
+def test_a_shot_under_another_light_takes_the_level_of_the_others_and_is_named(three, share):
+    scene = np.asarray(open_scene("near-planar", size=SIZE)).astype(np.float32)
+    frames = three.forward(scene)
+    frames[1] *= share
+    rng = np.random.default_rng(0)
+    frames += 0.003 * rng.standard_normal(frames.shape, np.float32)
+    result, verdict = reconstruct_judged("tv", three, frames, 0.003, settings=QUICK)
+    assert verdict.level == "doubt"
+    assert f"shot 2 is {1 - share:.0%}"[:-1] in verdict.words
+    assert "was evened to them" in verdict.words
+    assert result.light_field.mean() == pytest.approx(scene.mean(), rel=0.02)
+    two = dataclasses.replace(verdict.evidence, gains=(0.9, 1.1, 1.0), left_out=(2,))
+    assert "which is right is not known" in verdict_from(two).words
+
+
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-bayer-3shots"])
 @pytest.mark.parametrize("scene", ["near-planar", "wide-disparity"])
 def test_a_capture_without_a_fault_is_trusted(scene, camera):
