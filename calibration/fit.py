@@ -70,8 +70,8 @@ FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
 BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
 MOVES_UM = np.geomspace(0.002, 10.0, 12)
 """Widths of the whiteboards' own that are tried."""
-CLEARLY_LIKELIER = 2.0
-"""Difference of log evidence: the better explanation is seven times as likely."""
+CLEARLY_LIKELIER = 0.5
+"""Difference of log evidence: less than this tells nothing."""
 WIDTH_ROUNDS = 2
 SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""

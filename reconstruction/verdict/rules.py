@@ -95,6 +95,8 @@ noise (0.0005), it is 4."""
 COLOUR_ERROR = 0.1
 """Root mean square. One shot of `scenario-iii-mono`: 0.08 to 0.16, of `rgbw-mono` 0.04 to 0.13
 (64x80, three scenes of group A, two built in)."""
+LEAST_PARALLAX = 0.005
+"""Root mean square by which the views differ, over the middle one's."""
 LEFT_OUT = Limits(0.4, 1.0)
 LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
 """For methods that lose little with one shot."""
@@ -484,6 +486,13 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
 
 
 def _fit(e: Evidence) -> Iterator[Reason]:
+    if e.parallax is not None and e.parallax < LEAST_PARALLAX:
+        yield Reason(
+            "the frames show no parallax: the light field is one picture for all views",
+            e.parallax,
+            "focus nearer or farther, or take more shots, if the scene has depth",
+            "cannot tell",
+        )
     if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
         yield Reason(
             f"the light field explains {max(e.explained, 0):.0%} of the detail that held-out "
@@ -492,3 +501,14 @@ def _fit(e: Evidence) -> Iterator[Reason]:
             "take another method, or more shots",
             UNEXPLAINED.level(1 - e.explained),
         )
+    for over, what in (
+        (e.over_flat, "one picture for all views"),
+        (e.over_neighbours, "the mean of the readings beside"),
+    ):
+        if over is not None and over > 1:
+            yield Reason(
+                f"{what} foretells the readings kept from the fit better than the light field",
+                over,
+                "check Psi and the noise, or take another method or more shots",
+                "doubt",
+            )

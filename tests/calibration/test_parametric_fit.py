@@ -254,7 +254,7 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     assert "in brightness against the others" in advice
     assert "in 1 of" in advice
     assert "um in third" in advice
-    assert fit.moved_um == pytest.approx(3.0, rel=0.1)
+    assert fit.moved_um == pytest.approx(3.0, rel=0.2)
 
 
 def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():
