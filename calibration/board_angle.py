@@ -1,11 +1,15 @@
 """How uneven the white board is over the directions into the aperture, from the board turned.
 
-What the camera lets through of a view stays when the board is turned by 90 degrees; what the board
+What the camera lets through of a view stays when the board is turned in its plane; what the board
 sends into it turns. With the board's radiance 1 + sum_k c_k t_k(u, v), t the gradients and the
 saddles over the aperture, the same open whiteboard after the turn reads
 sum_j psi_j (1 + sum_k c_k (t_k(turned u_j) - t_k(u_j))): linear in c, and the views' shadows show
-the terms apart. What no turn changes, a board brighter in the middle than at the rim of the
-aperture, stays in Psi.
+the terms apart. Which way a board was turned is not taken on trust: half a turn reads alike both
+ways, and with it a quarter turn shows its sense. The mask may have moved meanwhile: its place is
+fitted beside.
+
+What no turn changes, a lamp from one side, gloss, a board that does not fill the aperture, looks as
+if the aperture let so much through. `leaning` says how large it is, if it is smooth over the views.
 """
 
 from __future__ import annotations
@@ -18,6 +22,9 @@ from numpy.typing import NDArray
 
 from calibration.boards import Board
 from calibration.choice import white_by_view
+from calibration.fit import Fit
+from calibration.placement import SCALARS
+from calibration.shadow import Shadow, ShadowMask
 from calibration.whiteboard import Calibration
 from emmc_rig.model.sensing import ImagingMatrix
 
@@ -28,15 +35,30 @@ ROUNDS = 4
 CLIP = 4.0
 SAMPLED = 500_000
 """Pixels at most: of more the board's unevenness is known to 1e-5."""
+CLEARLY = 12.0
+"""Difference of the squared misfits, in deviations, that decides the sense of turning."""
+LEAST_LEANING, LEANS = 5e-3, 5.0
+"""Of the light, peak to peak over the views, and deviations of it, from which on it matters."""
+NATURAL = 2.0
+"""Times what the cosine law makes of the outermost views: lenses are between none and so much."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardAngle:
-    """The board's radiance into every view, (v, u), mean 1, and its relative deviation."""
+    """The board's radiance into every view, (v, u), mean 1, and its relative deviation.
+
+    sense: 1 the boards were turned as the sensor's rows and columns run (from right to down), -1
+    the other way, 0 it cannot be told: both are counted. moved_um: by how many degrees turned, how
+    far the mask stood from where it stood before, (x, y), and the deviation of that. disagreement:
+    of the boards' unevenness among themselves, peak to peak, and in deviations.
+    """
 
     radiance: NDArray[np.float64]
     deviation: NDArray[np.float64]
     significance: float
+    sense: int
+    moved_um: Mapping[float, tuple[float, float, float]]
+    disagreement: tuple[float, float]
 
     @property
     def uneven(self) -> bool:
@@ -53,50 +75,122 @@ def _terms(views: tuple[int, int], turn_deg: float) -> NDArray[np.float64]:
     return np.stack([across, down, across**2 - down**2, across * down])
 
 
-def board_over_angle(psi: ImagingMatrix, turned: Mapping[float, Board]) -> BoardAngle:
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """What one turned board says: change of the radiance by term, its information, the mask's move.
+
+    squares: mean squared residual, over the noise.
+    """
+
+    change: NDArray[np.float64]
+    information: NDArray[np.float64]
+    moved_um: tuple[float, float, float]
+    squares: float
+
+
+def board_over_angle(
+    psi: ImagingMatrix, turned: Mapping[float, Board], shadow: Shadow | None = None
+) -> BoardAngle:
     """Return the board's radiance from open whiteboards by the degrees it was turned.
 
-    psi: as measured with the board not turned.
+    psi: as measured with the board not turned. shadow: of the mask as fitted, which shows where it
+    stands (None: it is taken to stand still).
     """
     views = psi.light_field_shape[:2]
     upright = _terms(views, 0.0)
-    size = len(upright)
-    matrix, right = np.zeros((size, size)), np.zeros(size)
-    squares = count = 0.0
-    for turn_deg, board in turned.items():
-        change = _terms(views, turn_deg) - upright
-        use = np.flatnonzero(board.usable)
-        if len(use) > SAMPLED:
-            use = np.sort(np.random.default_rng(0).choice(use, SAMPLED, replace=False))
-        seen = board.channels.ravel()[use]
-        by_view = np.stack([one.ravel()[use] for one in white_by_view(psi, board.shot)], axis=1)
-        even = by_view.sum(axis=1)
-        levels = [np.where(seen == c, even, 0) for c in np.unique(seen)]
-        columns = np.column_stack([by_view @ change.reshape(size, -1).T, *levels])
-        deviation = np.sqrt(board.variance.ravel()[use].astype(np.float64))
-        scaled, value = columns / deviation[:, None], board.reading.ravel()[use] / deviation
-        weight = np.ones(len(value))
-        left = value
-        for _ in range(ROUNDS):
-            normal = scaled.T @ (scaled * weight[:, None])
-            solution = np.linalg.solve(normal, scaled.T @ (weight * value))
-            left = value - scaled @ solution
-            limit = CLIP * 1.4826 * float(np.median(np.abs(left)))
-            weight = (np.abs(left) < limit).astype(np.float64)
-        squares += float((weight * left**2).sum())
-        count += float(weight.sum())
-        # The levels of the colours are free: what is left determines the terms.
-        inside, outside = slice(0, size), slice(size, None)
-        solved = np.linalg.solve(normal[outside, outside], normal[outside, inside])
-        matrix += normal[inside, inside] - normal[inside, outside] @ solved
-        projected = scaled.T @ (weight * value)
-        right += projected[inside] - solved.T @ projected[outside]
-    found = np.linalg.solve(matrix, right)
-    covariance = np.linalg.inv(matrix) * max(squares / max(count, 1.0), 1.0)
+    size, flat = len(upright), upright.reshape(len(upright), -1)
+    seen = {turn: _turned(psi, board, flat, shadow) for turn, board in turned.items()}
+    noise = max(1.0, float(np.mean([one.squares for one in seen.values()])))
+
+    def solved(sense: int) -> tuple[Array, Array, float, Array]:
+        """Return terms, covariance, squared misfit and what each board leaves."""
+        matrix, right = np.zeros((size, size)), np.zeros(size)
+        maps = {}
+        for turn, one in seen.items():
+            change = (_terms(views, sense * turn) - upright).reshape(size, -1)
+            # The change by its own terms.
+            maps[turn] = change @ np.linalg.pinv(flat)
+            matrix += maps[turn] @ one.information @ maps[turn].T
+            right += maps[turn] @ one.information @ one.change
+        inverse = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
+        found = inverse @ right
+        left = np.array([one.change - maps[turn].T @ found for turn, one in seen.items()])
+        pairs = zip(left, seen.values(), strict=True)
+        misfit = sum(float(off @ one.information @ off) for off, one in pairs)
+        return found, inverse * noise, misfit / noise, left
+
+    both = {sense: solved(sense) for sense in (1, -1)}
+    sense = min(both, key=lambda one: both[one][2])
+    found, covariance, misfit, left = both[sense]
+    freedom = size * (len(seen) - 1)
+    if both[-sense][2] - misfit < CLEARLY:
+        other = both[-sense][0]
+        covariance = covariance + np.outer(found - other, found - other) / 4
+        found, sense = (found + other) / 2, 0
     radiance = 1 + np.tensordot(found, upright, 1)
     deviation = np.sqrt(np.einsum("kvu,kl,lvu->vu", upright, covariance, upright))
-    significance = float(np.sqrt(found @ np.linalg.solve(covariance, found) / size))
-    return BoardAngle(radiance / radiance.mean(), deviation, significance)
+    inverse = np.linalg.pinv(both[1][1], rcond=1e-9, hermitian=True)
+    single = both[1][0]
+    apart = max(float(np.ptp(one @ flat)) for one in left)
+    return BoardAngle(
+        radiance / radiance.mean(),
+        deviation.astype(np.float64),
+        float(np.sqrt(single @ inverse @ single / size)),
+        sense,
+        {turn: one.moved_um for turn, one in seen.items()},
+        (apart, float(np.sqrt(misfit / freedom)) if freedom else 0.0),
+    )
+
+
+def _turned(psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None) -> _Turned:
+    """Return what a board says of the change of radiance; flat: the terms, (term, view)."""
+    use = np.flatnonzero(board.usable)
+    if len(use) > SAMPLED:
+        use = np.sort(np.random.default_rng(0).choice(use, SAMPLED, replace=False))
+    channels = board.channels.ravel()[use]
+    pixels = np.stack(np.unravel_index(use, board.reading.shape), axis=1)
+    by_view = np.stack([one.ravel()[use] for one in white_by_view(psi, board.shot)], axis=1)
+    even, size = by_view.sum(axis=1), len(flat)
+    deviation = np.sqrt(board.variance.ravel()[use].astype(np.float64))
+    reading = board.reading.ravel()[use]
+    move = np.zeros(2)
+    for _ in range(ROUNDS):
+        there, slopes = np.zeros(len(use)), np.zeros((len(use), 0))
+        if shadow is not None:
+            how = pixels, channels, board.views_open
+            x, y = board.stage_um
+            at = (x + float(move[0]), y + float(move[1]))
+            moved, by_all = shadow.with_slopes(*how, at, board.shot)
+            there = moved - shadow.readings(*how, board.stage_um, board.shot)
+            slopes = by_all[:, :2]
+        light = even + there
+        levels = [np.where(channels == c, light, 0) for c in np.unique(channels)]
+        columns = np.column_stack([by_view @ flat.T, slopes, *levels]) / deviation[:, None]
+        value = reading / deviation
+        weight = np.ones(len(value))
+        for _ in range(ROUNDS):
+            normal = columns.T @ (columns * weight[:, None])
+            solution = np.linalg.lstsq(normal, columns.T @ (weight * value), rcond=None)[0]
+            left = value - columns @ solution
+            limit = CLIP * 1.4826 * float(np.median(np.abs(left)))
+            weight = (np.abs(left) < limit).astype(np.float64)
+        step = solution[size : size + slopes.shape[1]]
+        if not step.size:
+            break
+        move = move + step
+        if np.abs(step).max() < 1e-3:
+            break
+    squares = float((weight * left**2).sum() / weight.sum())
+    # The levels of the colours and the mask's place are free: what is left determines the terms.
+    inside, outside = slice(0, size), slice(size, None)
+    solved = np.linalg.solve(normal[outside, outside], normal[outside, inside])
+    information = normal[inside, inside] - normal[inside, outside] @ solved
+    moved_deviation = 0.0
+    if slopes.shape[1]:
+        covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) * max(squares, 1.0)
+        moved_deviation = float(np.sqrt(np.diag(covariance)[size : size + 2].max()))
+    moved_um = float(move[0]), float(move[1]), moved_deviation
+    return _Turned(solution[:size].astype(np.float64), information, moved_um, squares)
 
 
 def take_out(board: BoardAngle, known: Calibration) -> None:
@@ -108,3 +202,53 @@ def take_out(board: BoardAngle, known: Calibration) -> None:
         spread = np.square(deviation[shot, v, u] / radiance)
         spread += np.square(even * (board.deviation[v, u] / radiance))
         weights[shot, v, u], deviation[shot, v, u] = even, np.sqrt(spread)
+
+
+def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> NDArray[np.float64]:
+    """Return what of the views' light lamp or board may make, (v, u): 0 where nothing is sure.
+
+    It is smooth over the aperture, but for one that falls or rises from its middle. board: what the
+    turned boards showed, which is not counted again. Lenses let as much through on either side, and
+    less outside by the cosine law at most twice; more than that may be lamp or board as well, and
+    no turn of the board tells them apart.
+    """
+    views = np.shape(fit.placement.aperture)
+    v, u = (np.linspace(-1, 1, count) if count > 1 else np.zeros(1) for count in views)
+    far = (v[:, None] ** 2 + u**2) / max(float((v[:, None] ** 2 + u**2).max()), 1e-12)
+    through = 1 + fit.placement.falloff * far
+    sent = board.radiance if board is not None and board.uneven else np.ones(views)
+    weights = (np.array(fit.placement.aperture) * through / sent).ravel()
+    weights = weights / weights.mean()
+    smooth = [np.broadcast_to(one, views).ravel() for one in (u[None, :], v[:, None], far)]
+    columns = np.stack([one - one.mean() for one in smooth], axis=1)
+    columns = columns[:, np.ptp(columns, axis=0) > 0]
+    freedom = weights.size - columns.shape[1] - 1
+    if freedom < columns.shape[1] or not columns.shape[1]:
+        return np.zeros(views)
+    inverse = np.linalg.pinv(columns.T @ columns, rcond=1e-9, hermitian=True)
+    solution = inverse @ columns.T @ (weights - 1)
+    rough = float(np.sum((weights - 1 - columns @ solution) ** 2)) / freedom
+    # As sure as views differ from their neighbours, and as the fit is.
+    slopes = np.zeros((weights.size, len(fit.covariance)))
+    slopes[:, len(SCALARS) :] = np.diag(through.ravel())
+    slopes[:, SCALARS.index("falloff")] = (np.array(fit.placement.aperture) * far).ravel()
+    slopes -= slopes.mean(axis=0)
+    of_fit = inverse @ columns.T @ slopes
+    covariance = rough * inverse + of_fit @ fit.covariance @ of_fit.T
+    half = [(count - 1) / 2 * mask.aperture_cell_um for count in views]
+    natural = -2 * float(half[0] ** 2 + half[1] ** 2) / mask.lens_um**2
+    sure = np.abs(solution) > LEANS * np.sqrt(np.diag(covariance))
+    if columns.shape[1] == len(smooth) and NATURAL * natural <= solution[-1] <= 0:
+        sure[-1] = False
+    found = columns[:, sure] @ solution[sure]
+    if columns.shape[1] == len(smooth) and sure[-1]:
+        # No lens is known to fall off so: lobes of gloss, and edges of a board, have any shape.
+        found = weights - 1
+    return (found if np.ptp(found) > LEAST_LEANING else np.zeros(weights.size)).reshape(views)
+
+
+def less_sure(known: Calibration, by_view: Array) -> None:
+    """Count a relative error of every view, (v, u), beside in the deviations of a calibration."""
+    for shot, v, u in np.ndindex(*known.psi.weights.shape[:3]):
+        more = np.square(by_view[v, u] * known.psi.weights[shot, v, u])
+        known.deviation[shot, v, u] = np.sqrt(np.square(known.deviation[shot, v, u]) + more)

@@ -20,6 +20,10 @@ LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
 
 
+Opening = tuple[NDArray[np.bool_], tuple[float, float], int]
+"""Views open, (view_y, view_x); place of the mask in um, x and y; shot."""
+
+
 @dataclass(frozen=True, eq=False)
 class BoardFrame:
     """One whiteboard setting as captured: its mean frame, and how the bench stood.
@@ -135,9 +139,10 @@ class Board:
     views_open: NDArray[np.bool_]
     stage_um: tuple[float, float]
     shot: int
+    taken_s: float = 0.0
 
     @property
-    def opening(self) -> tuple[NDArray[np.bool_], tuple[float, float], int]:
+    def opening(self) -> Opening:
         """Views open, place of the mask, shot: what `Shadow.readings` takes."""
         return self.views_open, self.stage_um, self.shot
 
@@ -145,6 +150,10 @@ class Board:
     def usable(self) -> NDArray[np.bool_]:
         """Which pixels count, (pixel_y, pixel_x)."""
         return np.isfinite(self.variance)
+
+    def without(self, pixels: NDArray[np.bool_]) -> Board:
+        """Return the board, of which these pixels, (pixel_y, pixel_x), do not count."""
+        return replace(self, variance=np.where(pixels, np.float32(np.inf), self.variance))
 
 
 def gain_of(boards: BoardSet) -> SensorGain:
@@ -236,6 +245,7 @@ def _board(
         views_open(layout.views, one.pinhole, one.window),
         one.stage_um,
         one.shot,
+        frame.taken_s,
     )
 
 

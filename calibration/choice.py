@@ -89,21 +89,30 @@ def white_by_view(psi: ImagingMatrix, shot: int) -> Iterator[Array]:
 
 
 def judge(
-    route: str, board: Board, predicted: Array, predicted_variance: Array | float = 0.0
+    route: str,
+    board: Board,
+    predicted: Array,
+    predicted_variance: Array | float = 0.0,
+    unsteady: float = 0.0,
 ) -> HeldOut:
-    """Return how a prediction (pixel_y, pixel_x) fits a held-out whiteboard."""
+    """Return how a prediction (pixel_y, pixel_x) fits a held-out whiteboard.
+
+    unsteady: by which whiteboards differ in brightness among themselves, relative (standard
+    deviation): the likeliest difference of this one is taken out.
+    """
     usable = board.usable
     if not usable.any():
         raise CalibrationError(f"{board.name}: no usable pixel to judge by")
     spread = np.broadcast_to(predicted_variance, usable.shape)
     scaled = np.empty(usable.shape, dtype=np.float32)
     missed = power = light = expected = 0.0
+    brighter = 1 + _brighter(board, predicted, spread, unsteady)
     for rows in bands(scaled):
         good = usable[rows]
         reading, prediction = (
             np.where(good, one[rows], np.float64(0)) for one in (board.reading, predicted)
         )
-        residual = reading - prediction
+        residual = reading - brighter * prediction
         variance = board.variance[rows].astype(np.float64) + spread[rows]
         scaled[rows] = residual / np.sqrt(np.where(good, variance, 1.0))
         missed, power = missed + float((residual**2).sum()), power + float((reading**2).sum())
@@ -115,6 +124,20 @@ def judge(
         scaled,
         light / max(expected, 1e-9),
     )
+
+
+def _brighter(board: Board, predicted: Array, spread: Array, unsteady: float) -> float:
+    """Return by which share a whiteboard is likeliest brighter than predicted."""
+    if unsteady == 0:
+        return 0.0
+    light = light2 = 0.0
+    for rows in bands(board.reading):
+        good = board.usable[rows]
+        weight = 1 / (board.variance[rows].astype(np.float64) + spread[rows])[good]
+        prediction = predicted[rows][good]
+        light += float((weight * prediction * (board.reading[rows][good] - prediction)).sum())
+        light2 += float((weight * prediction**2).sum())
+    return light / (light2 + unsteady**-2)
 
 
 def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:

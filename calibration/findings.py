@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.board_angle import BoardAngle
 from calibration.fit import Fit
@@ -12,6 +13,7 @@ from calibration.levels import Levels
 from calibration.placement import Placement
 
 SIGNIFICANT = 5.0
+LEAST_MOVE_UM = 0.2
 NOTEWORTHY = {
     "tilt_x_rad": (
         5e-4,
@@ -103,10 +105,56 @@ def unwatched(missing: Sequence[str]) -> list[str]:
 
 
 def angle_findings(board: BoardAngle) -> list[str]:
-    """Return how uneven the white board is over angle."""
+    """Return how uneven the white board is over angle, and whether the mask moved meanwhile."""
+    found = []
+    moved = [
+        (turn_deg, float(np.hypot(x, y)), deviation)
+        for turn_deg, (x, y, deviation) in board.moved_um.items()
+        if np.hypot(x, y) > max(LEAST_MOVE_UM, SIGNIFICANT * deviation)
+    ]
+    if moved:
+        turn_deg, moved_um, deviation = min(moved)
+        found.append(
+            f"the mask moved by {moved_um:.2f} +- {deviation:.2f} um before the board turned by "
+            f"{turn_deg:g} degrees: taken out of what is said of the board; let the mount settle, "
+            "and capture the turned boards next to the others"
+        )
     if not board.uneven:
-        return []
-    return [
+        return found
+    words = (
         f"the white board is uneven by {np.ptp(board.radiance):.1%} over the directions into the "
         "aperture: taken out; what is alike in every direction from its middle cannot be measured"
+    )
+    if board.sense == 0:
+        words += (
+            "; which way it was turned is not known, and both are counted: turn it by 180 degrees "
+            "as well"
+        )
+    elif board.sense < 0:
+        words += "; it was turned the other way than the rows and columns of the sensor run"
+    return [*found, words]
+
+
+def leaning_findings(leans: NDArray[np.floating], turned: bool) -> list[str]:
+    """Return what of the views' light, (v, u), may be board or lamp as well as the lens.
+
+    turned: the board was turned, and does not send it.
+    """
+    if not leans.any():
+        return []
+    board = "the lamp (from one side, or its gloss)" if turned else "lamp or board"
+    return [
+        f"the views' light differs by {np.ptp(leans):.1%} over the aperture, more than lenses "
+        f"make: it may be {board}, or a board that does not fill the aperture, and counts "
+        "in Psi's deviation; take the whiteboards again with the lamp moved: what stays is the "
+        "camera's"
     ]
+
+
+def dust_finding(dusty: NDArray[np.bool_]) -> str:
+    """Return in words that pixels, (pixel_y, pixel_x), lie under dust that moved."""
+    return (
+        f"{int(dusty.sum())} pixels ({dusty.mean():.1%}) read another share of the light in every "
+        "whiteboard than in the references: dust moved on the sensor in between; they do not "
+        "count; clean the sensor, and capture all again"
+    )

@@ -14,7 +14,12 @@ and softenings are taken as normal, of variances tau^2 that the whiteboards' res
 effects: Searle, Casella, McCulloch 1992, chapter 6); the placement's covariance C then grows by
 C N diag(tau^2) N^T C, N the information between its parameters and the views' own.
 
-Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
+What all pixels of one whiteboard share is no noise of single pixels: shutter and lamp change its
+brightness, and the mask stands a little elsewhere. Each whiteboard has these three of its own,
+normal about 0, of the widths that make the readings likeliest.
+
+Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963; of the widths (evidence):
+MacKay 1992.
 """
 
 from __future__ import annotations
@@ -27,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from calibration.boards import Board
+from calibration.boards import Board, Opening
 from calibration.errors import CalibrationError
 from calibration.placement import (
     SCALARS,
@@ -59,6 +64,17 @@ LEAST_FIT_CORRELATION = 0.7
 SOFT_EDGES = 0.1
 """Of a cell: how soft edges are taken to be where a fit begins."""
 OFFSETS = slice(0, 2)
+OWN = 3
+"""Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
+FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
+BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
+MOVES_UM = np.geomspace(0.002, 10.0, 12)
+"""Widths of the whiteboards' own that are tried."""
+CLEARLY_LIKELIER = 0.5
+"""Difference of log evidence: less than this tells nothing."""
+WIDTH_ROUNDS = 2
+SURE_MOVE = 5.0
+"""Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
 TAUS_UM = np.geomspace(0.002, 0.2, 6)
@@ -86,8 +102,8 @@ class FitSettings(Settings):
 class BoardCheck:
     """How one whiteboard agrees with the fit of all: brightness and where its mask stood.
 
-    chi2: mean squared residual over the noise, of the pixels that are no outliers. outliers:
-    their share.
+    taken_s: when, on the clock of the capture. chi2: mean squared residual over the noise, of the
+    pixels that are no outliers. outliers: their share.
     """
 
     name: str
@@ -95,6 +111,7 @@ class BoardCheck:
     brightness_deviation: float
     moved_um: tuple[float, float]
     moved_deviation_um: float
+    taken_s: float
     chi2: float
     outliers: float
 
@@ -106,7 +123,10 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`. chi2: mean squared
     residual over the noise without outliers. undecided: names of parameters that the prior decides
     more than the whiteboards; more_boards: how many more of the same kinds would decide them
-    (MOST_MORE_BOARDS: no number of them).
+    (MOST_MORE_BOARDS: no number of them). brightness_spread: by
+    which whiteboards differ among themselves; so do the references, which the covariance does not
+    count. moved_um: how far the mask stands from its place; so it may in the shots of a scene,
+    which the covariance counts.
     """
 
     placement: Placement
@@ -120,6 +140,8 @@ class Fit:
     undecided: tuple[str, ...]
     more_boards: int
     boards: tuple[BoardCheck, ...]
+    brightness_spread: float = 0.0
+    moved_um: float = 0.0
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -164,9 +186,72 @@ def _samples(
     return found
 
 
-def _scaled_residuals(shadow: Shadow, sample: _Sample) -> Array:
-    predicted = shadow.readings(sample.pixels, sample.channels, *sample.board.opening)
-    return (sample.reading - predicted) / sample.deviation
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The placement, and each whiteboard's own: (board, OWN)."""
+
+    placement: Placement
+    own: NDArray[np.float64]
+
+    def vector(self) -> NDArray[np.float64]:
+        """Return all parameters as one vector."""
+        return np.concatenate([self.placement.vector(), self.own.ravel()])
+
+    def moved(self, step: Array) -> _State:
+        """Return the state after a step, within what is possible."""
+        size = len(step) - self.own.size
+        own = self.own + step[size:].reshape(self.own.shape)
+        return _State(self.placement.moved(step[:size]), own)
+
+    def opening(self, board: Board, index: int) -> Opening:
+        """Return what `Shadow` asks of a whiteboard, the mask where it stood of that one."""
+        views_open, (x, y), shot = board.opening
+        return views_open, (x + float(self.own[index, 1]), y + float(self.own[index, 2])), shot
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """Precisions of all parameters, and where they are drawn to."""
+
+    precision: NDArray[np.float64]
+    centre: NDArray[np.float64]
+
+    def loss(self, at: _State) -> float:
+        """Return what the prior adds to the loss."""
+        return 0.5 * float(np.sum(self.precision * (at.vector() - self.centre) ** 2))
+
+
+def _prior(placement: Array, centre: Array, widths: tuple[float, float], boards: int) -> _Prior:
+    """Return the prior of a placement (precisions, centre) and of the whiteboards' own."""
+    own = np.tile(1 / np.square([widths[0], widths[1], widths[1]]), boards)
+    precision = np.concatenate([placement, own]).astype(np.float64)
+    return _Prior(precision, np.concatenate([centre, np.zeros(len(own))]).astype(np.float64))
+
+
+def _scaled_residuals(
+    shadow: Shadow, sample: _Sample, at: _State, index: int
+) -> NDArray[np.float64]:
+    opening = at.opening(sample.board, index)
+    predicted = shadow.readings(sample.pixels, sample.channels, *opening)
+    return (sample.reading - (1 + at.own[index, 0]) * predicted) / sample.deviation
+
+
+def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> list[Array]:
+    shadow = Shadow(mask, at.placement)
+    return [_scaled_residuals(shadow, one, at, index) for index, one in enumerate(samples)]
+
+
+def _with_own(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
+    """Return the slopes by the placement and by a whiteboard's own, (n, parameter + OWN)."""
+    brighter = 1 + own[0]
+    rows = [brighter * slope, read, brighter * slope[:, OFFSETS]]
+    return np.column_stack(rows).astype(np.float64, copy=False)
+
+
+def _places(at: _State, index: int) -> NDArray[np.int64]:
+    """Return where the placement's and one whiteboard's own parameters lie in the vector."""
+    size = len(at.placement.vector())
+    return np.concatenate([np.arange(size), size + index * OWN + np.arange(OWN)])
 
 
 def _spread(residuals: Sequence[Array]) -> float:
@@ -196,24 +281,25 @@ class _Normal:
     count: int
 
 
-def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) -> _Normal:
-    shadow = Shadow(mask, placement)
-    residuals = [_scaled_residuals(shadow, sample) for sample in samples]
+def _normal(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> _Normal:
+    shadow = Shadow(mask, at.placement)
+    residuals = _all_residuals(mask, at, samples)
     spread = _spread(residuals)
-    size = len(placement.vector())
+    size = len(at.vector())
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
-    for sample, residual in zip(samples, residuals, strict=True):
+    for index, (sample, residual) in enumerate(zip(samples, residuals, strict=True)):
+        places, opening = _places(at, index), at.opening(sample.board, index)
+        block = np.ix_(places, places)
         for first in range(0, len(residual), CHUNK):
             part = slice(first, first + CHUNK)
-            slope = shadow.with_slopes(
-                sample.pixels[part], sample.channels[part], *sample.board.opening
-            )[1]
+            read, slope = shadow.with_slopes(sample.pixels[part], sample.channels[part], *opening)
+            slope = _with_own(read, slope, at.own[index])
             slope /= sample.deviation[part, None] * spread
             scaled = residual[part] / spread
             weight = _weights(scaled)
-            matrix += slope.T @ (slope * weight[:, None])
-            gradient += slope.T @ (weight * scaled)
+            matrix[block] += slope.T @ (slope * weight[:, None])
+            gradient[places] += slope.T @ (weight * scaled)
             inside = weight > 0
             squares += float((residual[part][inside] ** 2).sum())
             kept += int(inside.sum())
@@ -222,25 +308,27 @@ def _normal(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) 
 
 
 def _view_terms(
-    mask: ShadowMask, placement: Placement, samples: Sequence[_Sample], spread: float
+    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return what `bias_covariance` takes of the views' own displacements and softenings."""
-    shadow = Shadow(mask, placement)
-    size, own_size = len(placement.vector()), OF_VIEW * mask.views[0] * mask.views[1]
+    shadow = Shadow(mask, at.placement)
+    size, own_size = len(at.vector()), OF_VIEW * mask.views[0] * mask.views[1]
     mixed, own = np.zeros((size, own_size)), np.zeros((own_size, own_size))
     pull = np.zeros(own_size)
-    for sample in samples:
-        scaled = _scaled_residuals(shadow, sample) / spread
+    for index, residual in enumerate(_all_residuals(mask, at, samples)):
+        sample = samples[index]
+        scaled = residual / spread
         weight = _weights(scaled)
         for first in range(0, len(scaled), CHUNK):
             part = slice(first, first + CHUNK)
-            slope, by_view = shadow.slopes_by_view(
-                sample.pixels[part], sample.channels[part], *sample.board.opening
-            )
+            opening = at.opening(sample.board, index)
+            how = sample.pixels[part], sample.channels[part], *opening
+            slope, by_view = shadow.slopes_by_view(*how)
+            slope = _with_own(shadow.readings(*how), slope, at.own[index])
             scale = 1 / (sample.deviation[part, None] * spread)
             slope, by_view = slope * scale, by_view * scale
             weighted = by_view * weight[part, None]
-            mixed += slope.T @ weighted
+            mixed[_places(at, index)] += slope.T @ weighted
             own += by_view.T @ weighted
             pull += weighted.T @ scaled[part]
     return mixed, own, pull
@@ -251,9 +339,10 @@ def bias_covariance(
 ) -> NDArray[np.float64]:
     """Return what the views' own displacements and softenings add to the placement's covariance.
 
-    covariance: of the placement without them, (parameter, parameter). mixed: information between
-    the placement and the views' own (see `Shadow.slopes_by_view`). own, pull: information of the
-    latter, and the gradient of the log likelihood by them, at the placement fitted.
+    covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
+    information between these and the views' own (see `Shadow.slopes_by_view`). own, pull:
+    information of the latter, and the gradient of the log likelihood by them, at the placement
+    fitted.
     """
     left = own - mixed.T @ covariance @ mixed
     kind = np.resize(KINDS, len(pull))
@@ -275,16 +364,34 @@ def bias_covariance(
 
 
 def _posterior(
-    mask: ShadowMask,
-    placement: Placement,
-    samples: Sequence[_Sample],
-    spread: float,
-    prior: Array,
-    centre: Array,
+    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float, prior: _Prior
 ) -> float:
-    shadow = Shadow(mask, placement)
-    loss = sum(_loss(_scaled_residuals(shadow, sample) / spread) for sample in samples)
-    return loss + 0.5 * float(np.sum(prior * (placement.vector() - centre) ** 2))
+    residuals = _all_residuals(mask, at, samples)
+    return sum(_loss(one / spread) for one in residuals) + prior.loss(at)
+
+
+def _widths(normal: _Normal, at: _State, placement: Array, centre: Array) -> tuple[float, float]:
+    """Return the widths of brightness and place that make the readings likeliest, at a fit.
+
+    placement, centre: precisions of its prior, and where it is drawn to.
+    """
+    boards = len(at.own)
+    away = at.vector() - np.concatenate([centre, np.zeros(at.own.size)])
+    pull = normal.gradient + normal.matrix @ away
+
+    def evidence(widths: tuple[float, float]) -> float:
+        precision = _prior(placement, centre, widths, boards).precision
+        factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
+        seen = np.linalg.solve(factor, pull)
+        own = precision[len(placement) :]
+        return float(0.5 * seen @ seen - np.log(np.diag(factor)).sum() + 0.5 * np.log(own).sum())
+
+    found = {widths: evidence(widths) for widths in product(BRIGHTNESSES, MOVES_UM)}
+    best = max(found, key=lambda widths: found[widths])
+    # One that is hardly likelier than none is none.
+    still = found[best[0], MOVES_UM[0]] > found[best] - CLEARLY_LIKELIER
+    steady = found[BRIGHTNESSES[0], best[1]] > found[best] - CLEARLY_LIKELIER
+    return BRIGHTNESSES[0] if steady else best[0], MOVES_UM[0] if still else best[1]
 
 
 @one_blas_thread()
@@ -316,20 +423,30 @@ def fit_placement(
     deviations = tolerances.deviations(camera.views)
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
-    prior = 1 / deviations**2
+    of_placement = 1 / deviations**2
+    widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
+    at = _State(placement, np.zeros((len(boards), OWN)))
     rng = np.random.default_rng(settings.seed)
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
-        placement, taken, converged, normal = _descend(
-            mask, placement, samples, prior, centre, settings
-        )
+        prior = _prior(of_placement, centre, widths, len(boards))
+        at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     assert normal is not None
-    placement = with_aperture_mean_one(placement)
-    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior)), np.float64)
-    correlation = _correlation(mask, placement, samples)
+    for _ in range(WIDTH_ROUNDS):
+        widths = _widths(normal, at, of_placement, centre)
+        prior = _prior(of_placement, centre, widths, len(boards))
+        at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
+        steps += taken
+    size = len(of_placement)
+    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
+    terms = _view_terms(mask, at, samples, normal.spread)
+    covariance = (covariance + bias_covariance(covariance, *terms))[:size, :size]
+    checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
+    correlation = _correlation(mask, at, samples)
+    placement = with_aperture_mean_one(at.placement)
     if correlation < LEAST_FIT_CORRELATION:
         raise CalibrationError(
             f"the fit does not explain the whiteboards: their correlation with the shadow of the "
@@ -347,10 +464,11 @@ def fit_placement(
     lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE_BOARDS))
     kept = max(normal.kept, 1)
-    terms = _view_terms(mask, placement, samples, normal.spread)
+    moved_um = _farthest_um(widths[1], checks)
+    covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement,
-        covariance + bias_covariance(covariance, *terms),
+        covariance,
         correlation,
         normal.squares / kept,
         1 - normal.kept / max(normal.count, 1),
@@ -359,8 +477,23 @@ def fit_placement(
         "" if converged else "raise max_steps, or capture another whiteboard",
         undecided,
         more,
-        tuple(_check(mask, placement, sample) for sample in samples),
+        checks,
+        float(widths[0]),
+        moved_um,
     )
+
+
+def _farthest_um(width_um: float, boards: Sequence[BoardCheck]) -> float:
+    """Return how far from the fitted place the mask may stand, um: 0 where it seems to stand still.
+
+    The largest move that is sure, as the width of all takes the one that stayed away for chance.
+    """
+    sure = [
+        float(np.hypot(*one.moved_um))
+        for one in boards
+        if np.hypot(*one.moved_um) > SURE_MOVE * one.moved_deviation_um
+    ]
+    return max([width_um if width_um > MOVES_UM[0] else 0.0, *sure])
 
 
 def shares_of_prior(
@@ -401,42 +534,41 @@ def _windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]
 
 def _descend(
     mask: ShadowMask,
-    placement: Placement,
+    at: _State,
     samples: Sequence[_Sample],
-    prior: Array,
-    centre: Array,
+    prior: _Prior,
     settings: FitSettings,
-) -> tuple[Placement, int, bool, _Normal]:
-    """Return the placement after Levenberg-Marquardt steps on these samples."""
+) -> tuple[_State, int, bool, _Normal]:
+    """Return the state after Levenberg-Marquardt steps on these samples."""
     damping = 1e-3
-    normal = _normal(mask, placement, samples)
+    normal = _normal(mask, at, samples)
     for step in range(settings.max_steps):
-        pull = prior * (centre - placement.vector())
-        value = _posterior(mask, placement, samples, normal.spread, prior, centre)
+        pull = prior.precision * (prior.centre - at.vector())
+        value = _posterior(mask, at, samples, normal.spread, prior)
         while True:
-            matrix = normal.matrix + np.diag(prior)
+            matrix = normal.matrix + np.diag(prior.precision)
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            trial = _stepped(placement, matrix, normal.gradient + pull)
-            found = _posterior(mask, trial, samples, normal.spread, prior, centre)
+            trial = _stepped(at, matrix, normal.gradient + pull)
+            found = _posterior(mask, trial, samples, normal.spread, prior)
             if found <= value or damping > 1e6:
                 break
             damping *= 8
         damping = max(damping / 5, 1e-7)
-        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior)
-        size = float(np.max(np.abs(trial.vector() - placement.vector()) / deviations))
+        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior.precision)
+        size = float(np.max(np.abs(trial.vector() - at.vector()) / deviations))
         if found <= value:
-            placement = trial
-        normal = _normal(mask, placement, samples)
+            at = trial
+        normal = _normal(mask, at, samples)
         if size < settings.tolerance or value - found < LEAST_GAIN:
-            return placement, step + 1, True, normal
-    return placement, settings.max_steps, False, normal
+            return at, step + 1, True, normal
+    return at, settings.max_steps, False, normal
 
 
-def _stepped(placement: Placement, matrix: Array, gradient: Array) -> Placement:
-    """Return the placement after a step; one that meets a limit lets the others move without it."""
-    here = placement.vector()
+def _stepped(at: _State, matrix: Array, gradient: Array) -> _State:
+    """Return the state after a step; one that meets a limit lets the others move without it."""
+    here = at.vector()
     move = np.linalg.solve(matrix, gradient)
-    trial = placement.moved(move)
+    trial = at.moved(move)
     held = np.abs(trial.vector() - here - move) > 1e-12
     if not held.any():
         return trial
@@ -444,7 +576,7 @@ def _stepped(placement: Placement, matrix: Array, gradient: Array) -> Placement:
     move[held] = (trial.vector() - here)[held]
     rest = gradient[free] - matrix[np.ix_(free, held)] @ move[held]
     move[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
-    return placement.moved(move)
+    return at.moved(move)
 
 
 def _contrast(board: Board) -> float:
@@ -455,39 +587,40 @@ def _contrast(board: Board) -> float:
     return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
 
 
-def _correlation(mask: ShadowMask, placement: Placement, samples: Sequence[_Sample]) -> float:
+def _correlation(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> float:
     """Return the correlation of readings and fit, colour by colour, outliers clipped."""
-    shadow = Shadow(mask, placement)
-    product = mine = theirs = 0.0
-    for sample in samples:
-        fitted = sample.reading - _scaled_residuals(shadow, sample) * sample.deviation
+    products = mine = theirs = 0.0
+    for sample, residual in zip(samples, _all_residuals(mask, at, samples), strict=True):
+        fitted = sample.reading - residual * sample.deviation
         for channel in np.unique(sample.channels):
             seen = sample.channels == channel
             a = sample.reading[seen] - np.median(sample.reading[seen])
             a = np.clip(a, -4 * np.std(a), 4 * np.std(a))
             b = fitted[seen] - fitted[seen].mean()
             a -= a.mean()
-            product += float(a @ b)
+            products += float(a @ b)
             mine += float(a @ a)
             theirs += float(b @ b)
-    return product / np.sqrt(max(mine * theirs, 1e-300))
+    return products / np.sqrt(max(mine * theirs, 1e-300))
 
 
-def _check(mask: ShadowMask, placement: Placement, sample: _Sample) -> BoardCheck:
-    """Return how far one board's brightness and mask are off, all else as fitted."""
-    shadow = Shadow(mask, placement)
-    board = sample.board
-    fitted, slope = shadow.with_slopes(sample.pixels, sample.channels, *board.opening)
+def _check(mask: ShadowMask, at: _State, sample: _Sample, index: int) -> BoardCheck:
+    """Return how far one board's brightness and mask are off, the placement as fitted."""
+    shadow = Shadow(mask, at.placement)
+    board, own = sample.board, at.own[index]
+    opening = at.opening(board, index)
+    fitted, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
     rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
-    residual = (sample.reading - fitted) / sample.deviation
+    residual = (sample.reading - (1 + own[0]) * fitted) / sample.deviation
     weight = np.ones(len(residual))
-    found = np.zeros(3)
+    more = np.zeros(3)
     matrix = np.eye(3)
     for _ in range(8):
         matrix = rows.T @ (rows * weight[:, None])
-        found = np.linalg.solve(matrix, rows.T @ (weight * residual))
-        left = residual - rows @ found
+        more = np.linalg.solve(matrix, rows.T @ (weight * residual))
+        left = residual - rows @ more
         weight = _weights(left / _spread([left]))
+    found = own + more
     spread = _spread([residual])
     inside = _weights(residual / spread) > 0
     deviation = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
@@ -497,6 +630,7 @@ def _check(mask: ShadowMask, placement: Placement, sample: _Sample) -> BoardChec
         float(deviation[0]),
         (float(found[1]), float(found[2])),
         float(deviation[1:].max()),
+        board.taken_s,
         float(np.mean(residual[inside] ** 2)),
         float(1 - inside.mean()),
     )

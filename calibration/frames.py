@@ -14,7 +14,11 @@ Frame = NDArray[np.floating] | NDArray[np.integer]
 BAND_PIXELS = 2**20
 """Worked on at once: a dozen temporary arrays of them take 100 MB."""
 LARGEST_CLIPPED_SHARE = 1e-3
+NEARLY_WHITE = 0.7
+"""Of white, that a pixel reads beside one that light saturates."""
 LARGEST_FLICKER = 0.02
+LARGEST_ROLLING = 0.007
+"""Of the brightness: standard deviation of rows against their frame, between repeats."""
 SAME_EXPOSURE = 0.02
 """Relative: exposures that differ by less have one dark frame."""
 DARK_ELECTRONS_PER_S = 100.0
@@ -30,6 +34,8 @@ class MeanFrame:
     mean_dn: (y, x) float32. variance_dn2: variance of one frame, averaged over the pixels, from
     the spread between repeats; NaN with one frame. taken_s: when, on any clock of the capture.
     extra_variance_dn2: of the mean beyond its own noise, from what was subtracted of it.
+    row_variance_dn2: (y,), of a row's mean between repeats: lamp and shutter change whole rows
+    alike, which is no noise of single pixels.
     """
 
     mean_dn: NDArray[np.float32]
@@ -38,6 +44,31 @@ class MeanFrame:
     exposure_s: float
     taken_s: float = 0.0
     extra_variance_dn2: float = 0.0
+    row_variance_dn2: NDArray[np.float64] | None = None
+
+    def noise_dn2(self, dark_dn: NDArray[np.floating] | float) -> float:
+        """Return the variance of a pixel of one frame without what whole rows do alike.
+
+        dark_dn: what the mean reads in the dark.
+        """
+        return self.variance_dn2 - float(np.mean(self._of_rows(dark_dn)))
+
+    def flicker(self, dark_dn: NDArray[np.floating] | float) -> float:
+        """Return the standard deviation of a row's light between repeats, over that light."""
+        light = float(np.mean(self.mean_dn - dark_dn))
+        return float(np.sqrt(max(np.mean(self._of_rows(dark_dn)), 0.0))) / max(light, 1e-9)
+
+    def _of_rows(self, dark_dn: NDArray[np.floating] | float) -> NDArray[np.float64]:
+        """Return the variance of pixels by what their rows do alike, (y,)."""
+        if self.row_variance_dn2 is None:
+            return np.zeros(len(self.mean_dn))
+        light = (self.mean_dn - dark_dn).astype(np.float64)
+        mean, columns = light.mean(axis=1), light.shape[1]
+        alike = float(np.sum(self.row_variance_dn2 - self.variance_dn2 / columns))
+        # A pixel that is brighter than others changes by more. Rows that see no light, as under a
+        # lamp of another colour, tell nothing.
+        relative = alike / max(float(np.sum(np.square(mean))), 1e-12)
+        return relative * np.square(light).mean(axis=1)
 
 
 def average(
@@ -50,15 +81,17 @@ def average(
 ) -> MeanFrame:
     """Return the mean of repeated frames (y, x), uint16; lit: they are no darks.
 
-    Raises CalibrationError when there are none, when they differ in size, when more than
-    LARGEST_CLIPPED_SHARE of the pixels of one are saturated, and when their brightness differs by
-    more than LARGEST_FLICKER of the brightest, and more than noise explains.
+    Raises CalibrationError when there are none, when they differ in size, when light saturates
+    more than LARGEST_CLIPPED_SHARE of the pixels of one, and when their brightness differs by
+    more than LARGEST_FLICKER of the brightest, or that of their rows by LARGEST_ROLLING, and more
+    than noise explains.
     """
     total: NDArray[np.float64] | None = None
     count, squares = 0, 0.0
     levels: list[float] = []
+    rows: list[NDArray[np.float64]] = []
     for frame in frames:
-        clipped = float(np.mean(frame >= white_level_dn))
+        clipped = _saturated_share(frame, white_level_dn)
         if clipped > LARGEST_CLIPPED_SHARE:
             raise CalibrationError(
                 f"{what}: {clipped:.1%} of the pixels are saturated; shorten the exposure "
@@ -71,14 +104,19 @@ def average(
         total += frame
         squares += _sum_of_squares(frame)
         count += 1
-        levels.append(float(frame.mean(dtype=np.float64)))
+        rows.append(frame.mean(axis=1, dtype=np.float64))
+        levels.append(float(rows[-1].mean()))
     if total is None:
         raise CalibrationError(f"{what}: no frame was taken")
-    spread = np.nan
+    spread, of_rows = np.nan, None
     if count > 1:
+        of_rows = np.var(rows, axis=0, ddof=1)
         spread = (squares - _sum_of_squares(total) / count) / total.size / (count - 1)
         _check_steady(levels, float(np.sqrt(spread / total.size)), what, lit)
-    return MeanFrame((total / count).astype(np.float32), spread, count, exposure_s, taken_s)
+        if lit:
+            _check_rows(np.array(rows), spread / total.shape[1], what)
+    mean = (total / count).astype(np.float32)
+    return MeanFrame(mean, spread, count, exposure_s, taken_s, row_variance_dn2=of_rows)
 
 
 def bands(frame: Frame) -> list[slice]:
@@ -168,6 +206,36 @@ def _check_steady(levels: list[float], noise: float, what: str, lit: bool) -> No
         )
 
 
+def _saturated_share(frame: NDArray[np.uint16], white_level_dn: int) -> float:
+    """Return the share of pixels that light saturates: hot ones among dark neighbours do not count.
+
+    Of pixels of the same colour, which lie two apart in a Bayer mosaic.
+    """
+    saturated = frame >= white_level_dn
+    if not saturated.any():
+        return 0.0
+    bright = np.pad(frame >= NEARLY_WHITE * white_level_dn, 2)
+    sides = (bright[:-4, 2:-2], bright[4:, 2:-2], bright[2:-2, :-4], bright[2:-2, 4:])
+    return float(np.mean(saturated & np.logical_or.reduce(sides)))
+
+
+def _check_rows(rows: NDArray[np.float64], noise_dn2: float, what: str) -> None:
+    """Raise CalibrationError when rows differ apart from the brightness of their frames.
+
+    rows: mean of each, (repeat, y). noise_dn2: variance of a row's mean by the noise of its pixels.
+    """
+    levels = rows.mean(axis=1, keepdims=True)
+    alone = np.var(rows / levels * levels.mean(), axis=0, ddof=1).mean() - noise_dn2
+    rolling = float(np.sqrt(max(alone, 0.0))) / float(levels.mean())
+    sure = alone > SURE * noise_dn2 * np.sqrt(2 / (rows.size - rows.shape[1]))
+    if sure and rolling > LARGEST_ROLLING:
+        raise CalibrationError(
+            f"{what}: the rows of repeats differ by {rolling:.1%} in brightness: the lamp flickers "
+            "while the sensor's rows are read; run it on direct current, or expose for whole "
+            "periods of the mains"
+        )
+
+
 @dataclass(frozen=True)
 class SensorGain:
     """What the noise of a frame follows from: DN per electron, and the variance in the dark."""
@@ -190,5 +258,6 @@ def photon_transfer(dark: MeanFrame, flat: MeanFrame) -> SensorGain:
     signal = float(np.mean(flat.mean_dn - dark.mean_dn))
     if signal <= 0:
         raise CalibrationError("the whiteboard is no brighter than the dark: is the lamp on?")
-    gain = max((flat.variance_dn2 - dark.variance_dn2) / signal, 1e-9)
+    noise_dn2 = flat.noise_dn2(dark.mean_dn) - dark.variance_dn2
+    gain = max(noise_dn2 / signal, 1e-9)
     return SensorGain(gain, dark.variance_dn2)

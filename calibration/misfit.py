@@ -14,6 +14,7 @@ deviation says which.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,10 +34,14 @@ OUTLIER2 = 36.0
 
 @dataclass(frozen=True)
 class Misfit:
-    """Of one view's coefficients: a variance, and what a squared slope adds to it."""
+    """Of one view's coefficients: a variance, and what a squared slope adds to it.
+
+    evidence: deviations by which the squares exceed those of noise alone.
+    """
 
     level: float = 0.0
     per_slope: float = 0.0
+    evidence: float = 0.0
 
     def variance(self, plane: Array) -> NDArray[np.float64]:
         """Return the variance of coefficients (y, x) of the model."""
@@ -75,7 +80,20 @@ def measured_misfit(
         per_slope = max(
             float(np.average(excess, weights=weight) / np.average(mean, weights=weight)), 0.0
         )
-    return Misfit(max(level, 0.0), per_slope)
+    noise = float(variance[calm].mean()) * np.sqrt(2 / max(int(calm.sum()), 1))
+    evidence = float(np.average(excess, weights=weight)) / max(noise, 1e-300)
+    return Misfit(max(level, 0.0), per_slope, evidence)
+
+
+def beyond_chance(misfits: Sequence[Misfit]) -> list[Misfit]:
+    """Return the views' misfits, none where noise alone explains them.
+
+    No estimate is below zero, so that those of half the views are above it by chance. The noise's
+    own variance, alike for all, is as sure as the squares of one view are.
+    """
+    if np.mean([one.evidence for one in misfits]) > SURE:
+        return list(misfits)
+    return [one if one.evidence > SURE * np.sqrt(2) else Misfit() for one in misfits]
 
 
 def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> Calibration:
@@ -87,13 +105,27 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
     k = free.psi.binning
     usable = good.repeat(k, axis=0).repeat(k, axis=1)
     shots, views_v, views_u, _, stored, _ = weights.shape
-    for shot, v, u, colour in np.ndindex(shots, views_v, views_u, stored):
-        place = (shot, v, u, slice(None), colour)
+    places = [
+        (shot, v, u, slice(None), colour)
+        for shot, v, u, colour in np.ndindex(shots, views_v, views_u, stored)
+    ]
+
+    def of_plane(place: tuple[int, int, int, slice, int]) -> tuple[Array, ...]:
+        """Return what pinhole and model say, and the variances of both."""
         measured, expected = (one.psi.weights[place].astype(np.float64) for one in (free, model))
-        noise = np.square(free.deviation[place], dtype=np.float64)
-        inherent = np.square(model.deviation[place], dtype=np.float64)
+        noise, inherent = (
+            np.square(one.deviation[place], dtype=np.float64) for one in (free, model)
+        )
+        return measured, expected, noise, inherent
+
+    views = []
+    for place in places:
+        measured, expected, noise, inherent = of_plane(place)
         squares = (measured - expected) ** 2
-        view = measured_misfit(squares, noise + inherent, expected, usable)
+        views.append(measured_misfit(squares, noise + inherent, expected, usable))
+    for place, view in zip(places, beyond_chance(views), strict=True):
+        measured, expected, noise, inherent = of_plane(place)
+        squares = (measured - expected) ** 2
         misfit = _around(squares, noise + inherent, view.variance(expected), usable)
         share = (inherent + misfit) / (inherent + misfit + noise)
         share = np.where(squares > OUTLIER2 * (noise + inherent + misfit), 1.0, share)

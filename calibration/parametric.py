@@ -104,7 +104,8 @@ def psi_deviation(
 
     covariance: of the placement's parameters.
     """
-    root = np.linalg.cholesky(covariance + 1e-15 * np.diag(np.diag(covariance)))
+    values, vectors = np.linalg.eigh(covariance)
+    root = (vectors * np.sqrt(np.maximum(values, 0)))[:, values > 0]
     mask = replace(shadow.mask, binning=1)
     samples_shadow = Shadow(mask, shadow.placement)
     deviation = np.empty(layout.shape, dtype=np.float32)

@@ -53,6 +53,7 @@ FREE_GRADIENT = {True: 0.015, False: 0.1}
 """The same of the free route, whose whiteboards are many: benches that are as they may be have
 at most 0.003 of the open aperture. Small pictures of few whiteboards show 0.02."""
 LARGEST_UNEVENNESS = 0.25
+LARGEST_DISAGREEMENT = 0.005
 SURE = 5.0
 MIRRORED = 0.02
 """By which the views in another order must correlate better with the design's."""
@@ -104,6 +105,8 @@ def _refuse_lit_darks(boards: BoardSet) -> None:
 
 
 def _refuse_saturated(boards: BoardSet) -> None:
+    """Raise CalibrationError for frames that are saturated below the white level."""
+
     def lit() -> Iterator[tuple[str, MeanFrame]]:
         for (_, lamp), frame in boards.references.items():
             yield f"the reference whiteboard, {lamp} lamp", frame
@@ -132,8 +135,9 @@ def _above_dn(frame: MeanFrame, boards: BoardSet) -> Array:
 
 def _gain(frame: MeanFrame, boards: BoardSet) -> float:
     """Return the noise's variance per DN of light."""
-    light = float(np.mean(_above_dn(frame, boards)))
-    return (frame.variance_dn2 - boards.dark.variance_dn2) / light
+    dark_dn = boards.dark_at(frame.exposure_s).mean_dn
+    light = float(np.mean(frame.mean_dn - dark_dn))
+    return (frame.noise_dn2(dark_dn) - boards.dark.variance_dn2) / light
 
 
 def _plateau(above_dn: Array, gain: float, count: int) -> float:
@@ -302,6 +306,13 @@ def _gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
 def refuse_uneven_board(board: BoardAngle) -> None:
     """Raise CalibrationError for a white board that is far from even over angle."""
     uneven = float(np.ptp(board.radiance))
+    apart, deviations = board.disagreement
+    if apart > LARGEST_DISAGREEMENT and deviations > SURE:
+        raise CalibrationError(
+            f"the turned white boards contradict each other by {apart:.1%}: no board turned in its "
+            "plane does so; the lamp changed, or the board was tilted: fasten both, turn the board "
+            "in its plane only, and capture the turned boards again"
+        )
     if board.uneven and uneven > LARGEST_UNEVENNESS:
         raise CalibrationError(
             f"the white board is uneven by {uneven:.0%} over the directions into the aperture: it "

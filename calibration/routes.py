@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import board_over_angle, take_out
+from calibration.board_angle import board_over_angle, leaning, less_sure, take_out
 from calibration.boards import (
     Board,
     BoardSet,
@@ -30,12 +30,20 @@ from calibration.choice import (
 )
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
 from calibration.defects import View, find_defects, loss_variance
+from calibration.dust import moved_dust
 from calibration.errors import CalibrationError
-from calibration.findings import angle_findings, level_findings, mask_findings, unwatched
-from calibration.fit import MOST_MORE_BOARDS, SOFT_EDGES, Fit, fit_placement
+from calibration.findings import (
+    angle_findings,
+    dust_finding,
+    leaning_findings,
+    level_findings,
+    mask_findings,
+    unwatched,
+)
+from calibration.fit import MOST_MORE_BOARDS, OFFSETS, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
-from calibration.misfit import Misfit, combined, measured_misfit
+from calibration.misfit import Misfit, beyond_chance, combined, measured_misfit
 from calibration.openings import views_open
 from calibration.parametric import (
     Parametric,
@@ -71,6 +79,8 @@ LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
 LARGEST_MOVE_UM = 1.0
+FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
+"""Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 REGISTERED_MISS = 3.0
 """Times what a fitted mask misses: what one that is but registered does."""
 
@@ -148,11 +158,13 @@ def calibrate(
         refuse_without_mask(board)
     stage_um = shot_stages(camera)[0]
     modelled = bool({"parametric", "mixed", "combined"} & set(routes))
+    shadow: Shadow | None = None
     if not modelled or pinholes is not None:
         boards = pinholes or held_out
-        findings += _unlike_the_design(
+        odd, shadow = _unlike_the_design(
             camera, layout, boards, judges, good, seen_colours, not modelled
         )
+        findings += odd
     calibrations: dict[str, Calibration] = {}
     bare: dict[str, Calibration] = {}
     judged: dict[str, HeldOut] = {}
@@ -170,6 +182,12 @@ def calibrate(
         fit = fit_placement(seen, camera, mask)
         advice += fit_advice(fit)
         refuse_odd_fit(fit, seen)
+        dusty = moved_dust(Shadow(mask, fit.placement), seen)
+        if dusty.any():
+            findings.append(dust_finding(dusty))
+            good = good & ~dusty
+            seen, judges = ([one.without(dusty) for one in some] for some in (seen, judges))
+            fit = fit_placement(seen, camera, mask, start=fit.placement)
         parametric = with_misfit(Parametric(fit, mask), seen)
         if {"mixed", "combined"} & set(routes) and layout.binning == 1:
             on_stage("defects of the mask")
@@ -180,7 +198,7 @@ def calibrate(
                 on_stage(f"Psi, {name}")
                 bare[name] = _calibration(one, camera, layout, few, good)
                 calibrations[name] = _counting_misfit(bare[name], one)
-                judged[name] = _judged(name, one.shadow, judges, seen)
+                judged[name] = _judged(name, one, judges, seen)
                 frames[name] = few.exposures
         refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
         findings += mask_findings((mixed or parametric).fit)
@@ -207,6 +225,10 @@ def calibrate(
             calibrations["combined"] = both
             judged["combined"] = _judged_measured("combined", both, still[0], layout.binning)
             frames["combined"] = few.exposures
+    for name, one in calibrations.items():
+        _make_less_sure(one, _unsteady(name, sets, parametric))
+        if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
+            _count_moves(one, parametric, layout, shot_stages(camera))
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > LARGEST_CHI2:
@@ -231,14 +253,22 @@ def calibrate(
         assert by is not None
         others = other_colours(by, plain, seen_colours, layout, shot_stages(camera))
         calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
+    board = None
     if turned:
         boards = {turn: as_readings(one, layout, good)[0] for turn, one in turned.items()}
-        board = board_over_angle(calibrations[chosen.route].psi, boards)
+        by = mixed or parametric
+        shadow = shadow if by is None else by.shadow
+        board = board_over_angle(calibrations[chosen.route].psi, boards, shadow)
         refuse_uneven_board(board)
         findings += angle_findings(board)
         if board.uneven:
             for one in calibrations.values():
                 take_out(board, one)
+    if parametric is not None:
+        leans = leaning(parametric.fit, parametric.mask, board)
+        findings += leaning_findings(leans, bool(turned))
+        for one in calibrations.values():
+            less_sure(one, leans)
     return Outcome(
         chosen.route,
         why,
@@ -253,6 +283,21 @@ def calibrate(
         tuple(unwatched(_missing(sets, levels, layout, bool(turned)))),
         seen_colours,
     )
+
+
+def _unsteady(route: str, sets: Sequence[BoardSet], parametric: Parametric | None) -> float:
+    """Return the relative error that shutter and lamp leave in all of a Psi alike.
+
+    Every whiteboard is divided by the references, which are as unsteady as it is; of single views
+    as measured through a pinhole each has its own beside.
+    """
+    if parametric is not None:
+        spread = parametric.fit.brightness_spread
+    else:
+        means = [one.references[key] for one in sets for key in one.references]
+        dark_dn = sets[0].dark.mean_dn
+        spread = float(np.mean([one.flicker(dark_dn) / np.sqrt(one.count) for one in means]))
+    return spread * (np.sqrt(2) if route == "free" else 1.0)
 
 
 def _missing(
@@ -279,17 +324,18 @@ def _unlike_the_design(
     good: NDArray[np.bool_],
     crosstalk: Crosstalk | None,
     fitted: bool,
-) -> list[str]:
-    """Return what of the mask is off; raises CalibrationError for another mask, or a tilted board.
+) -> tuple[list[str], Shadow | None]:
+    """Return what of the mask is off, and its shadow.
 
-    Nothing for cameras whose mask is not modelled. Of those through the pinhole the middle view
+    Raises CalibrationError for another mask, or a tilted board. Nothing for cameras whose mask is
+    not modelled. Of those through the pinhole the middle view
     and two corners' are enough. fitted: the mask is fitted to these as well, which distinguishes
     another distance and references with less light from whiteboards that every coefficient follows.
     """
     try:
         mask = shadow_mask(camera, layout.size)
     except CalibrationError:
-        return []
+        return [], None
     if crosstalk is not None:
         mask = mixing(mask, crosstalk.seen)
     v, u = camera.views
@@ -300,14 +346,14 @@ def _unlike_the_design(
     placement = refuse_another_mask(seen or judges, camera, mask)
     refuse_tilted_board(Shadow(mask, placement), judges, REGISTERED_MISS)
     if not fitted:
-        return []
+        return [], Shadow(mask, placement)
     seen = [*seen, *judges]
     start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
     fit = fit_placement(seen, camera, mask, start=start)
     refuse_odd_fit(fit, seen)
     refuse_tilted_board(Shadow(mask, fit.placement), seen, limits=FREE_GRADIENT)
     # Finer than that, Psi as measured is what counts, and few whiteboards do not determine it well.
-    return mask_findings(fit, ("distance_share", "clear"))
+    return mask_findings(fit, ("distance_share", "clear")), Shadow(mask, fit.placement)
 
 
 def _mixed(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
@@ -329,13 +375,14 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     """
     shadow = one.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
-    for board in seen:
-        count = int(board.views_open.sum())
-        if count == board.views_open.size:
-            continue
+    of_few = [board for board in seen if not board.views_open.all()]
+    misfits = []
+    for board in of_few:
         predicted = predicted_by_shadow(shadow, board)
         squares = (board.reading - predicted) ** 2
-        misfit = measured_misfit(squares, board.variance, predicted, board.usable)
+        misfits.append(measured_misfit(squares, board.variance, predicted, board.usable))
+    for board, misfit in zip(of_few, beyond_chance(misfits), strict=True):
+        count = int(board.views_open.sum())
         for v, u in np.argwhere(board.views_open).tolist():
             found[v, u].append((count, Misfit(misfit.level / count, misfit.per_slope)))
     if not found:
@@ -377,12 +424,15 @@ def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
     return max(missed / taken, 0.0) if taken > 0 else 0.0
 
 
-def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
+def _judged(name: str, one: Parametric, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
+
+    def judged(board: Board) -> HeldOut:
+        predicted = predicted_by_shadow(one.shadow, board)
+        return judge(name, board, predicted, unsteady=one.fit.brightness_spread)
+
     groups = {
-        ("open aperture" if i == 0 else "mask moved"): judge(
-            name, board, predicted_by_shadow(shadow, board)
-        )
+        ("open aperture" if i == 0 else "mask moved"): judged(board)
         for i, board in enumerate(judges)
     }
     for board in seen:
@@ -391,7 +441,7 @@ def _judged(name: str, shadow: Shadow, judges: Sequence[Board], seen: Sequence[B
             through = f"view ({v[0]}, {u[0]})"
             if board.views_open.sum() > 1:
                 through = f"views ({v[0]}, {u[0]}) to ({v[1]}, {u[1]})"
-            groups[through] = judge(name, board, predicted_by_shadow(shadow, board))
+            groups[through] = judged(board)
     return worst(groups)
 
 
@@ -412,6 +462,14 @@ def _make_less_sure(known: Calibration, missed: float) -> None:
     for place in np.ndindex(*known.deviation.shape[:3]):
         more = np.square(missed * known.psi.weights[place])
         known.deviation[place] = np.sqrt(np.square(known.deviation[place]) + more)
+
+
+def _count_moves(known: Calibration, one: Parametric, layout: PsiLayout, stages: Stages) -> None:
+    """Count in a measured Psi's deviation that the mask may stand elsewhere: models have it."""
+    covariance = np.zeros_like(one.fit.covariance)
+    covariance[OFFSETS, OFFSETS] = np.eye(2) * one.fit.moved_um**2
+    moved = psi_deviation(one.shadow, layout, stages, covariance)
+    np.sqrt(np.square(known.deviation) + np.square(moved), out=known.deviation)
 
 
 def _calibration(
@@ -496,13 +554,7 @@ def fit_advice(fit: Fit) -> list[str]:
             f"{worst_of.name}: {worst_of.brightness - 1:+.1%} in brightness against the others"
             f"{others}; the lamp is not steady, let it warm up and capture it again"
         )
-    for one in fit.boards:
-        moved = float(np.hypot(*one.moved_um))
-        if moved > LARGEST_MOVE_UM and moved > 5 * one.moved_deviation_um:
-            found.append(
-                f"{one.name}: the mask stands {moved:.1f} um from where the stage says "
-                f"({one.moved_um[0]:+.1f}, {one.moved_um[1]:+.1f}); capture it again"
-            )
+    found += _moves(fit)
     if fit.undecided:
         shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
         more = (
@@ -515,3 +567,31 @@ def fit_advice(fit: Fit) -> list[str]:
             f"the design: {more}; `emmc-rig calibrate --plan` says which"
         )
     return found
+
+
+def _moves(fit: Fit) -> list[str]:
+    """Return in words that the mask stands elsewhere than the stage says, if that matters."""
+    moved = [
+        one
+        for one in fit.boards
+        if np.hypot(*one.moved_um) > max(LARGEST_MOVE_UM, 5 * one.moved_deviation_um)
+    ]
+    if not moved:
+        return []
+    worst = max(moved, key=lambda one: float(np.hypot(*one.moved_um)))
+    words = (
+        f"the mask stands elsewhere than the stage says in {len(moved)} of {len(fit.boards)} "
+        f"whiteboards, farthest by ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
+        f"{worst.name}, which Psi's deviation counts: "
+    )
+    times_s = np.array([one.taken_s for one in fit.boards])
+    places_um = np.array([one.moved_um for one in fit.boards])
+    times_s, places_um = times_s - times_s.mean(), places_um - places_um.mean(axis=0)
+    rate = times_s @ places_um / max(float(times_s @ times_s), 1e-12)
+    left = np.square(places_um - times_s[:, None] * rate).sum() / np.square(places_um).sum()
+    if len(fit.boards) >= FEWEST_FOR_DRIFT and left < DRIFT_LEAVES:
+        per_minute = 60 * float(np.hypot(*rate))
+        words += f"it drifts by {per_minute:.2g} um/min; fasten it, let the bench settle"
+    else:
+        words += "let the stage approach every place from the same side, and settle"
+    return [words + ", and capture again"]

@@ -60,7 +60,7 @@ ones a half to a tenth are called bad (dice, without glints, as many)."""
 class Screened:
     """frames, usable: (shot, pixel_y, pixel_x), for any method. notes: what was done, in words.
 
-    dark, double: shots left out. gains: (shot,), by which the frames were divided, mean 1. bad:
+    dark, double: shots left out. gains: (shot,), by which the frames were divided. bad:
     (pixel_y, pixel_x), pixels left out.
     """
 
@@ -144,7 +144,9 @@ def double_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tup
 
 
 def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
-    """Return the brightness of the light in every shot, mean 1; all 1 where none is sure.
+    """Return the brightness of the light in every shot, all 1 where none is sure.
+
+    The light of most shots counts as 1 (the median), of two their mean.
 
     What a pixel reads over what a smooth picture predicts is, but for the light, much the same in
     every shot: the scene's texture is in all of them. The median over the pixels is the light.
@@ -173,6 +175,8 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
         gains[kept] /= gains[kept].mean()
     if np.abs(gains[kept] - 1).max() < max(LEAST_FLICKER, SURE * error):
         return even
+    if len(kept) > 2:
+        gains[kept] /= np.median(gains[kept])
     return gains
 
 

@@ -23,7 +23,7 @@ from emmc_rig.model.masks import cfa_tile
 from emmc_rig.session.planned import SHOT_DARK, Bench, Kind, PlannedFrame
 
 OPEN_LAMP = "white"
-TURN_DEG = 90.0
+FIRST_TURN_DEG = 90.0
 """Of the white board: what maps no gradient and no saddle over the aperture onto itself."""
 RESPONSE_REPEATS = 2
 
@@ -253,11 +253,19 @@ def _lamp_checks(boards: Boards, camera: Camera, window_um: float) -> Iterator[P
 
 def _turned_boards(boards: Boards, camera: Camera, window_um: float) -> Iterator[PlannedFrame]:
     """Yield the board turned: through the masks, which are in the beam, then without them."""
-    for masks_in in (True, False):
-        offsets_um = mask_offsets_um(camera, 0) if masks_in else {}
-        bench = replace(_open_bench(window_um, masks_in, offsets_um), board_turn_deg=TURN_DEG)
-        name = f"turned-{'open' if masks_in else 'reference'}"
-        yield from _repeated(name, "turned", bench, boards.turned, part=1, **_white(boards))
+    offsets_um = mask_offsets_um(camera, 0)
+    # Without the masks the other way round: one turn less by hand.
+    ways = [
+        *(("open", turn, offsets_um) for turn in boards.turns_deg),
+        *(("reference", turn, {}) for turn in reversed(boards.turns_deg)),
+    ]
+    for name, turn_deg, at_um in ways:
+        bench = replace(_open_bench(window_um, name == "open", at_um), board_turn_deg=turn_deg)
+        # Plans of version 0.2 turned the board by 90 degrees only.
+        by = "" if turn_deg == FIRST_TURN_DEG else f"{turn_deg:g}-"
+        yield from _repeated(
+            f"turned-{by}{name}", "turned", bench, boards.turned, part=1, **_white(boards)
+        )
 
 
 def _last_references(boards: Boards, window_um: float) -> Iterator[PlannedFrame]:

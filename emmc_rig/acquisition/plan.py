@@ -117,13 +117,26 @@ class Boards(Settings):
     )
     turned: Annotated[int, Field(ge=0, le=10_000)] = Field(
         default=0,
-        description="open whiteboards and references with the board turned by 90 degrees: how "
-        "uneven the board is over angle",
+        description="open whiteboards and references with the board turned: how uneven the board "
+        "is over angle",
+    )
+    turns_deg: tuple[Annotated[float, Field(gt=0, lt=360)], ...] = Field(
+        default=(90.0,),
+        min_length=1,
+        description="by how much it is turned in its plane; 90, 180 and 270 show the sense as "
+        "well, and what does not turn with the board",
     )
     level: float = Field(default=0.7, gt=0, lt=1, description="of white, where metering aims")
     exposure_s: Positive | None = Field(
         default=None, description="of the references; default: metered"
     )
+
+    @field_validator("turns_deg")
+    @classmethod
+    def _each_once(cls, turns_deg: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(turns_deg)) < len(turns_deg):
+            raise ValueError("write each turn once")
+        return turns_deg
 
 
 class Metering(Settings):

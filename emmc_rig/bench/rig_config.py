@@ -134,7 +134,10 @@ class AskingAttendant:
 
     def place(self, target: str, turn_deg: float = 0.0) -> None:
         """Ask for the scene or the board."""
-        turned = f", turned by {turn_deg:g} degrees in its plane" if turn_deg else ""
+        turned = ""
+        if turn_deg:
+            turned = f", turned in its plane by {turn_deg:g} degrees from how it first stood"
+            turned += ", every time the same way round"
         self._want("target", f"put the {target} before the camera{turned}")
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:

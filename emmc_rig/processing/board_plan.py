@@ -44,6 +44,7 @@ PLAN_HEAD = """\
 """
 METERING_DARKS, BOARD_DARKS, SHOT_DARKS = 2, 1, 2
 LAMP_CHECKS, COLOUR_REPEATS, TURNED_REPEATS = 6, 2, 2
+TURNS_DEG = 90.0, 180.0, 270.0
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
 VERIFY_UM = (-207.0, 118.0)
 """Where the mask stage has not been before: the whiteboards to judge by."""
@@ -57,7 +58,7 @@ WATCHES = {
     "lamp": "open whiteboards between the others, and the reference again at the end",
     "response": "references at several exposures",
     "colours": "references under red, green and blue lamps",
-    "turned": "the white board turned by 90 degrees",
+    "turned": "the white board turned by 90, 180 and 270 degrees",
 }
 """Whiteboards that show errors of other parts than the mask: each may be left out of a plan."""
 
@@ -126,6 +127,7 @@ def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
             response=() if "response" in settings.leave_out else SERIES_SHARES,
             colours=COLOUR_REPEATS if coloured else 0,
             turned=0 if "turned" in settings.leave_out else TURNED_REPEATS,
+            turns_deg=TURNS_DEG,
         ),
         darks=Darks(
             exposure_s=(METERING_EXPOSURE_S,),

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.colour import unseen_colour
 from reconstruction.flat import flat_psi
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.displaced import displaced
-from reconstruction.verdict.kept import compare_held_out
+from reconstruction.verdict.kept import compare_held_out, over_baselines
 from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.shadow import Relief, relief, shadow
 from reconstruction.verdict.shots import compared
@@ -39,6 +40,8 @@ class Evidence:
     the light field removes; noise_share: share of its own that is noise.
     colour_error: root mean square by colours that frames do not show, over the brightness. short:
     share of the readings that only say that there was at least so much light, and are needed.
+    gains: by which the shots' brightness was evened. over_flat, over_neighbours: see
+    `over_baselines`. parallax: root mean square by which views differ from the middle one, over it.
     """
 
     method: str
@@ -69,6 +72,10 @@ class Evidence:
     colour_error: float | None = None
     motion_left: float | None = None
     short: float = 0.0
+    gains: tuple[float, ...] = ()
+    over_flat: float | None = None
+    over_neighbours: float | None = None
+    parallax: float | None = None
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -94,7 +101,8 @@ class Read:
     excluded: what the pixels read that were not usable to begin with, 0 elsewhere. left_out: shots
     that screening left out, for being dark or for repeating others. bad: share of the pixels that
     it left out, for differing from their neighbours. short: share of the readings that are
-    saturated and that a light field fitted without them falls short of.
+    saturated and that a light field fitted without them falls short of. gains: by which screening
+    divided the shots.
     """
 
     frames: Array
@@ -104,6 +112,7 @@ class Read:
     left_out: tuple[int, ...] = ()
     bad: float = 0.0
     short: float = 0.0
+    gains: tuple[float, ...] = ()
 
     @property
     def clipped(self) -> NDArray[np.bool_]:
@@ -149,6 +158,9 @@ def gathered(
             key: result.parameters[key] for key in REPORTED_PARAMETERS if key in result.parameters
         },
         short=read.short,
+        gains=read.gains,
+        parallax=_parallax(result.light_field),
+        **over_baselines(psi, frames, residual, noise_sigma, usable, read.kept),
     )
 
 
@@ -158,6 +170,16 @@ def _colour_error(
     unseen = unseen_colour(flat_psi(psi), frames, usable, found.picture)
     square = np.square(found.picture.mean(axis=-1, dtype=np.float64)).mean()
     return float(np.sqrt(unseen.mean() / max(square, 1e-12)))
+
+
+def _parallax(light_field: Array) -> float | None:
+    if light_field.shape[0] * light_field.shape[1] == 1:
+        return None
+    middle = centre_view(light_field)
+    square = float(np.mean(np.square(middle, dtype=np.float64)))
+    views = (light_field[v, u] - middle for v, u in np.ndindex(light_field.shape[:2]))
+    apart = float(np.mean([np.mean(np.square(one, dtype=np.float64)) for one in views]))
+    return float(np.sqrt(apart / max(square, 1e-30)))
 
 
 def _plain(values: Iterable[float]) -> tuple[float | None, ...]:

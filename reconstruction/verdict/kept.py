@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.tv import reconstruct_tv
+from reconstruction.verdict.pixels import neighbours
 from reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
@@ -76,3 +78,58 @@ def missed_readings(
     np.divide(squares, shares, out=missed, where=shares > 0)
     rows, columns = psi.size
     return cv2.resize(np.sqrt(missed), (columns, rows), interpolation=cv2.INTER_NEAREST)
+
+
+def over_baselines(
+    psi: ImagingMatrix,
+    frames: Array,
+    residual: Array,
+    noise_sigma: float,
+    usable: NDArray[np.bool_],
+    kept: NDArray[np.bool_],
+) -> dict[str, Any]:
+    """Return by how much a light field misses readings kept from its fit, over what anybody would.
+
+    over_flat: one picture for all views, by total variation. over_neighbours: the mean of the
+    readings beside, of the same colour. Root mean squares, at the lower end of three deviations:
+    above 1 the light field is surely the worse. None with too few readings.
+
+    frames, residual (frames less what the light field predicts), usable, kept: (shot, y, x).
+    """
+    kept = kept & usable
+    if kept.sum() < FEWEST:
+        return {"over_flat": None, "over_neighbours": None}
+    fitted = usable & ~kept
+    flat = reconstruct_tv(_flat(psi), np.where(fitted, frames, 0), noise_sigma, usable=fitted)
+    of_flat = frames - _flat(psi).forward(flat.light_field)
+    return {
+        "over_flat": _surely_over(residual[kept], of_flat[kept]),
+        "over_neighbours": _surely_over(residual[kept], _off_neighbours(psi, frames, fitted)[kept]),
+    }
+
+
+def _flat(psi: ImagingMatrix) -> ImagingMatrix:
+    """Return Psi of a light field of one view, which all views are."""
+    summed = psi.weights.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
+    return ImagingMatrix(summed.astype(psi.weights.dtype), psi.colour, psi.binning)
+
+
+def _off_neighbours(
+    psi: ImagingMatrix, frames: Array, good: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return what readings differ by from the mean of those beside, (shot, pixel_y, pixel_x)."""
+    step = 1 if psi.colour is None or psi.binning > 1 else 2
+    return np.stack(
+        [
+            frame - neighbours(frame, of_shot, step)[0].mean(axis=0)
+            for frame, of_shot in zip(frames, good, strict=True)
+        ]
+    )
+
+
+def _surely_over(mine: Array, theirs: Array) -> float:
+    """Return the ratio of root mean squares, three deviations of their difference lower."""
+    mine2, theirs2 = (np.square(one, dtype=np.float64) for one in (mine, theirs))
+    deviation = float(np.std(mine2 - theirs2)) / np.sqrt(len(mine2))
+    least = max(float(mine2.mean()) - 3 * deviation, 0.0)
+    return float(np.sqrt(least / max(float(theirs2.mean()), 1e-30)))

@@ -38,7 +38,7 @@ def pixel_figures(
         passed = 1 + found.masks[shot]
         detail = (1 + found.read[shot]) / np.maximum(passed, DIMMEST)
         good = found.good[shot] & (passed > DIMMEST)
-        around, known = _neighbours(detail, good, step)
+        around, known = neighbours(detail, good, step)
         low, high, typical = around[1], around[-2], np.abs(around[3:5].mean(axis=0))
         spread = high - low
         smooth = good & (known >= ENOUGH) & (spread < SMOOTH * typical)
@@ -73,7 +73,7 @@ def _saturated(excluded: Array, found: Relief, usable: NDArray[np.bool_]) -> flo
     return above / usable.size
 
 
-def _neighbours(
+def neighbours(
     values: Array, good: NDArray[np.bool_], step: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return the eight neighbours at a step in order, (8, y, x), and how many are good, (y, x).

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+import numpy as np
+
 from reconstruction.method import Sensitivity
 from reconstruction.methods import METHODS
 from reconstruction.verdict.evidence import Evidence
@@ -93,6 +95,8 @@ noise (0.0005), it is 4."""
 COLOUR_ERROR = 0.1
 """Root mean square. One shot of `scenario-iii-mono`: 0.08 to 0.16, of `rgbw-mono` 0.04 to 0.13
 (64x80, three scenes of group A, two built in)."""
+LEAST_PARALLAX = 0.005
+"""Root mean square by which the views differ, over the middle one's."""
 LEFT_OUT = Limits(0.4, 1.0)
 LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
 """For methods that lose little with one shot."""
@@ -204,6 +208,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
                 "do not use",
             )
             return
+    yield from _evened(e, kept)
     apart = [abs(brightness - 1) for brightness in bright]
     worst = apart.index(max(apart))
     yield Reason(
@@ -227,6 +232,26 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             "hold scene and camera still, or reconstruct one shot by adaptive",
             MOTION.level(e.motion_effect) if e.motion_px > LEAST_MOTION_PX else "trust",
         )
+
+
+def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
+    """What evening the shots' brightness leaves open; kept: shots that were not left out."""
+    gains = {shot: e.gains[shot] for shot in kept if e.gains}
+    if len(gains) < 2:
+        return
+    worst = max(gains, key=lambda shot: abs(np.log(max(gains[shot], 1e-6))))
+    apart = abs(gains[worst] - 1)
+    darker = f"{apart:.1%} {'darker' if gains[worst] < 1 else 'brighter'}"
+    words = f"shot {worst + 1} is {darker} than the others, and was evened to them"
+    if len(gains) == 2:
+        words = f"the two shots differ in brightness by {np.ptp(list(gains.values())):.1%}: which "
+        words += "is right is not known, and the light field has their mean"
+    yield Reason(
+        words,
+        apart,
+        "steady the lamp, or normalise the frames by a reference",
+        "doubt" if apart > FLICKER.doubt else "trust",
+    )
 
 
 def _is_parallax(e: Evidence) -> bool:
@@ -461,6 +486,13 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
 
 
 def _fit(e: Evidence) -> Iterator[Reason]:
+    if e.parallax is not None and e.parallax < LEAST_PARALLAX:
+        yield Reason(
+            "the frames show no parallax: the light field is one picture for all views",
+            e.parallax,
+            "focus nearer or farther, or take more shots, if the scene has depth",
+            "cannot tell",
+        )
     if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
         yield Reason(
             f"the light field explains {max(e.explained, 0):.0%} of the detail that held-out "
@@ -469,3 +501,14 @@ def _fit(e: Evidence) -> Iterator[Reason]:
             "take another method, or more shots",
             UNEXPLAINED.level(1 - e.explained),
         )
+    for over, what in (
+        (e.over_flat, "one picture for all views"),
+        (e.over_neighbours, "the mean of the readings beside"),
+    ):
+        if over is not None and over > 1:
+            yield Reason(
+                f"{what} foretells the readings kept from the fit better than the light field",
+                over,
+                "check Psi and the noise, or take another method or more shots",
+                "doubt",
+            )

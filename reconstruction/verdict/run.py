@@ -98,4 +98,5 @@ def _as_fitted(
     left_out = tuple(sorted((*seen.dark, *seen.double)))
     kept, bad = kept_readings(seen.usable), float(seen.bad.mean())
     excluded = (excluded / seen.gains[:, None, None]).astype(excluded.dtype)
-    return Read(seen.frames, seen.usable, kept, excluded, left_out, bad), seen.notes
+    gains = tuple(seen.gains.tolist())
+    return Read(seen.frames, seen.usable, kept, excluded, left_out, bad, gains=gains), seen.notes

@@ -109,11 +109,16 @@ def test_a_turned_board_separates_its_unevenness_from_the_cameras():
     measured = ImagingMatrix(
         psi.weights * true[None, :, :, None, None, None].astype(np.float32), psi.colour
     )
-    turned = open_board(psi, np.rot90(true, -1), 1e-3, rng)
-    found = board_over_angle(measured, {90.0: turned})
+    turned = {90.0 * n: open_board(psi, np.rot90(true, -n), 1e-3, rng) for n in (1, 2)}
+    found = board_over_angle(measured, turned)
     assert found.uneven
+    assert found.sense == 1
     np.testing.assert_allclose(found.radiance, true / true.mean(), atol=2e-3)
     assert (np.abs(found.radiance - true) < 5 * found.deviation + 1e-3).all()
+    # Turned once, it may have been turned either way.
+    once = board_over_angle(measured, {90.0: turned[90.0]})
+    assert once.sense == 0
+    assert (np.abs(once.radiance - true) < 2 * once.deviation + 1e-3).all()
 
 
 def test_an_even_board_is_found_even():

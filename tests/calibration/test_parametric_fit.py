@@ -252,7 +252,9 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     advice = " ".join(fit_advice(fit))
     assert "second" in advice
     assert "in brightness against the others" in advice
-    assert "third: the mask stands" in advice
+    assert "in 1 of" in advice
+    assert "um in third" in advice
+    assert fit.moved_um == pytest.approx(3.0, rel=0.2)
 
 
 def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():

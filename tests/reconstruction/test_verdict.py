@@ -24,7 +24,12 @@ from reconstruction.screening import screened
 from reconstruction.tv import TVSettings
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
-from reconstruction.verdict.kept import compare_held_out, kept_readings, missed_readings
+from reconstruction.verdict.kept import (
+    compare_held_out,
+    kept_readings,
+    missed_readings,
+    over_baselines,
+)
 from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
@@ -260,6 +265,53 @@ def test_many_shots_that_screening_left_out_are_reported_and_few_are_not():
     assert judged_trial("missing-shot", 1).level == "trust"
 
 
+@pytest.mark.parametrize("share", [0.7, 0.9])
+def test_a_shot_under_another_light_takes_the_level_of_the_others_and_is_named(three, share):
+    scene = np.asarray(open_scene("near-planar", size=SIZE)).astype(np.float32)
+    frames = three.forward(scene)
+    frames[1] *= share
+    rng = np.random.default_rng(0)
+    frames += 0.003 * rng.standard_normal(frames.shape, np.float32)
+    result, verdict = reconstruct_judged("tv", three, frames, 0.003, settings=QUICK)
+    assert verdict.level == "doubt"
+    assert f"shot 2 is {1 - share:.0%}"[:-1] in verdict.words
+    assert "was evened to them" in verdict.words
+    assert result.light_field.mean() == pytest.approx(scene.mean(), rel=0.02)
+    two = dataclasses.replace(verdict.evidence, gains=(0.9, 1.1, 1.0), left_out=(2,))
+    assert "which is right is not known" in verdict_from(two).words
+
+
+def test_a_light_field_that_foretells_less_than_anybody_would_is_doubted(three):
+    scene = np.asarray(open_scene("near-planar", size=SIZE)).astype(np.float32)
+    rng = np.random.default_rng(0)
+    frames = three.forward(scene)
+    frames += 0.003 * rng.standard_normal(frames.shape, np.float32)
+    kept, usable = kept_readings(everywhere(three)), everywhere(three)
+    rough = 0.1 * rng.standard_normal(frames.shape)
+    for residual, worse in ((rough, True), (0.003 * rng.standard_normal(frames.shape), False)):
+        over = over_baselines(three, frames, residual, 0.003, usable, kept)
+        assert (over["over_flat"] > 1) == worse
+    # Beside flat fields the mean of neighbours is as good as readings can be: their noise.
+    even = 0.5 + 0.003 * rng.standard_normal(frames.shape)
+    assert over_baselines(three, even, rough, 0.003, usable, kept)["over_neighbours"] > 10
+    too_few = over_baselines(
+        three, even, rough, 0.003, usable, kept & (rng.random(kept.shape) < 0.1)
+    )
+    assert set(too_few.values()) == {None}
+
+
+def test_what_foretells_better_is_named_and_one_picture_for_all_views_is_said_to_be_one(three):
+    clean = clean_evidence(three)
+    for figures, words, level in (
+        ({"over_flat": 1.2}, "one picture for all views foretells", "doubt"),
+        ({"over_neighbours": 1.2}, "the mean of the readings beside foretells", "doubt"),
+        ({"parallax": 1e-4}, "no parallax: the light field is one picture", "cannot tell"),
+    ):
+        verdict = verdict_from(dataclasses.replace(clean, **figures))
+        assert words in verdict.words
+        assert verdict.level == level
+
+
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-bayer-3shots"])
 @pytest.mark.parametrize("scene", ["near-planar", "wide-disparity"])
 def test_a_capture_without_a_fault_is_trusted(scene, camera):
@@ -273,7 +325,8 @@ def clean_evidence(three):
     empty = Reconstruction("tv", even, Status.CONVERGED, "", 1, (), 0.0, {})
     usable = everywhere(three)
     read = Read(grey(three), usable, kept_readings(usable), np.zeros(three.frames_shape))
-    return gathered(three, read, 1e-3, empty)
+    # Of a scene with depth, but for that.
+    return dataclasses.replace(gathered(three, read, 1e-3, empty), parallax=0.05)
 
 
 def test_evidence_survives_json(three):

@@ -1,0 +1,137 @@
+"""Psi of the outside bench: its stated error true, or refused by its right name."""
+
+import re
+
+import numpy as np
+import pytest
+from outside_bench import Course, Optics, Sensor
+from outside_boards import Photographer, agreement, bench_of, camera_of
+
+from calibration.errors import CalibrationError
+from calibration.routes import calibrate
+
+SIZE = (48, 64)
+ALL_VIEWS = tuple((v, u) for v in range(5) for u in range(5))
+SOME_VIEWS = ((0, 0), (2, 2), (4, 4), (0, 4), (4, 0))
+MODELS, EVERY = ("parametric",), ("parametric", "mixed", "free", "combined")
+TURNS = 90.0, 180.0, 270.0
+BEFORE_THE_TURNED = 4 * (2 + 1 + 3 + len(SOME_VIEWS) + 2) + 1
+"""The first frame of the turned boards, of which there are four each."""
+BEFORE_THE_BOARDS = 4 * (2 + 1)
+
+
+def measured(routes=MODELS, turns=(), optics=None, course=None, sensor=None, seed=0):
+    """Return (outcome, {route: agreement}) of the outside bench with its flaws."""
+    optics = Optics(**(optics or {}))
+    camera = camera_of(optics)
+    bench = bench_of(
+        camera, SIZE, optics=optics, course=Course(**(course or {})),
+        sensor=Sensor(**(sensor or {})), seed=seed,
+    )  # fmt: skip
+    pinholes = ALL_VIEWS if routes == EVERY else SOME_VIEWS
+    sets = Photographer(bench).sets(pinholes=pinholes, turns=turns)
+    found = calibrate(camera, camera.psi(SIZE).layout, routes, **sets)
+    return found, {
+        route: agreement(bench, one.psi.weights, one.deviation, found.good)
+        for route, one in found.calibrations.items()
+    }
+
+
+def said(found):
+    return " ".join((*found.findings, *found.advice))
+
+
+def is_true(agreement, one=(0.45, 0.95), two=(0.88, 1.0)):
+    """Return whether the coefficients lie within their deviations as often as those say."""
+    return one[0] <= agreement["one"] <= one[1] and two[0] <= agreement["two"] <= two[1]
+
+
+FLAWS = {
+    "none": {},
+    "tilt": {"optics": {"tilt": (0.004, -0.002)}},
+    "glare": {"optics": {"glare": 0.01}},
+    "hot pixels": {"sensor": {"hot": 0.002}},
+    "cells of 0.03 and 0.93": {"optics": {"open": 0.93, "closed": 0.03}},
+    "row noise": {"sensor": {"row_noise": 6.0, "row_correlation": 0.8}},
+    "exposures that differ": {"course": {"shutter": 0.003}},
+    "dust after the references": {"course": {"dust": 5, "dust_from": BEFORE_THE_BOARDS}},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FLAWS)
+def test_stated_errors_are_true_of_every_route(name):
+    _, by_route = measured(EVERY, **FLAWS[name])
+    wide = name == "exposures that differ"
+    for route, one in by_route.items():
+        # What a whole frame shares is one number: it may lie anywhere within its deviation.
+        assert is_true(one, (0.1, 1.0) if wide else (0.45, 0.95)), (route, one)
+
+
+def test_exposures_that_differ_are_no_noise_of_pixels():
+    off = []
+    for seed in range(4):
+        found, by_route = measured(course={"shutter": 0.004}, seed=seed)
+        off.append(by_route["parametric"]["true"] / by_route["parametric"]["stated"])
+        assert 0.8 < found.judged["parametric"].chi2 < 1.25
+    assert np.sqrt(np.mean(np.square(off))) < 1.6
+
+
+def test_rows_that_flicker_are_named():
+    with pytest.raises(CalibrationError, match=r"rows of repeats differ .* the lamp flickers"):
+        measured(course={"rolling": 0.02})
+
+
+def test_dust_that_moved_after_the_references_does_not_count():
+    found, by_route = measured(course={"dust": 5, "dust_from": BEFORE_THE_BOARDS})
+    assert "dust moved on the sensor" in said(found)
+    assert 0.01 < 1 - found.good.mean() < 0.25
+    assert by_route["parametric"]["true"] < 0.005
+    clean, _ = measured(course={"dust": 5})
+    assert "dust" not in said(clean)
+
+
+@pytest.mark.parametrize("moved_um", [0.5, 2.0])
+def test_a_mask_that_moves_before_the_board_turns_makes_no_board_uneven(moved_um):
+    found, by_route = measured(turns=TURNS, course={"moves_um": ((BEFORE_THE_TURNED, moved_um),)})
+    words = re.search(r"the mask moved by ([\d.]+) \+- ([\d.]+) um", said(found))
+    assert words
+    assert float(words[1]) == pytest.approx(moved_um, abs=4 * float(words[2]))
+    assert "uneven" not in said(found)
+    assert by_route["parametric"]["true"] < 0.006
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_boards_turned_either_way_round_show_how_uneven_they_are(sense):
+    found, by_route = measured(turns=TURNS, optics={"board": 0.1, "turn_sense": sense})
+    assert "uneven by 10" in said(found)
+    assert ("the other way" in said(found)) == (sense < 0)
+    assert is_true(by_route["parametric"])
+    assert by_route["parametric"]["true"] < 0.006
+
+
+def test_a_board_turned_once_tells_nothing_of_its_sense_and_both_are_counted():
+    found, by_route = measured(turns=(90.0,), optics={"board": 0.1, "turn_sense": -1})
+    assert "which way it was turned is not known" in said(found)
+    assert by_route["parametric"]["two"] > 0.9
+
+
+@pytest.mark.parametrize("flaw", ["lamp_side", "gloss", "unfilled"])
+def test_what_does_not_turn_with_the_board_counts_as_deviation(flaw):
+    found, by_route = measured(turns=TURNS, optics={flaw: 0.1})
+    assert "over the aperture, more than lenses make" in said(found)
+    assert by_route["parametric"]["two"] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("course", "words"),
+    [
+        ({"backlash_um": 3.0}, "approach every place from the same side"),
+        ({"moves_um": tuple((10 * i + 8, 1.0) for i in range(1, 6))}, "it drifts by"),
+    ],
+)
+def test_masks_that_stand_elsewhere_than_the_stage_says_are_named_and_counted(course, words):
+    found, by_route = measured(course=course)
+    assert "the mask stands elsewhere than the stage says" in said(found)
+    assert words in said(found)
+    assert by_route["parametric"]["two"] > 0.9
