@@ -19,7 +19,7 @@ from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import LIGHT_FIELD, MAPS
 from emmc_rig.files.folders import KEPT, is_session, kept_folder, result_folder
-from emmc_rig.files.psi import PSI, SavedPsi, open_psi, psi_beside, read_frames
+from emmc_rig.files.psi import PSI, open_psi, psi_beside, read_frames
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array

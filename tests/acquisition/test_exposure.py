@@ -19,7 +19,7 @@ from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.session.exposure import ShotExposure, exposure_reasons, shot_exposures
+from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import Figures, metered
 from emmc_rig.session.verify import verify
 from simulators.clock import ManualClock
