@@ -39,20 +39,21 @@ class Shift:
         return float(np.hypot(self.x_px, self.y_px))
 
 
-def registered(now: RawFrame, then: RawFrame) -> Shift:
+def registered(now: RawFrame, then: RawFrame, longest_px: int | None = None) -> Shift:
     """Return how the frame `now` is shifted against `then`, in sensor pixels.
 
-    Frames of different sizes are not alike at all.
+    longest_px: only so much of the frames' middle is compared. Frames of different sizes are not
+    alike at all.
     """
-    (one, tile), (other, _) = (without_tile(frame) for frame in (now, then))
+    (one, tile), (other, _) = (without_tile(frame, longest_px) for frame in (now, then))
     found = shift_of(one, other)
     return Shift(found.x_px * tile, found.y_px * tile, found.likeness)
 
 
-def without_tile(frame: RawFrame) -> tuple[Plane, int]:
+def without_tile(frame: RawFrame, longest_px: int | None = None) -> tuple[Plane, int]:
     """Return a frame averaged over its colour tile, (y, x), and the tile's side in pixels.
 
-    A tile that is not known counts as 2 x 2.
+    A tile that is not known counts as 2 x 2. longest_px: only so much of the middle.
     """
     try:
         side = max(cfa_tile(frame.cfa).shape[:2])
@@ -60,7 +61,7 @@ def without_tile(frame: RawFrame) -> tuple[Plane, int]:
         side = 2
     cuts = []
     for length in frame.mosaic.shape:
-        kept = length // side * side
+        kept = min(length, longest_px or length) // side * side
         start = (length - kept) // (2 * side) * side
         cuts.append(slice(start, start + kept))
     plane = frame.mosaic[tuple(cuts)].astype(np.float32)
