@@ -316,9 +316,12 @@ def _blurred(fine: np.ndarray, deviation: float) -> np.ndarray:
     kernel /= kernel.sum()
     padded = np.pad(fine, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
     rows, columns = fine.shape[:2]
-    across = [weight * padded[:, i : i + columns] for i, weight in enumerate(kernel)]
-    narrow = np.sum(across, axis=0)
-    return np.sum([weight * narrow[i : i + rows] for i, weight in enumerate(kernel)], axis=0)
+    across, found = np.zeros((len(padded), *fine.shape[1:])), np.zeros(fine.shape)
+    for i, weight in enumerate(kernel):
+        across += weight * padded[:, i : i + columns]
+    for i, weight in enumerate(kernel):
+        found += weight * across[i : i + rows]
+    return found
 
 
 def changed(bench: Bench, **parts: Any) -> Bench:
