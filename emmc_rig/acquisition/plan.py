@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BeforeValidator,
@@ -200,6 +200,7 @@ class Checks(Settings):
 class Plan(Settings):
     """What to capture; see `new_plan` for a commented one."""
 
+    removed: ClassVar = ("suspend",)
     title: str = ""
     camera: str = Field(description="a shipped camera (`emmc-rig cameras`), or a YAML file")
     shots: tuple[PlannedShot, ...] = Field(min_length=1)

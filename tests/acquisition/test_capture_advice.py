@@ -226,6 +226,13 @@ def a_single_dark_of_the_shots(bench):
     bench.plan(darks={**PLAN["darks"], "of_shots": 2})
 
 
+@walk("write each turn once")
+def a_board_turned_twice_alike(bench):
+    bench.plan(whiteboards={"views": [], "turned": 1, "turns_deg": [90, 90]})
+    yield bench.refused()
+    bench.plan()
+
+
 @walk(" shots, from 0")
 def shots_that_are_none(bench):
     bench.boards(shots=[0, 2])

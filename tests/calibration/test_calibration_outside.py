@@ -68,6 +68,7 @@ def test_stated_errors_are_true_of_every_route(name):
         assert is_true(one, (0.1, 1.0) if wide else (0.45, 0.95)), (route, one)
 
 
+@pytest.mark.slow
 def test_exposures_that_differ_are_no_noise_of_pixels():
     off = []
     for seed in range(4):
@@ -82,6 +83,7 @@ def test_rows_that_flicker_are_named():
         measured(course={"rolling": 0.02})
 
 
+@pytest.mark.slow
 def test_dust_that_moved_after_the_references_does_not_count():
     found, by_route = measured(course={"dust": 5, "dust_from": BEFORE_THE_BOARDS})
     assert "dust moved on the sensor" in said(found)
@@ -91,7 +93,7 @@ def test_dust_that_moved_after_the_references_does_not_count():
     assert "dust" not in said(clean)
 
 
-@pytest.mark.parametrize("moved_um", [0.5, 2.0])
+@pytest.mark.parametrize("moved_um", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_a_mask_that_moves_before_the_board_turns_makes_no_board_uneven(moved_um):
     found, by_route = measured(turns=TURNS, course={"moves_um": ((BEFORE_THE_TURNED, moved_um),)})
     words = re.search(r"the mask moved by ([\d.]+) \+- ([\d.]+) um", said(found))
@@ -101,7 +103,7 @@ def test_a_mask_that_moves_before_the_board_turns_makes_no_board_uneven(moved_um
     assert by_route["parametric"]["true"] < 0.006
 
 
-@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("sense", [pytest.param(1, marks=pytest.mark.slow), -1])
 def test_boards_turned_either_way_round_show_how_uneven_they_are(sense):
     found, by_route = measured(turns=TURNS, optics={"board": 0.1, "turn_sense": sense})
     assert "uneven by 10" in said(found)
@@ -110,12 +112,14 @@ def test_boards_turned_either_way_round_show_how_uneven_they_are(sense):
     assert by_route["parametric"]["true"] < 0.006
 
 
+@pytest.mark.slow
 def test_a_board_turned_once_tells_nothing_of_its_sense_and_both_are_counted():
     found, by_route = measured(turns=(90.0,), optics={"board": 0.1, "turn_sense": -1})
     assert "which way it was turned is not known" in said(found)
     assert by_route["parametric"]["two"] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["lamp_side", "gloss", "unfilled"])
 def test_what_does_not_turn_with_the_board_counts_as_deviation(flaw):
     found, by_route = measured(turns=TURNS, optics={flaw: 0.1})
@@ -123,6 +127,7 @@ def test_what_does_not_turn_with_the_board_counts_as_deviation(flaw):
     assert by_route["parametric"]["two"] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("course", "words"),
     [
