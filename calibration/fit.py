@@ -70,6 +70,9 @@ FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
 BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
 MOVES_UM = np.geomspace(0.002, 10.0, 12)
 """Widths of the whiteboards' own that are tried."""
+LEAST_MOVED_UM = 0.25
+"""Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
+rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
 CLEARLY_LIKELIER = 0.5
 """Difference of log evidence: less than this tells nothing."""
 WIDTH_ROUNDS = 2
@@ -389,7 +392,8 @@ def _widths(normal: _Normal, at: _State, placement: Array, centre: Array) -> tup
     found = {widths: evidence(widths) for widths in product(BRIGHTNESSES, MOVES_UM)}
     best = max(found, key=lambda widths: found[widths])
     # One that is hardly likelier than none is none.
-    still = found[best[0], MOVES_UM[0]] > found[best] - CLEARLY_LIKELIER
+    still = best[1] < LEAST_MOVED_UM
+    still = still or found[best[0], MOVES_UM[0]] > found[best] - CLEARLY_LIKELIER
     steady = found[BRIGHTNESSES[0], best[1]] > found[best] - CLEARLY_LIKELIER
     return BRIGHTNESSES[0] if steady else best[0], MOVES_UM[0] if still else best[1]
 
@@ -491,7 +495,7 @@ def _farthest_um(width_um: float, boards: Sequence[BoardCheck]) -> float:
     sure = [
         float(np.hypot(*one.moved_um))
         for one in boards
-        if np.hypot(*one.moved_um) > SURE_MOVE * one.moved_deviation_um
+        if np.hypot(*one.moved_um) > max(LEAST_MOVED_UM, SURE_MOVE * one.moved_deviation_um)
     ]
     return max([width_um if width_um > MOVES_UM[0] else 0.0, *sure])
 
