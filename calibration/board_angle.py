@@ -9,7 +9,7 @@ ways, and with it a quarter turn shows its sense. The mask may have moved meanwh
 fitted beside.
 
 What no turn changes, a lamp from one side, gloss, a board that does not fill the aperture, looks as
-if the aperture let so much through. `leaning` says how large it is, if it is smooth over the views.
+if the aperture let so much through. `leaning` says how large it is, if it is lopsided.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CLEARLY = 12.0
 LEAST_LEANING, LEANS = 5e-3, 5.0
 """Of the light, peak to peak over the views, and deviations of it, from which on it matters."""
 NATURAL = 2.0
-"""Times what the cosine law makes of the outermost views: lenses are between none and so much."""
+"""Times what the cosine law makes of the outermost views: more is said."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,13 +204,25 @@ def take_out(board: BoardAngle, known: Calibration) -> None:
         weights[shot, v, u], deviation[shot, v, u] = even, np.sqrt(spread)
 
 
-def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> NDArray[np.float64]:
-    """Return what of the views' light lamp or board may make, (v, u): 0 where nothing is sure.
+@dataclass(frozen=True, eq=False)
+class Leaning:
+    """What of the views' light lamp or board may make.
 
-    It is smooth over the aperture, but for one that falls or rises from its middle. board: what the
-    turned boards showed, which is not counted again. Lenses let as much through on either side, and
-    less outside by the cosine law at most twice; more than that may be lamp or board as well, and
-    no turn of the board tells them apart.
+    lopsided: over the views, (v, u): 0 where nothing is sure. falling: the share by which the
+    outermost views are darker than the middle, alike on every side, if that is more than the
+    cosine law makes: lenses vignette so, and so do gloss and a board that is too small.
+    """
+
+    lopsided: NDArray[np.float64]
+    falling: float
+
+
+def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> Leaning:
+    """Return what of the views' light lamp or board may make: that which is smooth over the views.
+
+    board: what the turned boards showed, which is not counted again. Lenses let as much through on
+    either side. No lens is known well enough to say that what falls alike on every side is too
+    much, and no turn of the board tells it apart.
     """
     views = np.shape(fit.placement.aperture)
     v, u = (np.linspace(-1, 1, count) if count > 1 else np.zeros(1) for count in views)
@@ -219,12 +231,12 @@ def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> NDArray[np.
     sent = board.radiance if board is not None and board.uneven else np.ones(views)
     weights = (np.array(fit.placement.aperture) * through / sent).ravel()
     weights = weights / weights.mean()
-    smooth = [np.broadcast_to(one, views).ravel() for one in (u[None, :], v[:, None], far)]
+    smooth = [np.broadcast_to(one, views).ravel() for one in (far, v[:, None], u[None, :])]
     columns = np.stack([one - one.mean() for one in smooth], axis=1)
     columns = columns[:, np.ptp(columns, axis=0) > 0]
     freedom = weights.size - columns.shape[1] - 1
     if freedom < columns.shape[1] or not columns.shape[1]:
-        return np.zeros(views)
+        return Leaning(np.zeros(views), 0.0)
     inverse = np.linalg.pinv(columns.T @ columns, rcond=1e-9, hermitian=True)
     solution = inverse @ columns.T @ (weights - 1)
     rough = float(np.sum((weights - 1 - columns @ solution) ** 2)) / freedom
@@ -236,15 +248,17 @@ def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> NDArray[np.
     of_fit = inverse @ columns.T @ slopes
     covariance = rough * inverse + of_fit @ fit.covariance @ of_fit.T
     half = [(count - 1) / 2 * mask.aperture_cell_um for count in views]
-    natural = -2 * float(half[0] ** 2 + half[1] ** 2) / mask.lens_um**2
-    sure = np.abs(solution) > LEANS * np.sqrt(np.diag(covariance))
-    if columns.shape[1] == len(smooth) and NATURAL * natural <= solution[-1] <= 0:
-        sure[-1] = False
+    natural = 2 * float(half[0] ** 2 + half[1] ** 2) / mask.lens_um**2
+    deviations = np.sqrt(np.diag(covariance))
+    falling = -float(solution[0])
+    if falling < max(NATURAL * natural, LEANS * float(deviations[0])):
+        falling = 0.0
+    sure = np.abs(solution) > LEANS * deviations
+    # What rises outward is no lens.
+    sure[0] &= solution[0] > 0
     found = columns[:, sure] @ solution[sure]
-    if columns.shape[1] == len(smooth) and sure[-1]:
-        # No lens is known to fall off so: lobes of gloss, and edges of a board, have any shape.
-        found = weights - 1
-    return (found if np.ptp(found) > LEAST_LEANING else np.zeros(weights.size)).reshape(views)
+    found = found if np.ptp(found) > LEAST_LEANING else np.zeros(weights.size)
+    return Leaning(found.reshape(views), falling)
 
 
 def less_sure(known: Calibration, by_view: Array) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import BoardAngle
+from calibration.board_angle import BoardAngle, Leaning
 from calibration.fit import Fit
 from calibration.levels import Levels
 from calibration.placement import Placement
@@ -135,20 +135,26 @@ def angle_findings(board: BoardAngle) -> list[str]:
     return [*found, words]
 
 
-def leaning_findings(leans: NDArray[np.floating], turned: bool) -> list[str]:
-    """Return what of the views' light, (v, u), may be board or lamp as well as the lens.
+def leaning_findings(leans: Leaning, turned: bool) -> list[str]:
+    """Return what of the views' light may be board or lamp as well as the lens.
 
     turned: the board was turned, and does not send it.
     """
-    if not leans.any():
-        return []
-    board = "the lamp (from one side, or its gloss)" if turned else "lamp or board"
-    return [
-        f"the views' light differs by {np.ptp(leans):.1%} over the aperture, more than lenses "
-        f"make: it may be {board}, or a board that does not fill the aperture, and counts "
-        "in Psi's deviation; take the whiteboards again with the lamp moved: what stays is the "
-        "camera's"
-    ]
+    found = []
+    moved = "take the whiteboards again with the lamp moved: what stays is the camera's"
+    if leans.lopsided.any():
+        found.append(
+            f"the views' light differs by {np.ptp(leans.lopsided):.1%} from one side of the "
+            f"aperture to the other, which lenses do not make: it may be "
+            f"{'the lamp' if turned else 'lamp or board'}, and counts in Psi's deviation; {moved}"
+        )
+    if leans.falling:
+        found.append(
+            f"the outermost views have {leans.falling:.1%} less light than the middle one, alike "
+            "on every side: taken for the lens's vignetting, and not counted; a lobe of gloss or a "
+            f"board that does not fill the aperture looks alike: if the lens has less, {moved}"
+        )
+    return found
 
 
 def dust_finding(dusty: NDArray[np.bool_]) -> str:

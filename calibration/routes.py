@@ -268,7 +268,7 @@ def calibrate(
         leans = leaning(parametric.fit, parametric.mask, board)
         findings += leaning_findings(leans, bool(turned))
         for one in calibrations.values():
-            less_sure(one, leans)
+            less_sure(one, leans.lopsided)
     return Outcome(
         chosen.route,
         why,
