@@ -124,7 +124,7 @@ FULL = {
     "streamed": Size((1000, 2000), 0),
 }
 SEARCH = DriftSettings(blocks=24, coarse_blocks=16, disparity_px=0.5, disparity_steps=3, block_px=4)
-SMALLEST = Size((24, 32), 32, 1, ("shift of 0.5 px",), ("lamp",), "tv", SEARCH, (3, 3))
+SMALLEST = Size((24, 32), 128, 1, ("shift of 0.5 px",), ("lamp",), "tv", SEARCH, (3, 3))
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,15 @@ slope of the logarithms. The largest sizes take minutes: `--largest 512x640`.
 
 from __future__ import annotations
 
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import lab
 import numpy as np
 from matplotlib import pyplot as plt
 
-from emmc_rig.study.chart.chart_points import Configuration, Point
-from emmc_rig.study.chart.measure import Job, Worker
+from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point
+from emmc_rig.study.chart.measure import measured
 from emmc_rig.study.trial import Capture
 from reconstruction.methods import MethodSettings
 
@@ -35,9 +35,9 @@ def measure(
     capture = Capture(scene, camera, size, seed, zoom, shots, (views, views))
     settings = MethodSettings.model_validate(METHODS[method])
     point = Point(capture, Configuration(method, axis, settings))
-    with TemporaryDirectory() as folder, Worker(limit_s=3600) as worker:
-        pictures = Path(folder, "picture.webp"), Path(folder, "truth.webp")
-        result = worker.measure(Job(point, *pictures, None, repeats=3, enough_s=20))
+    chart = ChartSettings(scenes=(scene,), cameras=(camera,), repeats=3, enough_s=20)
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        result = pool.submit(measured, point, chart).result()
     return {name: result[name] for name in ("seconds", "cpu_seconds", "peak_mib")}
 
 
