@@ -24,6 +24,8 @@ NEEDS = {"train_network": "torch"}
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_a_script_runs_at_its_smallest_size(script, tmp_path):
+    if script.stem == "real_captures" and "EMMC_PEER_FILES" not in os.environ:
+        pytest.skip("EMMC_PEER_FILES does not name a folder with captures")
     if script.stem in NEEDS:
         pytest.importorskip(NEEDS[script.stem])
     paths = os.pathsep.join([str(LAB.parent), os.environ.get("PYTHONPATH", "")])
