@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,28 @@ class Reconstruction:
     maps: Mapping[str, NDArray] = field(default_factory=dict)
     screening: tuple[str, ...] = ()
 
+    @property
+    def stated_db(self) -> float | None:
+        """The PSNR that the deviation of the light field stands for, dB; None without one."""
+        sigma = self.maps.get("sigma")
+        if sigma is None:
+            return None
+        return float(-10 * np.log10(np.mean(np.square(sigma, dtype=np.float64))))
+
     def without_light_field(self) -> Reconstruction:
         """Return the result with an empty light field and no maps, to keep many."""
         empty = np.empty((0, 0, 0, 0, 3), dtype=np.float32)
         return replace(self, light_field=empty, maps={})
+
+
+BELOW, ABOVE = "stated_below_db", "stated_above_db"
+"""Parameters of a result: by how much the true PSNR lies below and above the one stated, dB, at most
+in 9 of 10 captures."""
+
+
+def stated_figures(stated_db: float | None, parameters: Mapping[str, float]) -> dict[str, Any]:
+    """Return a stated PSNR and its interval, as metrics.json has them; None where not stated."""
+    interval = None
+    if stated_db is not None and BELOW in parameters and ABOVE in parameters:
+        interval = [stated_db - parameters[BELOW], stated_db + parameters[ABOVE]]
+    return {"stated_db": stated_db, "stated_interval_db": interval}

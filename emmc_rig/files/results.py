@@ -7,7 +7,7 @@ import math
 import platform
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -77,6 +77,17 @@ def _finite(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [_finite(item) for item in value]
     return value
+
+
+def stated_words(metrics: Mapping[str, object]) -> str:
+    """Return "31.2 dB (29.8 to 33.0 in 9 of 10)" of metrics.json, as far as it says; else ""."""
+    stated_db, interval = metrics.get("stated_db"), metrics.get("stated_interval_db")
+    if not isinstance(stated_db, float):
+        return ""
+    within = ""
+    if isinstance(interval, Sequence):
+        within = " ({:.1f} to {:.1f} in 9 of 10)".format(*interval)
+    return f"{stated_db:.1f} dB{within}"
 
 
 def save_frames(

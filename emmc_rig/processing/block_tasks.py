@@ -37,7 +37,7 @@ from emmc_rig.processing.pool import Pool
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import MethodSettings, find_method
-from reconstruction.result import Reconstruction, Status
+from reconstruction.result import Reconstruction, Status, stated_figures
 from reconstruction.tiles import (
     AXES,
     Block,
@@ -284,7 +284,7 @@ class Blocks:
         """
         return {
             "blocks": list(self.grid.shape),
-            "stated_db": self.stated_db,
+            **stated_figures(self.stated_db, self.result().parameters),
             "workers": self.workers,
             "peak_gib": max(block.peak_mib for block in self.done) / 2**10,
             "program_peak_gib": peak_memory_mib() / 2**10,

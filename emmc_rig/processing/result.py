@@ -27,7 +27,7 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.viewer import render_viewer
-from reconstruction.result import Reconstruction
+from reconstruction.result import Reconstruction, stated_figures
 from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 
@@ -96,9 +96,13 @@ class Result:
     @property
     def stated_db(self) -> float | None:
         """The PSNR that `sigma` stands for, dB; None where the method has none."""
-        if self.sigma is None:
-            return None
-        return float(-10 * np.log10(np.mean(np.square(self.sigma, dtype=np.float64))))
+        return self.solved.stated_db
+
+    @property
+    def stated_interval_db(self) -> tuple[float, float] | None:
+        """Lowest and highest PSNR, dB: the true one lies between them in 9 of 10 captures."""
+        interval = stated_figures(self.stated_db, self.solved.parameters)["stated_interval_db"]
+        return None if interval is None else (interval[0], interval[1])
 
     @property
     def disparity(self) -> NDArray[np.floating] | None:
@@ -145,7 +149,7 @@ class Result:
         """Return the figures of the reconstruction, as metrics.json has them."""
         return {
             **figures(self.solved, self.verdict, self.frames),
-            "stated_db": self.stated_db,
+            **stated_figures(self.stated_db, self.solved.parameters),
             "shots": self.psi.shots,
             "size": list(self.psi.size),
             "psi_sha256": self.psi.checksum(),
