@@ -68,8 +68,8 @@ class Reconstruction:
 
 
 BELOW, ABOVE = "stated_below_db", "stated_above_db"
-"""Parameters of a result: by how much the true PSNR lies below and above the one stated, dB, at most
-in 9 of 10 captures."""
+"""Parameters of a result: by how many dB the true PSNR lies below and above the one stated, in 9 of
+10 captures at most."""
 
 
 def stated_figures(stated_db: float | None, parameters: Mapping[str, float]) -> dict[str, Any]:
