@@ -45,7 +45,7 @@ from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import scaled_readings, shot_frames
 from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
-from reconstruction.result import Progress, Reconstruction, stated_figures
+from reconstruction.result import Progress, Reconstruction
 from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
@@ -211,7 +211,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "psnr_db": psnr,
             "ssim": ssim(estimate, truth),
             "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
-            **stated_figures(result.stated_db, result.parameters),
+            **result.stated,
             "psi_relative_error": psi_error,
             "design_relative_error": design_error,
             "psi_mean_deviation": float(calibration.deviation.mean()),

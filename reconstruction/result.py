@@ -54,12 +54,11 @@ class Reconstruction:
     screening: tuple[str, ...] = ()
 
     @property
-    def stated_db(self) -> float | None:
-        """The PSNR that the deviation of the light field stands for, dB; None without one."""
+    def stated(self) -> dict[str, Any]:
+        """The PSNR stated and its interval, see `stated_figures`."""
         sigma = self.maps.get("sigma")
-        if sigma is None:
-            return None
-        return float(-10 * np.log10(np.mean(np.square(sigma, dtype=np.float64))))
+        variance = None if sigma is None else float(np.mean(np.square(sigma, dtype=np.float64)))
+        return stated_figures(variance, self.parameters)
 
     def without_light_field(self) -> Reconstruction:
         """Return the result with an empty light field and no maps, to keep many."""
@@ -67,14 +66,19 @@ class Reconstruction:
         return replace(self, light_field=empty, maps={})
 
 
-BELOW, ABOVE = "stated_below_db", "stated_above_db"
-"""Parameters of a result: by how many dB the true PSNR lies below and above the one stated, in 9 of
-10 captures at most."""
+TAILS, WITHIN = "stated_tails_db", "stated_within_db"
+"""Parameters of a result: by how many dB its mean square error exceeds that of its deviation, since
+few errors are large; how far the true PSNR is from the one stated, in 9 of 10 captures at most."""
 
 
-def stated_figures(stated_db: float | None, parameters: Mapping[str, float]) -> dict[str, Any]:
-    """Return a stated PSNR and its interval, as metrics.json has them; None where not stated."""
-    interval = None
-    if stated_db is not None and BELOW in parameters and ABOVE in parameters:
-        interval = [stated_db - parameters[BELOW], stated_db + parameters[ABOVE]]
-    return {"stated_db": stated_db, "stated_interval_db": interval}
+def stated_figures(variance: float | None, parameters: Mapping[str, float]) -> dict[str, Any]:
+    """Return stated_db and stated_interval_db as metrics.json has them; None where not stated.
+
+    variance: mean square of the deviation of the light field.
+    """
+    if variance is None:
+        return {"stated_db": None, "stated_interval_db": None}
+    stated_db, within = float(-10 * np.log10(variance)) - parameters.get(TAILS, 0.0), None
+    if WITHIN in parameters:
+        within = [stated_db - parameters[WITHIN], stated_db + parameters[WITHIN]]
+    return {"stated_db": stated_db, "stated_interval_db": within}

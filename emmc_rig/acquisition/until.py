@@ -145,9 +145,10 @@ class Until:
 
 def stated_psnr_db(result: Reconstruction) -> float:
     """Return the PSNR that a result's own deviation stands for; raises AppError without one."""
-    if result.stated_db is None:
+    stated_db = result.stated["stated_db"]
+    if stated_db is None:
         raise AppError(f"{result.method} states no deviation of its light field: use {METHOD}")
-    return result.stated_db
+    return stated_db
 
 
 def light_field_so_far(

@@ -25,7 +25,7 @@ from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 from reconstruction.errors import ReconstructionError
-from reconstruction.result import Progress, Reconstruction, stated_figures
+from reconstruction.result import Progress, Reconstruction
 
 SHOWN_FRAMES, SHOWN_MESSAGES = 300, 12
 PATIENCE_S = 10.0
@@ -142,7 +142,7 @@ class SessionPage(EventWatcher):
         super().light_field(shots, result)
         number = 1 if self._pictures is None else self._pictures.number + 1
         self._pictures = Pictures(number, export_of(result.light_field, result.maps))
-        stated = stated_words(stated_figures(result.stated_db, result.parameters))
+        stated = stated_words(result.stated)
         words = f", states {stated}" if stated else ""
         self._show_field(f"{result.method}: {result.status}{words}", shots)
 

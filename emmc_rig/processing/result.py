@@ -27,7 +27,7 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.viewer import render_viewer
-from reconstruction.result import Reconstruction, stated_figures
+from reconstruction.result import Reconstruction
 from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 
@@ -95,14 +95,13 @@ class Result:
 
     @property
     def stated_db(self) -> float | None:
-        """The PSNR that `sigma` stands for, dB; None where the method has none."""
-        return self.solved.stated_db
+        """The PSNR that the method states, dB; None where it has no `sigma`."""
+        return self.solved.stated["stated_db"]
 
     @property
-    def stated_interval_db(self) -> tuple[float, float] | None:
+    def stated_interval_db(self) -> list[float] | None:
         """Lowest and highest PSNR, dB: the true one lies between them in 9 of 10 captures."""
-        interval = stated_figures(self.stated_db, self.solved.parameters)["stated_interval_db"]
-        return None if interval is None else (interval[0], interval[1])
+        return self.solved.stated["stated_interval_db"]
 
     @property
     def disparity(self) -> NDArray[np.floating] | None:
@@ -149,7 +148,7 @@ class Result:
         """Return the figures of the reconstruction, as metrics.json has them."""
         return {
             **figures(self.solved, self.verdict, self.frames),
-            **stated_figures(self.stated_db, self.solved.parameters),
+            **self.solved.stated,
             "shots": self.psi.shots,
             "size": list(self.psi.size),
             "psi_sha256": self.psi.checksum(),
