@@ -13,12 +13,18 @@ import pandas as pd
 
 from emmc_rig.files.scenes import Scene, open_scene
 from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive.uncertainty import FEATURES, WITHIN_ONE, foretold_db
+from reconstruction.adaptive.uncertainty import (
+    EVEN_DECIDED,
+    FEATURES,
+    WITHIN_ONE,
+    foretold_db,
+)
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import SCENES
 
 CAMERAS = "rgbw-bayer-1shot", "scenario-ii-cfa", "rgbw-bayer-2shots", "rgbw-bayer-3shots"
 NOISES = 0.003, 0.01
+LEVEL = 0.9
 FITTED = {"error_db": (("apart", "disparity"), 0.1), "deviation_db": (tuple(FEATURES), 0.3)}
 """By which features each is foretold, and the ridge over their variance. With all four, or with
 that of parallax, range, noise, shots, misfit and what held-out readings explain, error_db of scenes
@@ -56,6 +62,7 @@ def measure(
         "within_two": float(np.mean(times <= 2)),
         "error_db": factor_db - psnr_db - 10 * np.log10(np.mean(np.square(sigma))),
         "deviation_db": factor_db + 20 * np.log10(np.quantile(times, WITHIN_ONE)),
+        "decided": result.parameters.get("decided", 1.0),
         **of,
     }
 
@@ -98,8 +105,18 @@ def fit(rows: pd.DataFrame) -> None:
         low, high = rows[name].min(), rows[name].max()
         print(f'"{name}": Foretold({error:.3f}, {deviation:.3f}, {low:.2f}, {high:.2f}),')
     print("ERROR_DB, DEVIATION_DB = {:.2f}, {:.2f}".format(*by.loc["first"]))
-    rank = min(int(np.ceil(0.9 * (len(rows) + 1))), len(rows)) - 1
-    print(f"WITHIN_DB = {np.sort(missed_db(rows, 'error_db').abs())[rank]:.2f}, of {len(rows)}")
+    times = missed_db(rows, "error_db").abs() / (EVEN_DECIDED + 1 - rows.decided)
+    print(f"WITHIN_DB = {_quantile_of_scenes(times, rows.scene):.2f}, of {len(rows)}")
+
+
+def _quantile_of_scenes(values: pd.Series, scenes: pd.Series) -> float:
+    """Return what 9 of 10 values of another scene lie below: each scene counts alike, and one more
+    is thought to lie above all."""
+    count = scenes.nunique()
+    shares = 1 / scenes.map(scenes.value_counts()) / (count + 1)
+    order = values.sort_values().index
+    reached = shares[order].cumsum() >= LEVEL
+    return float(values[order][reached].iloc[0]) if reached.any() else float("inf")
 
 
 def summary(rows: pd.DataFrame) -> None:

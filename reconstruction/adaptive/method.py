@@ -30,7 +30,8 @@ from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Patches, averaged, fitted_models
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import checked, checked_disparity, surveyed
-from reconstruction.result import Progress, Reconstruction, Status
+from reconstruction.adaptive.uncertainty import within_db
+from reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 TEXTURED = 0.01
@@ -107,6 +108,7 @@ def reconstruct_adaptive(
             **({} if decided is None else {"decided": decided}),
             **({} if mean.over_plain is None else {"over_plain": mean.over_plain}),
             **mean.reported,
+            **({} if mean.sigma is None else {WITHIN: within_db(decided)}),
         },
         maps=maps,
     )
