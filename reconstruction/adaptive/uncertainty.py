@@ -21,9 +21,9 @@ unless one plane is the whole scene: its disparity is known.
 
 What this misses on average is taken from captures of known truth: FEATURES of a capture foretell by
 how many dB its mean square error, and the square below which WITHIN_ONE of its errors lie, exceed
-that variance. The latter scales sigma. The former is the PSNR stated, and how far captures of scenes
-that were not fitted to lie from it is its interval (conformal, as Wen et al. 2025, arXiv 2505.09528;
-of scenes rather than captures, as those of one scene err alike).
+that variance. The latter scales sigma. The former is the PSNR stated, and how far captures of
+scenes that were not fitted to lie from it is its interval (conformal, as Wen et al. 2025, arXiv
+2505.09528; of scenes rather than captures, as those of one scene err alike).
 """
 
 from __future__ import annotations
@@ -186,7 +186,8 @@ FEATURES = {
 built-in scenes, 96x96, one to three shots, noise 0.003 and 0.01."""
 ERROR_DB, DEVIATION_DB = 6.29, 1.89
 WITHIN_DB, EVEN_DECIDED = 7.8, 0.3
-"""The true PSNR lies within WITHIN_DB (EVEN_DECIDED + u) of the one stated, of u undecided patches."""
+"""The true PSNR lies within WITHIN_DB (EVEN_DECIDED + u) of the one stated, u of the patches being
+undecided."""
 
 
 def features(variance: Array, apart: Array, spread: Array, disparity_sigma: Array, of: Array):
