@@ -89,16 +89,21 @@ def fitted(rows: pd.DataFrame, column: str) -> pd.Series:
 
 def missed_db(rows: pd.DataFrame, column: str) -> pd.Series:
     """Return by how much a column differs from what the captures of all other scenes foretell."""
-    missed = rows[column].astype(float)
+    missed = pd.Series(rows[column].to_numpy(float), index=rows.index)
     for _, own in rows.groupby("scene"):
         by = fitted(rows.drop(own.index), column)
         missed[own.index] -= own[by.index[:-1]] @ by[:-1] + by["first"]
     return missed
 
 
+def _trusted(rows: pd.DataFrame) -> pd.DataFrame:
+    stated = (rows.verdict == "trust") & rows[list(FEATURES)].notna().all(axis=1)
+    return rows.loc[stated].reset_index(drop=True)
+
+
 def fit(rows: pd.DataFrame) -> None:
     """Print the constants that trusted captures give."""
-    rows = rows[rows.verdict == "trust"].dropna(subset=list(FEATURES)).reset_index(drop=True)
+    rows = _trusted(rows)
     by = pd.DataFrame({column: fitted(rows, column) for column in FITTED}).fillna(0.0)
     for name in FEATURES:
         error, deviation = by.loc[name]
@@ -114,14 +119,14 @@ def _quantile_of_scenes(values: pd.Series, scenes: pd.Series) -> float:
     is thought to lie above all."""
     count = scenes.nunique()
     shares = 1 / scenes.map(scenes.value_counts()) / (count + 1)
-    order = values.sort_values().index
-    reached = shares[order].cumsum() >= LEVEL
-    return float(values[order][reached].iloc[0]) if reached.any() else float("inf")
+    order = np.argsort(values.to_numpy())
+    below = values.to_numpy()[order][shares.to_numpy()[order].cumsum() >= LEVEL]
+    return float(below.min(initial=np.inf))
 
 
 def summary(rows: pd.DataFrame) -> None:
     """Print how true what trusted captures state is."""
-    rows = rows[rows.verdict == "trust"].dropna(subset=["stated_db"])
+    rows = _trusted(rows)
     off, width = rows.stated_db - rows.psnr_db, (rows.high_db - rows.low_db).median()
     held = rows.psnr_db.between(rows.low_db, rows.high_db).mean()
     alike = (rows.within_one - WITHIN_ONE).abs() <= 0.08
