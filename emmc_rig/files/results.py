@@ -7,7 +7,7 @@ import math
 import platform
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -84,10 +84,10 @@ def stated_words(metrics: Mapping[str, object]) -> str:
     stated_db, interval = metrics.get("stated_db"), metrics.get("stated_interval_db")
     if not isinstance(stated_db, float):
         return ""
-    within = ""
-    if isinstance(interval, Sequence):
-        within = " ({:.1f} to {:.1f} in 9 of 10)".format(*interval)
-    return f"{stated_db:.1f} dB{within}"
+    match interval:
+        case [float(low), float(high)]:
+            return f"{stated_db:.1f} dB ({low:.1f} to {high:.1f} in 9 of 10)"
+    return f"{stated_db:.1f} dB"
 
 
 def save_frames(

@@ -131,7 +131,7 @@ class Figure(NamedTuple):
 
 FIGURES = {
     "psnr_db": Figure("PSNR", ".2f", "dB", "peak 1, over all views, pixels and colours"),
-    "stated_db": Figure("Stated PSNR", ".2f", "dB", "that the stated deviation stands for"),
+    "stated_db": Figure("Stated PSNR", ".2f", "dB", "by the method, without the truth"),
     "stated_interval_db": Figure("Interval of the stated PSNR", ".1f", "",
         "dB, from and to; it holds the true one in 9 of 10 captures"),
     "ssim": Figure("SSIM", ".4f", "", "structural similarity, averaged over views; 1 is identical"),

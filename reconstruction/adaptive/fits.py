@@ -139,4 +139,5 @@ def averaged(survey: Survey, fits: Fits, disparity_sigma: Array) -> Mean:
     difference = apart(light_field, survey.plain)
     variance += np.float32(over_plain / (1 + over_plain)) * difference
     times, reported = stated(features(variance, difference, spread, disparity_sigma, light_field))
-    return Mean(light_field, shares, np.sqrt(times * variance), over_plain, reported)
+    variance *= times
+    return Mean(light_field, shares, np.sqrt(variance, out=variance), over_plain, reported)

@@ -190,7 +190,9 @@ WITHIN_DB, EVEN_DECIDED = 7.8, 0.3
 undecided."""
 
 
-def features(variance: Array, apart: Array, spread: Array, disparity_sigma: Array, of: Array):
+def features(
+    variance: Array, apart: Array, spread: Array, disparity_sigma: Array, of: Array
+) -> dict[str, float]:
     """Return the FEATURES of a capture, all natural logarithms.
 
     variance: of the samples, as here without them, (v, u, y, x); over its mean are those of apart,
@@ -198,11 +200,16 @@ def features(variance: Array, apart: Array, spread: Array, disparity_sigma: Arra
     median, in pixels. of: the light field, its standard deviation over its mean.
     """
     whole = max(float(variance.mean(dtype=np.float64)), 1e-30)
+    # View by view: in float64 the light field is twice as large.
+    square = np.mean(
+        [np.square(of[at], dtype=np.float64).mean() for at in np.ndindex(of.shape[:2])]
+    )
+    mean = max(float(of.mean(dtype=np.float64)), 1e-30)
     values = {
         "apart": apart.mean(dtype=np.float64) / whole,
         "disparity": np.median(disparity_sigma),
         "spread": spread.mean(dtype=np.float64) / whole,
-        "contrast": of.std(dtype=np.float64) / max(float(of.mean(dtype=np.float64)), 1e-30),
+        "contrast": max(float(square) / mean**2 - 1, 0.0) ** 0.5,
     }
     return {name: float(np.log(max(float(value), 1e-30))) for name, value in values.items()}
 
