@@ -211,6 +211,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "psnr_db": psnr,
             "ssim": ssim(estimate, truth),
             "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
+            **result.stated,
             "psi_relative_error": psi_error,
             "design_relative_error": design_error,
             "psi_mean_deviation": float(calibration.deviation.mean()),

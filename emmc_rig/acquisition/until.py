@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from calibration.shadow import shadow_mask
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.watcher import CaptureWatcher
@@ -147,10 +145,10 @@ class Until:
 
 def stated_psnr_db(result: Reconstruction) -> float:
     """Return the PSNR that a result's own deviation stands for; raises AppError without one."""
-    sigma = result.maps.get("sigma")
-    if sigma is None:
+    stated_db = result.stated["stated_db"]
+    if stated_db is None:
         raise AppError(f"{result.method} states no deviation of its light field: use {METHOD}")
-    return float(-10 * np.log10(np.mean(np.square(sigma, dtype=np.float64))))
+    return stated_db
 
 
 def light_field_so_far(

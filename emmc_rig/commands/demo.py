@@ -55,7 +55,7 @@ def demo(
     from emmc_rig.commands.first_run import compiled_first
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.results import parse_size
+    from emmc_rig.files.results import parse_size, stated_words
     from emmc_rig.model.settings import validated
     from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 
@@ -91,11 +91,13 @@ def demo(
         compiled_first(bars, method, camera, shots),
     ):
         metrics = run_demo(settings, folder, bars)
+    stated = stated_words(metrics)
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
     tell(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
-        f"copied centre view; SSIM {metrics['ssim']:.3f}; Psi to "
-        f"{metrics['psi_relative_error']:.2%}; {metrics['status']}"
+        f"copied centre view; SSIM {metrics['ssim']:.3f}; "
+        + (f"stated {stated}; " if stated else "")
+        + f"Psi to {metrics['psi_relative_error']:.2%}; {metrics['status']}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     tell(f"open {out / 'report.html'}")

@@ -141,6 +141,8 @@ def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
 
 
 def _say_result(metrics: dict, out: Path) -> None:
+    from emmc_rig.files.results import stated_words
+
     for line in metrics["screening"]:
         say("screening", line)
     compared = ""
@@ -150,6 +152,8 @@ def _say_result(metrics: dict, out: Path) -> None:
             f"; {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB against the copied centre view, "
             f"SSIM {metrics['ssim']:.3f}"
         )
+    if stated := stated_words(metrics):
+        compared += f"; stated {stated}"
     if "blocks" in metrics:
         rows, columns = metrics["blocks"]
         compared += f"; {rows}x{columns} blocks, at most {metrics['peak_gib']:.2f} GiB a worker"

@@ -79,6 +79,17 @@ def _finite(value: object) -> object:
     return value
 
 
+def stated_words(metrics: Mapping[str, object]) -> str:
+    """Return "31.2 dB (29.8 to 33.0 in 9 of 10)" of metrics.json, as far as it says; else ""."""
+    stated_db, interval = metrics.get("stated_db"), metrics.get("stated_interval_db")
+    if not isinstance(stated_db, float):
+        return ""
+    match interval:
+        case [float(low), float(high)]:
+            return f"{stated_db:.1f} dB ({low:.1f} to {high:.1f} in 9 of 10)"
+    return f"{stated_db:.1f} dB"
+
+
 def save_frames(
     path: Path,
     frames_dn: NDArray[np.uint16],

@@ -12,9 +12,10 @@ from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.events import Event, EventWatcher
-from emmc_rig.acquisition.until import METHOD, light_field_so_far, stated_psnr_db
+from emmc_rig.acquisition.until import METHOD, light_field_so_far
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
+from emmc_rig.files.results import stated_words
 from emmc_rig.live.light_field import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
@@ -141,11 +142,9 @@ class SessionPage(EventWatcher):
         super().light_field(shots, result)
         number = 1 if self._pictures is None else self._pictures.number + 1
         self._pictures = Pictures(number, export_of(result.light_field, result.maps))
-        try:
-            stated = f", states {stated_psnr_db(result):.1f} dB"
-        except AppError:
-            stated = ""
-        self._show_field(f"{result.method}: {result.status}{stated}", shots)
+        stated = stated_words(result.stated)
+        words = f", states {stated}" if stated else ""
+        self._show_field(f"{result.method}: {result.status}{words}", shots)
 
     def _publish(self, **parts: Any) -> None:
         with self._changed:

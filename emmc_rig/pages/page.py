@@ -13,6 +13,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from emmc_rig.files.results import stated_words
 from emmc_rig.version import __version__
 
 KINDS = {
@@ -79,6 +80,8 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
             f"{'' if why else agree + ', '}but the truth, which frames do not show, is missed by "
             f"{lost_db:.1f} dB more than by the copied centre view"
         )
+    if stated := stated_words(metrics):
+        why = [*(why or [agree]), f"stated {stated}"]
     remedies = [*(reason["remedy"] for reason in reasons), str(metrics.get("advice") or "")]
     tone = {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad")
     return Head(

@@ -37,7 +37,7 @@ from emmc_rig.processing.pool import Pool
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import MethodSettings, find_method
-from reconstruction.result import Reconstruction, Status
+from reconstruction.result import Reconstruction, Status, stated_figures
 from reconstruction.tiles import (
     AXES,
     Block,
@@ -284,20 +284,20 @@ class Blocks:
         """
         return {
             "blocks": list(self.grid.shape),
-            "stated_db": self.stated_db,
+            **stated_figures(self.variance, self.result().parameters),
             "workers": self.workers,
             "peak_gib": max(block.peak_mib for block in self.done) / 2**10,
             "program_peak_gib": peak_memory_mib() / 2**10,
         }
 
     @property
-    def stated_db(self) -> float | None:
-        """The PSNR that the deviations of all blocks stand for; None where one has none."""
+    def variance(self) -> float | None:
+        """The mean square of the deviations of all blocks; None where one has none."""
         variances = [block.variance for block in self.done]
         if None in variances:
             return None
         samples = np.prod(self.job.psi.views) * np.prod(self.grid.size)
-        return float(-10 * np.log10(sum(v for v in variances if v is not None) / samples))
+        return float(sum(v for v in variances if v is not None) / samples)
 
     def result(self) -> Reconstruction:
         """Return the figures of all blocks together, without arrays."""

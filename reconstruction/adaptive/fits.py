@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey
 from reconstruction.adaptive.sweep import swept
-from reconstruction.adaptive.uncertainty import apart, deviation
+from reconstruction.adaptive.uncertainty import apart, deviation, features, stated
 
 Array = NDArray[np.floating]
 Patches = Callable[[NDArray[np.bool_]], Array]
@@ -99,16 +99,20 @@ def fitted_models(
 class Mean:
     """light_field: (v, u, y, x, c). shares: of the models, (model, pixel_y, pixel_x). sigma: its
     standard deviation, None with too few held-out readings. over_plain: its mean square residual of
-    these beyond their noise, over total variation's; None without any."""
+    these beyond their noise, over total variation's; None without any. reported: parameters of what
+    is stated."""
 
     light_field: Array
     shares: NDArray[np.float32]
     sigma: Array | None
     over_plain: float | None = None
+    reported: dict[str, float] = field(default_factory=dict)
 
 
-def averaged(survey: Survey, fits: Fits) -> Mean:
+def averaged(survey: Survey, fits: Fits, disparity_sigma: Array) -> Mean:
     """Return the mean of the models, by the held-out readings; the first model without any.
+
+    disparity_sigma: deviation of the centre view's disparity, (y, x).
 
     Their light fields are given back: what follows needs as much memory, and none of them.
     """
@@ -128,10 +132,12 @@ def averaged(survey: Survey, fits: Fits) -> Mean:
     plain = (given.frames - given.psi.forward(survey.plain)).astype(np.float32)
     excess, its_own = (mixture.excess(one, given.noise, held) for one in (residual, plain))
     over_plain = excess / max(its_own, 1e-20)
-    if sigma is not None:
-        # The residuals, on which it is calibrated, show neither.
-        variance = np.square(sigma) + survey.unseen.astype(np.float32)
-        share = np.float32(over_plain / (1 + over_plain))
-        variance += share * apart(light_field, survey.plain)
-        sigma = np.sqrt(variance)
-    return Mean(light_field, shares, sigma, over_plain)
+    if sigma is None:
+        return Mean(light_field, shares, None, over_plain)
+    # The residuals, on which it is calibrated, show neither.
+    variance = np.square(sigma) + survey.unseen.astype(np.float32)
+    difference = apart(light_field, survey.plain)
+    variance += np.float32(over_plain / (1 + over_plain)) * difference
+    times, reported = stated(features(variance, difference, spread, disparity_sigma, light_field))
+    variance *= times
+    return Mean(light_field, shares, np.sqrt(variance, out=variance), over_plain, reported)

@@ -30,7 +30,8 @@ from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Patches, averaged, fitted_models
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import checked, checked_disparity, surveyed
-from reconstruction.result import Progress, Reconstruction, Status
+from reconstruction.adaptive.uncertainty import within_db
+from reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 TEXTURED = 0.01
@@ -75,12 +76,13 @@ def reconstruct_adaptive(
     known = None if disparity is None else checked_disparity(disparity, psi)
     survey = surveyed(given, settings, known, report)
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches)
-    mean = averaged(survey, fits)
-    residual = (given.frames - given.psi.forward(mean.light_field)).astype(np.float32)
     size, k = psi.size, psi.binning
+    disparity_sigma = np.sqrt(search.variance_per_pixel(survey.volume, size, k))
+    mean = averaged(survey, fits, disparity_sigma)
+    residual = (given.frames - given.psi.forward(mean.light_field)).astype(np.float32)
     maps = {
         "disparity": fits.scene.centre,
-        "disparity_sigma": np.sqrt(search.variance_per_pixel(survey.volume, size, k)),
+        "disparity_sigma": disparity_sigma,
         "texture": _texture_map(survey.volume, size, k),
         **({} if mean.sigma is None else {"sigma": mean.sigma}),
     }
@@ -105,6 +107,8 @@ def reconstruct_adaptive(
             **misfit(residual, given.noise, given.usable & ~survey.held),
             **({} if decided is None else {"decided": decided}),
             **({} if mean.over_plain is None else {"over_plain": mean.over_plain}),
+            **mean.reported,
+            **({} if mean.sigma is None else {WITHIN: within_db(decided)}),
         },
         maps=maps,
     )

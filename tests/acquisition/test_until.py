@@ -267,12 +267,18 @@ def test_a_capture_that_cannot_spare_shots_says_why_and_makes_nothing(
     assert sorted(one.name for one in tmp_path.iterdir()) == ["camera.yaml", "plan.yaml"]
 
 
-def test_the_stated_psnr_is_that_of_the_deviation():
-    def result_with(**maps):
+def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cost():
+    def result_with(parameters=None, **maps):
         light_field = np.full((3, 3, 8, 8, 3), 0.5, np.float32)
-        return Reconstruction("tv", light_field, Status.CONVERGED, "", 1, (), 1.0, {}, maps)
+        return Reconstruction(
+            "tv", light_field, Status.CONVERGED, "", 1, (), 1.0, parameters or {}, maps
+        )
 
     assert stated_psnr_db(result_with(sigma=np.full((2, 2), 0.1))) == pytest.approx(20)
+    few = result_with({"stated_tails_db": 1.5, "stated_within_db": 2.0}, sigma=np.full((2, 2), 0.1))
+    assert stated_psnr_db(few) == pytest.approx(18.5)
+    assert few.stated["stated_interval_db"] == pytest.approx([16.5, 20.5])
+    assert result_with().stated == {"stated_db": None, "stated_interval_db": None}
     with pytest.raises(AppError, match="states no deviation"):
         stated_psnr_db(result_with())
 

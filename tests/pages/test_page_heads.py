@@ -60,6 +60,24 @@ def test_a_trusted_result_below_its_copied_view_is_not_shown_as_good(found_db, t
     assert "frames, Psi and light field agree" in head.why
 
 
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ({}, "agree"),
+        ({"stated_db": None, "stated_interval_db": None}, "agree"),
+        ({"stated_db": 31.24}, "agree; stated 31.2 dB"),
+        (
+            {"stated_db": 31.24, "stated_interval_db": [29.81, 33.02]},
+            "agree; stated 31.2 dB (29.8 to 33.0 in 9 of 10)",
+        ),
+    ],
+    ids=["none by an earlier version", "no method's", "no interval", "interval"],
+)
+def test_the_head_says_the_stated_psnr_with_its_interval(stated, words):
+    head = light_field_head({"verdict": {"level": "trust", "reasons": []}, **stated})
+    assert head.why == f"frames, Psi and light field {words}"
+
+
 def test_a_path_is_typed_short_below_this_folder_and_quoted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert typed(tmp_path / "one/two") == "one/two"

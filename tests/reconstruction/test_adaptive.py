@@ -27,7 +27,13 @@ from reconstruction.adaptive.search import (
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import checked, surveyed
 from reconstruction.adaptive.sweep import plane_frames, swept
-from reconstruction.adaptive.uncertainty import held_out
+from reconstruction.adaptive.uncertainty import (
+    FEATURES,
+    features,
+    foretold_db,
+    held_out,
+    within_db,
+)
 from reconstruction.adaptive.visibility import carried
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import MethodSettings, reconstruct
@@ -251,6 +257,35 @@ def test_sigma_is_calibrated_on_the_planted_plane(planted):
     # The flat part is known better, and said to be.
     for known in (sigma[..., 0], np.sqrt(np.square(error).mean(axis=-1))):
         assert known[..., :12].mean() < 0.9 * known[..., -20:].mean()
+
+
+def test_the_stated_interval_holds_the_true_psnr_of_the_planted_plane(planted):
+    truth, _, _, found = planted
+    low_db, high_db = found.stated["stated_interval_db"]
+    assert low_db < psnr_db(found.light_field, truth) < high_db
+    assert high_db - low_db == pytest.approx(2 * within_db(found.parameters["decided"]))
+
+
+def test_an_interval_is_wider_where_patches_do_not_decide():
+    assert 2 * within_db(1.0) < within_db(0.5) < within_db(0.2)
+    assert within_db(None) == within_db(1.0)
+
+
+def test_what_a_capture_foretells_does_not_depend_on_its_brightness():
+    rng = np.random.default_rng(0)
+    light_field = rng.random((3, 3, 8, 8, 3))
+    variance, other, spread = rng.random((3, 3, 3, 8, 8))
+    sigma_px = rng.random((8, 8))
+    of = features(variance, other, spread, sigma_px, light_field)
+    dim = features(variance / 16, other / 16, spread / 16, sigma_px, light_field / 4)
+    assert dim == pytest.approx(of)
+    # Further from total variation, or less sure of disparities: more errors, and larger ones.
+    further = of | {"apart": of["apart"] + 1}, of | {"disparity": -2.0}
+    for one, more in ((of, further[0]), (of | {"disparity": -3.0}, further[1])):
+        assert all(b > a for a, b in zip(foretold_db(one), foretold_db(more), strict=True))
+    # Nothing is foretold from beyond the captures that were fitted.
+    least = {name: one.lowest for name, one in FEATURES.items()}
+    assert foretold_db({name: value - 5 for name, value in least.items()}) == foretold_db(least)
 
 
 def test_a_mask_that_treats_all_views_alike_decides_nothing():
