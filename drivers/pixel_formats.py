@@ -114,100 +114,61 @@ def unpack(
 def _unpack_flat(packed: Array, form: PixelFormat, pixels: Array) -> None:
     group_bytes, group_pixels, kernel = KERNELS[form.stored_bits, form.bits, form.packing]
     groups = len(pixels) // group_pixels
-    kernel(packed, pixels[: groups * group_pixels])
+    kernel(packed, pixels[: groups * group_pixels], form.bits)
     rest = len(pixels) - groups * group_pixels
     if rest:
         last = np.zeros(group_bytes, np.uint8)
         tail = packed[groups * group_bytes :]
         last[: len(tail)] = tail
         group = np.empty(group_pixels, np.uint16)
-        kernel(last, group)
+        kernel(last, group, form.bits)
         pixels[-rest:] = group[:rest]
 
 
 @njit(cache=True, nogil=True)
-def widen(packed: Any, pixels: Any) -> None:
+def widen(packed: Any, pixels: Any, bits: int) -> None:
     """Set pixels from one byte each."""
     for i in range(pixels.size):
         pixels[i] = packed[i]
 
 
 @njit(cache=True, nogil=True)
-def join_bytes(packed: Any, pixels: Any) -> None:
+def join_bytes(packed: Any, pixels: Any, bits: int) -> None:
     """Set pixels from two bytes each, the low one first."""
     for i in range(pixels.size):
         pixels[i] = np.uint16(packed[2 * i]) | (np.uint16(packed[2 * i + 1]) << np.uint16(8))
 
 
 @njit(cache=True, nogil=True)
-def unpack_12p(packed: Any, pixels: Any) -> None:
-    """Set two pixels from every three bytes, lowest bits first."""
-    four = np.uint16(4)
-    for i in range(pixels.size // 2):
-        a, b, c = (
-            np.uint16(packed[3 * i]),
-            np.uint16(packed[3 * i + 1]),
-            np.uint16(packed[3 * i + 2]),
-        )
-        pixels[2 * i] = a | ((b & np.uint16(15)) << np.uint16(8))
-        pixels[2 * i + 1] = (b >> four) | (c << four)
+def unpack_p(packed: Any, pixels: Any, bits: int) -> None:
+    """Set pixels of 10 or 12 bits, each from two neighbouring bytes, lowest bits first."""
+    for i in range(pixels.size):
+        at = i * bits
+        both = np.uint16(packed[at >> 3]) | (np.uint16(packed[(at >> 3) + 1]) << np.uint16(8))
+        pixels[i] = (both >> np.uint16(at & 7)) & np.uint16((1 << bits) - 1)
 
 
 @njit(cache=True, nogil=True)
-def unpack_12_packed(packed: Any, pixels: Any) -> None:
-    """Set two pixels from every three bytes: high, both low halves, high."""
-    four, low = np.uint16(4), np.uint16(15)
+def unpack_packed(packed: Any, pixels: Any, bits: int) -> None:
+    """Set two pixels from every three bytes: high bits, the low bits of both, high bits."""
+    below = np.uint16(bits - 8)
+    low = np.uint16((1 << (bits - 8)) - 1)
     for i in range(pixels.size // 2):
-        a, b, c = (
-            np.uint16(packed[3 * i]),
-            np.uint16(packed[3 * i + 1]),
-            np.uint16(packed[3 * i + 2]),
-        )
-        pixels[2 * i] = (a << four) | (b & low)
-        pixels[2 * i + 1] = (c << four) | (b >> four)
+        both = np.uint16(packed[3 * i + 1])
+        pixels[2 * i] = (np.uint16(packed[3 * i]) << below) | (both & low)
+        pixels[2 * i + 1] = (np.uint16(packed[3 * i + 2]) << below) | ((both >> np.uint16(4)) & low)
 
 
-@njit(cache=True, nogil=True)
-def unpack_10p(packed: Any, pixels: Any) -> None:
-    """Set four pixels from every five bytes, lowest bits first."""
-    for i in range(pixels.size // 4):
-        a, b, c, d, e = (
-            np.uint16(packed[5 * i]),
-            np.uint16(packed[5 * i + 1]),
-            np.uint16(packed[5 * i + 2]),
-            np.uint16(packed[5 * i + 3]),
-            np.uint16(packed[5 * i + 4]),
-        )
-        pixels[4 * i] = a | ((b & np.uint16(3)) << np.uint16(8))
-        pixels[4 * i + 1] = (b >> np.uint16(2)) | ((c & np.uint16(15)) << np.uint16(6))
-        pixels[4 * i + 2] = (c >> np.uint16(4)) | ((d & np.uint16(63)) << np.uint16(4))
-        pixels[4 * i + 3] = (d >> np.uint16(6)) | (e << np.uint16(2))
-
-
-@njit(cache=True, nogil=True)
-def unpack_10_packed(packed: Any, pixels: Any) -> None:
-    """Set two pixels from every three bytes: high, both low pairs of bits, high."""
-    two, low = np.uint16(2), np.uint16(3)
-    for i in range(pixels.size // 2):
-        a, b, c = (
-            np.uint16(packed[3 * i]),
-            np.uint16(packed[3 * i + 1]),
-            np.uint16(packed[3 * i + 2]),
-        )
-        pixels[2 * i] = (a << two) | (b & low)
-        pixels[2 * i + 1] = (c << two) | ((b >> np.uint16(4)) & low)
-
-
-Kernel = Callable[[Array, Array], None]
+Kernel = Callable[[Array, Array, int], None]
 
 KERNELS: dict[tuple[int, int, str], tuple[int, int, Kernel]] = {
     (8, 8, ""): (1, 1, widen),
     (16, 10, ""): (2, 1, join_bytes),
     (16, 12, ""): (2, 1, join_bytes),
     (16, 16, ""): (2, 1, join_bytes),
-    (12, 12, "p"): (3, 2, unpack_12p),
-    (12, 12, "Packed"): (3, 2, unpack_12_packed),
-    (10, 10, "p"): (5, 4, unpack_10p),
-    (12, 10, "Packed"): (3, 2, unpack_10_packed),
+    (12, 12, "p"): (3, 2, unpack_p),
+    (12, 12, "Packed"): (3, 2, unpack_packed),
+    (10, 10, "p"): (5, 4, unpack_p),
+    (12, 10, "Packed"): (3, 2, unpack_packed),
 }
 """By bits stored, bits of light and packing: bytes and pixels of one group, and what unpacks it."""
