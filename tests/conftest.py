@@ -148,6 +148,15 @@ def run(monkeypatch, capsys, tmp_path):
     return call
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless browser; the module's marks are those of `browsers`."""
+    from browsers import open_browser
+
+    with open_browser(tmp_path_factory.mktemp("profile")) as driver:
+        yield driver
+
+
 @pytest.fixture(scope="session")
 def random_psi():
     """Return a maker of imaging matrices with random weights and colours."""

@@ -21,6 +21,7 @@ import pytest
 import typer
 import yaml
 from capture_rigs import BLACK, WHITE, NamedFrames, still_rig
+from programs import one_line
 
 import drivers.errors
 import emmc_rig
@@ -161,11 +162,8 @@ class Bench:
     def refused(self, *arguments):
         """Run the program, by default the capture, and return the one line that it ends with."""
         code, _, err = self.run(*(arguments or self.finish))
-        lines = [line for line in err.splitlines() if line.startswith("emmc-rig:")]
         assert code in (1, 130), err
-        assert len(lines) == 1, err
-        assert "Traceback" not in err
-        return lines[0]
+        return one_line(err)
 
     def begun(self):
         """Take all frames but the last one."""

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from programs import one_line
 from serial.tools import list_ports
 
 from drivers.apt import ACTUATORS, AptAxis, AptStage
@@ -50,13 +51,6 @@ def usb_port(device, product):
         description="FT232R",
         manufacturer="FTDI",
     )
-
-
-def one_line(text):
-    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
-    assert len(lines) == 1, text
-    assert "Traceback" not in text
-    return lines[0]
 
 
 def wait_until(condition):

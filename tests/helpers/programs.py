@@ -31,6 +31,14 @@ def program(*arguments):
     return code, out.getvalue(), err.getvalue()
 
 
+def one_line(text):
+    """Return the one line that the program said last, on standard error."""
+    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    return lines[0]
+
+
 @contextmanager
 def line_server(script):
     """Start a script beside this file; yield what writes a line to it and returns its answer."""
