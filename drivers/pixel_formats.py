@@ -114,61 +114,72 @@ def unpack(
 def _unpack_flat(packed: Array, form: PixelFormat, pixels: Array) -> None:
     group_bytes, group_pixels, kernel = KERNELS[form.stored_bits, form.bits, form.packing]
     groups = len(pixels) // group_pixels
-    kernel(packed, pixels[: groups * group_pixels], form.bits)
+    kernel(packed, pixels[: groups * group_pixels])
     rest = len(pixels) - groups * group_pixels
     if rest:
         last = np.zeros(group_bytes, np.uint8)
         tail = packed[groups * group_bytes :]
         last[: len(tail)] = tail
         group = np.empty(group_pixels, np.uint16)
-        kernel(last, group, form.bits)
+        kernel(last, group)
         pixels[-rest:] = group[:rest]
 
 
 @njit(cache=True, nogil=True)
-def widen(packed: Any, pixels: Any, bits: int) -> None:
+def widen(packed: Any, pixels: Any) -> None:
     """Set pixels from one byte each."""
     for i in range(pixels.size):
         pixels[i] = packed[i]
 
 
 @njit(cache=True, nogil=True)
-def join_bytes(packed: Any, pixels: Any, bits: int) -> None:
+def join_bytes(packed: Any, pixels: Any) -> None:
     """Set pixels from two bytes each, the low one first."""
     for i in range(pixels.size):
         pixels[i] = np.uint16(packed[2 * i]) | (np.uint16(packed[2 * i + 1]) << np.uint16(8))
 
 
-@njit(cache=True, nogil=True)
-def unpack_p(packed: Any, pixels: Any, bits: int) -> None:
-    """Set pixels of 10 or 12 bits, each from two neighbouring bytes, lowest bits first."""
-    for i in range(pixels.size):
-        at = i * bits
-        both = np.uint16(packed[at >> 3]) | (np.uint16(packed[(at >> 3) + 1]) << np.uint16(8))
-        pixels[i] = (both >> np.uint16(at & 7)) & np.uint16((1 << bits) - 1)
+Kernel = Callable[[Array, Array], None]
 
 
-@njit(cache=True, nogil=True)
-def unpack_packed(packed: Any, pixels: Any, bits: int) -> None:
-    """Set two pixels from every three bytes: high bits, the low bits of both, high bits."""
-    below = np.uint16(bits - 8)
-    low = np.uint16((1 << (bits - 8)) - 1)
-    for i in range(pixels.size // 2):
-        both = np.uint16(packed[3 * i + 1])
-        pixels[2 * i] = (np.uint16(packed[3 * i]) << below) | (both & low)
-        pixels[2 * i + 1] = (np.uint16(packed[3 * i + 2]) << below) | ((both >> np.uint16(4)) & low)
+def low_first(bits: int) -> Kernel:
+    """Return what sets four pixels from every 5 or 6 bytes, lowest bits first."""
+    mask = np.uint16((1 << bits) - 1)
+
+    @njit(cache=True, nogil=True)
+    def unpack_p(packed: Any, pixels: Any) -> None:
+        for i in range(pixels.size // 4):
+            for k in range(4):
+                at = i * bits // 2 + (k * bits >> 3)
+                both = np.uint16(packed[at]) | (np.uint16(packed[at + 1]) << np.uint16(8))
+                pixels[4 * i + k] = (both >> np.uint16(k * bits & 7)) & mask
+
+    return unpack_p
 
 
-Kernel = Callable[[Array, Array, int], None]
+def high_and_low(bits: int) -> Kernel:
+    """Return what sets two pixels from every three bytes: high, the low bits of both, high."""
+    below, mask = np.uint16(bits - 8), np.uint16((1 << (bits - 8)) - 1)
+
+    @njit(cache=True, nogil=True)
+    def unpack_packed(packed: Any, pixels: Any) -> None:
+        for i in range(pixels.size // 2):
+            both = np.uint16(packed[3 * i + 1])
+            pixels[2 * i] = (np.uint16(packed[3 * i]) << below) | (both & mask)
+            second = np.uint16(packed[3 * i + 2]) << below
+            pixels[2 * i + 1] = second | ((both >> np.uint16(4)) & mask)
+
+    return unpack_packed
+
 
 KERNELS: dict[tuple[int, int, str], tuple[int, int, Kernel]] = {
     (8, 8, ""): (1, 1, widen),
     (16, 10, ""): (2, 1, join_bytes),
     (16, 12, ""): (2, 1, join_bytes),
     (16, 16, ""): (2, 1, join_bytes),
-    (12, 12, "p"): (3, 2, unpack_p),
-    (12, 12, "Packed"): (3, 2, unpack_packed),
-    (10, 10, "p"): (5, 4, unpack_p),
-    (12, 10, "Packed"): (3, 2, unpack_packed),
+    (12, 12, "p"): (6, 4, low_first(12)),
+    (12, 12, "Packed"): (3, 2, high_and_low(12)),
+    (10, 10, "p"): (5, 4, low_first(10)),
+    (12, 10, "Packed"): (3, 2, high_and_low(10)),
 }
 """By bits stored, bits of light and packing: bytes and pixels of one group, and what unpacks it."""
