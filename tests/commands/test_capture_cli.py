@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from programs import one_line, program
+from programs import one_line, program, wait_until
 
 from drivers.raw import decode_raw
 from emmc_rig.session.listing import sessions_in
@@ -404,20 +404,15 @@ def test_files_of_any_name_are_taken_in_order_where_all_exposures_agree(
     assert not (tmp_path / "other").exists()
 
 
-def wait_until(condition):
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-
-
 def started_capture(folder):
     """Start a capture that takes its time, and return it when it has taken some frames."""
     plan_file(folder, darks={"repeats": 300})
     command = [*PROGRAM, "capture", "plan.yaml", *RIG, "--real-time"]
     process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
     journal = folder / "plan-session" / "journal.jsonl"
-    wait_until(lambda: journal.exists() and journal.read_bytes().count(b'"kind":"frame"') > 2)
+    wait_until(
+        lambda: journal.exists() and journal.read_bytes().count(b'"kind":"frame"') > 2, PATIENCE_S
+    )
     return process
 
 

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from programs import one_line
+from programs import one_line, wait_until
 from serial.tools import list_ports
 
 from drivers.apt import ACTUATORS, AptAxis, AptStage
@@ -51,13 +51,6 @@ def usb_port(device, product):
         description="FT232R",
         manufacturer="FTDI",
     )
-
-
-def wait_until(condition):
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 @pytest.mark.parametrize("rig", ["simulated", "simulated:grbl", "simulated:apt"])

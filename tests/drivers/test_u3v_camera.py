@@ -11,7 +11,6 @@ from random import Random
 import numpy as np
 import pytest
 import usb.core
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers import u3v_codec as codec
@@ -665,17 +664,14 @@ class Noise(U3vCameraSimulator):
 
 
 @pytest.mark.slow
-def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(request, caplog):
+def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(fuzz, caplog):
     caplog.set_level("CRITICAL")
-    cases = request.config.getoption("--fuzz-cases")
     mosaic = MOSAIC[:4, :6].copy()
     clock = ManualClock()
     noisy = Noise(lambda exposure_s: mosaic, clock, mosaic.shape, zipped=False)
     bus = SimulatedUsb(clock, noisy)
     opened = open_u3v("", clock, bus)
 
-    @settings(max_examples=cases, deadline=None, database=None)
-    @given(SEEDS)
     def check(seed):
         nonlocal opened
         before_s = clock.now_s()
@@ -717,16 +713,13 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
             opened = open_u3v("", clock, bus)
             np.testing.assert_array_equal(opened.snap().mosaic, mosaic)
 
-    check()
+    fuzz(check, SEEDS)
 
 
 @pytest.mark.slow
-def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors(request):
-    cases = request.config.getoption("--fuzz-cases")
+def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors(fuzz):
     original = Bench(MOSAIC[:4, :6].copy()).open().snap().original
 
-    @settings(max_examples=cases, deadline=None, database=None)
-    @given(SEEDS)
     def check(seed):
         random, raw = Random(seed), bytearray(original)
         for _ in range(random.randint(0, 8)):
@@ -735,7 +728,7 @@ def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors(reques
         with suppress(DriverError):
             decode_frame(bytes(raw))
 
-    check()
+    fuzz(check, SEEDS)
 
 
 def test_an_array_of_stale_bytes_before_the_first_frame_is_passed_over(bench):
