@@ -20,12 +20,7 @@ from drivers.errors import (
     TransportTimeoutError,
 )
 from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
-from drivers.transport import (
-    EXCHANGE_LIMIT_S,
-    FOREIGN_MESSAGES_TOLERATED,
-    Transport,
-    repeated,
-)
+from drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
 
@@ -265,13 +260,10 @@ class _Link:
         with self.transport.lock:
             self._take_waiting()
             self.transport.write(raw)
-            started_s = self._clock.now_s()
-            for _ in range(FOREIGN_MESSAGES_TOLERATED):
+            for _ in turns(self._clock):
                 message = self._read_message()
                 if message.id == answer and channel.sent(message, channel_matters):
                     return message
-                if self._clock.now_s() - started_s > EXCHANGE_LIMIT_S:
-                    break
             raise GarbledReplyError(b"", f"no {answer.name} among what came")
 
     def _take_waiting(self) -> None:

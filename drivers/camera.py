@@ -106,13 +106,17 @@ class StoppableCamera(Camera, Protocol):
         ...
 
 
+def within(value: float, limits: Limits) -> bool:
+    """Return whether a camera takes a value: limits in its own units come back rounded."""
+    return limits[0] * (1 - 1e-9) <= value <= limits[1] * (1 + 1e-9)
+
+
 def check_setting(setting: str, value: float, limits: Limits) -> None:
     """Raise `ValueError` unless positive and finite, `CameraSettingError` outside the limits."""
     if not (value > 0 and math.isfinite(value)):
         raise ValueError(f"the {setting} {value:g} is not positive")
     low, high = limits
-    # Limits that went through a camera's own units come back rounded.
-    if not low * (1 - 1e-9) <= value <= high * (1 + 1e-9):
+    if not within(value, limits):
         offered = f"is fixed at {low:g}" if low == high else f"goes from {low:g} to {high:g}"
         raise CameraSettingError(setting, f"{offered}, not to {value:g}")
 

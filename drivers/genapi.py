@@ -218,27 +218,25 @@ class Features:
 
     def _target(self, node: _Node) -> _Node | None:
         """Return the node that holds the value, None where the description itself does."""
-        index = node.text("pIndex")
-        if index is not None:
-            chosen = self._number(self._node(index))
-            for item in node.all("pValueIndexed"):
-                if _integer(item.index) == chosen:
-                    return self._node(item.text)
-            default = node.text("pValueDefault")
-            if default is not None:
-                return self._node(default)
-        target = node.text("pValue")
+        target = self._chosen(node, "pValue")
+        if target is None:
+            target = node.text("pValue")
         return None if target is None else self._node(target)
 
     def _literal(self, node: _Node) -> str:
+        indexed = node.text("pIndex") is not None
+        return (self._chosen(node, "Value") if indexed else node.text("Value")) or "0"
+
+    def _chosen(self, node: _Node, tag: str) -> str | None:
+        """Return what a node's index chooses among its tags, the default's where it is none."""
         index = node.text("pIndex")
-        if index is not None:
-            chosen = self._number(self._node(index))
-            for item in node.all("ValueIndexed"):
-                if _integer(item.index) == chosen:
-                    return item.text
-            return node.text("ValueDefault") or "0"
-        return node.text("Value") or "0"
+        if index is None:
+            return None
+        chosen = self._number(self._node(index))
+        for item in node.all(f"{tag}Indexed"):
+            if _integer(item.index) == chosen:
+                return item.text
+        return node.text(f"{tag}Default")
 
     def _linked(self, node: _Node, tag: str, default: Number) -> Number:
         target = node.text("p" + tag)

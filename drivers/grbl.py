@@ -17,7 +17,7 @@ from drivers.errors import (
     TransportTimeoutError,
 )
 from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
-from drivers.transport import EXCHANGE_LIMIT_S, Transport, repeated
+from drivers.transport import Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
 
@@ -287,8 +287,7 @@ class _Controller:
             with self._transport.lock:
                 self._take_waiting()
                 self._transport.write(codec.encode_line(line))
-                started_s = self._clock.now_s()
-                for _ in range(LINES_TOLERATED):
+                for _ in turns(self._clock, LINES_TOLERATED):
                     message = self._read_message()
                     if isinstance(message, codec.Ok):
                         self._raise_restart()
@@ -298,8 +297,6 @@ class _Controller:
                     if isinstance(message, codec.Feedback):
                         feedback[message.kind] = message.text
                     self.raise_alarm()
-                    if self._clock.now_s() - started_s > EXCHANGE_LIMIT_S:
-                        break
                 raise GarbledReplyError(b"", "no ok among what came")
         except (TransportTimeoutError, GarbledReplyError) as error:
             self.raise_alarm()
@@ -414,14 +411,11 @@ class _Controller:
         self._alarm, self._restarted = None, False
 
     def _read_status(self) -> codec.Status:
-        started_s = self._clock.now_s()
-        for _ in range(LINES_TOLERATED):
+        for _ in turns(self._clock, LINES_TOLERATED):
             message = self._read_message()
             if isinstance(message, codec.Status):
                 return message
             self._note(message)
-            if self._clock.now_s() - started_s > EXCHANGE_LIMIT_S:
-                break
         raise GarbledReplyError(b"", "no report among what came")
 
     def _drain(self) -> None:

@@ -139,75 +139,47 @@ def join_bytes(packed: Any, pixels: Any) -> None:
         pixels[i] = np.uint16(packed[2 * i]) | (np.uint16(packed[2 * i + 1]) << np.uint16(8))
 
 
-@njit(cache=True, nogil=True)
-def unpack_12p(packed: Any, pixels: Any) -> None:
-    """Set two pixels from every three bytes, lowest bits first."""
-    four = np.uint16(4)
-    for i in range(pixels.size // 2):
-        a, b, c = (
-            np.uint16(packed[3 * i]),
-            np.uint16(packed[3 * i + 1]),
-            np.uint16(packed[3 * i + 2]),
-        )
-        pixels[2 * i] = a | ((b & np.uint16(15)) << np.uint16(8))
-        pixels[2 * i + 1] = (b >> four) | (c << four)
-
-
-@njit(cache=True, nogil=True)
-def unpack_12_packed(packed: Any, pixels: Any) -> None:
-    """Set two pixels from every three bytes: high, both low halves, high."""
-    four, low = np.uint16(4), np.uint16(15)
-    for i in range(pixels.size // 2):
-        a, b, c = (
-            np.uint16(packed[3 * i]),
-            np.uint16(packed[3 * i + 1]),
-            np.uint16(packed[3 * i + 2]),
-        )
-        pixels[2 * i] = (a << four) | (b & low)
-        pixels[2 * i + 1] = (c << four) | (b >> four)
-
-
-@njit(cache=True, nogil=True)
-def unpack_10p(packed: Any, pixels: Any) -> None:
-    """Set four pixels from every five bytes, lowest bits first."""
-    for i in range(pixels.size // 4):
-        a, b, c, d, e = (
-            np.uint16(packed[5 * i]),
-            np.uint16(packed[5 * i + 1]),
-            np.uint16(packed[5 * i + 2]),
-            np.uint16(packed[5 * i + 3]),
-            np.uint16(packed[5 * i + 4]),
-        )
-        pixels[4 * i] = a | ((b & np.uint16(3)) << np.uint16(8))
-        pixels[4 * i + 1] = (b >> np.uint16(2)) | ((c & np.uint16(15)) << np.uint16(6))
-        pixels[4 * i + 2] = (c >> np.uint16(4)) | ((d & np.uint16(63)) << np.uint16(4))
-        pixels[4 * i + 3] = (d >> np.uint16(6)) | (e << np.uint16(2))
-
-
-@njit(cache=True, nogil=True)
-def unpack_10_packed(packed: Any, pixels: Any) -> None:
-    """Set two pixels from every three bytes: high, both low pairs of bits, high."""
-    two, low = np.uint16(2), np.uint16(3)
-    for i in range(pixels.size // 2):
-        a, b, c = (
-            np.uint16(packed[3 * i]),
-            np.uint16(packed[3 * i + 1]),
-            np.uint16(packed[3 * i + 2]),
-        )
-        pixels[2 * i] = (a << two) | (b & low)
-        pixels[2 * i + 1] = (c << two) | ((b >> np.uint16(4)) & low)
-
-
 Kernel = Callable[[Array, Array], None]
+
+
+def low_first(bits: int) -> Kernel:
+    """Return what sets four pixels from every 5 or 6 bytes, lowest bits first."""
+    mask = np.uint16((1 << bits) - 1)
+
+    @njit(cache=True, nogil=True)
+    def unpack_p(packed: Any, pixels: Any) -> None:
+        for i in range(pixels.size // 4):
+            for k in range(4):
+                at = i * bits // 2 + (k * bits >> 3)
+                both = np.uint16(packed[at]) | (np.uint16(packed[at + 1]) << np.uint16(8))
+                pixels[4 * i + k] = (both >> np.uint16(k * bits & 7)) & mask
+
+    return unpack_p
+
+
+def high_and_low(bits: int) -> Kernel:
+    """Return what sets two pixels from every three bytes: high, the low bits of both, high."""
+    below, mask = np.uint16(bits - 8), np.uint16((1 << (bits - 8)) - 1)
+
+    @njit(cache=True, nogil=True)
+    def unpack_packed(packed: Any, pixels: Any) -> None:
+        for i in range(pixels.size // 2):
+            both = np.uint16(packed[3 * i + 1])
+            pixels[2 * i] = (np.uint16(packed[3 * i]) << below) | (both & mask)
+            second = np.uint16(packed[3 * i + 2]) << below
+            pixels[2 * i + 1] = second | ((both >> np.uint16(4)) & mask)
+
+    return unpack_packed
+
 
 KERNELS: dict[tuple[int, int, str], tuple[int, int, Kernel]] = {
     (8, 8, ""): (1, 1, widen),
     (16, 10, ""): (2, 1, join_bytes),
     (16, 12, ""): (2, 1, join_bytes),
     (16, 16, ""): (2, 1, join_bytes),
-    (12, 12, "p"): (3, 2, unpack_12p),
-    (12, 12, "Packed"): (3, 2, unpack_12_packed),
-    (10, 10, "p"): (5, 4, unpack_10p),
-    (12, 10, "Packed"): (3, 2, unpack_10_packed),
+    (12, 12, "p"): (6, 4, low_first(12)),
+    (12, 12, "Packed"): (3, 2, high_and_low(12)),
+    (10, 10, "p"): (5, 4, low_first(10)),
+    (12, 10, "Packed"): (3, 2, high_and_low(10)),
 }
 """By bits stored, bits of light and packing: bytes and pixels of one group, and what unpacks it."""

@@ -5,11 +5,12 @@ import logging
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import serial
 
+from drivers.clock import Clock
 from drivers.errors import (
     DriverError,
     GarbledReplyError,
@@ -46,6 +47,15 @@ EXCHANGE_LIMIT_S = 2.0
 
 _Answer = TypeVar("_Answer")
 _log = logging.getLogger(__name__)
+
+
+def turns(clock: Clock, most: int = FOREIGN_MESSAGES_TOLERATED) -> Iterator[None]:
+    """Yield before each message of an exchange, until they are too many or take too long."""
+    started_s = clock.now_s()
+    for _ in range(most):
+        yield
+        if clock.now_s() - started_s > EXCHANGE_LIMIT_S:
+            return
 
 
 def repeated(

@@ -80,14 +80,12 @@ class UsbListing:
 
 def list_devices(kind: Kind | None = None, backend: Any = None) -> list[UsbListing]:
     """Return the devices that have an interface of that kind; raises `UsbUnavailableError`."""
-    return [_listing(device) for device in _find(kind, None, None, backend)]
+    return [_listing(device) for device in _find(kind, backend)]
 
 
 def open_device(
     kind: Kind | None = None,
     *,
-    vendor: int | None = None,
-    product: int | None = None,
     serial: str = "",
     backend: Any = None,
     proc: Path = PROC,
@@ -99,7 +97,7 @@ def open_device(
     `UsbPermissionError`; other errors: `UsbUnavailableError`, `UsbNotFoundError`.
     """
     others, refused = [], None
-    for device in _find(kind, vendor, product, backend):
+    for device in _find(kind, backend):
         listing = _listing(device)
         if not listing.accessible:
             refused = listing
@@ -364,14 +362,12 @@ def _holder_advice(holders: tuple[str, ...]) -> str:
     return CLOSE_IT if holders else UNKNOWN_HOLDER
 
 
-def _find(kind: Kind | None, vendor: int | None, product: int | None, backend: Any) -> list[Any]:
+def _find(kind: Kind | None, backend: Any) -> list[Any]:
     chosen = backend if backend is not None else libusb_package.get_libusb1_backend()
     if chosen is None:
         raise UsbUnavailableError("libusb did not start")
 
     def matches(device: Any) -> bool:
-        if vendor not in (None, device.idVendor) or product not in (None, device.idProduct):
-            return False
         if kind is None:
             return True
         # A device that hides its descriptors cannot be what is looked for.

@@ -22,12 +22,7 @@ from drivers.errors import (
     TransportTimeoutError,
 )
 from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
-from drivers.transport import (
-    EXCHANGE_LIMIT_S,
-    FOREIGN_MESSAGES_TOLERATED,
-    Transport,
-    repeated,
-)
+from drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
 
@@ -336,9 +331,8 @@ class _Chain:
         with self._transport.lock:
             self._transport.discard_input()
             self._transport.write(codec.encode_command(device, number, message_id, data))
-            started_s = self._clock.now_s()
             line = b""
-            for _ in range(FOREIGN_MESSAGES_TOLERATED):
+            for _ in turns(self._clock):
                 line = self._transport.read_until(codec.TERMINATOR)
                 message = codec.decode_message(line, checksum_required)
                 if message is not None and (
@@ -348,8 +342,6 @@ class _Chain:
                 ) == (device, number, message_id):
                     return message
                 _log.debug("%s: %r came in between", name, message)
-                if self._clock.now_s() - started_s > EXCHANGE_LIMIT_S:
-                    break
             raise GarbledReplyError(line, f"{name} never answered message {message_id}")
 
 

@@ -5,7 +5,6 @@ pixels per view step of 5 views of 256 columns. S runs from -1/2 to 1/2 across t
 downwards, +-3/8 at 3:4.
 """
 
-import difflib
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from emmc_rig.model.errors import SceneError
+from emmc_rig.model.errors import SceneError, did_you_mean
 from simulators import textures
 from simulators.raycaster import Ball, Card, Tables, World, measure_disparity, paint_view, tabulated
 
@@ -66,8 +65,7 @@ def render(
         SceneError: unknown name, a size or number of views too small, or a negative seed.
     """
     if name not in SCENES:
-        near = difflib.get_close_matches(name, SCENES, n=1, cutoff=0.4)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(name, SCENES, 0.4)
         raise SceneError(f"no built-in scene '{name}': {hint}built in are {', '.join(SCENES)}")
     if min(views) < 1:
         raise SceneError(f"{views[0]}x{views[1]} views: needs 1x1 or more")

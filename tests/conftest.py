@@ -148,6 +148,32 @@ def run(monkeypatch, capsys, tmp_path):
     return call
 
 
+@pytest.fixture
+def fuzz(request):
+    """Run a check on as many random cases as were asked for."""
+    from hypothesis import HealthCheck, given, settings
+
+    cases = request.config.getoption("--fuzz-cases")
+
+    def run(check, *strategies):
+        slow = [HealthCheck.too_slow, HealthCheck.data_too_large]
+        chosen = settings(
+            max_examples=cases, deadline=None, suppress_health_check=slow, database=None
+        )
+        chosen(given(*strategies)(check))()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless browser; the module's marks are those of `browsers`."""
+    from browsers import open_browser
+
+    with open_browser(tmp_path_factory.mktemp("profile")) as driver:
+        yield driver
+
+
 @pytest.fixture(scope="session")
 def random_psi():
     """Return a maker of imaging matrices with random weights and colours."""

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera import Limits
+from drivers.camera import within
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Checks
@@ -26,8 +26,6 @@ HOT_RATIO = 2.0
 """Of a pixel over all eight of its colour around it. Where light is brighter than half of white, a
 hot pixel is not found by it: metering then exposes less and looks again."""
 LEAST_LIKENESS = 0.3
-ROUNDING = 1e-9
-"""Limits that went through a device's own units come back rounded."""
 
 
 class FrameRefusedError(DriverError):
@@ -147,13 +145,13 @@ def refuse_impossible(rig: Rig, frames: Iterable[PlannedFrame]) -> None:
         exposure_s = frame.exposure_s
         # A camera whose exposure cannot be chosen says for each frame what it is.
         chosen = exposures_s[0] < exposures_s[1]
-        if chosen and exposure_s is not None and not _within(exposure_s, exposures_s):
+        if chosen and exposure_s is not None and not within(exposure_s, exposures_s):
             raise AppError(
                 f"frame {frame.id}: the camera exposes from {exposures_s[0]:g} to "
                 f"{exposures_s[1]:g} s, not {exposure_s:g} s: change "
                 f"{exposure_setting(frame)} in the plan"
             )
-        if not _within(frame.gain, gains):
+        if not within(frame.gain, gains):
             raise AppError(
                 f"frame {frame.id}: the camera's gain goes from {gains[0]:g} to {gains[1]:g}, not "
                 f"to {frame.gain:g}: change shots.{frame.bench.shot}.gain in the plan"
@@ -174,7 +172,3 @@ def _refuse_place(rig: Rig, frame: PlannedFrame, axis: str, offset_um: float) ->
             f"({rig.zero_um[axis]:g} um), it reaches {low_um:g} to {high_um:g} um: change the "
             "place in the plan, or zero_um in the rig's file"
         )
-
-
-def _within(value: float, limits: Limits) -> bool:
-    return limits[0] * (1 - ROUNDING) <= value <= limits[1] * (1 + ROUNDING)

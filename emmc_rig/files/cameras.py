@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from emmc_rig.model.arguments import NAMES, required
 from emmc_rig.model.camera import Camera, load_camera, shipped_camera_files
-from emmc_rig.model.errors import CameraError
+from emmc_rig.model.errors import CameraError, did_you_mean
 from emmc_rig.model.settings import validated
 
 
@@ -59,9 +58,8 @@ def camera_file(spec: str) -> Path:
     shipped = shipped_camera_files()
     if spec in shipped:
         return shipped[spec]
-    near = difflib.get_close_matches(spec.lower(), shipped, n=1, cutoff=0.5)
-    hint = f"did you mean '{near[0]}'? " if near else ""
     raise CameraError(
-        f"no camera is called '{spec}': {hint}`emmc-rig cameras` lists them; "
+        f"no camera is called '{spec}': {did_you_mean(spec.lower(), shipped)}`emmc-rig cameras` "
+        "lists them; "
         "a camera of your own is given by the path of its .yaml file"
     )

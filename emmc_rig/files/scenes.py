@@ -3,7 +3,6 @@
 A built-in name wins over a folder of that name; write `./dark` for the folder.
 """
 
-import difflib
 import os
 import warnings
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike
 from emmc_rig.files import shards
 from emmc_rig.files.formats import FORMATS
 from emmc_rig.model.arguments import NAMES, numbers_of, pair_of, required
-from emmc_rig.model.errors import SceneError, ViewOrderWarning
+from emmc_rig.model.errors import SceneError, ViewOrderWarning, did_you_mean
 from emmc_rig.model.lightfield import check_light_field, load_hdf5, load_views, shifted
 from emmc_rig.model.view_order import ViewOrder, order_of
 from simulators.raycaster import World
@@ -257,11 +256,9 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
             "NAME_VxU_eslf.png; other pictures come as a folder"
         )
     else:
-        near = difflib.get_close_matches(spec, SCENES, n=1, cutoff=0.5)
-        hint = f"did you mean '{near[0]}'? " if near else ""
         raise SceneError(
-            f"no scene '{spec}': no such folder or file, and no built-in scene; {hint}"
-            f"built in are {', '.join(SCENES)}"
+            f"no scene '{spec}': no such folder or file, and no built-in scene; "
+            f"{did_you_mean(spec, SCENES)}built in are {', '.join(SCENES)}"
         )
     n_v, n_u, height, width, _ = light_field.shape
     described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels"

@@ -14,14 +14,12 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.json_text import one_line, shown_path
 from emmc_rig.model.lightfield import check_light_field
-from emmc_rig.model.reading import FREE_BYTES, MOST_COMPRESSED
+from emmc_rig.model.reading import FAULTS, FREE_BYTES, MOST_COMPRESSED
 
 ENDING = ".zarr"
 MISSING_BYTE = 255
 CHUNK, SHARD = 128, 512
 """Samples a side of what is read at once, and of one file."""
-
-_FAULTS = (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError)
 
 Place = tuple[slice, slice]
 
@@ -129,7 +127,7 @@ def stored_shards(folder: Path, error: type[Exception], remedy: str) -> Iterator
         yield StoredGroup(zarr.open_group(folder, mode="r"), folder)
     except error:
         raise
-    except _FAULTS as fault:
+    except FAULTS as fault:
         why = f"no Zarr group, damaged or incomplete ({one_line(fault)})"
         raise error(f"{shown_path(folder)}: {why}; {remedy}") from fault
 
@@ -139,7 +137,7 @@ def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any
     zarr = _zarr()
     try:
         array = zarr.open_group(folder, mode=mode)[name]
-    except _FAULTS as fault:
+    except FAULTS as fault:
         raise AppError(
             f"{shown_path(folder)}: holds no array {name} of Zarr ({one_line(fault)})"
         ) from fault
@@ -152,6 +150,6 @@ def load_light_field(folder: Path) -> NDArray[np.float32]:
     try:
         check_fits(stored.nbytes, folder)
         light_field = np.asarray(stored[...])
-    except _FAULTS as fault:
+    except FAULTS as fault:
         raise SceneError(f"{shown_path(folder)}: damaged ({one_line(fault)})") from fault
     return check_light_field(light_field, shown_path(folder)).astype(np.float32)

@@ -7,8 +7,13 @@ from collections.abc import Iterable
 def nearest_of(name: str, known: Iterable[str]) -> str:
     """Return a hint for a name that is not known: the nearest one, if any is near, and all."""
     known = list(known)
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return (f"did you mean '{near[0]}'? " if near else "") + f"known are {', '.join(known)}"
+    return f"{did_you_mean(name, known, 0.6)}known are {', '.join(known)}"
+
+
+def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.5) -> str:
+    """Return a question that names the nearest of what is known, "" where none is that near."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=likeness)
+    return f"did you mean '{near[0]}'? " if near else ""
 
 
 class ModelError(Exception):

@@ -326,7 +326,7 @@ def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
     back, middle, margin = -front, 0.0, 0.0
     for _ in range(3):
         candidates = np.linspace(back - margin, front + margin, 41)
-        spread = np.stack([_disagreement(small, float(d)) for d in candidates])
+        spread = np.stack([disagreement(small, float(d), 5) for d in candidates])
         best = candidates[spread.argmin(axis=0)][inner][textured]
         back, middle, front = (float(d) for d in np.percentile(best, (5, 50, 95)))
         margin = float(candidates[1] - candidates[0])
@@ -489,9 +489,9 @@ def _catmull_rom(fraction: float) -> np.ndarray:
     )
 
 
-def _disagreement(lf: np.ndarray, disparity_px: float) -> np.ndarray:
-    """Variance over the views sheared to this disparity, averaged over 5x5 pixels: (y, x)."""
-    return cv2.blur(shear(lf, disparity_px).var(axis=(0, 1))[..., 0], (5, 5))
+def disagreement(lf: np.ndarray, disparity_px: float, window_px: int) -> np.ndarray:
+    """Variance over grey views sheared to this disparity, averaged over a window: (y, x)."""
+    return cv2.blur(shear(lf, disparity_px).var(axis=(0, 1))[..., 0], (window_px, window_px))
 
 
 def _check_same_shape(estimate: np.ndarray, truth: np.ndarray) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from emmc_rig.model.lightfield import centre_view, focus_disparities, shear, small_grey_views
+from emmc_rig.model.lightfield import centre_view, disagreement, focus_disparities, small_grey_views
 
 Array = NDArray[np.floating]
 STEPS = 3
@@ -49,12 +49,7 @@ def estimated_disparity(light_field: Array) -> NDArray[np.float32]:
     back, _, front = focus_disparities(light_field)
     margin = max(0.15 * (front - back), 0.1)
     tried = np.linspace(back - margin, front + margin, CANDIDATES) / shrink
-    cost = np.stack(
-        [
-            cv2.blur(shear(small, float(d)).var(axis=(0, 1))[..., 0], (WINDOW_PX, WINDOW_PX))
-            for d in tried
-        ]
-    )
+    cost = np.stack([disagreement(small, float(d), WINDOW_PX) for d in tried])
     best = cv2.medianBlur(tried[cost.argmin(axis=0)].astype(np.float32), 5)
     return cv2.resize(best, (width, height), interpolation=cv2.INTER_NEAREST) * np.float32(shrink)
 

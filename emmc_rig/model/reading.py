@@ -43,11 +43,11 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 """By colour type. Source: PNG 1.2, table 11.1 (the channels, and the depths allowed)."""
 _OTHER_PICTURES = ("BMP", "GIF", "JPEG", "JPEG2000", "PPM", "TIFF", "WEBP")
-_FAULTS = (
+FAULTS = (
     *(OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError),
     MemoryError,
 )
-
+"""Whatever decoders run into."""
 
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -218,7 +218,7 @@ def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[S
             yield StoredArrays(file, size)
     except error:
         raise
-    except _FAULTS as fault:
+    except FAULTS as fault:
         why = f"cannot be read, damaged or incomplete ({one_line(fault)})"
         raise error(f"{shown_path(path)}: {why}; {remedy}") from fault
 
@@ -300,6 +300,6 @@ def _picture_size(content: bytes, source: str, error: type[Exception]) -> tuple[
             columns, rows = picture.size
     except Image.DecompressionBombError as fault:
         raise error(f"{source}: {one_line(fault)}") from fault
-    except (SyntaxError, struct.error, *_FAULTS) as fault:
+    except (SyntaxError, struct.error, *FAULTS) as fault:
         raise error(f"{source}: not a picture, or damaged") from fault
     return rows, columns

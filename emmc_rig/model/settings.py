@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import warnings
 from typing import ClassVar, TypeGuard, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from emmc_rig.model.errors import RemovedSettingWarning
+from emmc_rig.model.errors import RemovedSettingWarning, did_you_mean
 
 
 class Settings(BaseModel):
@@ -93,8 +92,7 @@ def explain(error: ValidationError, cls: type[BaseModel]) -> str:
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
         valid = _keys_beside(cls, first["loc"])
-        near = difflib.get_close_matches(key, valid, n=1, cutoff=0.5)
-        hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(valid)}"
+        hint = did_you_mean(key, valid).strip() or f"valid keys: {', '.join(valid)}"
         return f"unknown key '{where}': {hint}"
     message = _in_words(first["msg"].replace("\n", " "))
     if first["type"] == "value_error":

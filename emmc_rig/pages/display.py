@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -71,6 +72,14 @@ def png_of(image: NDArray[np.uint8]) -> str:
     return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 
+def tiled(views: NDArray[np.uint8], tile: int = TILE_MULTIPLE_PX) -> NDArray[np.uint8]:
+    """All views of (v, u, y, x, c) in one picture, each padded to whole tiles."""
+    rows, columns, height, width, colours = views.shape
+    padding = [(0, 0), (0, 0), (0, -height % tile), (0, -width % tile), (0, 0)]
+    padded = np.pad(views, padding, mode="edge").transpose(0, 2, 1, 3, 4)
+    return padded.reshape(rows * padded.shape[1], columns * padded.shape[3], colours)
+
+
 def sprite(views: NDArray[np.uint8], most_bytes: int, tile: int = TILE_MULTIPLE_PX) -> str:
     """All views of (v, u, y, x, c) in one JPEG, each padded to whole tiles.
 
@@ -78,18 +87,13 @@ def sprite(views: NDArray[np.uint8], most_bytes: int, tile: int = TILE_MULTIPLE_
 
     Colour is kept at full resolution: half-resolution chroma bleeds from view to view.
     """
-    rows, columns, height, width, colours = views.shape
-    padding = [(0, -height % tile), (0, -width % tile)]
-    padded = np.pad(views, [(0, 0), (0, 0), *padding, (0, 0)], mode="edge")
-    tiled = padded.transpose(0, 2, 1, 3, 4).reshape(
-        rows * padded.shape[2], columns * padded.shape[3], colours
-    )
-    if colours == 3:
-        tiled = np.ascontiguousarray(tiled[..., ::-1])  # OpenCV's channel order
+    picture = tiled(views, tile)
+    if picture.shape[-1] == 3:
+        picture = np.ascontiguousarray(picture[..., ::-1])  # OpenCV's channel order
     address = ""
     for quality in JPEG_QUALITIES:
         address = _data_uri(
-            tiled,
+            picture,
             ".jpg",
             cv2.IMWRITE_JPEG_QUALITY,
             quality,
@@ -119,6 +123,15 @@ def reduced(views: Array, most_pixels: int = SPRITE_PIXELS) -> Array:
 def three_colours(views: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return pictures of one colour as pictures of three equal ones, others as they are."""
     return np.repeat(views, 3, axis=-1) if views.shape[-1] == 1 else views
+
+
+def ends(maps: Iterable[Array | None]) -> tuple[float, float]:
+    """Return what 1 and 99 % of the finite values lie below; 0 and 1 where there is none."""
+    good = [values[np.isfinite(values)] for values in maps if values is not None]
+    if not any(values.size for values in good):
+        return 0.0, 1.0
+    low, high = (float(end) for end in np.percentile(np.concatenate(good), (1, 99)))
+    return low, max(high, low + 1e-6)
 
 
 def round_up(value: float) -> float:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.formats import Export
 from emmc_rig.model.lightfield import epi_horizontal, psnr_db, ssim
-from emmc_rig.pages.display import DisplayCurve, finite, round_up, three_colours
+from emmc_rig.pages.display import DisplayCurve, ends, finite, round_up, three_colours
 from emmc_rig.pages.drawing import FAINT, INK, save_publication
 from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
 from emmc_rig.version import __version__
@@ -295,8 +295,8 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
     ]  # fmt: skip
     deviations = [None if one.sigma is None else one.sigma[view] for one in results]
     disparities = [one.disparity for one in results]
-    top = round_up(_ends([*errors, *deviations])[1])
-    low, high = _ends(disparities)
+    top = round_up(ends([*errors, *deviations])[1])
+    low, high = ends(disparities)
     if high - low < LEAST_RANGE_PX:
         low, high = low - LEAST_RANGE_PX / 2, high + LEAST_RANGE_PX / 2
     every = [
@@ -305,15 +305,6 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
         _Maps("disparity, px per view", disparities, low, high, "viridis"),
     ]
     return [one for one in every if any(values is not None for values in one.values)]
-
-
-def _ends(maps: Sequence[Array | None]) -> tuple[float, float]:
-    """Return what 1 and 99 % of the finite values lie below; 0 and 1 where there is none."""
-    good = [values[np.isfinite(values)] for values in maps if values is not None]
-    if not any(values.size for values in good):
-        return 0.0, 1.0
-    low, high = (float(end) for end in np.percentile(np.concatenate(good), (1, 99)))
-    return low, max(high, low + 1e-6)
 
 
 def _names(columns: Sequence[Export]) -> list[str]:

@@ -27,12 +27,14 @@ from emmc_rig.pages.display import (
     SPRITE_PIXELS,
     TILE_MULTIPLE_PX,
     DisplayCurve,
+    ends,
     finite,
     png_of,
     reduced,
     round_up,
     sprite,
     three_colours,
+    tiled,
 )
 from emmc_rig.pages.page import fragment, light_field_head
 
@@ -133,27 +135,19 @@ def overlays_of(content: Export) -> list[Overlay]:
     found = []
     rows, columns = content.light_field.shape[:2]
     if content.disparity is not None:
-        low, high = _ends(content.disparity)
+        low, high = ends([content.disparity])
         found.append(
             Overlay("disparity", "disparity", "px per view", content.disparity, low, high, DEPTH)
         )
     if content.sigma is not None:
         values = content.sigma[rows // 2, columns // 2]
-        high = round_up(_ends(values)[1])
+        high = round_up(ends([values])[1])
         found.append(Overlay("sigma", "standard deviation", "", values, 0, high))
     if content.misfit is not None:
         found.append(
             Overlay("doubt", "readings missed", "times their noise", content.misfit, 1.0, 5.0)
         )
     return found
-
-
-def _ends(values: Array) -> tuple[float, float]:
-    good = values[np.isfinite(values)]
-    if not good.size:
-        return 0.0, 1.0
-    low, high = (float(end) for end in np.percentile(good, (1, 99)))
-    return low, max(high, low + 1e-6)
 
 
 def _resized(values: NDArray, shown: Array) -> NDArray:
@@ -178,26 +172,14 @@ def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
 def _atlas(curve: DisplayCurve, views: Array, lossless: bool) -> str:
     codes = three_colours(curve.encode(views))
     return (
-        png_of(np.ascontiguousarray(_tiled(codes)[..., ::-1]))
+        png_of(np.ascontiguousarray(tiled(codes)[..., ::-1]))
         if lossless
         else sprite(codes, int(BYTES_PER_PIXEL * codes.size / 3))
     )
 
 
 def _grey_atlas(codes: NDArray[np.uint8]) -> str:
-    return png_of(_tiled(codes[..., None])[..., 0])
-
-
-def _tiled(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    rows, columns, height, width, colours = codes.shape
-    multiple = TILE_MULTIPLE_PX
-    around = [(0, 0), (0, 0), (0, -height % multiple), (0, -width % multiple), (0, 0)]
-    padded = np.pad(codes, around, mode="edge")
-    return np.ascontiguousarray(
-        padded.transpose(0, 2, 1, 3, 4).reshape(
-            rows * padded.shape[2], columns * padded.shape[3], colours
-        )
-    )
+    return png_of(tiled(codes[..., None])[..., 0])
 
 
 def _write(folder: Path, export: Export) -> None:

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict
 
@@ -265,21 +265,9 @@ class CompleteEntry(Entry):
 
 
 _KINDS = {
-    "created": CreatedEntry,
-    "amended": AmendedEntry,
-    "run": RunEntry,
-    "frame": FrameEntry,
-    "discarded": DiscardedEntry,
-    "metered": MeteredEntry,
-    "until": UntilEntry,
-    "decided": DecidedEntry,
-    "paused": HaltEntry,
-    "resumed": ResumedEntry,
-    "retry": RetryEntry,
-    "registered": ComparedEntry,
-    "refused": ComparedEntry,
-    "stopped": HaltEntry,
-    "complete": CompleteEntry,
+    kind: one
+    for one in Entry.__subclasses__()
+    for kind in get_args(one.model_fields["kind"].annotation)
 }
 _CHECK = ',"crc32":"'
 _TAIL_CHARACTERS = len(_CHECK) + len('01234567"}')
@@ -361,20 +349,21 @@ def count_entry(found: dict[str, FrameEntry], entry: Entry) -> None:
 
 def found_complete(entries: Sequence[Entry]) -> bool:
     """Return whether every frame was found good after the last one was stored."""
-    deciding = (CompleteEntry, FrameEntry, DiscardedEntry, AmendedEntry)
-    last = next((entry for entry in reversed(entries) if isinstance(entry, deciding)), None)
+    last = _last_of(entries, CompleteEntry, FrameEntry, DiscardedEntry, AmendedEntry)
     return isinstance(last, CompleteEntry)
 
 
 def ended(entries: Sequence[Entry]) -> DecidedEntry | None:
     """Return the decision that no more shots are needed; None while there is none, or no longer."""
-    deciding = (DecidedEntry, UntilEntry, AmendedEntry)
-    last = next((entry for entry in reversed(entries) if isinstance(entry, deciding)), None)
+    last = _last_of(entries, DecidedEntry, UntilEntry, AmendedEntry)
     return last if isinstance(last, DecidedEntry) and last.next is None else None
 
 
 def metered(entries: Sequence[Entry]) -> MeteredEntry | None:
     """Return what metering of the scene asks for; None while that is open."""
-    deciding = (MeteredEntry, AmendedEntry)
-    last = next((entry for entry in reversed(entries) if isinstance(entry, deciding)), None)
+    last = _last_of(entries, MeteredEntry, AmendedEntry)
     return last if isinstance(last, MeteredEntry) else None
+
+
+def _last_of(entries: Sequence[Entry], *kinds: type[Entry]) -> Entry | None:
+    return next((entry for entry in reversed(entries) if isinstance(entry, kinds)), None)

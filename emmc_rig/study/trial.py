@@ -177,11 +177,6 @@ class Trial:
     true_psi: ImagingMatrix
     peak: float = 1.0
 
-    @property
-    def even(self) -> Array:
-        """A picture of the scene's mean colour, a lower bound for any method."""
-        return np.broadcast_to(self.truth.mean(axis=(0, 1, 2, 3)), self.truth.shape)
-
     def dictionary(self, method: str, spec: str | None = None) -> Dictionary | None:
         """Return the dictionary of a method that needs one; spec: what `open_dictionary` takes."""
         if not METHODS[method].needs_dictionary:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from capture_rigs import begun, still_rig
-from programs import program
+from programs import one_line, program
 from simulated_disk import SimulatedDisk
 
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -78,30 +78,27 @@ def _judged_once():
         yield
 
 
-@pytest.fixture(scope="module")
-def enough(tmp_path_factory):
-    """A folder with a session that needed one shot of three."""
-    folder = tmp_path_factory.mktemp("enough")
+def session_until(folder, target, reason):
     plan_file(folder)
     code, out, err = program(
-        "capture", folder / "plan.yaml", *RIG, "--until", "12dB", "--out", folder / "s"
+        "capture", folder / "plan.yaml", *RIG, "--until", target, "--out", folder / "s"
     )
     assert code == 0, err
-    assert "the target is reached, 2 shots spared" in out
+    assert reason in out
     return folder / "s"
+
+
+@pytest.fixture(scope="module")
+def enough(tmp_path_factory):
+    """A session that needed one shot of three."""
+    folder = tmp_path_factory.mktemp("enough")
+    return session_until(folder, "12dB", "the target is reached, 2 shots spared")
 
 
 @pytest.fixture(scope="module")
 def every(tmp_path_factory):
-    """A folder with a session whose target lies beyond its three shots."""
-    folder = tmp_path_factory.mktemp("every")
-    plan_file(folder)
-    code, out, err = program(
-        "capture", folder / "plan.yaml", *RIG, "--until", "70", "--out", folder / "s"
-    )
-    assert code == 0, err
-    assert "every planned shot is taken" in out
-    return folder / "s"
+    """A session whose target lies beyond its three shots."""
+    return session_until(tmp_path_factory.mktemp("every"), "70", "every planned shot is taken")
 
 
 def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
@@ -261,9 +258,7 @@ def test_a_capture_that_cannot_spare_shots_says_why_and_makes_nothing(
     path = plan_file(tmp_path, **changes)
     code, _, err = program("capture", path, *RIG, "--until", until, "--out", tmp_path / "s")
     assert code == (2 if "write a PSNR" in line else 1)
-    lines = [one for one in err.splitlines() if one.startswith("emmc-rig:")]
-    assert len(lines) == 1
-    assert line in lines[0]
+    assert line in one_line(err)
     assert sorted(one.name for one in tmp_path.iterdir()) == ["camera.yaml", "plan.yaml"]
 
 

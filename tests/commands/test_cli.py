@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from programs import one_line
 
 from emmc_rig.version import __version__
 
@@ -35,13 +36,6 @@ def camera_file(path, **changes):
     }
     path.write_text(yaml.safe_dump({**base, **changes}))
     return path
-
-
-def one_line(text):
-    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
-    assert len(lines) == 1, text
-    assert "Traceback" not in text
-    return lines[0]
 
 
 def leftovers(folder):

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from programs import one_line, wait_until
 from serial.tools import list_ports
 
 from drivers.apt import ACTUATORS, AptAxis, AptStage
@@ -50,20 +51,6 @@ def usb_port(device, product):
         description="FT232R",
         manufacturer="FTDI",
     )
-
-
-def one_line(text):
-    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
-    assert len(lines) == 1, text
-    assert "Traceback" not in text
-    return lines[0]
-
-
-def wait_until(condition):
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 @pytest.mark.parametrize("rig", ["simulated", "simulated:grbl", "simulated:apt"])

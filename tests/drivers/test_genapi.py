@@ -555,12 +555,9 @@ def damaged_xml(random):
 
 
 @pytest.mark.slow
-def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors(request):
-    cases = request.config.getoption("--fuzz-cases")
+def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors(fuzz):
     names = ("Width", "ExposureTime", "Gain", "PixelFormat", "AcquisitionStart", "BlackLevel")
 
-    @settings(max_examples=cases, deadline=None, database=None)
-    @given(SEEDS)
     def check(seed):
         random = Random(seed)
         try:
@@ -575,7 +572,7 @@ def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors(request):
                 with suppress(DriverError):
                     found.set(name, value)
 
-    check()
+    fuzz(check, SEEDS)
 
 
 PIECES = (
@@ -585,15 +582,11 @@ PIECES = (
 )
 
 
-def test_no_formula_makes_the_evaluator_fail_or_hang(request):
-    cases = request.config.getoption("--fuzz-cases")
-
-    @settings(max_examples=cases, deadline=None, database=None)
-    @given(SEEDS)
+def test_no_formula_makes_the_evaluator_fail_or_hang(fuzz):
     def check(seed):
         random = Random(seed)
         text = " ".join(random.choices(PIECES, k=random.randint(0, 40)))
         with suppress(FormulaError):
             Formula(text).value(lambda name: -3, random.random() < 0.5)
 
-    check()
+    fuzz(check, SEEDS)

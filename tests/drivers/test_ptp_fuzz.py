@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers import ptp_codec as codec
@@ -73,21 +72,6 @@ SAMPLES = (
     codec.encode_message(codec.Message(codec.Kind.RESPONSE, 0x2001, 5, (1, 2))),
     codec.encode_handles((1, 2, 3)),
 )
-
-
-@pytest.fixture
-def fuzz(request):
-    """Run a check on as many random cases as were asked for."""
-    cases = request.config.getoption("--fuzz-cases")
-
-    def run(check, *strategies):
-        slow = [HealthCheck.too_slow, HealthCheck.data_too_large]
-        chosen = settings(
-            max_examples=cases, deadline=None, suppress_health_check=slow, database=None
-        )
-        chosen(given(*strategies)(check))()
-
-    return run
 
 
 @contextmanager

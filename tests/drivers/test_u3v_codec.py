@@ -4,7 +4,6 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import CameraFormatError, DriverError
@@ -178,15 +177,11 @@ def damaged(random):
     return bytes(raw)
 
 
-def test_no_bytes_make_a_decoder_fail_outside_the_drivers_errors(request):
-    cases = request.config.getoption("--fuzz-cases")
-
-    @settings(max_examples=cases, deadline=None, database=None)
-    @given(st.integers(0, 1 << 62))
+def test_no_bytes_make_a_decoder_fail_outside_the_drivers_errors(fuzz):
     def check(seed):
         raw = damaged(Random(seed))
         for decode in DECODERS:
             with suppress(DriverError):
                 decode(raw)
 
-    check()
+    fuzz(check, st.integers(0, 1 << 62))

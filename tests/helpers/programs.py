@@ -3,6 +3,7 @@
 import io
 import subprocess
 import sys
+import time
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -29,6 +30,22 @@ def program(*arguments):
     with redirect_stdout(out), redirect_stderr(err):
         code = exit_code(*arguments)
     return code, out.getvalue(), err.getvalue()
+
+
+def one_line(text):
+    """Return the one line that the program said last, on standard error."""
+    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    return lines[0]
+
+
+def wait_until(condition, limit_s=20.0):
+    """Return when the condition holds, which another process or thread makes true."""
+    deadline_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from programs import exit_code
 from pydantic import ValidationError
+from test_live_alignment import BLACK, WHITE, frame_of
 
 from drivers.camera import CameraIdentity
 from drivers.errors import (
@@ -25,7 +26,6 @@ from drivers.errors import (
     RawFrameError,
     TransportTimeoutError,
 )
-from drivers.raw import RawFrame
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
@@ -39,21 +39,8 @@ from emmc_rig.live.server import served as serving
 from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 
-BLACK, WHITE = 256, 4095
 PATIENCE_S = 60.0
 TOKEN = "secret"
-
-
-def frame_of(mosaic, cfa="rggb"):
-    return RawFrame(
-        mosaic=mosaic.astype(np.uint16),
-        cfa=cfa,
-        black_level_dn=np.full(4, BLACK, np.float64),
-        white_level_dn=WHITE,
-        exposure_s=0.01,
-        original=b"",
-        sha256="",
-    )
 
 
 @pytest.mark.parametrize("cfa", ["rggb", "bggr", "grbg", "gbrg"])

@@ -25,7 +25,7 @@ WITHOUT_SHADOW = sorted(CAMERAS.keys() - set(WITH_SHADOW))
 BLACK, WHITE = 256, 4095
 
 
-def frame_of(mosaic, cfa="mono", white=WHITE):
+def frame_of(mosaic, cfa="rggb", white=WHITE):
     return RawFrame(
         mosaic=mosaic.astype(np.uint16),
         cfa=cfa,
@@ -150,7 +150,7 @@ def test_a_mask_that_moved_on_is_followed_and_one_that_went_is_not_shown():
     assert later.rotation_deg == pytest.approx(-0.2, abs=0.05)
     noise = np.random.default_rng(0).normal(2000, 200, SIZE)
     with pytest.raises(CalibrationError, match="not seen"):
-        gauge.measure(frame_of(noise, "rggb"))
+        gauge.measure(frame_of(noise))
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_nothing_is_said_of_the_mask_in_a_dark_picture_or_through_other_filters(
     with pytest.raises(CalibrationError, match="bggr"):
         gauge.measure(frame_of(np.full(SIZE, 2000), "bggr"))
     with pytest.raises(CalibrationError, match="72x96"):
-        gauge.measure(frame_of(np.full((8, 8), 2000), "rggb"))
+        gauge.measure(frame_of(np.full((8, 8), 2000)))
 
 
 def test_edges_in_all_directions_have_no_straightness():
@@ -176,7 +176,7 @@ def noisy(blur, seed, level=1500.0, sigma=40.0, shape=(120, 160)):
     scene = np.random.default_rng(7).random(shape)
     sharp = cv2.GaussianBlur(scene, (0, 0), blur) if blur else scene
     noise = np.random.default_rng(seed).normal(0, sigma, shape)
-    return frame_of(np.clip(BLACK + level * sharp + noise, 0, WHITE))
+    return frame_of(np.clip(BLACK + level * sharp + noise, 0, WHITE), "mono")
 
 
 def test_sharpness_is_that_of_the_scene_without_its_noise():
@@ -191,7 +191,7 @@ def test_sharpness_is_that_of_the_scene_without_its_noise():
 
 def test_dark_noise_has_no_sharpness_and_never_becomes_the_best():
     rng = np.random.default_rng(0)
-    dark = [frame_of(BLACK + rng.normal(0, 5, (120, 160)).round()) for _ in range(4)]
+    dark = [frame_of(BLACK + rng.normal(0, 5, (120, 160)).round(), "mono") for _ in range(4)]
     assert sharpness(dark[0], dark[1]) is None
     meter = FocusMeter()
     assert [meter.add(frame, number) for number, frame in enumerate(dark)] == [None] * 4

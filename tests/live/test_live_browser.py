@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from browsers import MARKS, complaints, open_browser
+from browsers import MARKS, complaints
 from test_live import PatientCamera
 
 from emmc_rig.acquisition.control import Control
@@ -30,12 +30,6 @@ pytestmark = MARKS
 TOKEN = "a-secret"
 PATIENCE_S = 60
 WIDTH = "return document.getElementById('viewer-picture').width"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp("profile")) as driver:
-        yield driver
 
 
 @pytest.fixture(scope="module")

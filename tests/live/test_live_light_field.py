@@ -245,8 +245,8 @@ def test_frames_that_do_not_fit_and_dark_ones_are_refused_in_words(one_shot):
     _, psi, _ = one_shot
     live = LiveLightField(designed_scale(psi), "tv")
     with pytest.raises(AppError, match="48x64"):
-        live.update(frame_of(np.full((16, 16), 900)))
-    dark = live.update(frame_of(np.full(SIZE, 256), "rggb"))
+        live.update(frame_of(np.full((16, 16), 900), "mono"))
+    dark = live.update(frame_of(np.full(SIZE, 256)))
     assert "dark" in dark["why"]
     assert dark["pictures"] is None
 

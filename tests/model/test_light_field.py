@@ -1,5 +1,6 @@
 """Light fields: reading, writing, shearing, refocusing and comparing, against theory."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -322,62 +323,52 @@ def test_an_opaque_alpha_channel_is_dropped_and_a_transparent_one_refused(tmp_pa
         load_views(tmp_path)
 
 
-def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(SceneError, match="nowhere: no such folder"):
-        load_views(tmp_path / "nowhere")
-
-
-def test_a_folder_without_views_says_how_they_are_named(tmp_path):
-    (tmp_path / "IMG_0001.png").write_bytes(b"")
-    with pytest.raises(SceneError, match=r"no views; they are named view_ROW_COL\.png"):
-        load_views(tmp_path)
-
-
-def test_missing_views_are_named(tmp_path):
-    save_views(tmp_path, random_light_field(3, 3, 6, 7))
-    (tmp_path / "view_0_2.png").unlink()
-    (tmp_path / "view_2_1.png").unlink()
-    with pytest.raises(SceneError) as error:
-        load_views(tmp_path)
-    assert "2 of 3x3 views missing: view_0_2.png, view_2_1.png" in message_of(error)
-
-
-def test_many_missing_views_are_counted_in_one_short_line(tmp_path):
-    save_views(tmp_path, random_light_field(2, 2, 6, 7))
-    (tmp_path / "view_1_1.png").rename(tmp_path / "view_8_8.png")
-    with pytest.raises(SceneError) as error:
-        load_views(tmp_path)
-    assert "77 of 9x9 views missing" in message_of(error)
-    assert "and 71 more" in message_of(error)
-
-
-def test_one_view_under_two_names_is_refused(tmp_path):
-    save_views(tmp_path, random_light_field(2, 2, 6, 7))
-    (tmp_path / "view_00_1.png").write_bytes((tmp_path / "view_0_1.png").read_bytes())
-    with pytest.raises(SceneError, match="are the same view"):
-        load_views(tmp_path)
-
-
-def test_a_file_that_is_no_picture_is_named(tmp_path):
-    save_views(tmp_path, random_light_field(2, 2, 6, 7))
-    (tmp_path / "view_1_0.png").write_text("a letter")
-    with pytest.raises(SceneError, match=r"view_1_0\.png: not a PNG picture"):
-        load_views(tmp_path)
-
-
-def test_a_picture_cut_short_is_named(tmp_path):
-    save_views(tmp_path, random_light_field(2, 2, 30, 40))
-    path = tmp_path / "view_0_1.png"
+def shortened(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(SceneError, match=r"view_0_1\.png: a PNG picture cut short"):
-        load_views(tmp_path)
 
 
-def test_views_of_different_sizes_are_refused_with_both_sizes(tmp_path):
-    save_views(tmp_path, random_light_field(2, 2, 6, 7))
-    write_png(tmp_path / "view_1_1.png", np.zeros((6, 8, 3), np.uint8))
-    with pytest.raises(SceneError, match=r"view_1_1\.png: 6x8 pixels, but .* has 6x7"):
-        load_views(tmp_path)
+@pytest.mark.parametrize(
+    ("views", "spoil", "complaint"),
+    [
+        (0, lambda folder: folder.rmdir(), r"views: no such folder"),
+        (0, lambda folder: (folder / "IMG_0001.png").touch(), r"named view_ROW_COL\.png"),
+        (
+            3,
+            lambda folder: [(folder / f"view_{place}.png").unlink() for place in ("0_2", "2_1")],
+            r"2 of 3x3 views missing: view_0_2\.png, view_2_1\.png",
+        ),
+        (
+            2,
+            lambda folder: (folder / "view_1_1.png").rename(folder / "view_8_8.png"),
+            r"77 of 9x9 views missing.* and 71 more",
+        ),
+        (
+            2,
+            lambda folder: shutil.copy(folder / "view_0_1.png", folder / "view_00_1.png"),
+            r"are the same view",
+        ),
+        (
+            2,
+            lambda folder: (folder / "view_1_0.png").write_text("a letter"),
+            r"view_1_0\.png: not a PNG picture",
+        ),
+        (2, lambda folder: shortened(folder / "view_0_1.png"), r"view_0_1\.png: a PNG picture cut"),
+        (
+            2,
+            lambda folder: write_png(folder / "view_1_1.png", np.zeros((30, 41, 3), np.uint8)),
+            r"view_1_1\.png: 30x41 pixels, but .* has 30x40",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_folder_of_views_is_named(tmp_path, views, spoil, complaint):
+    folder = tmp_path / "views"
+    folder.mkdir()
+    if views:
+        save_views(folder, random_light_field(views, views, 30, 40))
+    spoil(folder)
+    with pytest.raises(SceneError, match=complaint) as error:
+        load_views(folder)
+    assert message_of(error)
 
 
 def test_views_are_not_mixed_with_those_of_a_larger_grid(tmp_path):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from browsers import MARKS, open_browser
+from browsers import MARKS
 
 from emmc_rig.files.formats import Export
 from emmc_rig.pages.page import Head, Section, framed
@@ -15,12 +15,6 @@ WIDTHS_PX = 1600, 800, 390
 @pytest.fixture(scope="module")
 def light_field():
     return np.random.default_rng(0).random((3, 3, 24, 32, 3), dtype=np.float32)
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp("profile")) as driver:
-        yield driver
 
 
 def of_width(browser, path, width):

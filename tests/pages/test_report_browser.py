@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from browsers import MARKS, complaints, open_browser
+from browsers import MARKS, complaints
 
 from emmc_rig.pages.report import ReportContent, write_report
 
@@ -36,12 +36,6 @@ def content() -> ReportContent:
         metrics={"psnr_db": 30.0},
         stage_s={"reconstruction": 1.0},
     )
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp("profile")) as driver:
-        yield driver
 
 
 @pytest.fixture(scope="module")

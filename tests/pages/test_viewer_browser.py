@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browsers import MARKS, complaints, open_browser
+from browsers import MARKS, complaints
 
 from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
@@ -21,12 +21,6 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp("profile")) as driver:
-        yield driver
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from emmc_rig.study.chart import chart_points, measure
 from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings
 from emmc_rig.study.chart.charting import COLUMNS, run_chart
 from emmc_rig.study.chart.measure import ChartStudy, measured
-from emmc_rig.study.points import StudyStopped
 from emmc_rig.study.trial import Capture
 from reconstruction.methods import MethodSettings
 from simulators.scenes import render
@@ -74,27 +73,6 @@ def test_a_chart_holds_every_point(quick, tmp_path):
         assert (folder / "charts" / f"chart-{chart.key}.svg").stat().st_size > 5000
     front = json.loads((folder / METRICS).read_text())["fronts"]["rgbw-bayer-1shot, all scenes"]
     assert front
-
-
-@pytest.mark.slow
-def test_an_interrupted_chart_goes_on(quick, monkeypatch, tmp_path):
-    calls = []
-
-    def stopping(*point):
-        calls.append(point)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return measured(*point)
-
-    monkeypatch.setattr(measure, "measured", stopping)
-    with pytest.raises(StudyStopped, match="1 of 2 points are kept"):
-        run_chart(settings(), tmp_path / "out", Silent())
-    run_chart(settings(), tmp_path / "out", Silent())
-    assert len(calls) == 3
-    kept = (tmp_path / "out" / ChartStudy.journal).read_text()
-    run_chart(settings(), tmp_path / "out", Silent())
-    assert len(calls) == 3
-    assert (tmp_path / "out" / ChartStudy.journal).read_text() == kept
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from pages import Page
+from programs import one_line
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
@@ -180,13 +181,6 @@ def whole(scenes, tmp_path_factory):
 def run(run):
     """Run `emmc-rig tables` in this process: exit code, standard output and standard error."""
     return partial(run, "tables")
-
-
-def one_line(text):
-    lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
-    assert len(lines) == 1, text
-    assert "Traceback" not in text
-    return lines[0]
 
 
 def test_every_cell_is_one_row_of_the_csv(whole):
