@@ -87,8 +87,6 @@ def test_an_even_scene_behind_a_displaced_mask_shows_the_displacement():
     psi, true = build_imaging_matrix(camera, SIZE), build_imaging_matrix(moved, SIZE)
     found = displaced(psi, relief_in(psi, grey(true)))
     still = displaced(psi, relief_in(psi, grey(psi)))
-    assert found is not None
-    assert still is not None
     # Samples of 24 um.
     assert found.shift == pytest.approx((-0.2, 0.1), abs=0.03)
     assert found.size_px == pytest.approx(np.hypot(0.2, 0.1), abs=0.03)
@@ -106,7 +104,7 @@ def test_what_derivatives_elsewhere_would_show_as_well_is_no_displacement():
     sizes = []
     for frames in (psi.forward(scene), true.forward(scene)):
         found = displaced(psi, relief_in(psi, frames))
-        assert found is not None
+        assert found.size_px is not None
         sizes.append(found.size_px)
     assert sizes[0] < 0.22
     assert sizes[1] > 0.8
@@ -114,14 +112,14 @@ def test_what_derivatives_elsewhere_would_show_as_well_is_no_displacement():
 
 def test_a_psi_without_its_camera_gives_no_displacement(three):
     bare = ImagingMatrix(three.weights, three.colour, three.binning)
-    assert displaced(bare, relief_in(bare, grey(bare))) is None
+    assert displaced(bare, relief_in(bare, grey(bare))).size_px is None
 
 
 def test_a_coded_aperture_casts_no_shadow_that_could_tell():
     psi = build_imaging_matrix(find_camera("coded-aperture-random"), SIZE)
     found = relief_in(psi, grey(psi) * (1 + 0.1 * np.random.default_rng(0).random(SIZE)))
     assert np.isnan(shadow(found).strength).all()
-    assert displaced(psi, found) is None
+    assert displaced(psi, found).size_px is None
 
 
 def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
