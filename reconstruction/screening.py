@@ -49,6 +49,14 @@ BAD_STEPS = 3
 """Rounds at most: bad pixels found in one no longer widen their neighbours' range in the next."""
 LEAST = 1e-3
 """Of the mean prediction, by which readings are divided at least."""
+BESIDE, SAMPLED = 4, 1000
+"""Lines of the same colours on either side that a line is compared with, and pixels of it, about,
+that are looked at."""
+TILES = 1, 2, 3, 4, 6, 12
+"""Sides of tiles of colour filters."""
+UNVARYING = 0.25
+"""Range of a line's readings over that of the lines on either side, below which it is dead or
+stuck. Of good lines of group A and the built-in scenes (96x96) LEAST_CLEAN at least."""
 AS_LIGHT = 0.3
 """Square misfit of what a pixel reads too much, as light that the masks let through, over that as
 the same in every shot, below which it is a bright detail. On 64x80 middles of four real scenes,
@@ -61,7 +69,7 @@ class Screened:
     """frames, usable: (shot, pixel_y, pixel_x), for any method. notes: what was done, in words.
 
     dark, double: shots left out. gains: (shot,), by which the frames were divided. bad:
-    (pixel_y, pixel_x), pixels left out.
+    (pixel_y, pixel_x), single pixels left out, not those of dead lines.
     """
 
     frames: Array
@@ -96,6 +104,17 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
         frames = (frames / gains[:, None, None]).astype(frames.dtype)
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
         notes.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
+    rows, columns = dead_lines(flat, frames, usable)
+    if rows.any() or columns.any():
+        usable = usable & ~rows[:, None] & ~columns
+        notes.append(
+            "left out whole lines, whose readings hardly vary while those beside do: "
+            + " and ".join(
+                f"{name} {', '.join(map(str, np.flatnonzero(lines)))}"
+                for name, lines in (("rows", rows), ("columns", columns))
+                if lines.any()
+            )
+        )
     bad = bad_pixels(flat, frames, usable)
     if bad.any():
         usable = usable & ~bad
@@ -178,6 +197,39 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
     if len(kept) > 2:
         gains[kept] /= np.median(gains[kept])
     return gains
+
+
+def dead_lines(
+    flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the rows and the columns (both one-dimensional) that are dead or stuck in all shots.
+
+    Their readings hardly vary, while those of the lines on either side do. A line's neighbours are
+    as dead as its pixels, so that none of these seems to differ from those around.
+    """
+    seen, k = usable.any(axis=(1, 2)), flat.binning
+    colours = np.zeros(frames.shape) if flat.colour is None else flat.colour[:, ::k, ::k]
+    three = frames[seen], usable[seen], colours[seen]
+    return _unvarying(*three), _unvarying(*(one.swapaxes(1, 2) for one in three))
+
+
+def _unvarying(frames: Array, usable: NDArray[np.bool_], colours: NDArray) -> NDArray[np.bool_]:
+    """Return the rows (pixel_y,) of frames (shot, pixel_y, pixel_x) that vary in no shot."""
+    tile = next((n for n in TILES if np.array_equal(colours[:, n:], colours[:, :-n])), 1)
+    if not len(frames) or frames.shape[1] <= BESIDE * tile:
+        return np.zeros(frames.shape[1], bool)
+    # An odd step, so that every colour of a tile is looked at.
+    step = frames.shape[2] // SAMPLED | 1
+    frames, usable = frames[:, :, ::step], usable[:, :, ::step]
+    known = usable.any(axis=2)
+    read = np.where(usable | ~known[:, :, None], frames, np.nan)
+    low, high = np.nanquantile(read, (TAIL, 1 - TAIL), axis=2)
+    spread, reach = high - low, BESIDE * tile
+    padded = np.pad(spread, ((0, 0), (reach, reach)), mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=1)[..., ::tile]
+    before, after = around[..., :BESIDE], around[..., BESIDE + 1 :]
+    beside = np.minimum(np.median(before, axis=-1), np.median(after, axis=-1))
+    return (known & (spread < UNVARYING * beside)).all(axis=0)
 
 
 @row_kernel("values", 0)

@@ -14,6 +14,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.colour import unseen_colour
 from reconstruction.flat import flat_psi
 from reconstruction.result import Reconstruction
+from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.kept import compare_held_out, over_baselines
 from reconstruction.verdict.pixels import pixel_figures
@@ -42,6 +43,7 @@ class Evidence:
     share of the readings that only say that there was at least so much light, and are needed.
     gains: by which the shots' brightness was evened. over_flat, over_neighbours: see
     `over_baselines`. parallax: root mean square by which views differ from the middle one, over it.
+    blockiness: see there. steps: noise by quantisation, over the noise stated.
     """
 
     method: str
@@ -76,6 +78,8 @@ class Evidence:
     over_flat: float | None = None
     over_neighbours: float | None = None
     parallax: float | None = None
+    blockiness: float | None = None
+    steps: float | None = None
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -134,6 +138,7 @@ def gathered(
     residual = frames - psi.forward(result.light_field)
     left = None if moved is None else moved.unexplained(residual, noise_sigma**2, usable)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
+    step = quantised(frames, usable)
     return Evidence(
         method=result.method,
         status=result.status,
@@ -161,6 +166,8 @@ def gathered(
         gains=read.gains,
         parallax=_parallax(result.light_field),
         **over_baselines(psi, frames, residual, noise_sigma, usable, read.kept),
+        blockiness=blockiness(frames, usable),
+        steps=None if step is None else step / np.sqrt(12) / max(noise_sigma, 1e-12),
     )
 
 
