@@ -69,7 +69,7 @@ class Screened:
     """frames, usable: (shot, pixel_y, pixel_x), for any method. notes: what was done, in words.
 
     dark, double: shots left out. gains: (shot,), by which the frames were divided. bad:
-    (pixel_y, pixel_x), single pixels left out, not those of dead lines.
+    (pixel_y, pixel_x), single pixels left out; lines: those of dead rows and columns.
     """
 
     frames: Array
@@ -79,6 +79,7 @@ class Screened:
     double: tuple[int, ...]
     gains: Array
     bad: NDArray[np.bool_]
+    lines: NDArray[np.bool_]
 
 
 def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Screened:
@@ -105,14 +106,15 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
         notes.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
     rows, columns = dead_lines(flat, frames, usable)
-    if rows.any() or columns.any():
-        usable = usable & ~rows[:, None] & ~columns
+    lines = rows[:, None] | columns
+    if lines.any():
+        usable = usable & ~lines
         notes.append(
             "left out whole lines, whose readings hardly vary while those beside do: "
             + " and ".join(
-                f"{name} {', '.join(map(str, np.flatnonzero(lines)))}"
-                for name, lines in (("rows", rows), ("columns", columns))
-                if lines.any()
+                f"{name} {', '.join(map(str, np.flatnonzero(dead)))}"
+                for name, dead in (("rows", rows), ("columns", columns))
+                if dead.any()
             )
         )
     bad = bad_pixels(flat, frames, usable)
@@ -121,7 +123,7 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
         notes.append(
             f"left out {int(bad.sum())} pixels ({bad.mean():.2%}) that differ from their neighbours"
         )
-    return Screened(frames, usable, tuple(notes), dark, double, gains, bad)
+    return Screened(frames, usable, tuple(notes), dark, double, gains, bad, lines)
 
 
 def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
@@ -209,8 +211,9 @@ def dead_lines(
     """
     seen, k = usable.any(axis=(1, 2)), flat.binning
     colours = np.zeros(frames.shape) if flat.colour is None else flat.colour[:, ::k, ::k]
-    three = frames[seen], usable[seen], colours[seen]
-    return _unvarying(*three), _unvarying(*(one.swapaxes(1, 2) for one in three))
+    frames, usable, colours = frames[seen], usable[seen], colours[seen]
+    rows = _unvarying(frames, usable, colours)
+    return rows, _unvarying(frames.swapaxes(1, 2), usable.swapaxes(1, 2), colours.swapaxes(1, 2))
 
 
 def _unvarying(frames: Array, usable: NDArray[np.bool_], colours: NDArray) -> NDArray[np.bool_]:
@@ -226,10 +229,12 @@ def _unvarying(frames: Array, usable: NDArray[np.bool_], colours: NDArray) -> ND
     low, high = np.nanquantile(read, (TAIL, 1 - TAIL), axis=2)
     spread, reach = high - low, BESIDE * tile
     padded = np.pad(spread, ((0, 0), (reach, reach)), mode="reflect")
-    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=1)[..., ::tile]
+    around: Array = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=1)[
+        ..., ::tile
+    ]
     before, after = around[..., :BESIDE], around[..., BESIDE + 1 :]
     beside = np.minimum(np.median(before, axis=-1), np.median(after, axis=-1))
-    return (known & (spread < UNVARYING * beside)).all(axis=0)
+    return np.asarray((known & (spread < UNVARYING * beside)).all(axis=0))
 
 
 @row_kernel("values", 0)

@@ -39,17 +39,17 @@ def blockiness(frames: Array, usable: NDArray[np.bool_]) -> float | None:
     middle = tuple(slice(max(0, (n - MOST_PX) // 2), (n + MOST_PX) // 2) for n in frames.shape[1:])
     found = []
     for frame, good in zip(frames[:, *middle], usable[:, *middle], strict=True):
-        values = [_smallness(frame[y:, x:], good[y:, x:]) for y, x in np.ndindex(8, 8)]
-        if None not in values:
+        values = np.array([_smallness(frame[y:, x:], good[y:, x:]) for y, x in np.ndindex(8, 8)])
+        if np.isfinite(values).all():
             found.append(float(np.median(values) - np.min(values)))
     return max(found, default=None)
 
 
-def _smallness(frame: Array, good: NDArray[np.bool_]) -> float | None:
-    blocks, whole = (_blocks(one) for one in (frame, good))
-    blocks = blocks[whole.all(axis=(1, 2))].astype(np.float64)
+def _smallness(frame: Array, good: NDArray[np.bool_]) -> float:
+    """Return the mean of log(|coefficient| / its root mean square); NaN with few whole blocks."""
+    blocks = _blocks(frame)[_blocks(good).all(axis=(1, 2))].astype(np.float64)
     if len(blocks) < FEWEST_BLOCKS:
-        return None
+        return np.nan
     cosines = _cosines()
     sizes = np.abs(cosines @ blocks @ cosines.T).reshape(len(blocks), -1)[:, 1:]
     typical = np.sqrt(np.mean(np.square(sizes), axis=0)) + 1e-30
@@ -58,11 +58,10 @@ def _smallness(frame: Array, good: NDArray[np.bool_]) -> float | None:
 
 def _blocks(values: NDArray) -> NDArray:
     """Return the whole blocks of an array (y, x), (block, 8, 8)."""
-    rows, columns = (n // BLOCK_PX for n in values.shape)
-    cut = values[: rows * BLOCK_PX, : columns * BLOCK_PX]
-    return (
-        cut.reshape(rows, BLOCK_PX, columns, BLOCK_PX).swapaxes(1, 2).reshape(-1, BLOCK_PX, BLOCK_PX)
-    )
+    n = BLOCK_PX
+    rows, columns = (size // n for size in values.shape)
+    cut = values[: rows * n, : columns * n].reshape(rows, n, columns, n)
+    return cut.swapaxes(1, 2).reshape(-1, n, n)
 
 
 def quantised(frames: Array, usable: NDArray[np.bool_]) -> float | None:

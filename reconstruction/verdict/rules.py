@@ -168,12 +168,7 @@ class Verdict:
 
 def verdict_from(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
-    reasons = [
-        reason
-        for rule in RULES
-        for reason in rule(evidence)
-        if reason.level != "trust"
-    ]
+    reasons = [reason for rule in RULES for reason in rule(evidence) if reason.level != "trust"]
     return _of(evidence, reasons)
 
 
@@ -433,10 +428,11 @@ def _compression(e: Evidence) -> Iterator[Reason]:
             "store raw frames",
             BLOCKINESS.level(e.blockiness),
         )
-    if (e.steps or 0) > STEPS and e.steps * (e.noise_share or 0) ** 0.5 > STEPS_SHARE:
+    steps, share = e.steps or 0.0, e.noise_share or 0.0
+    if steps > STEPS and steps * share**0.5 > STEPS_SHARE:
         yield Reason(
-            f"the readings come in steps, which add {e.steps:.1f} times the noise stated",
-            e.steps,
+            f"the readings come in steps, which add {steps:.1f} times the noise stated",
+            steps,
             "store more bits, or raise the gain",
             "doubt",
         )
