@@ -224,14 +224,12 @@ def _unvarying(frames: Array, usable: NDArray[np.bool_], colours: NDArray) -> ND
     # An odd step, so that every colour of a tile is looked at.
     step = frames.shape[2] // SAMPLED | 1
     frames, usable = frames[:, :, ::step], usable[:, :, ::step]
-    known = usable.any(axis=2)
+    known = np.asarray(usable.any(axis=2))
     read = np.where(usable | ~known[:, :, None], frames, np.nan)
     low, high = np.nanquantile(read, (TAIL, 1 - TAIL), axis=2)
     spread, reach = high - low, BESIDE * tile
-    padded = np.pad(spread, ((0, 0), (reach, reach)), mode="reflect")
-    around: Array = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=1)[
-        ..., ::tile
-    ]
+    padded: Array = np.pad(spread, ((0, 0), (reach, reach)), mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=1)[..., ::tile]
     before, after = around[..., :BESIDE], around[..., BESIDE + 1 :]
     beside = np.minimum(np.median(before, axis=-1), np.median(after, axis=-1))
     return np.asarray((known & (spread < UNVARYING * beside)).all(axis=0))
