@@ -49,12 +49,12 @@ BAD_STEPS = 3
 """Rounds at most: bad pixels found in one no longer widen their neighbours' range in the next."""
 LEAST = 1e-3
 """Of the mean prediction, by which readings are divided at least."""
-BESIDE, SAMPLED = 4, 1000
+BESIDE, SAMPLED = 2, 1000
 """Lines of the same colours on either side that a line is compared with, and pixels of it, about,
 that are looked at."""
 TILES = 1, 2, 3, 4, 6, 12
 """Sides of tiles of colour filters."""
-UNVARYING = 0.25
+UNVARYING = 0.15
 """Range of a line's readings over that of the lines on either side, below which it is dead or
 stuck. Of good lines of group A and the built-in scenes (96x96) LEAST_CLEAN at least."""
 AS_LIGHT = 0.3

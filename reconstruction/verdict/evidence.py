@@ -43,7 +43,8 @@ class Evidence:
     share of the readings that only say that there was at least so much light, and are needed.
     gains: by which the shots' brightness was evened. over_flat, over_neighbours: see
     `over_baselines`. parallax: root mean square by which views differ from the middle one, over it.
-    blockiness: see there. steps: noise by quantisation, over the noise stated.
+    blockiness: see there. steps: noise by quantisation, over the noise stated. stated: standard
+    deviation that the method states, root mean square over the light field, over its mean.
     """
 
     method: str
@@ -80,6 +81,7 @@ class Evidence:
     parallax: float | None = None
     blockiness: float | None = None
     steps: float | None = None
+    stated: float | None = None
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -168,6 +170,7 @@ def gathered(
         **over_baselines(psi, frames, residual, noise_sigma, usable, read.kept),
         blockiness=blockiness(frames, usable),
         steps=None if step is None else step / np.sqrt(12) / max(noise_sigma, 1e-12),
+        stated=_stated(result),
     )
 
 
@@ -177,6 +180,13 @@ def _colour_error(
     unseen = unseen_colour(flat_psi(psi), frames, usable, found.picture)
     square = np.square(found.picture.mean(axis=-1, dtype=np.float64)).mean()
     return float(np.sqrt(unseen.mean() / max(square, 1e-12)))
+
+
+def _stated(result: Reconstruction) -> float | None:
+    if "sigma" not in result.maps:
+        return None
+    square = np.mean(np.square(result.maps["sigma"], dtype=np.float64))
+    return float(np.sqrt(square) / max(float(result.light_field.mean(dtype=np.float64)), 1e-12))
 
 
 def _parallax(light_field: Array) -> float | None:
