@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 BLOCK_PX = 8
-MOST_PX = 512
-"""Side of the middle that is transformed: a sixteenth of it shows JPEG quality 95."""
+MOST_PX = 256
+"""Side of the middle that is transformed."""
 FEWEST_BLOCKS = 20
 NOTHING = 1e-3
 """Of a coefficient's root mean square, below which all are alike: rounding of the readings."""

@@ -141,9 +141,8 @@ def test_the_black_level_is_off_by_a_share_of_the_mean_and_columns_are_dead(clea
     assert np.median(offset) == pytest.approx(0.06, rel=0.1)
     dead = made("dead-lines", 2).readings[:, :, 13:15]
     assert dead.max() < 0.1 * clean.readings[:, :, 13:15].mean()
-    np.testing.assert_array_equal(
-        made("dead-lines", 2).readings[:, :, 15:], clean.readings[:, :, 15:]
-    )
+    rest = made("dead-lines", 2).readings[:, :, 15:] - clean.readings[:, :, 15:]
+    assert np.abs(rest).mean() < 2 * clean.noise_sigma
 
 
 def test_readings_follow_a_power_of_the_light(clean):
