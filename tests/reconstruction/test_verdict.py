@@ -515,7 +515,7 @@ CAUSES = (
     ("blur", 0.81, "blurred by 0.9 pixels more", "whiteboards"),
     ("blur", -0.81, "sharper by 0.9 pixels", "whiteboards"),
     ("distance", 0.1, "10% further from", "--drift"),
-    ("vignetting", 0.3, "lose 30% more", "aperture"),
+    ("vignetting", 0.2, "lose 20% more", "aperture"),
     ("contrast", 0.1, "masks show at 95% of the strength", "--drift"),
 )
 
