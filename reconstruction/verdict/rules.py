@@ -102,8 +102,8 @@ at least in eight scenes, under a black level that is wrong 0.29 at most."""
 SURE = 3
 """Deviations by which a cause must differ from none to be named."""
 BLOCKINESS = Limits(0.45, float("inf"))
-"""See `blockiness`. In group A at 96x96 0.08 at most as they were read; by JPEG of quality 95, which
-costs 0.1 to 2.3 dB, 0.12 to 0.41, of quality 85, at 2.1 to 15 dB, 0.56 to 1.2."""
+"""See `blockiness`. In group A at 96x96 0.08 at most as they were read; by JPEG of quality 95, at a
+loss of 0.1 to 2.3 dB, 0.12 to 0.41; of quality 85, at 2.1 to 15 dB, 0.56 to 1.2."""
 STEPS, STEPS_SHARE = 2.0, 0.7
 """Noise by quantisation over the noise stated, and over the error of held-out readings."""
 AT_END = Limits(0.01, 1.0)
