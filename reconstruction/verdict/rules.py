@@ -90,10 +90,10 @@ most and lie 0.08 px off at most. Harm differs by scene: cells that stand 10 % t
 antinous 11.7 dB and buttercup 0.5, and this share is 0.7 and 0.3."""
 HARM, HARM_STATED, LEAST_EFFECT = 0.8, 0.38, 0.02
 """Relative change of the masks' modulation, above which a cause does harm: over the relative error
-of held-out readings, or over that which the method states for the light field, and alone. One shot
-whose black level is wrong by 3 or 6 % of the mean (96x96): six scenes of group A and two built in by
-adaptive-fast, 0.38 to 0.65 of what is stated where 3 dB are lost, 0.37 at most where 1 dB at most
-is; four scenes by tv, 0.85 and 1.8 of the held-out error where 3 dB are, 0.6 at most elsewhere."""
+of held-out readings, or over that which the method states for the light field, and alone. In one
+shot whose black level is wrong by 3 or 6 % of the mean (96x96), six scenes of group A and two built
+in by adaptive-fast, it is 0.38 to 0.65 of what is stated where 3 dB are lost, 0.37 at most where 1
+dB at most is; in four scenes by tv 0.85 and 1.8 of the held-out error, and elsewhere 0.6."""
 NAMED_LOST = 0.1
 """Relative change of the masks' modulation by a cause that is named, above which it is doubted by
 tv. Edges blurred by 0.4 pixels change 0.09 to 0.1, and cost 0.5 to 14 dB in eight scenes by
