@@ -2,8 +2,8 @@
 
 A result is broken when it lost more than 3 dB against the same capture without the fault, good when
 it lost 1 dB at most. It is poor when it had little to lose: without the fault it was within 5 dB of
-a picture of one even colour, or another method of those measured was 2 dB better. The first reason of what is
-flagged should name the fault, where there are words for it.
+a picture of one even colour, or another method of those measured was 2 dB better. The first reason
+of what is flagged should name the fault, where there are words for it.
 """
 
 from __future__ import annotations
