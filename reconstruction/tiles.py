@@ -313,8 +313,8 @@ def surveyed(
         found = screened(mosaic, read, use)
         left_out = tuple(sorted((*found.dark, *found.double)))
         gains = tuple(float(gain) for gain in found.gains)
-        # Single bad pixels are left to the blocks.
-        words = found.notes[: len(found.notes) - bool(found.bad.any())]
+        # Bad pixels and lines are left to the blocks.
+        words = found.notes[: len(found.notes) - bool(found.bad.any()) - bool(found.lines.any())]
         read, use = found.frames, found.usable
     halo, largest = REACH, 0.0
     patched = name == "adaptive" and takes_patches(mosaic, settings.adaptive)

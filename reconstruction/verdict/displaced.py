@@ -1,7 +1,14 @@
-"""Displacements of the masks' shadow, estimated from the readings and the camera's design.
+"""What may be wrong with masks and sensor: causes that compete on the same readings.
 
-The design predicts how the masks' modulation changes when they move or their distance differs. The
-residual of the readings beyond Psi's own modulation is regressed on these changes, tile by tile.
+Every cause changes the masks' modulation m of readings in its own way, to first order. The residual
+of the readings beyond Psi's own modulation is regressed on one cause at a time, beside a shift:
+
+    offset: - m / level, so that dark places lose more than bright ones;
+    gamma: (1 + m) log(1 + m), so that dark cells change otherwise than bright ones;
+    contrast: - m, whatever the level;
+    blur, distance, vignetting: as the masks' shadow changes by the camera's design.
+
+Where Psi has no design, blur is that of its own shadow. Displacements are also measured by tiles.
 """
 
 from __future__ import annotations
@@ -15,13 +22,26 @@ from numpy.typing import NDArray
 from emmc_rig.model.camera import Camera, build_imaging_matrix, camera_of
 from emmc_rig.model.errors import ModelError, SensingError
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.verdict.shadow import LEAST_RELIEF, Relief, relief_of, tiles
+from reconstruction.verdict.shadow import (
+    LEAST_RELIEF,
+    SMOOTH_PX,
+    Relief,
+    averaged,
+    channels,
+    relief_of,
+    tiles,
+)
 
 Array = NDArray[np.floating]
 STEP_PX = 0.25
 """Step of the finite differences."""
 DISTANCE_STEP = 0.1
 VIGNETTING_STEP = 0.3
+BLURS_PX = 0.5, 0.7, 1.0, 1.4, 2.0
+"""Deviations of the blurs that a Psi without a design is compared with."""
+DIMMEST = 0.05
+"""Level over the mean reading, and light through the masks over the level, that causes are divided
+by at least."""
 ALIKE = 0.5
 """Correlation below which the design says nothing about a Psi. 2x flags two broken results fewer of
 13."""
@@ -35,7 +55,7 @@ periodic masks."""
 
 @dataclass(frozen=True)
 class Change:
-    """One way in which the masks may be otherwise than Psi says, if it is the only one.
+    """One way in which masks or readings may be otherwise than Psi says, if it is the only one.
 
     value, deviation: of the change. gain: by how much it lowers the weighted squared residual.
     """
@@ -47,17 +67,27 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """By how much the masks' shadow lies off Psi's, in pixels.
+    """By how much the masks' shadow lies off Psi's, in pixels, and what else may be wrong.
 
     shift: (y, x), the weighted mean over tiles. size_px: their root mean square beyond what the
     deviations make, and beyond what derivatives elsewhere make of the same readings (a placebo:
-    what a wrong picture adds to both). changes: of `distance`, relative; `blur`, variance in px^2;
-    `vignetting`, what the outermost rays lose.
+    what a wrong picture adds to both). Both None without a design that determines them. changes: of
+    `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost rays lose;
+    `offset`, added to the readings, over their mean; `gamma`, power of the light less 1;
+    `contrast`, what the masks' modulation loses everywhere, relative.
     """
 
-    shift: tuple[float, float]
-    size_px: float
+    shift: tuple[float, float] | None
+    size_px: float | None
     changes: dict[str, Change]
+
+
+@dataclass(frozen=True, eq=False)
+class _Design:
+    """shifts: derivatives of the masks' shadow (y, x). changes: by name, for a change of 1."""
+
+    shifts: tuple[Array, Array]
+    changes: dict[str, Array]
 
 
 def _moved(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camera:
@@ -79,7 +109,7 @@ def _moved(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camer
     return camera.model_copy(update={"shots": tuple(shots), "masks": masks})
 
 
-def _design(psi: ImagingMatrix) -> Camera | None:
+def _camera(psi: ImagingMatrix) -> Camera | None:
     """Return the camera of a Psi, None where it is not known or has no mask near the sensor."""
     try:
         camera = camera_of(psi)
@@ -90,10 +120,34 @@ def _design(psi: ImagingMatrix) -> Camera | None:
     return camera if near and fits else None
 
 
-def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
-    """Return by how much the masks lie off; None where the design does not determine it."""
-    camera = _design(psi)
-    if camera is None:
+def displaced(psi: ImagingMatrix, found: Relief) -> Displaced:
+    """Return by how much the masks lie off, and every cause alone."""
+    design = _design(psi, found)
+    shifts = () if design is None else design.shifts
+    others = _blurs(psi, found) if design is None else design.changes.items()
+    changes: dict[str, Change] = {}
+    # One at a time: they are so correlated that together none could be estimated.
+    for name, cause in (*_of_readings(psi, found), *others):
+        fit = _regressed([cause, *shifts], found.seen - found.masks, found.weight)
+        if fit is not None and not (name in changes and changes[name].gain > fit.gain):
+            changes[name] = Change(float(fit.values[0]), float(fit.deviations[0]), fit.gain)
+    tiled = None if design is None else _tiled(found, *design.shifts)
+    if design is None or tiled is None:
+        return Displaced(None, None, changes)
+    placebo = [
+        one.beyond
+        for one in (_tiled(found, *moved) for moved in _decoys(*design.shifts, found.good))
+        if one is not None
+    ]
+    beyond = tiled.beyond - (float(np.mean(placebo)) if placebo else 0.0)
+    return Displaced(tiled.mean, float(np.sqrt(max(beyond, 0))), changes)
+
+
+def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
+    """Return how the masks' shadow changes by the camera's design; None where that is not Psi's."""
+    camera = _camera(psi)
+    good = found.good
+    if camera is None or not good.any():
         return None
     pixel_um = camera.sensor.sample_pitch_um * psi.binning
 
@@ -108,43 +162,42 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced | None:
         further = drawn(0, 0, 1 + DISTANCE_STEP)
     except ModelError:
         return None
-    good = found.good
     both = own[good], found.masks[good]
-    norms = [float(np.sqrt(np.mean(np.square(one)))) for one in both] if good.any() else [0.0]
+    norms = [float(np.sqrt(np.mean(np.square(one)))) for one in both]
     if min(norms) < LEAST_RELIEF or float(np.mean(both[0] * both[1])) < ALIKE * norms[0] * norms[1]:
         return None
-    shift_y, shift_x = (up - down) / (2 * STEP_PX), (right - left) / (2 * STEP_PX)
     darker = relief_of(_vignetted(psi, VIGNETTING_STEP), found.picture)[1]
-    changes = {
-        "distance": (further - own) / DISTANCE_STEP,
-        # A blur of variance s adds s/2 times the second derivatives.
-        "blur": (up + down + right + left - 4 * own) / (2 * STEP_PX**2),
-        "vignetting": (darker - found.masks) / VIGNETTING_STEP,
-    }
-    tiled = _tiled(found, shift_y, shift_x)
-    if tiled is None:
-        return None
-    placebo = [
-        one.beyond
-        for one in (_tiled(found, *moved) for moved in _decoys(shift_y, shift_x, good))
-        if one is not None
-    ]
-    beyond = tiled.beyond - (float(np.mean(placebo)) if placebo else 0.0)
-    # One at a time: they are so correlated that together none could be estimated.
-    beyond_psi = found.seen - found.masks
-    alone = {
-        name: _regressed([one, shift_y, shift_x], beyond_psi, found.weight)
-        for name, one in changes.items()
-    }
-    return Displaced(
-        tiled.mean,
-        float(np.sqrt(max(beyond, 0))),
+    return _Design(
+        ((up - down) / (2 * STEP_PX), (right - left) / (2 * STEP_PX)),
         {
-            name: Change(float(fit.values[0]), float(fit.deviations[0]), fit.gain)
-            for name, fit in alone.items()
-            if fit is not None
+            "distance": (further - own) / DISTANCE_STEP,
+            # A blur of variance s adds s/2 times the second derivatives.
+            "blur": (up + down + right + left - 4 * own) / (2 * STEP_PX**2),
+            "vignetting": (darker - found.masks) / VIGNETTING_STEP,
         },
     )
+
+
+def _of_readings(psi: ImagingMatrix, found: Relief) -> Iterator[tuple[str, Array]]:
+    """Yield what a wrong black level or a tone curve makes of the masks' modulation, by name."""
+    if float(np.mean(np.square(found.masks))) < LEAST_RELIEF**2:
+        return
+    passed = 1 + found.masks
+    mean = float(np.mean((found.level * passed)[found.good]))
+    yield "offset", -found.masks * mean / np.maximum(found.level, DIMMEST * mean)
+    power = passed * np.log(np.maximum(passed, DIMMEST))
+    around = averaged(power, found.good, channels(psi), SMOOTH_PX)
+    yield "gamma", power - passed * around
+    yield "contrast", -found.masks
+
+
+def _blurs(psi: ImagingMatrix, found: Relief) -> Iterator[tuple[str, Array]]:
+    """Yield what each of BLURS_PX changes of Psi's own shadow, over its variance."""
+    if float(np.mean(np.square(found.masks))) < LEAST_RELIEF**2:
+        return
+    for blur_px in BLURS_PX:
+        blurred = averaged(found.masks, found.good, channels(psi), blur_px)
+        yield "blur", (blurred - found.masks) / blur_px**2
 
 
 @dataclass(frozen=True, eq=False)

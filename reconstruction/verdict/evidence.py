@@ -14,6 +14,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.colour import unseen_colour
 from reconstruction.flat import flat_psi
 from reconstruction.result import Reconstruction
+from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.kept import compare_held_out, over_baselines
 from reconstruction.verdict.pixels import pixel_figures
@@ -42,6 +43,8 @@ class Evidence:
     share of the readings that only say that there was at least so much light, and are needed.
     gains: by which the shots' brightness was evened. over_flat, over_neighbours: see
     `over_baselines`. parallax: root mean square by which views differ from the middle one, over it.
+    blockiness: see there. steps: noise by quantisation, over the noise stated. stated: standard
+    deviation that the method states, root mean square over the light field, over its mean.
     """
 
     method: str
@@ -76,6 +79,9 @@ class Evidence:
     over_flat: float | None = None
     over_neighbours: float | None = None
     parallax: float | None = None
+    blockiness: float | None = None
+    steps: float | None = None
+    stated: float | None = None
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -134,6 +140,7 @@ def gathered(
     residual = frames - psi.forward(result.light_field)
     left = None if moved is None else moved.unexplained(residual, noise_sigma**2, usable)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
+    step = quantised(frames, usable)
     return Evidence(
         method=result.method,
         status=result.status,
@@ -143,8 +150,8 @@ def gathered(
         strengths=_plain(masks.strength),
         strength_errors=_plain(masks.error),
         other_strengths=tuple(_plain(row) for row in shots.masks),
-        displaced_px=None if off is None else off.size_px,
-        changes={} if off is None else {k: _plain(astuple(one)) for k, one in off.changes.items()},
+        displaced_px=off.size_px,
+        changes={name: _plain(astuple(one)) for name, one in off.changes.items()},
         brightness=_plain(shots.brightness),
         motion_px=None if moved is None else moved.size_px,
         motion_effect=None if moved is None else moved.effect,
@@ -161,6 +168,9 @@ def gathered(
         gains=read.gains,
         parallax=_parallax(result.light_field),
         **over_baselines(psi, frames, residual, noise_sigma, usable, read.kept),
+        blockiness=blockiness(frames, usable),
+        steps=None if step is None else step / np.sqrt(12) / max(noise_sigma, 1e-12),
+        stated=_stated(result),
     )
 
 
@@ -170,6 +180,13 @@ def _colour_error(
     unseen = unseen_colour(flat_psi(psi), frames, usable, found.picture)
     square = np.square(found.picture.mean(axis=-1, dtype=np.float64)).mean()
     return float(np.sqrt(unseen.mean() / max(square, 1e-12)))
+
+
+def _stated(result: Reconstruction) -> float | None:
+    if "sigma" not in result.maps:
+        return None
+    square = np.mean(np.square(result.maps["sigma"], dtype=np.float64))
+    return float(np.sqrt(square) / max(float(result.light_field.mean(dtype=np.float64)), 1e-12))
 
 
 def _parallax(light_field: Array) -> float | None:

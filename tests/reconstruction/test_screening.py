@@ -185,3 +185,22 @@ def test_a_glint_behind_masks_that_differ_is_no_hot_pixel():
     alone = one.usable.copy()
     alone[1:] = False
     assert bad_pixels(flat_psi(one.psi), frames, alone)[glint], "one shot cannot tell"
+
+
+@pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-mono", "conventional"])
+@pytest.mark.parametrize("response", [0.02, 0.0])
+def test_dead_lines_are_left_out_though_their_neighbours_are_dead_as_well(camera, response):
+    one = made("bad-pixels", 0, find_camera(camera))
+    assert not screen(one).lines.any()
+    stuck = 0.3 * float(one.readings.mean())
+    frames, dead = one.readings.copy(), np.zeros(SIZE, bool)
+    dead[:, 20:22] = dead[31] = True
+    frames[:, dead] = stuck + response * frames[:, dead]
+    found = screened(one.psi, frames, one.usable)
+    np.testing.assert_array_equal(found.lines, dead)
+    assert not found.usable[:, dead].any()
+    assert any("rows 31 and columns 20, 21" in note for note in found.notes)
+    # Said to be unusable they are not looked for, nor are the lines beside them blamed.
+    listed = screened(one.psi, frames, one.usable & ~dead)
+    assert not listed.lines.any()
+    np.testing.assert_array_equal(listed.usable, found.usable)

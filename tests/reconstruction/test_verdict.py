@@ -3,8 +3,10 @@
 import dataclasses
 import json
 
+import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
 import emmc_rig as emmc
@@ -22,6 +24,7 @@ from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction, Status
 from reconstruction.screening import screened
 from reconstruction.tv import TVSettings
+from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
 from reconstruction.verdict.kept import (
@@ -87,8 +90,7 @@ def test_an_even_scene_behind_a_displaced_mask_shows_the_displacement():
     psi, true = build_imaging_matrix(camera, SIZE), build_imaging_matrix(moved, SIZE)
     found = displaced(psi, relief_in(psi, grey(true)))
     still = displaced(psi, relief_in(psi, grey(psi)))
-    assert found is not None
-    assert still is not None
+    assert still.size_px is not None
     # Samples of 24 um.
     assert found.shift == pytest.approx((-0.2, 0.1), abs=0.03)
     assert found.size_px == pytest.approx(np.hypot(0.2, 0.1), abs=0.03)
@@ -106,7 +108,7 @@ def test_what_derivatives_elsewhere_would_show_as_well_is_no_displacement():
     sizes = []
     for frames in (psi.forward(scene), true.forward(scene)):
         found = displaced(psi, relief_in(psi, frames))
-        assert found is not None
+        assert found.size_px is not None
         sizes.append(found.size_px)
     assert sizes[0] < 0.22
     assert sizes[1] > 0.8
@@ -114,14 +116,88 @@ def test_what_derivatives_elsewhere_would_show_as_well_is_no_displacement():
 
 def test_a_psi_without_its_camera_gives_no_displacement(three):
     bare = ImagingMatrix(three.weights, three.colour, three.binning)
-    assert displaced(bare, relief_in(bare, grey(bare))) is None
+    assert displaced(bare, relief_in(bare, grey(bare))).size_px is None
+
+
+def spoilt(frames, fault, size):
+    """Return frames with a fault of the readings; numpy and a JPEG coder alone."""
+    if fault == "offset":
+        return frames + size * frames.mean()
+    if fault == "gamma":
+        return frames.max() * (frames / frames.max()) ** (1 + size)
+    assert fault == "jpeg"
+    peak = frames.max()
+    codes = np.clip(frames / peak * 255, 0, 255).round().astype(np.uint8)
+    packed = [cv2.imencode(".jpg", one, [cv2.IMWRITE_JPEG_QUALITY, size])[1] for one in codes]
+    read = [cv2.imdecode(one, cv2.IMREAD_GRAYSCALE) for one in packed]
+    return np.asarray(read, np.float32) / 255 * peak
+
+
+@pytest.fixture(scope="module")
+def one_shot():
+    """Psi of one shot and its readings of a scene, with noise and without a fault."""
+    psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), SIZE)
+    frames = psi.forward(np.asarray(open_scene("near-planar", size=SIZE)))
+    noise = 0.003 * np.random.default_rng(0).standard_normal(frames.shape, np.float32)
+    return psi, np.maximum(frames + noise, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "size", "found"),
+    [
+        # Over the mean of what was read, which contains it.
+        ("offset", 0.06, 0.06 / 1.06),
+        ("offset", -0.06, -0.06 / 0.94),
+        ("gamma", -0.1, -0.1),
+        ("gamma", 0.2, 0.2),
+    ],
+)
+def test_the_cause_that_explains_most_is_the_one_at_work_and_has_its_size(
+    one_shot, fault, size, found
+):
+    psi, frames = one_shot
+    changes = displaced(psi, relief_in(psi, spoilt(frames, fault, size))).changes
+    # Contrast names no cause: in a small frame it explains as much as an offset.
+    likely = max(set(changes) - {"contrast"}, key=lambda name: changes[name].gain)
+    assert likely == fault
+    assert changes[fault].value == pytest.approx(found, rel=0.2)
+    clean = displaced(psi, relief_in(psi, frames)).changes
+    assert abs(clean[fault].value) < 3 * clean[fault].deviation + 0.005
+
+
+@pytest.mark.parametrize("blur_px", [0.6, 0.9])
+def test_a_blur_is_measured_by_a_psi_without_its_camera(blur_px):
+    camera = find_camera("rgbw-mono")
+    psi = dataclasses.replace(build_imaging_matrix(camera, SIZE), camera_json="")
+    blurred = gaussian_filter(psi.weights, (0, 0, 0, blur_px, 0, blur_px))
+    true = dataclasses.replace(psi, weights=blurred)
+    scene = np.asarray(open_scene("near-planar", size=SIZE))
+    changes = displaced(psi, relief_in(psi, true.forward(scene))).changes
+    assert max(changes, key=lambda name: changes[name].gain) == "blur"
+    assert changes["blur"].value ** 0.5 == pytest.approx(blur_px, rel=0.12)
+
+
+def test_jpeg_is_seen_by_its_blocks_and_coarse_steps_by_their_repetition(one_shot):
+    _, frames = one_shot
+
+    def blocky(read):
+        return blockiness(read, np.ones(read.shape, bool)) or 0.0
+
+    usable = np.ones(frames.shape, bool)
+    assert 0 < blocky(frames) < 0.1
+    assert blocky(spoilt(frames, "jpeg", 85)) > 0.44
+    # The blocks of a cut frame begin elsewhere.
+    assert blocky(spoilt(frames, "jpeg", 70)[:, 3:, 5:]) > 0.44
+    assert blockiness(frames[:, :16, :24], usable[:, :16, :24]) is None
+    assert quantised(frames, usable) is None
+    assert quantised(np.round(frames / 0.05) * 0.05, usable) == pytest.approx(0.05)
 
 
 def test_a_coded_aperture_casts_no_shadow_that_could_tell():
     psi = build_imaging_matrix(find_camera("coded-aperture-random"), SIZE)
     found = relief_in(psi, grey(psi) * (1 + 0.1 * np.random.default_rng(0).random(SIZE)))
     assert np.isnan(shadow(found).strength).all()
-    assert displaced(psi, found) is None
+    assert displaced(psi, found).size_px is None
 
 
 def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
@@ -430,6 +506,56 @@ def test_noise_is_doubted_where_it_leaves_disparities_open(three):
     for noise, decided, level in ((0.1, 0.5, "doubt"), (0.1, 0.9, "trust"), (0.03, 0.5, "trust")):
         one = dataclasses.replace(clean, noise=noise, parameters={"decided": decided})
         assert verdict_from(one).level == level
+
+
+CAUSES = (
+    ("offset", 0.06, "black level seems 6.0% of the mean reading too low", "take darks"),
+    ("offset", -0.06, "black level seems 6.0% of the mean reading too high", "take darks"),
+    ("gamma", -0.1, "to the power of 0.90", "without gamma"),
+    ("blur", 0.81, "blurred by 0.9 pixels more", "whiteboards"),
+    ("blur", -0.81, "sharper by 0.9 pixels", "whiteboards"),
+    ("distance", 0.1, "10% further from", "--drift"),
+    ("vignetting", 0.2, "lose 20% more", "aperture"),
+    ("contrast", 0.03, "masks show at 95% of the strength", "--drift"),
+)
+
+
+@pytest.mark.parametrize(("cause", "value", "words", "remedy"), CAUSES)
+def test_causes_are_named_with_size_and_remedy_where_they_do_harm(
+    three, cause, value, words, remedy
+):
+    clean = dataclasses.replace(clean_evidence(three), strengths=(0.95,) * 3, noise=0.01)
+    changes = {"contrast": (0.03, 0.001, 0.5), "blur": (0.1, 0.01, 0.4), cause: (value, 0.001, 1.0)}
+    found = dataclasses.replace(clean, changes=changes, noise_share=0.25, explained=None)
+    verdict = verdict_from(found)
+    assert verdict.level == "doubt"
+    assert words in verdict.reasons[0].what
+    assert remedy in verdict.reasons[0].remedy
+    # Where the light field errs by far more, it is no matter; gamma is, as it is wrong brightness.
+    harmless = verdict_from(dataclasses.replace(found, noise_share=0.01))
+    assert harmless.level == ("trust" if cause not in ("gamma", "vignetting") else "doubt")
+    # So is a blur or a distance that changes much of the masks' modulation.
+    much = dict(changes, contrast=(0.05, 0.001, 0.5)) if cause != "contrast" else changes
+    strong = verdict_from(dataclasses.replace(found, changes=much, noise_share=0.01))
+    assert strong.level == ("trust" if cause in ("offset", "contrast") else "doubt")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "size", "words"),
+    [
+        ("offset", 0.2, "black level seems 1"),
+        ("gamma", -0.1, "to the power of 0.9"),
+        ("jpeg", 85, "JPEG"),
+    ],
+)
+def test_faults_of_the_readings_are_the_first_reason(one_shot, fault, size, words):
+    psi, frames = one_shot
+    spoiled = spoilt(frames, fault, size).astype(np.float32)
+    for readings, level in ((frames, "trust"), (spoiled, "doubt")):
+        _, verdict = reconstruct_judged("adaptive-fast", psi, readings, 0.003)
+        assert verdict.level == level, verdict.words
+    assert words in verdict.reasons[0].what
 
 
 @pytest.mark.parametrize(("name", "share"), [("unusable", 0.5), ("short", 0.05)])

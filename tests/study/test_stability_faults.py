@@ -22,6 +22,7 @@ MISPLACED = ("mask-shift", "mask-rotation", "mask-distance-error", "mask-scale",
 FAINT = {
     **dict.fromkeys(MISPLACED, 1e-4), "vignetting": 1e-4, "flicker": 1e-4, "scene-motion": 1e-4,
     "camera-motion": 1e-4, "specularity": 1e-3, "read-noise": 1e-3,
+    "black-level": 1e-4, "gamma": 1e-4,
 }  # fmt: skip
 
 
@@ -133,6 +134,33 @@ def test_bad_pixels_are_bad_in_every_shot_and_known_only_when_masked(clean):
     assert bad.mean() == pytest.approx(0.2, abs=0.03)
     off = np.abs(silent.readings - clean.readings).mean(axis=0)
     assert np.median(off[bad]) > 20 * np.median(off[~bad])
+
+
+def test_the_black_level_is_off_by_a_share_of_the_mean_and_columns_are_dead(clean):
+    offset = (made("black-level", 6).readings - clean.readings) / clean.readings.mean(axis=None)
+    assert np.median(offset) == pytest.approx(0.06, rel=0.1)
+    dead = made("dead-lines", 2).readings[:, :, 13:15]
+    assert dead.max() < 0.1 * clean.readings[:, :, 13:15].mean()
+    rest = made("dead-lines", 2).readings[:, :, 15:] - clean.readings[:, :, 15:]
+    assert np.abs(rest).mean() < 2 * clean.noise_sigma
+
+
+def test_readings_follow_a_power_of_the_light(clean):
+    light = np.maximum(clean.psi.forward(clean.truth), 1e-6)
+    bright = light > 0.2 * light.max()
+    read = np.log(np.maximum(made("gamma", 20).readings, 1e-6))
+    slope, _ = np.polyfit(np.log(light[bright]), read[bright], 1)
+    assert slope == pytest.approx(0.8, rel=0.03)
+
+
+def test_jpeg_of_a_lower_quality_is_further_off(clean):
+    off = [
+        np.sqrt(np.mean(np.square(made("jpeg", quality).readings - clean.readings)))
+        for quality in (100, 85, 50)
+    ]
+    step = clean.readings.max() / 255
+    assert off[0] < step
+    assert off[2] > 1.5 * off[1] > 1.5 * 3 * step
 
 
 def test_the_lamp_flickers_between_shots_alone(clean):

@@ -1,9 +1,11 @@
-"""Faults of sensor and light: photons, read noise, saturation, bad pixels."""
+"""Faults of sensor and light: photons, saturation, bad pixels, black level, tone curve, JPEG."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from emmc_rig.study.trial import Array, Capture, Trial, trial_of
 from simulators.flaws import SensorFlaws
 
 DEAD_RESPONSE = 0.02
+CODES = 255
 BLACK_DEVIATIONS = 6
 HEADROOM = 1.1
 """Of the white level over a white reading, for its noise."""
@@ -107,6 +110,40 @@ def _bad(capture: Capture, percent: float, listed: bool) -> Trial:
     return trial_of(capture, change_clean=spoilt, unusable=bad if listed else None)
 
 
+def black_level(capture: Capture, percent: float) -> Trial:
+    """The black level subtracted is too low, by a share of the mean reading."""
+    return trial_of(capture, change_clean=lambda clean: clean + percent / 100 * clean.mean())
+
+
+def gamma(capture: Capture, percent: float) -> Trial:
+    """The readings follow a power of the light, less than 1 by a share."""
+
+    def bent(clean: Array) -> Array:
+        peak = clean.max()
+        return peak * (np.maximum(clean, 0) / peak) ** (1 - percent / 100)
+
+    return trial_of(capture, change_clean=bent)
+
+
+def dead_lines(capture: Capture, count: float) -> Trial:
+    """Columns side by side, from a third of the width on, are dead and not marked."""
+    dead = np.zeros(capture.psi().frames_shape[2], np.bool_)
+    dead[len(dead) // 3 :][: int(count)] = True
+    return trial_of(capture, change_clean=lambda clean: np.where(dead, DEAD_RESPONSE, 1) * clean)
+
+
+def jpeg(capture: Capture, quality: float) -> Trial:
+    """Frames of 8 bits are stored as JPEG of some quality."""
+    trial = trial_of(capture)
+    peak = float(trial.readings.max())
+    stored = []
+    for frame in trial.readings:
+        codes = np.clip(frame / peak * CODES, 0, CODES).round().astype(np.uint8)
+        _, packed = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
+        stored.append(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE))
+    return replace(trial, readings=np.asarray(stored, np.float32) / CODES * peak)
+
+
 FAULTS = (
     Fault(
         "exposure", "Exposure", "electrons at white",
@@ -133,5 +170,25 @@ FAULTS = (
         "masked-pixels", "Bad pixels, masked", "% of pixels",
         (0, 1, 3, 10, 30, 60, 90), (0, 10, 40, 80),
         SENSOR, masked_pixels,
+    ),
+    Fault(
+        "dead-lines", "Dead columns, not marked", "columns",
+        (0, 1, 2, 4, 8), (0, 2, 4),
+        SENSOR, dead_lines, repairable=True,
+    ),
+    Fault(
+        "black-level", "Black level too low", "% of the mean reading",
+        (0, 1, 2, 4, 6, 10, 20), (0, 6, 20),
+        SENSOR, black_level, repairable=True,
+    ),
+    Fault(
+        "gamma", "Power of the light less than 1", "%",
+        (0, 2, 5, 10, 20, 50), (0, 10, 50),
+        SENSOR, gamma, repairable=True,
+    ),
+    Fault(
+        "jpeg", "Quality of JPEG", "of 100",
+        (100, 95, 90, 85, 70, 50), (100, 85, 50),
+        SENSOR, jpeg,
     ),
 )  # fmt: skip
