@@ -49,6 +49,10 @@ VIGNETTING = Limits(0.2, 0.5)
 """Light that the outermost rays lose beyond what Psi says, as a share."""
 FLICKER = Limits(0.05, 0.15)
 """Difference of a shot's brightness from the shots' mean, over that."""
+MOTION = Limits(1.0, 5.0)
+"""Ratio by which shots saw different scenes; refused only where nobody knows which shots, as that
+cannot be mended: where they are 7 dB or more worse for it, it is 2 to 13 (built-in scenes, 64x80,
+two and three shots, `tv`)."""
 OFF = Limits(0.0215, 0.05)
 """Share of readings that differ from all their neighbours. In clean frames of fine soil and leaves
 it is up to 2 %."""
@@ -208,7 +212,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         "steady the lamp, or normalise the frames by a reference",
         FLICKER.level(apart[worst]),
     )
-    if e.motion is not None and e.motion > 1 and e.moved_at and e.moved_px:
+    if e.motion is not None and e.motion > MOTION.doubt and e.moved_at and e.moved_px:
         shot, y, x = e.moved_at
         what, remedy = "shots saw different scenes", "hold scene and camera still"
         if shot is not None:
@@ -219,7 +223,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             f"{what} in {e.moved_px[0]}x{e.moved_px[1]} pixels about row {y}, column {x}{left_out}",
             e.motion,
             remedy,
-            "doubt",
+            MOTION.level(e.motion) if shot is None else "doubt",
         )
 
 

@@ -29,6 +29,8 @@ CLEARLY = 2.0
 """Times the square that any other shot leaves, from which on a shot is the one that differs."""
 NEAR_PX, BAD = 5, 20.0
 """Side of the window, and times the median of what is left there, that make a bad pixel."""
+UNSURE = 0.005
+"""Share of the mean reading that no Psi and no solver is right to."""
 LEAST_STRENGTH = 0.65
 """Of the masks, below which Psi is another camera's, and all shots differ by that."""
 
@@ -151,9 +153,10 @@ def _differences(
     apart = weight * np.square(brighter - np.average(brighter, axis=0, weights=weight))
     alone = np.square(left - expected * brighter)
     # A light field of more unknowns than readings follows noise, too, and leaves less.
-    noise = max(min(float(alone.mean()), noise_sigma**2), 1e-20)
+    noise = min(float(alone.mean()), noise_sigma**2)
+    least = max(noise, (UNSURE * float(expected[good].mean())) ** 2, 1e-20)
     share = 1 / (4 * np.pi * SPOT_PX**2)
-    return apart, share * alone, share * noise
+    return apart, share * alone, share * least
 
 
 def _differing(squares: NDArray[np.floating], shots: NDArray[np.intp]) -> int | None:
