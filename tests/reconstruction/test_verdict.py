@@ -23,6 +23,7 @@ from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction, Status
 from reconstruction.screening import screened
 from reconstruction.tv import TVSettings, reconstruct_tv
+from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
 from reconstruction.verdict.kept import (
@@ -595,6 +596,23 @@ def test_a_shot_is_left_out_where_something_moved_in_it_and_the_place_is_doubted
     assert after > before + 2
     assert after > without - 2
     assert any("saw another scene" in note for note in result.screening)
+    missed = missed_readings(three, result.light_field, frames, 0.003, everywhere(three))
+    assert missed[12:32, 22:48].mean() > 5 > missed[:, :10].mean()
+
+
+def test_the_place_of_a_block_where_something_moved_is_that_of_the_whole(three):
+    still = clean_evidence(three)
+    moved = dataclasses.replace(still, motion=3.0, moved_at=(1, 5, 6), moved_px=(9, 8))
+    verdict = judged_together(
+        [
+            JudgedBlock(verdict_from(one), row, 60, 100)
+            for one, row in ((moved, 50), (still, 0), (still, 0))
+        ]
+    )
+    assert verdict.level == "doubt"
+    assert "shot 2 saw another scene than the others in 9x8 pixels about row 55, column 66" in (
+        verdict.words
+    )
 
 
 def test_of_two_shots_either_may_have_seen_what_moved():
