@@ -148,8 +148,9 @@ def _differences(
     left[np.abs(left) > BAD * np.maximum(around, noise_sigma)] = 0
     weight = np.maximum(_spots(np.square(expected)), 1e-12)
     brighter = _spots(expected * left) / weight
-    # A lamp that flickers is nothing that moves.
-    brighter -= np.average(brighter, axis=(1, 2), weights=weight, keepdims=True)
+    # A lamp that flickers is nothing that moves, and what moves is less than half of the picture.
+    lamp = [np.median(one[of_shot]) for one, of_shot in zip(brighter, good, strict=True)]
+    brighter -= np.array(lamp, np.float32)[:, None, None]
     apart = weight * np.square(brighter - np.average(brighter, axis=0, weights=weight))
     alone = np.square(left - expected * brighter)
     # A light field of more unknowns than readings follows noise, too, and leaves less.
