@@ -36,7 +36,7 @@ from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
 from reconstruction.verdict.shadow import relief, shadow
-from reconstruction.verdict.shots import _differences, compared, motion
+from reconstruction.verdict.shots import _differences, _differing, compared, motion
 
 SIZE = (48, 64)
 SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")
@@ -530,8 +530,8 @@ def test_a_spot_that_one_shot_cannot_see_does_not_pass_for_motion(three):
 
 
 @pytest.mark.parametrize("shot", [0, 2])
-@pytest.mark.parametrize("side", [6, 20])
-def test_what_changes_in_one_shot_is_named_with_shot_and_place_at_any_size(three, shot, side):
+@pytest.mark.parametrize(("side", "brighter"), [(6, 0.15), (20, 0.15), (20, 0.025)])
+def test_what_changes_in_one_shot_is_named_with_shot_and_place(three, shot, side, brighter):
     rng = np.random.default_rng(0)
     scene = np.full(three.light_field_shape, 0.5, np.float32)
     noise = 0.003 * rng.standard_normal(three.frames_shape)
@@ -542,7 +542,7 @@ def test_what_changes_in_one_shot_is_named_with_shot_and_place_at_any_size(three
     assert found.ratio < 1
     assert not found.moved.any()
     frames = still.copy()
-    frames[shot, 15 : 15 + side, 30 : 30 + side] *= 1.15
+    frames[shot, 15 : 15 + side, 30 : 30 + side] *= 1 + brighter
     found = motion_in(three, frames, 0.003, light_field=scene)
     assert found.ratio > 1
     assert found.shot == shot
@@ -560,8 +560,8 @@ def test_noise_differs_between_shots_by_as_much_as_is_expected_of_it(three):
     rng = np.random.default_rng(1)
     residual = rng.standard_normal(three.frames_shape).astype(np.float32)
     apart, expected, least = _differences(relief_in(three, grey(three)), residual, np.arange(3), 1)
-    # Of three shots' mean each differs by two thirds of its square.
-    assert apart.mean() / expected.mean() == pytest.approx(2 / 3, rel=0.1)
+    # From the mean of three each differs by two thirds of its square; spots take some of the rest.
+    assert 2 / 3 < apart.mean() / expected.mean() < 1.25 * 2 / 3
     assert least == pytest.approx(expected.mean())
 
 
@@ -622,6 +622,9 @@ def test_of_two_shots_either_may_have_seen_what_moved():
     assert verdict.level in ("doubt", "do not use")
     assert "shots saw different scenes in " in verdict.words
     assert "without-shots" not in verdict.words
+    assert _differing(np.array([9.0, 1.0]), np.arange(2)) is None
+    assert _differing(np.array([1.0, 9.0, 1.0]), np.arange(3)) == 1
+    assert _differing(np.array([8.0, 9.0, 1.0]), np.arange(3)) is None
     assert not result.screening
 
 
