@@ -36,6 +36,10 @@ def reconstruct(
     truth: Annotated[
         str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
     ] = None,
+    without_shots: Annotated[
+        list[int] | None,
+        typer.Option("--without-shots", help="leave out a shot, such as 2; may repeat"),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option("--workers", min=1, help="processes that share blocks and captures"),
@@ -97,7 +101,7 @@ def reconstruct(
         for place, outcome in reconstruct_captures(
             places, workers, cluster, limit, lambda step: bars.advance(step),
             method=method, psi_path=psi, dictionary_spec=dictionary, settings=chosen, truth=truth,
-            chosen=why, as_zarr=as_zarr,
+            chosen=why, as_zarr=as_zarr, without_shots=without_shots or (),
         ):  # fmt: skip
             if isinstance(outcome, Exception) and len(places) == 1:
                 raise outcome

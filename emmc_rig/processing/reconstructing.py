@@ -202,6 +202,7 @@ def reconstruct_folder(
     chosen: str | None = None,
     pool: Pool | None = None,
     as_zarr: bool = False,
+    without_shots: Sequence[int] = (),
 ) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
 
@@ -210,10 +211,12 @@ def reconstruct_folder(
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
     as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
+    without_shots: counted from 1, that are not used.
     """
     find_method(method)
     settings = settings or MethodSettings()
     frames, psi_path = stored_frames(folder, out, psi_path)
+    frames = _without(frames, without_shots)
     saved = open_psi(psi_path)
     in_memory = is_one_block(saved.size, settings) and not as_zarr
     further: dict[str, Any] = {"chosen": chosen}
@@ -434,6 +437,22 @@ def stored_frames(folder: Path, out: Path, psi_path: Path | None) -> tuple[Frame
         measured.save(out / PSI)
         return frames, psi_path or out / PSI
     return read_frames(folder), psi_path or psi_beside(folder)
+
+
+def _without(frames: Frames, shots: Sequence[int]) -> Frames:
+    """Return frames of which some shots, counted from 1, are not used.
+
+    Raises AppError where there is no such shot, or none would be left.
+    """
+    count = len(frames.readings)
+    wrong = [shot for shot in shots if not 1 <= shot <= count]
+    if wrong or len(set(shots)) == count:
+        raise AppError(
+            f"--without-shots {' '.join(map(str, wrong or shots))}: the capture has shots 1 to "
+            f"{count}, and one of them must be left"
+        )
+    out = np.isin(np.arange(1, count + 1), shots)[:, None, None]
+    return replace(frames, readings=np.where(out, 0, frames.readings), usable=frames.usable & ~out)
 
 
 def load_settings(path: Path | None) -> MethodSettings:

@@ -77,11 +77,10 @@ def _places(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
     e = [(block, block.verdict.evidence) for block in blocks]
     block, one = max(e, key=lambda each: each[1].hole_px)
     found["hole_at"] = _at(block, one.hole_at)
-    moved = [(one.motion_effect, block, one) for block, one in e if one.motion_effect is not None]
+    moved = [(one.motion, block, one) for block, one in e if one.motion is not None]
     if moved:
-        effect, block, one = max(moved, key=lambda each: each[0])
-        found |= {"motion_px": one.motion_px, "motion_effect": effect}
-        found |= {"motion_left": one.motion_left}
+        ratio, block, one = max(moved, key=lambda each: each[0])
+        found |= {"motion": ratio, "motion_effect": one.motion_effect, "moved_px": one.moved_px}
         if one.moved_at is not None:
             found["moved_at"] = (one.moved_at[0], *_at(block, one.moved_at[1:]))
     return found
@@ -101,7 +100,7 @@ def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
     figures = {
         key: _combined(key, [getattr(of_block, key) for of_block in evidence], weights)
         for key in Evidence.__dataclass_fields__
-        if key not in (*same, "left_out", "kept", "hole_at", "moved_at")
+        if key not in (*same, "left_out", "kept", "hole_at", "moved_at", "moved_px")
     }
     kept = sum(of_block.kept for of_block in evidence)
     parameters = {**(figures["parameters"] or {})}
@@ -110,7 +109,7 @@ def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
         of_worst = worst.verdict.evidence.parameters
         row, column = _at(worst, (of_worst["misfit_row"], of_worst["misfit_column"]))
         parameters |= {"misfit_row": float(row), "misfit_column": float(column)}
-    whole = {"hole_at": (0, 0), "moved_at": None, **_places(blocks)}
+    whole = {"hole_at": (0, 0), "moved_at": None, "moved_px": None, **_places(blocks)}
     figures |= {"parameters": parameters, "changes": figures["changes"] or {}}
     return Evidence(**{**same, "left_out": left_out, "kept": kept, **figures, **whole})
 

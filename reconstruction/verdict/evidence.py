@@ -19,7 +19,7 @@ from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.kept import compare_held_out, over_baselines
 from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.shadow import Relief, relief, shadow
-from reconstruction.verdict.shots import compared
+from reconstruction.verdict.shots import Motion, compared
 
 Array = NDArray[np.floating]
 CLIPPED = 0.5
@@ -33,12 +33,13 @@ class Evidence:
 
     method: its name; status: its status. left_out: shots that screening left out. bad: share of
     the pixels that screening left out. noise: the readings' deviation over their mean.
-    motion_left: what the light field leaves unexplained where the picture moves most, over the mean
-    reading. off: share of readings that are far off all around, where neighbours agree; unusable,
-    saturated: shares of the readings. blind: share of the pixels that lie far from any that a shot
-    sees; hole_px, hole_at: radius and centre (y, x) of the largest hole. kept: readings kept from
-    the fit; explained: share of the smooth picture's squared residual of these, less noise, that
-    the light field removes; noise_share: share of its own that is noise.
+    motion: ratio of `Motion`, above 1 where shots saw different scenes; motion_effect: its effect;
+    moved_at: shot (None: any), row, column; moved_px: its rows and columns; moved: share of the
+    readings left out for it. off: share of readings that are far off all around, where neighbours
+    agree; unusable, saturated: shares of the readings. blind: share of the pixels that lie far from
+    any that a shot sees; hole_px, hole_at: radius and centre (y, x) of the largest hole. kept:
+    readings kept from the fit; explained: share of the smooth picture's squared residual of these,
+    less noise, that the light field removes; noise_share: share of its own that is noise.
     colour_error: root mean square by colours that frames do not show, over the brightness. short:
     share of the readings that only say that there was at least so much light, and are needed.
     gains: by which the shots' brightness was evened. over_flat, over_neighbours: see
@@ -58,9 +59,6 @@ class Evidence:
     displaced_px: float | None
     changes: dict[str, tuple[float | None, ...]]
     brightness: tuple[float | None, ...]
-    motion_px: float | None
-    motion_effect: float | None
-    moved_at: tuple[int, int, int] | None
     off: float
     bad: float
     unusable: float
@@ -73,7 +71,11 @@ class Evidence:
     noise_share: float | None
     parameters: dict[str, float]
     colour_error: float | None = None
-    motion_left: float | None = None
+    motion: float | None = None
+    motion_effect: float | None = None
+    moved_at: tuple[int | None, int, int] | None = None
+    moved_px: tuple[int, int] | None = None
+    moved: float = 0.0
     short: float = 0.0
     gains: tuple[float, ...] = ()
     over_flat: float | None = None
@@ -128,17 +130,22 @@ class Read:
 
 
 def gathered(
-    psi: ImagingMatrix, read: Read, noise_sigma: float, result: Reconstruction
+    psi: ImagingMatrix,
+    read: Read,
+    noise_sigma: float,
+    result: Reconstruction,
+    moved: Motion | None = None,
 ) -> Evidence:
-    """Return what there is to say of a light field that was fitted without the readings kept."""
+    """Return what there is to say of a light field that was fitted without the readings kept.
+
+    moved: where shots differ most in what they saw, if there are several.
+    """
     frames, usable = np.where(read.usable, read.frames, 0), read.usable
     found = relief(psi, frames, noise_sigma, usable)
     masks = shadow(found)
     off = displaced(psi, found)
-    shots = compared(psi, found)
-    moved = shots.motion
+    shots = compared(found)
     residual = frames - psi.forward(result.light_field)
-    left = None if moved is None else moved.unexplained(residual, noise_sigma**2, usable)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     step = quantised(frames, usable)
     return Evidence(
@@ -153,10 +160,7 @@ def gathered(
         displaced_px=off.size_px,
         changes={name: _plain(astuple(one)) for name, one in off.changes.items()},
         brightness=_plain(shots.brightness),
-        motion_px=None if moved is None else moved.size_px,
-        motion_effect=None if moved is None else moved.effect,
-        motion_left=None if left is None else left / mean,
-        moved_at=None if moved is None else (moved.shot, *moved.place),
+        **({} if moved is None else moved.figures()),
         bad=read.bad,
         **pixel_figures(psi, read.excluded, found, noise_sigma, usable),
         **compare_held_out(frames, residual, noise_sigma, read.kept & usable, found),

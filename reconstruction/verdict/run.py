@@ -2,7 +2,8 @@
 
 A saturated reading says that there was at least so much light. The light field is fitted without
 them first; those that it falls short of join the readings, and it is fitted again (an active set,
-of one round: a second one changed 64x80 crops by 0.0 to 0.4 dB).
+of one round: a second one changed 64x80 crops by 0.0 to 0.4 dB). Where a shot saw another scene
+than the others, its readings are left out, and it is fitted again, too.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from reconstruction.screening import screened
 from reconstruction.verdict.evidence import Read, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import Verdict, verdict_from
+from reconstruction.verdict.shadow import relief
+from reconstruction.verdict.shots import Motion, motion
 
 Array = NDArray[np.floating]
 FEWEST_SHORT = 1e-3
@@ -51,26 +54,46 @@ def reconstruct_judged(
     read, notes = _as_fitted(psi, frames, typical, usable, settings.screening)
     unscreened = settings.model_copy(update={"screening": False})
 
-    def solved(readings: Array, fitted: NDArray[np.bool_]) -> Reconstruction:
-        return reconstruct(
+    def solved(readings: Array, fitted: NDArray[np.bool_], before: float = 0.0) -> Reconstruction:
+        result = reconstruct(
             name, psi, readings, noise_sigma, dictionary, unscreened, fitted, on_step
         )
+        return dataclasses.replace(result, seconds=result.seconds + before)
 
-    fitted = read.usable & ~read.kept
-    result = solved(read.frames, fitted)
+    readings, fitted = read.frames, read.usable & ~read.kept
+    result = solved(readings, fitted)
     short = _short(psi, read, result)
     if short is not None:
         took = result.seconds
         del result
-        result = solved(np.where(short, read.excluded, read.frames), fitted | short)
-        result = dataclasses.replace(result, seconds=result.seconds + took)
+        readings, fitted = np.where(short, read.excluded, readings), fitted | short
+        result = solved(readings, fitted, took)
         read = dataclasses.replace(read, short=float(short.mean()))
         notes = (
             *notes,
             f"{read.short:.1%} of the readings are saturated and count as what they read at least",
         )
+    found = _motion(psi, read, typical, result)
+    if found is not None and found.moved.any():
+        took = result.seconds
+        del result
+        result = solved(readings, fitted & ~found.moved, took)
+        read = dataclasses.replace(read, kept=read.kept & ~found.moved)
+        notes = (
+            *notes,
+            f"left out {found.moved.mean():.1%} of the readings, where one shot saw another scene "
+            "than the others",
+        )
     result = dataclasses.replace(result, screening=notes)
-    return result, verdict_from(gathered(psi, read, typical, result))
+    return result, verdict_from(gathered(psi, read, typical, result, found))
+
+
+def _motion(
+    psi: ImagingMatrix, read: Read, noise_sigma: float, result: Reconstruction
+) -> Motion | None:
+    frames = np.where(read.usable, read.frames, 0)
+    seen = relief(psi, frames, noise_sigma, read.usable)
+    return motion(seen, frames - psi.forward(result.light_field), noise_sigma)
 
 
 def _short(psi: ImagingMatrix, read: Read, result: Reconstruction) -> NDArray[np.bool_] | None:

@@ -16,6 +16,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture, trial_of
@@ -23,7 +24,8 @@ from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.methods import MethodSettings
 from reconstruction.result import Reconstruction, Status
 from reconstruction.screening import screened
-from reconstruction.tv import TVSettings
+from reconstruction.tv import TVSettings, reconstruct_tv
+from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
@@ -37,7 +39,7 @@ from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
 from reconstruction.verdict.shadow import relief, shadow
-from reconstruction.verdict.shots import ShotMotion, compared
+from reconstruction.verdict.shots import _differences, _differing, compared, motion
 
 SIZE = (48, 64)
 SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")
@@ -202,9 +204,9 @@ def test_a_coded_aperture_casts_no_shadow_that_could_tell():
 
 def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
     gains = np.array([1.1, 0.9, 1.0])
-    found = compared(three, relief_in(three, grey(three) * gains[:, None, None]))
+    found = compared(relief_in(three, grey(three) * gains[:, None, None]))
     np.testing.assert_allclose(found.brightness, gains, atol=0.01)
-    swapped = compared(three, relief_in(three, grey(three)[[0, 2, 1]]))
+    swapped = compared(relief_in(three, grey(three)[[0, 2, 1]]))
     assert swapped.masks[1].argmax() == 2
     assert swapped.masks[2].argmax() == 1
     assert swapped.masks[0].argmax() == 0
@@ -319,7 +321,7 @@ def judged_trial(
         ("flicker", 20, "brightness"),
         ("repeated-shot", 1, "shot 3 shows the masks of shot 2"),
         ("missing-shot", 1, "shot 3 is dark"),
-        ("camera-motion", 2, "the picture moves"),
+        ("camera-motion", 2, " saw "),
         ("bad-pixels", 10, "far off"),
         ("saturation", 60, "saturated"),
         ("masked-pixels", 90, "holes"),
@@ -454,7 +456,7 @@ def test_a_coded_aperture_leaves_nothing_in_one_frame_that_would_show_a_wrong_ps
     assert "cannot be tested" in verdict.words
 
 
-MOVED = {"motion_effect": 0.2, "moved_at": (1, 5, 5)}
+MOVED = {"moved_at": (1, 5, 5), "moved_px": (9, 9)}
 
 
 @pytest.mark.parametrize(
@@ -463,10 +465,10 @@ MOVED = {"motion_effect": 0.2, "moved_at": (1, 5, 5)}
         ({"bad": 0.06}, "trust", "doubt"),
         ({"left_out": (1, 2)}, "doubt", "trust"),
         ({"bad": 0.03}, "trust", "trust"),
-        ({**MOVED, "motion_px": 0.3, "motion_left": 0.1}, "trust", "trust"),
-        ({**MOVED, "motion_px": 0.5, "motion_left": 0.1}, "doubt", "doubt"),
-        ({**MOVED, "motion_px": 0.5, "motion_left": None}, "doubt", "doubt"),
-        ({**MOVED, "motion_px": 0.5, "motion_left": 0.01}, "doubt", "trust"),
+        ({**MOVED, "motion": 0.9}, "trust", "trust"),
+        ({**MOVED, "motion": 1.1}, "doubt", "doubt"),
+        ({**MOVED, "motion": 9.0}, "doubt", "doubt"),
+        ({**MOVED, "moved_at": (None, 5, 5), "motion": 9.0}, "do not use", "do not use"),
         ({"bad": 0.1}, "doubt", "doubt"),
     ],
 )
@@ -622,31 +624,25 @@ def test_bad_pixels_that_screening_finds_are_reported():
     assert f"{share:.1%} of the pixels are bad and not listed" in verdict.words
 
 
-def motion_effect(fault, strength):
-    camera = find_camera("rgbw-bayer-3shots")
-    given = Point(Capture("deep-occlusions", camera, (64, 80), 0, 3), fault, strength).trial()
-    seen = screened(given.psi, given.readings, given.usable)
-    found = relief(given.psi, seen.frames, given.noise_sigma, seen.usable)
-    motion = compared(given.psi, found).motion
-    assert motion is not None
-    return motion.effect
+def motion_in(psi, frames, sigma=1e-4, usable=None, light_field=None):
+    """Return the motion that is found with a light field, by default one fitted to all shots."""
+    usable = everywhere(psi) if usable is None else usable
+    if light_field is None:
+        light_field = reconstruct_tv(psi, frames, sigma, usable=usable).light_field
+    residual = frames - psi.forward(light_field)
+    found = motion(relief(psi, frames, sigma, usable), residual, sigma)
+    assert found is not None
+    return found
 
 
 @pytest.mark.slow
 def test_bad_pixels_behind_dark_cells_do_not_pass_for_motion():
-    assert motion_effect("bad-pixels", 3) < 0.02
-    assert motion_effect("camera-motion", 1) > 0.2
-
-
-def test_what_a_light_field_leaves_of_a_moved_place_is_beyond_noise():
-    moved = ShotMotion(1.0, 0.2, 1, (slice(10, 30), slice(40, 60)))
-    assert moved.place == (20, 50)
-    residual = np.full((3, 64, 80), 5.0)
-    residual[:, 10:30, 40:60] = np.random.default_rng(0).normal(0, 0.05, (3, 20, 20))
-    usable = np.ones(residual.shape, bool)
-    assert moved.unexplained(residual, 0.03**2, usable) == pytest.approx(0.04, rel=0.1)
-    assert moved.unexplained(residual, 0.06**2, usable) == 0
-    assert moved.unexplained(residual, 0.03**2, ~usable) == 0
+    camera = find_camera("rgbw-bayer-3shots")
+    for fault, strength, moves in (("bad-pixels", 3, False), ("camera-motion", 1, True)):
+        given = Point(Capture("deep-occlusions", camera, (64, 80), 0, 3), fault, strength).trial()
+        seen = screened(given.psi, given.readings, given.usable)
+        found = motion_in(given.psi, seen.frames, given.noise_sigma, seen.usable)
+        assert (found.ratio > 1) == moves
 
 
 def test_a_spot_that_one_shot_cannot_see_does_not_pass_for_motion(three):
@@ -656,9 +652,106 @@ def test_a_spot_that_one_shot_cannot_see_does_not_pass_for_motion(three):
     scene = np.broadcast_to(picture[..., None], three.light_field_shape).astype(np.float32)
     usable = everywhere(three)
     usable[1, 16:21, 28:35] = False
-    found = compared(three, relief_in(three, three.forward(scene), usable=usable)).motion
-    assert found is not None
-    assert found.effect < 0.02
+    assert motion_in(three, three.forward(scene), usable=usable).ratio < 1
+
+
+@pytest.mark.parametrize("shot", [0, 2])
+@pytest.mark.parametrize(("side", "brighter"), [(6, 0.15), (20, 0.15), (20, 0.025)])
+def test_what_changes_in_one_shot_is_named_with_shot_and_place(three, shot, side, brighter):
+    rng = np.random.default_rng(0)
+    scene = np.full(three.light_field_shape, 0.5, np.float32)
+    noise = 0.003 * rng.standard_normal(three.frames_shape)
+    # Texture that the light field lacks is in all shots alike.
+    texture = 1 + 0.02 * rng.standard_normal(SIZE)
+    still = three.forward(scene) * texture + noise
+    found = motion_in(three, still, 0.003, light_field=scene)
+    assert found.ratio < 1
+    assert not found.moved.any()
+    frames = still.copy()
+    frames[shot, 15 : 15 + side, 30 : 30 + side] *= 1 + brighter
+    found = motion_in(three, frames, 0.003, light_field=scene)
+    assert found.ratio > 1
+    assert found.shot == shot
+    np.testing.assert_allclose(found.place, (15 + side / 2, 30 + side / 2), atol=3)
+    assert all(side <= length <= side + 10 for length in found.size)
+    changed = np.zeros(three.frames_shape, bool)
+    changed[shot, 15 : 15 + side, 30 : 30 + side] = True
+    assert found.moved[changed].mean() > 0.9
+    assert found.moved[~changed].mean() < 0.15
+    flicker = still * np.array([0.97, 1, 1.03])[:, None, None]
+    assert motion_in(three, flicker, 0.003, light_field=scene).ratio < 1
+
+
+def test_noise_differs_between_shots_by_as_much_as_is_expected_of_it(three):
+    rng = np.random.default_rng(1)
+    residual = rng.standard_normal(three.frames_shape).astype(np.float32)
+    apart, expected, least = _differences(relief_in(three, grey(three)), residual, np.arange(3), 1)
+    # From the mean of three each differs by two thirds of its square; spots take some of the rest.
+    assert 2 / 3 < apart.mean() / expected.mean() < 1.25 * 2 / 3
+    assert least == pytest.approx(expected.mean())
+
+
+def with_moved_object(psi, shot, by_px=6):
+    """Return readings of a striped square before a scene, moved in one shot, and the truth."""
+    truth = np.array(open_scene("deep-occlusions", size=SIZE), np.float32)
+    moved = truth.copy()
+    y, x = np.indices((24, 24))
+    stripes = (0.5 + 0.3 * np.sin((x + y) / 2))[..., None]
+    truth[:, :, 10:34, 20:44] = stripes
+    moved[:, :, 10:34, 20 + by_px : 44 + by_px] = stripes
+    frames = psi.forward(truth)
+    frames[shot] = psi.forward(moved)[shot]
+    frames += 0.003 * np.random.default_rng(0).standard_normal(frames.shape, np.float32)
+    return frames, truth
+
+
+def test_a_shot_is_left_out_where_something_moved_in_it_and_the_place_is_doubted(three):
+    frames, truth = with_moved_object(three, 1)
+    result, verdict = reconstruct_judged("tv", three, frames, 0.003, settings=QUICK)
+    assert verdict.level == "doubt"
+    assert "shot 2 saw another scene than the others in " in verdict.words
+    assert "left out there" in verdict.words
+    assert "--without-shots 2" in verdict.words
+    assert verdict.evidence.moved_at is not None
+    _, row, column = verdict.evidence.moved_at
+    np.testing.assert_allclose((row, column), (22, 35), atol=5)
+    blind = reconstruct_tv(three, frames, 0.003, QUICK.tv)
+    still, _ = with_moved_object(three, 1, 0)
+    best = reconstruct_tv(three, still, 0.003, QUICK.tv)
+    after, before, without = (psnr_db(one.light_field, truth) for one in (result, blind, best))
+    assert after > before + 2
+    assert after > without - 2
+    assert any("saw another scene" in note for note in result.screening)
+    missed = missed_readings(three, result.light_field, frames, 0.003, everywhere(three))
+    assert missed[12:32, 22:48].mean() > 5 > missed[:, :10].mean()
+
+
+def test_the_place_of_a_block_where_something_moved_is_that_of_the_whole(three):
+    still = clean_evidence(three)
+    moved = dataclasses.replace(still, motion=3.0, moved_at=(1, 5, 6), moved_px=(9, 8))
+    verdict = judged_together(
+        [
+            JudgedBlock(verdict_from(one), row, 60, 100)
+            for one, row in ((moved, 50), (still, 0), (still, 0))
+        ]
+    )
+    assert verdict.level == "doubt"
+    assert "shot 2 saw another scene than the others in 9x8 pixels about row 55, column 66" in (
+        verdict.words
+    )
+
+
+def test_of_two_shots_either_may_have_seen_what_moved():
+    psi = build_imaging_matrix(find_camera("rgbw-bayer-2shots"), SIZE)
+    frames, _ = with_moved_object(psi, 1)
+    result, verdict = reconstruct_judged("tv", psi, frames, 0.003, settings=QUICK)
+    assert verdict.level in ("doubt", "do not use")
+    assert "shots saw different scenes in " in verdict.words
+    assert "without-shots" not in verdict.words
+    assert _differing(np.array([9.0, 1.0]), np.arange(2)) is None
+    assert _differing(np.array([1.0, 9.0, 1.0]), np.arange(3)) == 1
+    assert _differing(np.array([8.0, 9.0, 1.0]), np.arange(3)) is None
+    assert not result.screening
 
 
 @pytest.fixture(scope="module")
@@ -709,6 +802,23 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     assert verdict["level"] == "do not use"
     assert "\x1b" not in last
     assert "calibrate --drift" in verdict["reasons"][0]["remedy"]
+
+
+def test_the_command_leaves_out_shots_and_says_which_there_are(folders, tmp_path):
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("tv: {max_steps: 5}\n")
+    given = ["reconstruct", str(folders[0]), "--method", "tv", "--settings", str(settings)]
+    for shots, code in ((["2"], 0), (["3"], 1), (["1", "2"], 1)):
+        out = tmp_path / "-".join(shots)
+        options = [part for shot in shots for part in ("--without-shots", shot)]
+        done = CliRunner().invoke(app, [*given, *options, "--out", str(out)])
+        assert done.exit_code == code, done.output
+        assert out.exists() == (code == 0)
+        if code:
+            assert "the capture has shots 1 to 2" in str(done.exception or done.output)
+    metrics = json.loads((tmp_path / "2" / "metrics.json").read_text())
+    assert metrics["usable_share"] == pytest.approx(0.5, abs=0.01)
+    assert metrics["verdict"]["features"]["motion"] is None
 
 
 @pytest.mark.slow
