@@ -129,7 +129,8 @@ class Board:
     """One whiteboard as readings: 1 is the same pixel with the aperture open and the masks out.
 
     reading, variance: (pixel_y, pixel_x); the variance of a pixel that is not to be used is
-    infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all).
+    infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all). repeats: frames
+    averaged. unsteady2: relative variance of the brightness between these, see `MeanFrame`.
     """
 
     name: str
@@ -140,6 +141,8 @@ class Board:
     stage_um: tuple[float, float]
     shot: int
     taken_s: float = 0.0
+    repeats: int = 1
+    unsteady2: float = 0.0
 
     @property
     def opening(self) -> Opening:
@@ -246,7 +249,19 @@ def _board(
         one.stage_um,
         one.shot,
         frame.taken_s,
+        frame.count,
+        frame.unsteady2(dark.mean_dn),
     )
+
+
+def unsteadiness2(boards: Sequence[Board], references: Sequence[tuple[int, float]] = ()) -> float:
+    """Return the relative variance of brightness from frame to frame, as repeats show it.
+
+    references: repeats of more, and what `MeanFrame.unsteady2` says of each.
+    """
+    every = [(one.repeats, one.unsteady2) for one in boards] + list(references)
+    freedom = sum(count - 1 for count, _ in every)
+    return max(sum((count - 1) * one for count, one in every) / max(freedom, 1), 0.0)
 
 
 def signal_of(

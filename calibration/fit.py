@@ -16,7 +16,8 @@ C N diag(tau^2) N^T C, N the information between its parameters and the views' o
 
 What all pixels of one whiteboard share is no noise of single pixels: shutter and lamp change its
 brightness, and the mask stands a little elsewhere. Each whiteboard has these three of its own,
-normal about 0, of the widths that make the readings likeliest.
+normal about 0, of the widths that make the readings likeliest; brightness in addition by what
+repeats of a whiteboard differ among themselves, over their number.
 
 Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963; of the widths (evidence):
 MacKay 1992.
@@ -32,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from calibration.boards import Board, Opening
+from calibration.boards import Board, Opening, unsteadiness2
 from calibration.errors import CalibrationError
 from calibration.placement import (
     SCALARS,
@@ -127,8 +128,8 @@ class Fit:
     residual over the noise without outliers. undecided: names of parameters that the prior decides
     more than the whiteboards; more_boards: how many more of the same kinds would decide them
     (MOST_MORE_BOARDS: no number of them). brightness_spread: by
-    which whiteboards differ among themselves; so do the references, which the covariance does not
-    count. moved_um: how far the mask stands from its place; so it may in the shots of a scene,
+    which whiteboards differ among themselves, beyond what their repeats do; so do the references,
+    which the covariance does not count. moved_um: how far the mask stands from its place; so it may in the shots of a scene,
     which the covariance counts.
     """
 
@@ -224,11 +225,15 @@ class _Prior:
         return 0.5 * float(np.sum(self.precision * (at.vector() - self.centre) ** 2))
 
 
-def _prior(placement: Array, centre: Array, widths: tuple[float, float], boards: int) -> _Prior:
-    """Return the prior of a placement (precisions, centre) and of the whiteboards' own."""
-    own = np.tile(1 / np.square([widths[0], widths[1], widths[1]]), boards)
-    precision = np.concatenate([placement, own]).astype(np.float64)
-    return _Prior(precision, np.concatenate([centre, np.zeros(len(own))]).astype(np.float64))
+def _prior(placement: Array, centre: Array, widths: tuple[float, float], fast2: Array) -> _Prior:
+    """Return the prior of a placement (precisions, centre) and of the whiteboards' own.
+
+    fast2: (board,), variance of brightness that repeats show, beside the width of all.
+    """
+    own2 = np.tile(np.square([widths[0], widths[1], widths[1]]), (len(fast2), 1))
+    own2[:, 0] += fast2
+    precision = np.concatenate([placement, 1 / own2.ravel()]).astype(np.float64)
+    return _Prior(precision, np.concatenate([centre, np.zeros(own2.size)]).astype(np.float64))
 
 
 def _scaled_residuals(
@@ -373,17 +378,18 @@ def _posterior(
     return sum(_loss(one / spread) for one in residuals) + prior.loss(at)
 
 
-def _widths(normal: _Normal, at: _State, placement: Array, centre: Array) -> tuple[float, float]:
+def _widths(
+    normal: _Normal, at: _State, placement: Array, centre: Array, fast2: Array
+) -> tuple[float, float]:
     """Return the widths of brightness and place that make the readings likeliest, at a fit.
 
-    placement, centre: precisions of its prior, and where it is drawn to.
+    placement, centre: precisions of its prior, and where it is drawn to. fast2: see `_prior`.
     """
-    boards = len(at.own)
     away = at.vector() - np.concatenate([centre, np.zeros(at.own.size)])
     pull = normal.gradient + normal.matrix @ away
 
     def evidence(widths: tuple[float, float]) -> float:
-        precision = _prior(placement, centre, widths, boards).precision
+        precision = _prior(placement, centre, widths, fast2).precision
         factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
         seen = np.linalg.solve(factor, pull)
         own = precision[len(placement) :]
@@ -429,19 +435,20 @@ def fit_placement(
     centre[OFFSETS] = placement.vector()[OFFSETS]
     of_placement = 1 / deviations**2
     widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
+    fast2 = unsteadiness2(boards) / np.array([one.repeats for one in boards])
     at = _State(placement, np.zeros((len(boards), OWN)))
     rng = np.random.default_rng(settings.seed)
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
-        prior = _prior(of_placement, centre, widths, len(boards))
+        prior = _prior(of_placement, centre, widths, fast2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     assert normal is not None
     for _ in range(WIDTH_ROUNDS):
-        widths = _widths(normal, at, of_placement, centre)
-        prior = _prior(of_placement, centre, widths, len(boards))
+        widths = _widths(normal, at, of_placement, centre, fast2)
+        prior = _prior(of_placement, centre, widths, fast2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     size = len(of_placement)

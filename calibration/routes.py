@@ -17,6 +17,7 @@ from calibration.boards import (
     channels_of,
     gain_of,
     sensor_blemishes,
+    unsteadiness2,
 )
 from calibration.choice import (
     LARGEST_CHI2,
@@ -39,6 +40,7 @@ from calibration.findings import (
     level_findings,
     mask_findings,
     unwatched,
+    views_assumed,
 )
 from calibration.fit import MOST_MORE_BOARDS, OFFSETS, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
@@ -52,6 +54,7 @@ from calibration.parametric import (
     psi_deviation,
     shot_stages,
 )
+from calibration.planning import pinhole_worth
 from calibration.refusals import (
     FREE_GRADIENT,
     refuse_another_bench,
@@ -170,6 +173,8 @@ def calibrate(
     judged: dict[str, HeldOut] = {}
     frames: dict[str, int] = {}
     parametric = mixed = plain = None
+    seen: list[Board] = []
+    assumed: list[str] = []
     if modelled:
         if few is None:
             raise CalibrationError("the parametric route was given no whiteboards")
@@ -203,6 +208,8 @@ def calibrate(
         refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
         findings += mask_findings((mixed or parametric).fit)
         findings += [mask.repeats.words] if mask.repeats.words else []
+        if layout.views != (1, 1) and all(board.views_open.all() for board in seen):
+            assumed.append(views_assumed(pinhole_worth(mixed or parametric, seen)))
     if {"free", "combined"} & set(routes):
         if pinholes is None:
             raise CalibrationError("the free route was given no whiteboards")
@@ -226,7 +233,7 @@ def calibrate(
             judged["combined"] = _judged_measured("combined", both, still[0], layout.binning)
             frames["combined"] = few.exposures
     for name, one in calibrations.items():
-        _make_less_sure(one, _unsteady(name, sets, parametric))
+        _make_less_sure(one, _unsteady(name, sets, [*judges, *seen], parametric))
         if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
             _count_moves(one, parametric, layout, shot_stages(camera))
     chosen, why = choose([judged[name] for name in judged if name in routes])
@@ -280,24 +287,29 @@ def calibrate(
         good,
         tuple(advice),
         tuple(findings),
-        tuple(unwatched(_missing(sets, levels, layout, bool(turned)))),
+        (*unwatched(_missing(sets, levels, layout, bool(turned))), *assumed),
         seen_colours,
     )
 
 
-def _unsteady(route: str, sets: Sequence[BoardSet], parametric: Parametric | None) -> float:
+def _unsteady(
+    route: str, sets: Sequence[BoardSet], boards: Sequence[Board], parametric: Parametric | None
+) -> float:
     """Return the relative error that shutter and lamp leave in all of a Psi alike.
 
-    Every whiteboard is divided by the references, which are as unsteady as it is; of single views
-    as measured through a pinhole each has its own beside.
+    Every whiteboard is divided by the references, which are as unsteady as it is: from frame to
+    frame, as repeats show, which their number averages; and slowly, as the fit shows. Of single
+    views as measured through a pinhole each has its own beside.
     """
-    if parametric is not None:
-        spread = parametric.fit.brightness_spread
-    else:
-        means = [one.references[key] for one in sets for key in one.references]
-        dark_dn = sets[0].dark.mean_dn
-        spread = float(np.mean([one.flicker(dark_dn) / np.sqrt(one.count) for one in means]))
-    return spread * (np.sqrt(2) if route == "free" else 1.0)
+    references = list({id(f): f for one in sets for f in one.references.values()}.values())
+    dark_dn = sets[0].dark.mean_dn
+    fast2 = unsteadiness2(boards, [(one.count, one.unsteady2(dark_dn)) for one in references])
+    slow2 = 0.0 if parametric is None else parametric.fit.brightness_spread**2
+    spread2 = slow2 + fast2 * float(np.mean([1 / one.count for one in references]))
+    if route == "free":
+        pinholes = [frame.count for one in sets for frame in one.frames if frame.pinhole]
+        spread2 += slow2 + fast2 * float(np.mean([1 / count for count in pinholes]))
+    return float(np.sqrt(spread2))
 
 
 def _missing(
@@ -375,7 +387,7 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     """
     shadow = one.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
-    of_few = [board for board in seen if not board.views_open.all()]
+    of_few = [board for board in seen if not board.views_open.all()] or list(seen)
     misfits = []
     for board in of_few:
         predicted = predicted_by_shadow(shadow, board)
@@ -426,10 +438,12 @@ def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
 
 def _judged(name: str, one: Parametric, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
+    every = [*judges, *seen]
 
     def judged(board: Board) -> HeldOut:
         predicted = predicted_by_shadow(one.shadow, board)
-        return judge(name, board, predicted, unsteady=one.fit.brightness_spread)
+        unsteady2 = one.fit.brightness_spread**2 + unsteadiness2(every) / board.repeats
+        return judge(name, board, predicted, unsteady=float(np.sqrt(unsteady2)))
 
     groups = {
         ("open aperture" if i == 0 else "mask moved"): judged(board)

@@ -14,6 +14,11 @@ import numpy as np
 
 POINTS = 12
 FINER = 20
+GEOMETRY = (
+    "lens_um", "mask_um", "pitch_um", "cell_um", "aperture_cell_um", "views", "offset_um",
+    "rotation_rad", "blur_um", "tilt", "glass_um",
+)  # fmt: skip
+TRACED: dict[Any, dict[tuple[float, float], np.ndarray]] = {}
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,9 @@ class Bench:
             fine = _blurred(fine, optics.blur_um * FINER / optics.cell_um)
         self.area = np.pad(fine.cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0)))
         self.filtered = self.colour if self.area.shape[2] == 3 else np.zeros(self.size, int)
-        self.known: dict[Any, np.ndarray] = {}
+        # What the mask's shadow depends on; benches that differ in the rest share it.
+        traced = {one: getattr(optics, one) for one in GEOMETRY}
+        self.known = TRACED.setdefault((repr(traced), self.size, sensor.bayer, cells.tobytes()), {})
 
     @property
     def colour(self) -> np.ndarray:
