@@ -81,9 +81,9 @@ SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
-TAUS_UM = np.geomspace(0.002, 0.2, 6)
-"""Of each kind: from far less than any whiteboard shows to a hundredth of a pixel. Beforehand tau
-is uniform (Gelman 2006, Bayesian Analysis 1:515): there are too few views to determine it well."""
+TAUS_UM = np.geomspace(0.003, 1.0, 6)
+"""Of each kind: from far less than any whiteboard shows to a tenth of a pixel. Beforehand tau is
+uniform (Gelman 2006, Bayesian Analysis 1:515): there are too few views to determine it well."""
 
 
 class FitSettings(Settings):
@@ -129,8 +129,9 @@ class Fit:
     more than the whiteboards; more_boards: how many more of the same kinds would decide them
     (MOST_MORE_BOARDS: no number of them). brightness_spread: by
     which whiteboards differ among themselves, beyond what their repeats do; so do the references,
-    which the covariance does not count. moved_um: how far the mask stands from its place; so it may in the shots of a scene,
-    which the covariance counts.
+    which the covariance does not count. moved_um: how far the mask stands from its place; so it
+    may in the shots of a scene, which the covariance counts. astray2: variances of the views' own
+    displacements and softenings.
     """
 
     placement: Placement
@@ -146,6 +147,7 @@ class Fit:
     boards: tuple[BoardCheck, ...]
     brightness_spread: float = 0.0
     moved_um: float = 0.0
+    astray2: tuple[float, ...] = ()
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -344,10 +346,10 @@ def _view_terms(
 
 def bias_covariance(
     covariance: Array, mixed: Array, own: Array, pull: Array
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return what the views' own displacements and softenings add to the placement's covariance.
 
-    covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
+    Beside it, the variances of these, by `Shadow.slopes_by_view`. covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
     information between these and the views' own (see `Shadow.slopes_by_view`). own, pull:
     information of the latter, and the gradient of the log likelihood by them, at the placement
     fitted.
@@ -368,7 +370,8 @@ def bias_covariance(
     share = np.exp(np.array(evidence) - max(evidence))
     expected = share @ np.array(squares) / share.sum()
     moved = covariance @ mixed
-    return np.asarray((moved * expected[kind]) @ moved.T, np.float64)
+    added = np.asarray((moved * expected[kind]) @ moved.T, np.float64)
+    return added, tuple(float(expected[one]) for one in KINDS)
 
 
 def _posterior(
@@ -454,7 +457,8 @@ def fit_placement(
     size = len(of_placement)
     covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
     terms = _view_terms(mask, at, samples, normal.spread)
-    covariance = (covariance + bias_covariance(covariance, *terms))[:size, :size]
+    of_views, astray2 = bias_covariance(covariance, *terms)
+    covariance = (covariance + of_views)[:size, :size]
     checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
     correlation = _correlation(mask, at, samples)
     placement = with_aperture_mean_one(at.placement)
@@ -491,6 +495,7 @@ def fit_placement(
         checks,
         float(widths[0]),
         moved_um,
+        astray2,
     )
 
 

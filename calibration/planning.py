@@ -134,8 +134,11 @@ class PinholeWorth:
     every: float
 
 
-def pinhole_worth(known: Parametric, boards: Sequence[Board]) -> PinholeWorth:
-    """Return what whiteboards through the pinhole are worth beside `boards`, taken as the first."""
+def pinhole_worth(known: Parametric, boards: Sequence[Board], stated: float) -> PinholeWorth:
+    """Return what whiteboards through the pinhole are worth beside `boards`, taken as the first.
+
+    stated: relative error of Psi; what of it is not the placement's stays.
+    """
     shadow, fit, board = known.shadow, known.fit, boards[0]
     mask = shadow.mask
     chosen, channels = drawn_pixels(mask)
@@ -146,6 +149,7 @@ def pinhole_worth(known: Parametric, boards: Sequence[Board]) -> PinholeWorth:
     unsteady2 = fit.brightness_spread**2 + unsteadiness2(boards) / board.repeats
     pixels = int(board.usable.sum()) / SAMPLED
     total = np.linalg.inv(fit.covariance)
+    stays2 = max(stated**2 - float(np.sum(fit.covariance * matrix)) / squares, 0.0)
 
     def added(view: tuple[int, int]) -> NDArray[np.float64]:
         reading, slopes = shadow.with_slopes(chosen, channels, views_open(mask.views, view))
@@ -155,7 +159,7 @@ def pinhole_worth(known: Parametric, boards: Sequence[Board]) -> PinholeWorth:
 
     def error(information: Array) -> float:
         missed2 = float(np.trace(np.linalg.solve(information, matrix))) / squares
-        return float(np.sqrt(missed2 + MODEL_ERROR**2))
+        return float(np.sqrt(missed2 + stays2))
 
     each = {view: added(view) for view in np.ndindex(mask.views)}
     best = min(each, key=lambda view: error(total + each[view]))
@@ -163,7 +167,7 @@ def pinhole_worth(known: Parametric, boards: Sequence[Board]) -> PinholeWorth:
     return PinholeWorth(
         float(np.sqrt(np.mean(np.square(shares)))) * Tolerances().aperture,
         (int(best[0]), int(best[1])),
-        error(total),
+        stated,
         error(total + each[best]),
         error(total + sum(each.values())),
     )

@@ -174,7 +174,6 @@ def calibrate(
     frames: dict[str, int] = {}
     parametric = mixed = plain = None
     seen: list[Board] = []
-    assumed: list[str] = []
     if modelled:
         if few is None:
             raise CalibrationError("the parametric route was given no whiteboards")
@@ -208,8 +207,6 @@ def calibrate(
         refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
         findings += mask_findings((mixed or parametric).fit)
         findings += [mask.repeats.words] if mask.repeats.words else []
-        if layout.views != (1, 1) and all(board.views_open.all() for board in seen):
-            assumed.append(views_assumed(pinhole_worth(mixed or parametric, seen)))
     if {"free", "combined"} & set(routes):
         if pinholes is None:
             raise CalibrationError("the free route was given no whiteboards")
@@ -276,6 +273,10 @@ def calibrate(
         findings += leaning_findings(leans, bool(turned))
         for one in calibrations.values():
             less_sure(one, leans.lopsided)
+    not_known = unwatched(_missing(sets, levels, layout, bool(turned)))
+    if parametric is not None and all(board.views_open.all() for board in seen):
+        stated = calibrations[chosen.route].stated_error
+        not_known.append(views_assumed(pinhole_worth(mixed or parametric, seen, stated)))
     return Outcome(
         chosen.route,
         why,
@@ -287,7 +288,7 @@ def calibrate(
         good,
         tuple(advice),
         tuple(findings),
-        (*unwatched(_missing(sets, levels, layout, bool(turned))), *assumed),
+        tuple(not_known),
         seen_colours,
     )
 
@@ -387,7 +388,7 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     """
     shadow = one.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
-    of_few = [board for board in seen if not board.views_open.all()] or list(seen)
+    of_few = [board for board in seen if not board.views_open.all()]
     misfits = []
     for board in of_few:
         predicted = predicted_by_shadow(shadow, board)
@@ -495,7 +496,9 @@ def _calibration(
 ) -> Calibration:
     stages = shot_stages(camera)
     psi = one.psi(layout, stages)
-    deviation = psi_deviation(one.shadow, layout, stages, one.fit.covariance)
+    # Whiteboards of single views show what the model misses of each; sums, how far they stray.
+    astray2 = one.fit.astray2 if one.misfit is None else ()
+    deviation = psi_deviation(one.shadow, layout, stages, one.fit.covariance, astray2)
     if one.defects is not None and one.defects.count:
         deviation = _counting_defects(deviation, one, layout, stages)
     white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])
