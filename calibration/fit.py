@@ -349,7 +349,9 @@ def bias_covariance(
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return what the views' own displacements and softenings add to the placement's covariance.
 
-    Beside it, the variances of these, by `Shadow.slopes_by_view`. covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
+    Beside it, the variances of these, by `Shadow.slopes_by_view`.
+
+    covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
     information between these and the views' own (see `Shadow.slopes_by_view`). own, pull:
     information of the latter, and the gradient of the log likelihood by them, at the placement
     fitted.

@@ -185,3 +185,16 @@ def test_a_gain_without_repeats_or_light_is_refused():
     with pytest.raises(CalibrationError, match="is the lamp on"):
         photon_transfer(two, two)
     assert SensorGain(0.5, 2.0).variance_dn2(np.array([10.0]))[0] == 7.0
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.003])
+def test_repeats_show_by_how_much_their_exposures_differ(jitter):
+    rng = np.random.default_rng(2)
+    seen = []
+    for _ in range(60):
+        levels = 2000 * (1 + jitter * rng.standard_normal(4))
+        frames = [rng.normal(64 + level, 20, (16, 16)).astype(np.uint16) for level in levels]
+        seen.append(average(frames, 1.0, WHITE_DN, "x").unsteady2(64.0))
+    of_noise2 = (20 / 2000) ** 2 / 16**2
+    expected = 4 * np.sqrt(2 / 180) * (jitter**2 + of_noise2)
+    assert np.mean(seen) == pytest.approx(jitter**2, abs=expected)
