@@ -25,6 +25,7 @@ MacKay 1992.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -32,6 +33,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.ndimage import correlate1d
 
 from calibration.boards import Board, Opening, unsteadiness2
 from calibration.errors import CalibrationError
@@ -77,6 +79,10 @@ rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um.""
 CLEARLY_LIKELIER = 0.5
 """Difference of log evidence: less than this tells nothing."""
 WIDTH_ROUNDS = 2
+SURE_ROWS = 3.0
+"""Deviations from which on rows that err alike are no chance."""
+MOST_ALIKE, ROWS_ALIKE = 0.95, 64
+"""Correlation of neighbouring rows, and beyond how many it is 0."""
 SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
@@ -344,6 +350,61 @@ def _view_terms(
     return mixed, own, pull
 
 
+def _rows_covariance(
+    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float, covariance: Array
+) -> NDArray[np.float64]:
+    """Return what rows that err alike add to the covariance, as the darks' repeats show it.
+
+    A row's error is its neighbour's to a share (autoregressive). Each whiteboard has its own;
+    those of the references and of the darks are in all whiteboards. What whole frames of light do
+    alike is counted beside.
+    """
+    size, height = len(covariance), len(samples[0].board.reading)
+    known = [rows for one in samples if (rows := one.board.rows) is not None]
+    if len(known) < len(samples):
+        return np.zeros((size, size))
+    own_dn2, next_dn2, noise_dn2, darks = (
+        float(np.mean([getattr(one, name) for one in known]))
+        for name in ("own_dn2", "next_dn2", "noise_dn2", "darks")
+    )
+    if not own_dn2 > SURE_ROWS * noise_dn2 * np.sqrt(2 / (height * max(darks - 1, 1))):
+        return np.zeros((size, size))
+    reach = min(ROWS_ALIKE, height - 1)
+    share = float(np.clip(next_dn2 / own_dn2, 0.0, MOST_ALIKE))
+    alike = share ** np.abs(np.arange(-reach, reach + 1))
+
+    def squared(by_row: Array) -> NDArray[np.float64]:
+        return by_row.T @ correlate1d(by_row, alike, axis=0, mode="constant")
+
+    def apart(by_row: Array) -> Array:
+        return by_row - by_row.mean(axis=0)
+
+    shadow = Shadow(mask, at.placement)
+    added, of_references = np.zeros((size, size)), np.zeros((height, size))
+    of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
+    for index, residual in enumerate(_all_residuals(mask, at, samples)):
+        sample, rows = samples[index], known[index]
+        weight = _weights(residual / spread) / np.square(sample.deviation * spread)
+        by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
+        places, opening = _places(at, index), at.opening(sample.board, index)
+        for first in range(0, len(residual), CHUNK):
+            part = slice(first, first + CHUNK)
+            read, slope = shadow.with_slopes(sample.pixels[part], sample.channels[part], *opening)
+            pull = _with_own(read, slope, at.own[index]) * weight[part, None]
+            where = sample.pixels[part, 0][:, None], places
+            np.add.at(by_row, where, pull)
+            np.add.at(read_by_row, where, pull * read[:, None])
+        by_row, read_by_row = by_row / rows.white_dn[0], read_by_row / rows.white_dn[1]
+        added += squared(apart(by_row)) / sample.board.repeats
+        of_references += apart(read_by_row) / np.sqrt(rows.references)
+        of_darks[rows.exposure_s[0]] += by_row
+        of_darks[rows.exposure_s[1]] -= read_by_row
+    added += squared(of_references)
+    for by_row in of_darks.values():
+        added += squared(by_row) / darks
+    return np.asarray(own_dn2 * covariance @ added @ covariance, np.float64)
+
+
 def bias_covariance(
     covariance: Array, mixed: Array, own: Array, pull: Array
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
@@ -460,7 +521,8 @@ def fit_placement(
     covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
     terms = _view_terms(mask, at, samples, normal.spread)
     of_views, astray2 = bias_covariance(covariance, *terms)
-    covariance = (covariance + of_views)[:size, :size]
+    of_rows = _rows_covariance(mask, at, samples, normal.spread, covariance)
+    covariance = (covariance + of_views + of_rows)[:size, :size]
     checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
     correlation = _correlation(mask, at, samples)
     placement = with_aperture_mean_one(at.placement)

@@ -389,6 +389,8 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     shadow = one.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
     of_few = [board for board in seen if not board.views_open.all()]
+    if not of_few:
+        return one
     misfits = []
     for board in of_few:
         predicted = predicted_by_shadow(shadow, board)
@@ -398,8 +400,6 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
         count = int(board.views_open.sum())
         for v, u in np.argwhere(board.views_open).tolist():
             found[v, u].append((count, Misfit(misfit.level / count, misfit.per_slope)))
-    if not found:
-        return one
     every = {}
     for view, several in found.items():
         fewest = min(count for count, _ in several)
