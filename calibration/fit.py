@@ -374,7 +374,8 @@ def _rows_covariance(
     alike = share ** np.abs(np.arange(-reach, reach + 1))
 
     def squared(by_row: Array) -> NDArray[np.float64]:
-        return by_row.T @ correlate1d(by_row, alike, axis=0, mode="constant")
+        product = by_row.T @ correlate1d(by_row, alike, axis=0, mode="constant")
+        return np.asarray(product, np.float64)
 
     def apart(by_row: Array) -> Array:
         return by_row - by_row.mean(axis=0)
