@@ -88,8 +88,11 @@ SURE_MOVE = 5.0
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
 TAUS_UM = np.geomspace(0.003, 1.0, 6)
-"""Of each kind: from far less than any whiteboard shows to a tenth of a pixel. Beforehand tau is
-uniform (Gelman 2006, Bayesian Analysis 1:515): there are too few views to determine it well."""
+"""Of each kind: from far less than any whiteboard shows to a tenth of a pixel."""
+TAU_UM = 0.1
+"""Beforehand tau is a half-t of 3 degrees of freedom and this scale (Gelman 2006, Bayesian Analysis
+1:515): there are too few views to determine it well. Uniform up to 1 um, whiteboards of nine views
+left a distance that was 12 % off undecided."""
 
 
 class FitSettings(Settings):
@@ -429,7 +432,8 @@ def bias_covariance(
         seen = vectors.T @ (tau * pull)
         likelihood = 0.5 * float(np.sum(seen**2 / values - np.log(values)))
         # Steps of the grid grow with tau.
-        evidence.append(likelihood + float(np.log(taus).sum()))
+        beforehand = np.log(taus) - 2 * np.log1p(np.square(taus) / TAU_UM**2 / 3)
+        evidence.append(likelihood + float(beforehand.sum()))
         squares.append(np.square(taus))
     share = np.exp(np.array(evidence) - max(evidence))
     expected = share @ np.array(squares) / share.sum()
