@@ -113,6 +113,7 @@ def test_open_whiteboards_say_what_one_through_the_pinhole_would_buy():
     words = re.search(
         r"expected ([\d.]+)% wrong, .* before view \((\d), (\d)\) ([\d.]+)%", found.unwatched[-1]
     )
+    assert words
     now, promised, view = float(words[1]), float(words[4]), (int(words[2]), int(words[3]))
     more, _ = measured(pinholes=(view,), **how)
     assert 100 * more.calibration.stated_error == pytest.approx(promised, rel=0.1)
