@@ -124,12 +124,32 @@ class BoardSet:
         )
 
 
+@dataclass(frozen=True)
+class Rows:
+    """How rows err alike from frame to frame, as a whiteboard's dark shows.
+
+    own_dn2, next_dn2: covariance of a row's mean with itself and the next row's, without what the
+    noise of its pixels makes, noise_dn2. white_dn, exposure_s: of the whiteboard, for a reading of
+    1, and its reference's; references, darks: frames of these.
+    """
+
+    own_dn2: float
+    next_dn2: float
+    noise_dn2: float
+    white_dn: tuple[float, float]
+    exposure_s: tuple[float, float]
+    references: int
+    darks: int
+
+
 @dataclass(frozen=True, eq=False)
 class Board:
     """One whiteboard as readings: 1 is the same pixel with the aperture open and the masks out.
 
     reading, variance: (pixel_y, pixel_x); the variance of a pixel that is not to be used is
-    infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all).
+    infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all). repeats: frames
+    averaged. unsteady2: relative variance of the brightness between these, see `MeanFrame`. rows:
+    how rows err alike.
     """
 
     name: str
@@ -140,6 +160,9 @@ class Board:
     stage_um: tuple[float, float]
     shot: int
     taken_s: float = 0.0
+    repeats: int = 1
+    unsteady2: float = 0.0
+    rows: Rows | None = None
 
     @property
     def opening(self) -> Opening:
@@ -246,7 +269,30 @@ def _board(
         one.stage_um,
         one.shot,
         frame.taken_s,
+        frame.count,
+        frame.unsteady2(dark.mean_dn),
+        _rows(frame, reference, dark),
     )
+
+
+def _rows(frame: MeanFrame, reference: MeanFrame, dark: MeanFrame) -> Rows:
+    noise_dn2 = dark.variance_dn2 / dark.mean_dn.shape[1]
+    own_dn2, next_dn2 = dark.rows_dn2
+    above = float(np.mean(reference.mean_dn - dark.mean_dn))
+    times_s = frame.exposure_s, reference.exposure_s
+    white_dn = above * times_s[0] / times_s[1], above
+    own_dn2 -= noise_dn2
+    return Rows(own_dn2, next_dn2, noise_dn2, white_dn, times_s, reference.count, dark.count)
+
+
+def unsteadiness2(boards: Sequence[Board], references: Sequence[tuple[int, float]] = ()) -> float:
+    """Return the relative variance of brightness from frame to frame, as repeats show it.
+
+    references: repeats of more, and what `MeanFrame.unsteady2` says of each.
+    """
+    every = [(one.repeats, one.unsteady2) for one in boards] + list(references)
+    freedom = sum(count - 1 for count, _ in every)
+    return max(sum((count - 1) * one for count, one in every) / max(freedom, 1), 0.0)
 
 
 def signal_of(

@@ -11,6 +11,7 @@ from calibration.board_angle import BoardAngle, Leaning
 from calibration.fit import Fit
 from calibration.levels import Levels
 from calibration.placement import Placement
+from calibration.planning import PinholeWorth
 
 SIGNIFICANT = 5.0
 LEAST_MOVE_UM = 0.2
@@ -155,6 +156,17 @@ def leaning_findings(leans: Leaning, turned: bool) -> list[str]:
             f"board that does not fill the aperture looks alike: if the lens has less, {moved}"
         )
     return found
+
+
+def views_assumed(worth: PinholeWorth) -> str:
+    """Return in words what whiteboards of the whole aperture leave to be assumed."""
+    v, u = worth.view
+    return (
+        "not measured: single views; their shares of the light are taken as designed but for what "
+        f"sums of all show, to {worth.weights:.1%} of each, which Psi's deviation counts; Psi is "
+        f"expected {worth.now:.2%} wrong, with one whiteboard through the pinhole before view "
+        f"({v}, {u}) {worth.one:.2%}, with one before every view {worth.every:.2%}"
+    )
 
 
 def dust_finding(dusty: NDArray[np.bool_]) -> str:

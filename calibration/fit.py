@@ -16,7 +16,8 @@ C N diag(tau^2) N^T C, N the information between its parameters and the views' o
 
 What all pixels of one whiteboard share is no noise of single pixels: shutter and lamp change its
 brightness, and the mask stands a little elsewhere. Each whiteboard has these three of its own,
-normal about 0, of the widths that make the readings likeliest.
+normal about 0, of the widths that make the readings likeliest; brightness in addition by what
+repeats of a whiteboard differ among themselves, over their number.
 
 Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963; of the widths (evidence):
 MacKay 1992.
@@ -24,6 +25,7 @@ MacKay 1992.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -31,8 +33,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.ndimage import correlate1d
 
-from calibration.boards import Board, Opening
+from calibration.boards import Board, Opening, unsteadiness2
 from calibration.errors import CalibrationError
 from calibration.placement import (
     SCALARS,
@@ -76,13 +79,20 @@ rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um.""
 CLEARLY_LIKELIER = 0.5
 """Difference of log evidence: less than this tells nothing."""
 WIDTH_ROUNDS = 2
+SURE_ROWS = 3.0
+"""Deviations from which on rows that err alike are no chance."""
+MOST_ALIKE, ROWS_ALIKE = 0.95, 64
+"""Correlation of neighbouring rows, and beyond how many it is 0."""
 SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
-TAUS_UM = np.geomspace(0.002, 0.2, 6)
-"""Of each kind: from far less than any whiteboard shows to a hundredth of a pixel. Beforehand tau
-is uniform (Gelman 2006, Bayesian Analysis 1:515): there are too few views to determine it well."""
+TAUS_UM = np.geomspace(0.003, 1.0, 6)
+"""Of each kind: from far less than any whiteboard shows to a tenth of a pixel."""
+TAU_UM = 0.1
+"""Beforehand tau is a half-t of 3 degrees of freedom and this scale (Gelman 2006, Bayesian Analysis
+1:515): there are too few views to determine it well. Uniform up to 1 um, whiteboards of nine views
+left a distance that was 12 % off undecided."""
 
 
 class FitSettings(Settings):
@@ -127,9 +137,10 @@ class Fit:
     residual over the noise without outliers. undecided: names of parameters that the prior decides
     more than the whiteboards; more_boards: how many more of the same kinds would decide them
     (MOST_MORE_BOARDS: no number of them). brightness_spread: by
-    which whiteboards differ among themselves; so do the references, which the covariance does not
-    count. moved_um: how far the mask stands from its place; so it may in the shots of a scene,
-    which the covariance counts.
+    which whiteboards differ among themselves, beyond what their repeats do; so do the references,
+    which the covariance does not count. moved_um: how far the mask stands from its place; so it
+    may in the shots of a scene, which the covariance counts. astray2: variances of the views' own
+    displacements and softenings.
     """
 
     placement: Placement
@@ -145,6 +156,7 @@ class Fit:
     boards: tuple[BoardCheck, ...]
     brightness_spread: float = 0.0
     moved_um: float = 0.0
+    astray2: tuple[float, ...] = ()
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -224,11 +236,15 @@ class _Prior:
         return 0.5 * float(np.sum(self.precision * (at.vector() - self.centre) ** 2))
 
 
-def _prior(placement: Array, centre: Array, widths: tuple[float, float], boards: int) -> _Prior:
-    """Return the prior of a placement (precisions, centre) and of the whiteboards' own."""
-    own = np.tile(1 / np.square([widths[0], widths[1], widths[1]]), boards)
-    precision = np.concatenate([placement, own]).astype(np.float64)
-    return _Prior(precision, np.concatenate([centre, np.zeros(len(own))]).astype(np.float64))
+def _prior(placement: Array, centre: Array, widths: tuple[float, float], fast2: Array) -> _Prior:
+    """Return the prior of a placement (precisions, centre) and of the whiteboards' own.
+
+    fast2: (board,), variance of brightness that repeats show, beside the width of all.
+    """
+    own2 = np.tile(np.square([widths[0], widths[1], widths[1]]), (len(fast2), 1))
+    own2[:, 0] += fast2
+    precision = np.concatenate([placement, 1 / own2.ravel()]).astype(np.float64)
+    return _Prior(precision, np.concatenate([centre, np.zeros(own2.size)]).astype(np.float64))
 
 
 def _scaled_residuals(
@@ -337,10 +353,68 @@ def _view_terms(
     return mixed, own, pull
 
 
+def _rows_covariance(
+    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float, covariance: Array
+) -> NDArray[np.float64]:
+    """Return what rows that err alike add to the covariance, as the darks' repeats show it.
+
+    A row's error is its neighbour's to a share (autoregressive). Each whiteboard has its own;
+    those of the references and of the darks are in all whiteboards. What whole frames of light do
+    alike is counted beside.
+    """
+    size, height = len(covariance), len(samples[0].board.reading)
+    known = [rows for one in samples if (rows := one.board.rows) is not None]
+    if len(known) < len(samples):
+        return np.zeros((size, size))
+    own_dn2, next_dn2, noise_dn2, darks = (
+        float(np.mean([getattr(one, name) for one in known]))
+        for name in ("own_dn2", "next_dn2", "noise_dn2", "darks")
+    )
+    if not own_dn2 > SURE_ROWS * noise_dn2 * np.sqrt(2 / (height * max(darks - 1, 1))):
+        return np.zeros((size, size))
+    reach = min(ROWS_ALIKE, height - 1)
+    share = float(np.clip(next_dn2 / own_dn2, 0.0, MOST_ALIKE))
+    alike = share ** np.abs(np.arange(-reach, reach + 1))
+
+    def squared(by_row: Array) -> NDArray[np.float64]:
+        product = by_row.T @ correlate1d(by_row, alike, axis=0, mode="constant")
+        return np.asarray(product, np.float64)
+
+    def apart(by_row: Array) -> Array:
+        return by_row - by_row.mean(axis=0)
+
+    shadow = Shadow(mask, at.placement)
+    added, of_references = np.zeros((size, size)), np.zeros((height, size))
+    of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
+    for index, residual in enumerate(_all_residuals(mask, at, samples)):
+        sample, rows = samples[index], known[index]
+        weight = _weights(residual / spread) / np.square(sample.deviation * spread)
+        by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
+        places, opening = _places(at, index), at.opening(sample.board, index)
+        for first in range(0, len(residual), CHUNK):
+            part = slice(first, first + CHUNK)
+            read, slope = shadow.with_slopes(sample.pixels[part], sample.channels[part], *opening)
+            pull = _with_own(read, slope, at.own[index]) * weight[part, None]
+            where = sample.pixels[part, 0][:, None], places
+            np.add.at(by_row, where, pull)
+            np.add.at(read_by_row, where, pull * read[:, None])
+        by_row, read_by_row = by_row / rows.white_dn[0], read_by_row / rows.white_dn[1]
+        added += squared(apart(by_row)) / sample.board.repeats
+        of_references += apart(read_by_row) / np.sqrt(rows.references)
+        of_darks[rows.exposure_s[0]] += by_row
+        of_darks[rows.exposure_s[1]] -= read_by_row
+    added += squared(of_references)
+    for by_row in of_darks.values():
+        added += squared(by_row) / darks
+    return np.asarray(own_dn2 * covariance @ added @ covariance, np.float64)
+
+
 def bias_covariance(
     covariance: Array, mixed: Array, own: Array, pull: Array
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return what the views' own displacements and softenings add to the placement's covariance.
+
+    Beside it, the variances of these, by `Shadow.slopes_by_view`.
 
     covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
     information between these and the views' own (see `Shadow.slopes_by_view`). own, pull:
@@ -358,12 +432,14 @@ def bias_covariance(
         seen = vectors.T @ (tau * pull)
         likelihood = 0.5 * float(np.sum(seen**2 / values - np.log(values)))
         # Steps of the grid grow with tau.
-        evidence.append(likelihood + float(np.log(taus).sum()))
+        beforehand = np.log(taus) - 2 * np.log1p(np.square(taus) / TAU_UM**2 / 3)
+        evidence.append(likelihood + float(beforehand.sum()))
         squares.append(np.square(taus))
     share = np.exp(np.array(evidence) - max(evidence))
     expected = share @ np.array(squares) / share.sum()
     moved = covariance @ mixed
-    return np.asarray((moved * expected[kind]) @ moved.T, np.float64)
+    added = np.asarray((moved * expected[kind]) @ moved.T, np.float64)
+    return added, tuple(float(expected[one]) for one in KINDS)
 
 
 def _posterior(
@@ -373,17 +449,18 @@ def _posterior(
     return sum(_loss(one / spread) for one in residuals) + prior.loss(at)
 
 
-def _widths(normal: _Normal, at: _State, placement: Array, centre: Array) -> tuple[float, float]:
+def _widths(
+    normal: _Normal, at: _State, placement: Array, centre: Array, fast2: Array
+) -> tuple[float, float]:
     """Return the widths of brightness and place that make the readings likeliest, at a fit.
 
-    placement, centre: precisions of its prior, and where it is drawn to.
+    placement, centre: precisions of its prior, and where it is drawn to. fast2: see `_prior`.
     """
-    boards = len(at.own)
     away = at.vector() - np.concatenate([centre, np.zeros(at.own.size)])
     pull = normal.gradient + normal.matrix @ away
 
     def evidence(widths: tuple[float, float]) -> float:
-        precision = _prior(placement, centre, widths, boards).precision
+        precision = _prior(placement, centre, widths, fast2).precision
         factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
         seen = np.linalg.solve(factor, pull)
         own = precision[len(placement) :]
@@ -429,25 +506,28 @@ def fit_placement(
     centre[OFFSETS] = placement.vector()[OFFSETS]
     of_placement = 1 / deviations**2
     widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
+    fast2 = unsteadiness2(boards) / np.array([one.repeats for one in boards])
     at = _State(placement, np.zeros((len(boards), OWN)))
     rng = np.random.default_rng(settings.seed)
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
-        prior = _prior(of_placement, centre, widths, len(boards))
+        prior = _prior(of_placement, centre, widths, fast2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     assert normal is not None
     for _ in range(WIDTH_ROUNDS):
-        widths = _widths(normal, at, of_placement, centre)
-        prior = _prior(of_placement, centre, widths, len(boards))
+        widths = _widths(normal, at, of_placement, centre, fast2)
+        prior = _prior(of_placement, centre, widths, fast2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     size = len(of_placement)
     covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
     terms = _view_terms(mask, at, samples, normal.spread)
-    covariance = (covariance + bias_covariance(covariance, *terms))[:size, :size]
+    of_views, astray2 = bias_covariance(covariance, *terms)
+    of_rows = _rows_covariance(mask, at, samples, normal.spread, covariance)
+    covariance = (covariance + of_views + of_rows)[:size, :size]
     checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
     correlation = _correlation(mask, at, samples)
     placement = with_aperture_mean_one(at.placement)
@@ -484,6 +564,7 @@ def fit_placement(
         checks,
         float(widths[0]),
         moved_um,
+        astray2,
     )
 
 

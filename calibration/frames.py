@@ -35,7 +35,8 @@ class MeanFrame:
     the spread between repeats; NaN with one frame. taken_s: when, on any clock of the capture.
     extra_variance_dn2: of the mean beyond its own noise, from what was subtracted of it.
     row_variance_dn2: (y,), of a row's mean between repeats: lamp and shutter change whole rows
-    alike, which is no noise of single pixels.
+    alike, which is no noise of single pixels. level_variance_dn2: of a frame's mean likewise.
+    rows_dn2: covariance of a row's mean between repeats with itself and with the next row's.
     """
 
     mean_dn: NDArray[np.float32]
@@ -45,6 +46,8 @@ class MeanFrame:
     taken_s: float = 0.0
     extra_variance_dn2: float = 0.0
     row_variance_dn2: NDArray[np.float64] | None = None
+    level_variance_dn2: float = 0.0
+    rows_dn2: tuple[float, float] = (0.0, 0.0)
 
     def noise_dn2(self, dark_dn: NDArray[np.floating] | float) -> float:
         """Return the variance of a pixel of one frame without what whole rows do alike.
@@ -53,10 +56,16 @@ class MeanFrame:
         """
         return self.variance_dn2 - float(np.mean(self._of_rows(dark_dn)))
 
-    def flicker(self, dark_dn: NDArray[np.floating] | float) -> float:
-        """Return the standard deviation of a row's light between repeats, over that light."""
+    def unsteady2(self, dark_dn: NDArray[np.floating] | float) -> float:
+        """Return the relative variance of the brightness between repeats, beyond the pixels' noise.
+
+        By chance it may be negative: average that of several, by their degrees of freedom.
+        """
+        if self.count < 2:
+            return 0.0
         light = float(np.mean(self.mean_dn - dark_dn))
-        return float(np.sqrt(max(np.mean(self._of_rows(dark_dn)), 0.0))) / max(light, 1e-9)
+        alike = self.level_variance_dn2 - self.variance_dn2 / self.mean_dn.size
+        return alike / max(light, 1e-9) ** 2
 
     def _of_rows(self, dark_dn: NDArray[np.floating] | float) -> NDArray[np.float64]:
         """Return the variance of pixels by what their rows do alike, (y,)."""
@@ -108,15 +117,22 @@ def average(
         levels.append(float(rows[-1].mean()))
     if total is None:
         raise CalibrationError(f"{what}: no frame was taken")
-    spread, of_rows = np.nan, None
+    spread, of_rows, of_levels, lags = np.nan, None, 0.0, (0.0, 0.0)
     if count > 1:
-        of_rows = np.var(rows, axis=0, ddof=1)
+        of_rows, of_levels = np.var(rows, axis=0, ddof=1), float(np.var(levels, ddof=1))
+        lags = _lags(np.array(rows) - np.mean(rows, axis=0), 1 - 1 / count)
         spread = (squares - _sum_of_squares(total) / count) / total.size / (count - 1)
         _check_steady(levels, float(np.sqrt(spread / total.size)), what, lit)
         if lit:
             _check_rows(np.array(rows), spread / total.shape[1], what)
     mean = (total / count).astype(np.float32)
-    return MeanFrame(mean, spread, count, exposure_s, taken_s, row_variance_dn2=of_rows)
+    return MeanFrame(mean, spread, count, exposure_s, taken_s, 0.0, of_rows, of_levels, lags)
+
+
+def _lags(apart: NDArray[np.float64], freedom: float) -> tuple[float, float]:
+    """Return the covariance of rows (repeat, y) with themselves and the next ones."""
+    next_ones = float(np.mean(apart[:, 1:] * apart[:, :-1])) if apart.shape[1] > 1 else 0.0
+    return float(np.mean(np.square(apart))) / freedom, next_ones / freedom
 
 
 def bands(frame: Frame) -> list[slice]:
@@ -150,6 +166,9 @@ def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:
         before.exposure_s,
         (before.taken_s + after.taken_s) / 2,
         change**2 / 12,
+        rows_dn2=_lags(
+            (difference - change).mean(axis=1)[None], 1 / before.count + 1 / after.count
+        ),
     )
 
 
@@ -183,7 +202,10 @@ def dark_at(darks: Sequence[MeanFrame], exposure_s: float) -> MeanFrame:
     count = min(one.count for _, one in used)
     extra = max(noise - spread / count, 0.0)
     mean_dn = np.asarray(mean, dtype=np.float32)
-    return MeanFrame(mean_dn, spread, count, exposure_s, extra_variance_dn2=extra)
+    own, following = (sum(share * one.rows_dn2[lag] for share, one in used) for lag in (0, 1))
+    return MeanFrame(
+        mean_dn, spread, count, exposure_s, extra_variance_dn2=extra, rows_dn2=(own, following)
+    )
 
 
 def dark_current_known(darks_s: ArrayLike, exposure_s: float) -> bool:

@@ -98,11 +98,16 @@ def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
 
 
 def psi_deviation(
-    shadow: Shadow, layout: PsiLayout, stages: Stages, covariance: NDArray[np.float64]
+    shadow: Shadow,
+    layout: PsiLayout,
+    stages: Stages,
+    covariance: NDArray[np.float64],
+    astray2: Sequence[float] = (),
 ) -> NDArray[np.float32]:
     """Return the standard deviation of every coefficient, shaped as Psi's weights.
 
-    covariance: of the placement's parameters.
+    covariance: of the placement's parameters. astray2: variances of the views' own displacements
+    and softenings, see `Shadow.slopes_by_view`.
     """
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0)))[:, values > 0]
@@ -114,10 +119,13 @@ def psi_deviation(
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
         chosen = views_open((views_v, views_u), (v, u))
         for band, samples, channels in _bands(layout, shot, stored):
-            slopes = samples_shadow.with_slopes(samples, channels, chosen, stages[shot], shot)[1]
-            spread = np.sqrt(np.square(slopes @ root).sum(axis=1)) / scale
+            how = samples, channels, chosen, stages[shot], shot
+            slopes = samples_shadow.with_slopes(*how)[1]
+            squares = np.square(slopes @ root).sum(axis=1)
+            if len(astray2):
+                squares += np.square(samples_shadow.own_slopes(*how)) @ np.asarray(astray2)
             target = deviation[shot, v, u, band, stored]
-            target[...] = spread.reshape(target.shape)
+            target[...] = (np.sqrt(squares) / scale).reshape(target.shape)
     return deviation
 
 

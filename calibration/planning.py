@@ -23,9 +23,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.boards import Board, unsteadiness2
+from calibration.fit import shares_of_prior
 from calibration.openings import CENTRED, Window, views_open
-from calibration.parametric import SAMPLED, drawn_pixels, psi_information
-from calibration.placement import Placement, Tolerances
+from calibration.parametric import SAMPLED, Parametric, drawn_pixels, psi_information
+from calibration.placement import SCALARS, Placement, Tolerances
 from calibration.shadow import Shadow, ShadowMask
 from emmc_rig.model.noise import SensorNoise
 
@@ -114,6 +116,61 @@ def information_of(
         + dark_variance(kind, light)
     )
     return (slopes.T @ (slopes / variance[:, None])) * (light.pixels / SAMPLED)
+
+
+@dataclass(frozen=True)
+class PinholeWorth:
+    """What whiteboards through the pinhole would add to open ones alone.
+
+    weights: relative deviation of the views' shares of the light, as known now. now, one, every:
+    relative error of Psi expected now, with a whiteboard before `view`, the best, and before every
+    view.
+    """
+
+    weights: float
+    view: tuple[int, int]
+    now: float
+    one: float
+    every: float
+
+
+def pinhole_worth(known: Parametric, boards: Sequence[Board], stated: float) -> PinholeWorth:
+    """Return what whiteboards through the pinhole are worth beside `boards`, taken as the first.
+
+    stated: relative error of Psi; what of it is not the placement's stays.
+    """
+    shadow, fit, board = known.shadow, known.fit, boards[0]
+    mask = shadow.mask
+    chosen, channels = drawn_pixels(mask)
+    matrix, squares = psi_information(shadow)
+    # A pinhole's whiteboard is exposed until it is as bright.
+    views = mask.views[0] * mask.views[1]
+    variance = float(np.median(board.variance[board.usable])) / views**2
+    unsteady2 = fit.brightness_spread**2 + unsteadiness2(boards) / board.repeats
+    pixels = int(board.usable.sum()) / SAMPLED
+    total = np.linalg.inv(fit.covariance)
+    stays2 = max(stated**2 - float(np.sum(fit.covariance * matrix)) / squares, 0.0)
+
+    def added(view: tuple[int, int]) -> NDArray[np.float64]:
+        reading, slopes = shadow.with_slopes(chosen, channels, views_open(mask.views, view))
+        light = slopes.T @ reading
+        level = float(reading @ reading) + variance / pixels / max(unsteady2, 1e-12)
+        return (slopes.T @ slopes - np.outer(light, light) / level) * pixels / variance
+
+    def error(information: Array) -> float:
+        missed2 = float(np.trace(np.linalg.solve(information, matrix))) / squares
+        return float(np.sqrt(missed2 + stays2))
+
+    each = {view: added(view) for view in np.ndindex(mask.views)}
+    best = min(each, key=lambda view: error(total + each[view]))
+    shares = shares_of_prior(fit.placement, fit.covariance, Tolerances())[len(SCALARS) :]
+    return PinholeWorth(
+        float(np.sqrt(np.mean(np.square(shares)))) * Tolerances().aperture,
+        (int(best[0]), int(best[1])),
+        stated,
+        error(total + each[best]),
+        error(total + sum(each.values())),
+    )
 
 
 def plan_parametric(

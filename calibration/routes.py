@@ -17,6 +17,7 @@ from calibration.boards import (
     channels_of,
     gain_of,
     sensor_blemishes,
+    unsteadiness2,
 )
 from calibration.choice import (
     LARGEST_CHI2,
@@ -39,6 +40,7 @@ from calibration.findings import (
     level_findings,
     mask_findings,
     unwatched,
+    views_assumed,
 )
 from calibration.fit import MOST_MORE_BOARDS, OFFSETS, SOFT_EDGES, Fit, fit_placement
 from calibration.frames import MeanFrame
@@ -52,6 +54,7 @@ from calibration.parametric import (
     psi_deviation,
     shot_stages,
 )
+from calibration.planning import pinhole_worth
 from calibration.refusals import (
     FREE_GRADIENT,
     refuse_another_bench,
@@ -170,6 +173,7 @@ def calibrate(
     judged: dict[str, HeldOut] = {}
     frames: dict[str, int] = {}
     parametric = mixed = plain = None
+    seen: list[Board] = []
     if modelled:
         if few is None:
             raise CalibrationError("the parametric route was given no whiteboards")
@@ -226,7 +230,7 @@ def calibrate(
             judged["combined"] = _judged_measured("combined", both, still[0], layout.binning)
             frames["combined"] = few.exposures
     for name, one in calibrations.items():
-        _make_less_sure(one, _unsteady(name, sets, parametric))
+        _make_less_sure(one, _unsteady(name, sets, [*judges, *seen], parametric))
         if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
             _count_moves(one, parametric, layout, shot_stages(camera))
     chosen, why = choose([judged[name] for name in judged if name in routes])
@@ -269,6 +273,10 @@ def calibrate(
         findings += leaning_findings(leans, bool(turned))
         for one in calibrations.values():
             less_sure(one, leans.lopsided)
+    not_known = unwatched(_missing(sets, levels, layout, bool(turned)))
+    if parametric is not None and all(board.views_open.all() for board in seen):
+        stated = calibrations[chosen.route].stated_error
+        not_known.append(views_assumed(pinhole_worth(mixed or parametric, seen, stated)))
     return Outcome(
         chosen.route,
         why,
@@ -280,24 +288,29 @@ def calibrate(
         good,
         tuple(advice),
         tuple(findings),
-        tuple(unwatched(_missing(sets, levels, layout, bool(turned)))),
+        tuple(not_known),
         seen_colours,
     )
 
 
-def _unsteady(route: str, sets: Sequence[BoardSet], parametric: Parametric | None) -> float:
+def _unsteady(
+    route: str, sets: Sequence[BoardSet], boards: Sequence[Board], parametric: Parametric | None
+) -> float:
     """Return the relative error that shutter and lamp leave in all of a Psi alike.
 
-    Every whiteboard is divided by the references, which are as unsteady as it is; of single views
-    as measured through a pinhole each has its own beside.
+    Every whiteboard is divided by the references, which are as unsteady as it is: from frame to
+    frame, as repeats show, which their number averages; and slowly, as the fit shows. Of single
+    views as measured through a pinhole each has its own beside.
     """
-    if parametric is not None:
-        spread = parametric.fit.brightness_spread
-    else:
-        means = [one.references[key] for one in sets for key in one.references]
-        dark_dn = sets[0].dark.mean_dn
-        spread = float(np.mean([one.flicker(dark_dn) / np.sqrt(one.count) for one in means]))
-    return spread * (np.sqrt(2) if route == "free" else 1.0)
+    references = list({id(f): f for one in sets for f in one.references.values()}.values())
+    dark_dn = sets[0].dark.mean_dn
+    fast2 = unsteadiness2(boards, [(one.count, one.unsteady2(dark_dn)) for one in references])
+    slow2 = 0.0 if parametric is None else parametric.fit.brightness_spread**2
+    spread2 = slow2 + fast2 * float(np.mean([1 / one.count for one in references]))
+    if route == "free":
+        pinholes = [frame.count for one in sets for frame in one.frames if frame.pinhole]
+        spread2 += slow2 + fast2 * float(np.mean([1 / count for count in pinholes]))
+    return float(np.sqrt(spread2))
 
 
 def _missing(
@@ -376,6 +389,8 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     shadow = one.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
     of_few = [board for board in seen if not board.views_open.all()]
+    if not of_few:
+        return one
     misfits = []
     for board in of_few:
         predicted = predicted_by_shadow(shadow, board)
@@ -385,8 +400,6 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
         count = int(board.views_open.sum())
         for v, u in np.argwhere(board.views_open).tolist():
             found[v, u].append((count, Misfit(misfit.level / count, misfit.per_slope)))
-    if not found:
-        return one
     every = {}
     for view, several in found.items():
         fewest = min(count for count, _ in several)
@@ -426,10 +439,12 @@ def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
 
 def _judged(name: str, one: Parametric, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
+    every = [*judges, *seen]
 
     def judged(board: Board) -> HeldOut:
         predicted = predicted_by_shadow(one.shadow, board)
-        return judge(name, board, predicted, unsteady=one.fit.brightness_spread)
+        unsteady2 = one.fit.brightness_spread**2 + unsteadiness2(every) / board.repeats
+        return judge(name, board, predicted, unsteady=float(np.sqrt(unsteady2)))
 
     groups = {
         ("open aperture" if i == 0 else "mask moved"): judged(board)
@@ -481,7 +496,9 @@ def _calibration(
 ) -> Calibration:
     stages = shot_stages(camera)
     psi = one.psi(layout, stages)
-    deviation = psi_deviation(one.shadow, layout, stages, one.fit.covariance)
+    # Whiteboards of single views show what the model misses of each; sums, how far they stray.
+    astray2 = one.fit.astray2 if one.misfit is None else ()
+    deviation = psi_deviation(one.shadow, layout, stages, one.fit.covariance, astray2)
     if one.defects is not None and one.defects.count:
         deviation = _counting_defects(deviation, one, layout, stages)
     white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])

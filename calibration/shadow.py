@@ -32,6 +32,8 @@ GLASS_INDEX = 1.52
 ANY_COLOUR = 3
 OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
+OWN_PIXELS = 2**12
+"""Whose derivatives are held at once."""
 SPARE_UM = 900.0
 """Beyond the beam, for a mask that sits askew."""
 SEARCH_UM = 600.0
@@ -444,6 +446,23 @@ class Shadow:
         count = len(pixels)
         slope = self._both(pixels, channels, views_open, stage_um, frame, count, 0, by_view)[1]
         return slope, by_view.reshape(count, -1)
+
+    def own_slopes(
+        self,
+        pixels: Pixels,
+        channels: NDArray[np.uint8],
+        views_open: NDArray[np.bool_],
+        stage_um: tuple[float, float] = (0.0, 0.0),
+        frame: int = 0,
+    ) -> NDArray[np.float64]:
+        """Return the derivatives of one open view's readings by what it alone sees, (n, 5)."""
+        found = np.empty((len(pixels), OF_VIEW))
+        for first in range(0, len(pixels), OWN_PIXELS):
+            part = slice(first, first + OWN_PIXELS)
+            how = pixels[part], channels[part], views_open, stage_um, frame
+            by_view = self.slopes_by_view(*how)[1].reshape(-1, self._aperture.size, OF_VIEW)
+            found[part] = by_view.sum(axis=1)
+        return found
 
     def coefficients(
         self,

@@ -70,6 +70,15 @@ class Calibration:
             white_dn_per_s=self.white_dn_per_s[chosen],
         )
 
+    @property
+    def stated_error(self) -> float:
+        """The relative error of Psi that the deviations state, root mean square."""
+        missed = total = 0.0
+        for place in np.ndindex(*self.deviation.shape[:3]):
+            missed += float(np.sum(np.square(self.deviation[place]), dtype=np.float64))
+            total += float(np.sum(np.square(self.psi.weights[place]), dtype=np.float64))
+        return float(np.sqrt(missed / max(total, 1e-300)))
+
     def usable(self, frames_dn: Frames, white_level_dn: int) -> NDArray[np.bool_]:
         """Return which readings to use, (shot, y, x): of good pixels, and not saturated."""
         unsaturated = np.asarray(frames_dn) < white_level_dn

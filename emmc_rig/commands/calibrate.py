@@ -59,8 +59,8 @@ def calibrate(
         str | None,
         typer.Option(
             "--leave-out",
-            help="with --plan: what the rig cannot take, some of lamp, response, colours, turned; "
-            "commas between",
+            help="with --plan: what the rig cannot take, some of lamp, response, colours, turned, "
+            "aperture; commas between",
         ),
     ] = None,
     sensor: Annotated[

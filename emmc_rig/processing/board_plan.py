@@ -46,6 +46,8 @@ METERING_DARKS, BOARD_DARKS, SHOT_DARKS = 2, 1, 2
 LAMP_CHECKS, COLOUR_REPEATS, TURNED_REPEATS = 6, 2, 2
 TURNS_DEG = 90.0, 180.0, 270.0
 STAGE_KINDS_UM = ((0.0, 0.0), (270.0, 162.0))
+MORE_STAGES_UM = ((-151.0, 293.0), (133.0, -245.0))
+"""Beside them where the aperture stays open: the mask's moves show single views in their sums."""
 VERIFY_UM = (-207.0, 118.0)
 """Where the mask stage has not been before: the whiteboards to judge by."""
 SERIES_SHARES = (0.25, 0.5, 0.75)
@@ -59,8 +61,10 @@ WATCHES = {
     "response": "references at several exposures",
     "colours": "references under red, green and blue lamps",
     "turned": "the white board turned by 90, 180 and 270 degrees",
+    "aperture": "whiteboards of single views, or of parts of the aperture",
 }
-"""Whiteboards that show errors of other parts than the mask: each may be left out of a plan."""
+"""Whiteboards that may be left out of a plan; all but the last show errors of other parts than the
+mask."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +191,11 @@ def few_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedF
     """
     camera, target = settings.camera, settings.target
     stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    whole = "aperture" in settings.leave_out
+    if whole and camera.moving_masks:
+        stages = STAGE_KINDS_UM + MORE_STAGES_UM
     kinds = [Kind(None, stage) for stage in stages]
-    kinds += [Kind(None, window=window) for window in parts(camera.views)]
+    kinds += [] if whole else [Kind(None, window=window) for window in parts(camera.views)]
     others = frames_by_kind(settings, PlannedFrames(dict.fromkeys(kinds, 1), 0.0)).total()
     others -= len(kinds)
     most = MOST_FRAMES if settings.most_frames is None else settings.most_frames - others
@@ -201,7 +208,7 @@ def few_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedF
         raise AppError(
             f"a relative error of Psi of {target:.3%} cannot be reached by few whiteboards: the "
             f"best is {planned.expected_error:.3%}, with {others + taken} frames; raise --target "
-            "or --frames, or leave --few out"
+            f"or --frames, or {'open the aperture in parts' if whole else 'leave --few out'}"
         )
     return planned
 
@@ -215,16 +222,18 @@ def write_plan(settings: PlanSettings, folder: Path) -> dict:
     camera = settings.camera
     mask = shadow_mask(camera, settings.size)
     light = plan_light(camera, mask)
-    planned = (few_plan if settings.few else combined_plan)(settings, mask, light)
-    counts, few, more = frames_by_kind(settings, planned), settings.few, 0
-    if few:
+    whole = "aperture" in settings.leave_out
+    few, more = settings.few or whole, 0
+    planned = (few_plan if few else combined_plan)(settings, mask, light)
+    counts = frames_by_kind(settings, planned)
+    if few and not whole:
         # The frames allowed may be too few to open every view.
         with suppress(AppError):
-            whole = combined_plan(settings, mask, light)
-            of_whole = frames_by_kind(settings, whole)
-            if of_whole.total() < counts.total():
+            every = combined_plan(settings, mask, light)
+            of_every = frames_by_kind(settings, every)
+            if of_every.total() < counts.total():
                 few, more = False, counts.total()
-                planned, counts = whole, of_whole
+                planned, counts = every, of_every
     metrics = {
         "camera": settings.camera_name,
         "size": list(settings.size),

@@ -56,6 +56,26 @@ def test_few_whiteboards_never_take_more_frames_than_every_view(
     assert same == opens_every_view
 
 
+def test_where_the_aperture_stays_open_only_the_mask_moves(run, tmp_path):
+    asked = ("calibrate", "--plan", "--leave-out", "aperture", "--size", "96x128")
+    code, _, _ = run(*asked, "--target", "0.01", "--out", tmp_path / "plan")
+    assert code == 0
+    boards = yaml.safe_load((tmp_path / "plan" / "plan.yaml").read_text())["whiteboards"]
+    assert boards["views"] == []
+    assert not any("window" in one for one in boards["open"])
+    places = {
+        tuple(one.get("mask_um", (0, 0))) for one in boards["open"] if not one.get("held_out")
+    }
+    assert len(places) == 4
+    metrics = json.loads((tmp_path / "plan" / "metrics.json").read_text())
+    assert metrics["expected_relative_error"] <= 0.01
+    assert "aperture" in metrics["left_out"]
+    code, _, said = run(*asked, "--target", "0.0001", "--out", tmp_path / "none")
+    assert code == 1
+    assert "open the aperture in parts" in said
+    assert not (tmp_path / "none" / "plan.yaml").exists()
+
+
 def test_few_whiteboards_are_planned_by_parts_of_the_aperture(run, tmp_path):
     out = tmp_path / "plan"
     asked = ("--plan", "--few", "--size", "32x48", "--target", "0.01", "--out", out)

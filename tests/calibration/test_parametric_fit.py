@@ -128,6 +128,17 @@ def synthetic(design, placement, noise=0.004, seed=0, settings=FEW):
     return boards
 
 
+def test_brightness_that_repeats_show_to_differ_counts_in_the_fit(design):
+    mask = shadow_mask(CAMERA, SIZE)
+    steady = synthetic(design, designed_placement(CAMERA), settings=FEW[:2])
+    jumping = [replace(one, repeats=2, unsteady2=0.02**2) for one in steady]
+    known, less = (fit_placement(boards, CAMERA, mask) for boards in (steady, jumping))
+    # Two whiteboards of two frames each are as bright as the mean of four.
+    assert less.deviation("clear") == pytest.approx(0.02 / 2 * less.placement.clear, rel=0.2)
+    assert known.deviation("clear") < 0.4 * less.deviation("clear")
+    assert known.brightness_spread < 0.001 > less.brightness_spread
+
+
 def cramer_rao(boards, shadow):
     """The inverse of the Fisher information of all readings, with the prior."""
     information = np.diag(1 / Tolerances().deviations(VIEWS) ** 2)

@@ -185,3 +185,31 @@ def test_a_gain_without_repeats_or_light_is_refused():
     with pytest.raises(CalibrationError, match="is the lamp on"):
         photon_transfer(two, two)
     assert SensorGain(0.5, 2.0).variance_dn2(np.array([10.0]))[0] == 7.0
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.003])
+def test_repeats_show_by_how_much_their_exposures_differ(jitter):
+    rng = np.random.default_rng(2)
+    seen = []
+    for _ in range(60):
+        levels = 2000 * (1 + jitter * rng.standard_normal(4))
+        frames = [rng.normal(64 + level, 20, (16, 16)).astype(np.uint16) for level in levels]
+        seen.append(average(frames, 1.0, WHITE_DN, "x").unsteady2(64.0))
+    of_noise2 = (20 / 2000) ** 2 / 16**2
+    expected = 4 * np.sqrt(2 / 180) * (jitter**2 + of_noise2)
+    assert np.mean(seen) == pytest.approx(jitter**2, abs=expected)
+
+
+def test_repeated_darks_show_how_rows_err_alike():
+    rng = np.random.default_rng(4)
+    seen = []
+    for _ in range(50):
+        rows = 3 * rng.standard_normal((4, 41))
+        rows = 0.8 * rows[:, 1:] + 0.6 * rows[:, :-1]
+        frames = 500 + rows[:, :, None] + rng.normal(0, 8, (4, 40, 16))
+        dark = average(np.rint(frames).astype(np.uint16), 1.0, WHITE_DN, "x", lit=False)
+        seen.append((dark.rows_dn2[0] - dark.variance_dn2 / 16, dark.rows_dn2[1]))
+    # Moving averages of two rows: correlated by 0.8 x 0.6 with the next. The rows' share of the
+    # pixels' variance is 9 of 73.
+    of_rows = 9 - 9 / 16
+    assert np.mean(seen, axis=0) == pytest.approx([of_rows, 0.48 * 9], rel=0.08)

@@ -14,6 +14,11 @@ import numpy as np
 
 POINTS = 12
 FINER = 20
+GEOMETRY = (
+    "lens_um", "mask_um", "pitch_um", "cell_um", "aperture_cell_um", "views", "offset_um",
+    "rotation_rad", "blur_um", "tilt", "glass_um", "astray_um",
+)  # fmt: skip
+TRACED: dict[Any, dict[tuple[float, float], np.ndarray]] = {}
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,7 @@ class Optics:
     turns with the board. lamp_side: the same of the lamp, which does not turn. gloss: of a lobe
     about the middle of the aperture. turn_sense: -1: "turned by 90 degrees" goes the other way.
     unfilled: by which the board's light falls in the outermost views (it does not fill the lens).
+    astray_um: standard deviation by which aberrations displace the shadow of every view.
     """
 
     lens_um: float = 50_000.0
@@ -51,6 +57,7 @@ class Optics:
     lamp_side: float = 0.0
     gloss: float = 0.0
     unfilled: float = 0.0
+    astray_um: float = 0.0
     turn_sense: int = 1
 
 
@@ -131,13 +138,17 @@ class Bench:
         for _ in range(self.course.dust):
             y, x = fixed.random(2) * self.size
             self.dust *= 1 - 0.3 * np.exp(-((rows - y) ** 2 + (columns - x) ** 2) / 8)
+        self.astray = optics.astray_um * fixed.standard_normal((2, *optics.views))
         cells = optics.closed + (optics.open - optics.closed) * np.asarray(self.cells, float)
         fine = np.atleast_3d(cells).repeat(FINER, 0).repeat(FINER, 1)
         if optics.blur_um:
             fine = _blurred(fine, optics.blur_um * FINER / optics.cell_um)
         self.area = np.pad(fine.cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0)))
         self.filtered = self.colour if self.area.shape[2] == 3 else np.zeros(self.size, int)
-        self.known: dict[Any, np.ndarray] = {}
+        # What the mask's shadow depends on; benches that differ in the rest share it.
+        traced = {one: getattr(optics, one) for one in GEOMETRY}
+        drawn = cells.tobytes(), self.astray.tobytes()
+        self.known = TRACED.setdefault((repr(traced), self.size, sensor.bayer, *drawn), {})
 
     @property
     def colour(self) -> np.ndarray:
@@ -274,6 +285,7 @@ class Bench:
         passed = np.zeros((*optics.views, *self.size))
         for j, at_v in enumerate(v):
             for i, at_u in enumerate(u):
+                stray_x, stray_y = self.astray[:, j, i]
                 for dy in within:
                     for dx in within:
                         to_x = (at_u - x - dx) / optics.lens_um
@@ -282,8 +294,8 @@ class Bench:
                         steep = 1 + to_x**2 + to_y**2
                         inside = 1 / np.sqrt(1.52**2 * steep - steep + 1)
                         far = far + optics.glass_um * (inside - 1 / 1.52)
-                        on_x = x + dx + far * to_x - optics.offset_um[0] - mask_x
-                        on_y = y + dy + far * to_y - optics.offset_um[1] - mask_y
+                        on_x = x + dx + far * to_x - optics.offset_um[0] - mask_x + stray_x
+                        on_y = y + dy + far * to_y - optics.offset_um[1] - mask_y + stray_y
                         column = cosine * on_x + sine * on_y
                         row = -sine * on_x + cosine * on_y
                         passed[j, i] += self._box(row, column, half)
