@@ -66,9 +66,10 @@ class Reconstruction:
         return replace(self, light_field=empty, maps={})
 
 
-TAILS, WITHIN = "stated_tails_db", "stated_within_db"
+TAILS, WITHIN, SCALE = "stated_tails_db", "stated_within_db", "stated_scale_db"
 """Parameters of a result: by how many dB its mean square error exceeds that of its deviation, since
-few errors are large; how far the true PSNR is from the one stated, in 9 of 10 captures at most."""
+few errors are large; how far the true PSNR is from the one stated, in 9 of 10 captures at most; by
+how many dB the square of the deviation was scaled from what held-out readings show."""
 
 
 def stated_figures(variance: float | None, parameters: Mapping[str, float]) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from scipy.optimize import minimize
 
 from reconstruction.adaptive.joint import FittedScene
 from reconstruction.adaptive.refine import slopes
-from reconstruction.result import TAILS
+from reconstruction.result import SCALE, TAILS
 
 Array = NDArray[np.floating]
 HELD_SHARE, MOST_SHARE = 0.02, 0.06
@@ -230,7 +230,8 @@ def stated(of: Mapping[str, float]) -> tuple[np.float32, dict[str, float]]:
     """Return the square of the deviation over the variance, and what to report, for FEATURES."""
     error_db, deviation_db = foretold_db(of)
     reported = {f"stated_{name}": value for name, value in of.items()}
-    return np.float32(10 ** (deviation_db / 10)), reported | {TAILS: error_db - deviation_db}
+    reported |= {TAILS: error_db - deviation_db, SCALE: deviation_db}
+    return np.float32(10 ** (deviation_db / 10)), reported
 
 
 def within_db(decided: float | None) -> float:

@@ -13,7 +13,7 @@ from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.colour import unseen_colour
 from reconstruction.flat import flat_psi
-from reconstruction.result import Reconstruction
+from reconstruction.result import SCALE, Reconstruction
 from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import displaced
 from reconstruction.verdict.kept import compare_held_out, over_baselines
@@ -45,7 +45,7 @@ class Evidence:
     gains: by which the shots' brightness was evened. over_flat, over_neighbours: see
     `over_baselines`. parallax: root mean square by which views differ from the middle one, over it.
     blockiness: see there. steps: noise by quantisation, over the noise stated. stated: standard
-    deviation that the method states, root mean square over the light field, over its mean.
+    deviation that held-out readings show, root mean square over the light field, over its mean.
     """
 
     method: str
@@ -190,6 +190,7 @@ def _stated(result: Reconstruction) -> float | None:
     if "sigma" not in result.maps:
         return None
     square = np.mean(np.square(result.maps["sigma"], dtype=np.float64))
+    square /= 10 ** (result.parameters.get(SCALE, 0.0) / 10)
     return float(np.sqrt(square) / max(float(result.light_field.mean(dtype=np.float64)), 1e-12))
 
 
