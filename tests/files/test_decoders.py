@@ -36,7 +36,7 @@ GUARDED = {
     "yaml": (READING, "emmc_rig/files/yaml_edit.py"),  # whose text was parsed there before
     "json.load": ("emmc_rig/model/json_text.py",),
     "h5py.File": (READING,),
-    "cv2.im": (READING,),
+    "cv2.im": (READING, "emmc_rig/study/stability/sensor_faults.py"),  # faults: its own bytes
     "PIL.Image.open": (READING,),
     "rawpy": (RAW,),
     "tifffile": (RAW, "drivers/dng.py", CHILD),  # drivers/dng.py: its own bytes
