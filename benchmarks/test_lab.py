@@ -16,7 +16,7 @@ OWN = [
 ]
 """Scripts that take their arguments from `lab`, and those that have their own."""
 SCRIPTS = [path for path in (*SHARED, *OWN) if path.stem not in ("lab", "test_lab")]
-KEEPING = [*SHARED, LAB / "calibration_checks.py"]
+KEEPING = [*SHARED, LAB / "calibration_checks.py", LAB / "real_captures.py"]
 """Scripts that write into docs/results unless told otherwise."""
 NEEDS = {"train_network": "torch"}
 """By script, a package beyond the extra `lab`."""
