@@ -96,7 +96,7 @@ def demo(
     tell(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
         f"copied centre view; SSIM {metrics['ssim']:.3f}; "
-        + (f"stated {stated}; " if stated else "")
+        + (f"stated PSNR {stated}; " if stated else "")
         + f"Psi to {metrics['psi_relative_error']:.2%}; {metrics['status']}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )

@@ -157,7 +157,7 @@ def _say_result(metrics: dict, out: Path) -> None:
             f"SSIM {metrics['ssim']:.3f}"
         )
     if stated := stated_words(metrics):
-        compared += f"; stated {stated}"
+        compared += f"; stated PSNR {stated}"
     if "blocks" in metrics:
         rows, columns = metrics["blocks"]
         compared += f"; {rows}x{columns} blocks, at most {metrics['peak_gib']:.2f} GiB a worker"

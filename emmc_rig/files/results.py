@@ -80,13 +80,13 @@ def _finite(value: object) -> object:
 
 
 def stated_words(metrics: Mapping[str, object]) -> str:
-    """Return "31.2 dB (29.8 to 33.0 in 9 of 10)" of metrics.json, as far as it says; else ""."""
+    """Return "31.2 dB (29.8 to 33.0 in 9 of 10 captures)" by metrics.json; "" without it."""
     stated_db, interval = metrics.get("stated_db"), metrics.get("stated_interval_db")
     if not isinstance(stated_db, float):
         return ""
     match interval:
         case [float(low), float(high)]:
-            return f"{stated_db:.1f} dB ({low:.1f} to {high:.1f} in 9 of 10)"
+            return f"{stated_db:.1f} dB ({low:.1f} to {high:.1f} in 9 of 10 captures)"
     return f"{stated_db:.1f} dB"
 
 

@@ -81,7 +81,7 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
             f"{lost_db:.1f} dB more than by the copied centre view"
         )
     if stated := stated_words(metrics):
-        why = [*(why or [agree]), f"stated {stated}"]
+        why = [*(why or [agree]), f"stated PSNR {stated}"]
     remedies = [*(reason["remedy"] for reason in reasons), str(metrics.get("advice") or "")]
     tone = {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad")
     return Head(

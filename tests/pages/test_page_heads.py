@@ -65,10 +65,10 @@ def test_a_trusted_result_below_its_copied_view_is_not_shown_as_good(found_db, t
     [
         ({}, "agree"),
         ({"stated_db": None, "stated_interval_db": None}, "agree"),
-        ({"stated_db": 31.24}, "agree; stated 31.2 dB"),
+        ({"stated_db": 31.24}, "agree; stated PSNR 31.2 dB"),
         (
             {"stated_db": 31.24, "stated_interval_db": [29.81, 33.02]},
-            "agree; stated 31.2 dB (29.8 to 33.0 in 9 of 10)",
+            "agree; stated PSNR 31.2 dB (29.8 to 33.0 in 9 of 10 captures)",
         ),
     ],
     ids=["none by an earlier version", "no method's", "no interval", "interval"],
