@@ -53,6 +53,8 @@ PROBE = 64
 FEWEST_TO_HOLD_OUT = 3
 UNIT = 1000.0
 """Between ms and s, um and mm, which are mistaken for one another."""
+LEAST_MOVE = 50.0
+"""Of a cell: nobody moves a mask or pinhole by less, but 0.02 to 2 cells in mm look like that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,6 +254,12 @@ class _Import:
         found, following = [], 0
         for item in items:
             row = item.listed.row
+            if row.gain != 1 and row.kind != "shot":
+                raise AppError(
+                    f"{item.listed.where}: gain {row.gain:g}; only shots may have another than 1"
+                )
+            if row.lamp is not None and (row.lamp == "off") != (row.kind == "dark"):
+                raise AppError(f"{item.listed.where}: kind {row.kind} with the lamp {row.lamp}")
             if row.kind != "shot":
                 found.append((item, row.shot or 0))
             elif free:
@@ -298,12 +306,12 @@ class _Import:
         own = self._own_place(shot) if shot < len(self._own.shots) else (0.0, 0.0)
         cells = [mask.cell_um for mask in self._own.masks.values()]
         largest = max(map(abs, place))
-        small = bool(cells) and 0 < largest < min(cells) / UNIT
+        small = bool(cells) and 0 < largest < min(cells) / LEAST_MOVE
         scaled = any(own) and _close((UNIT * place[0], UNIT * place[1]), own)
         if small or (scaled and largest):
             raise AppError(
-                f"{where}: mask at {place[0]:g}, {place[1]:g} um, a thousandth of what the camera "
-                "moves it by: mm for um? write um"
+                f"{where}: mask at {place[0]:g}, {place[1]:g} um, far less than its cells: mm for um? "
+                "write um"
             )
         if any(own) and _close((place[0] / UNIT, place[1] / UNIT), own):
             raise AppError(f"{where}: mask at {place[0]:g}, {place[1]:g} um: nm for um? write um")
@@ -365,10 +373,6 @@ class _Import:
         for (item, shot), exposure_s in zip(self._items, self._exposures_s, strict=True):
             row, where = item.listed.row, item.listed.where
             kind = "held-out" if item is held_out else row.kind
-            if row.gain != 1 and kind != "shot":
-                raise AppError(f"{where}: gain {row.gain:g}; only shots may have another than 1")
-            if (row.lamp == "off") != (kind == "dark") and row.lamp is not None:
-                raise AppError(f"{where}: kind {kind} with the lamp {row.lamp}")
             lamp = "off" if kind == "dark" else row.lamp or "white"
             at_um = mask_offsets_um(self._camera, shot)
             if _placed(row) and kind != "shot":
@@ -441,7 +445,7 @@ class _Import:
                 f"{where}: the pinhole at {x_um:g}, {y_um:g} um is {off_um:g} um from the nearest "
                 f"of the camera's {rows}x{columns} views, {cell_um:g} um apart: is the unit um?"
             )
-        if len(grids[0]) * len(grids[1]) > 1 and 0 < max(abs(x_um), abs(y_um)) < cell_um / 50:
+        if 0 < max(abs(x_um), abs(y_um)) < cell_um / LEAST_MOVE:
             raise AppError(
                 f"{where}: the pinhole at {x_um:g}, {y_um:g} um, of views {cell_um:g} um apart: "
                 "mm for um? write um"

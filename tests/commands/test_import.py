@@ -15,7 +15,7 @@ from programs import one_line, program
 
 from drivers.dng import encode_dng
 from emmc_rig.files.cameras import shipped_camera_files
-from emmc_rig.processing.reconstructing import open_frames
+from emmc_rig.processing.reconstructing import open_frames, reconstruct
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import ImportedEntry, of_kind
@@ -108,6 +108,10 @@ def test_calibration_and_readings_are_those_of_the_captured_session_bit_for_bit(
     assert np.array_equal(frames.readings, own_frames.readings)
     assert np.array_equal(frames.deviation, own_frames.deviation)
     assert np.array_equal(frames.usable, own_frames.usable)
+    captured_field, own_field = (
+        reconstruct(p, f, "tv").light_field for p, f in ((psi, frames), (own_psi, own_frames))
+    )
+    assert np.array_equal(captured_field, own_field)
 
 
 @pytest.fixture(scope="module")
@@ -162,3 +166,205 @@ def test_shots_of_every_format_read_as_those_of_the_captured_session(shots_only,
     assert np.array_equal(psi.weights, own_psi.weights)
     assert np.array_equal(frames.readings, own_frames.readings)
     assert np.array_equal(frames.deviation, own_frames.deviation)
+
+
+MILLI = 1000
+NAMES = ("s0.npy", "s1.npy", "d0.npy", "d1.npy")
+KINDS = ("shot", "shot", "dark", "dark")
+
+
+def good_rows():
+    rows = [{"file": name, "kind": kind} for name, kind in zip(NAMES, KINDS, strict=True)]
+    for shot, row in enumerate(rows[:2]):
+        row |= {"shot": shot, "exposure_s": 0.02}
+    for row in rows[2:]:
+        row["exposure_s"] = 0.02
+    return rows
+
+
+def world(folder):
+    """Write two shots and two darks, and return the rows that name them."""
+    for name, mosaic in zip(NAMES, (*LIT[:2], *DARK), strict=True):
+        np.save(folder / name, mosaic)
+    return good_rows()
+
+
+def changed(row, **cells):
+    """Return what changes cells of a row."""
+    return lambda folder, rows: rows[row].update(cells)
+
+
+def written(row, array):
+    """Return what writes another array into a row's file."""
+    return lambda folder, rows: np.save(folder / rows[row]["file"], array)
+
+
+def renamed(name, **rows_too):
+    """Return what calls a column otherwise in the row of shot 0."""
+    return lambda folder, rows: rows[0].update({name: 1.0}, **rows_too)
+
+
+def nan_pixel(folder, rows):
+    for row in rows:
+        array = np.load(folder / row["file"]).astype(np.float32)
+        np.save(folder / row["file"], array)
+    array[3, 4] = np.nan
+    np.save(folder / rows[-1]["file"], array)
+
+
+def file_written(row, name, content):
+    """Return what writes a file of any bytes and names it in a row."""
+
+    def change(folder, rows):
+        (folder / name).write_bytes(content)
+        rows[row]["file"] = name
+
+    return change
+
+
+def picture(shape, dtype=np.uint16, name="c.png"):
+    """Return what names a picture of noise in the row of shot 1."""
+
+    def change(folder, rows):
+        top = min(np.iinfo(dtype).max, 40_000)
+        codes = np.random.default_rng(8).integers(0, top, shape, dtype)
+        assert cv2.imwrite(str(folder / name), codes)
+        rows[1]["file"] = name
+
+    return change
+
+
+def raw_file(row, cfa="rggb", exposure_s=0.02, size=(24, 32), white=65_535):
+    def change(folder, rows):
+        mosaic = np.resize(LIT[3], size)
+        (folder / "raw.dng").write_bytes(encode_dng(mosaic, cfa, 256, white, exposure_s))
+        rows[row]["file"] = "raw.dng"
+
+    return change
+
+
+def ome(folder, rows):
+    metadata = {"axes": "YX", "Plane": {"ExposureTime": [20.0], "ExposureTimeUnit": ["ms"]}}
+    tifffile.imwrite(folder / "s.ome.tif", LIT[3], metadata=metadata)
+    rows[0] |= {"file": "s.ome.tif", "exposure_s": 20}
+
+
+def all_rows(**cells):
+    return lambda folder, rows: [row.update(cells) for row in rows]
+
+
+MISTAKES = {
+    "a file that is missing": (changed(1, file="s9.npy"), "s9.npy: no such file"),
+    "a file named twice": (changed(1, file="s0.npy"), "s0.npy is there twice, also in"),
+    "a copy under another name": (written(1, LIT[0]), "the same bytes as in"),
+    "a copy of a dark": (written(3, DARK[0]), "the same bytes as in"),
+    "another size": (written(1, LIT[1][:, :30]), "24x30 pixels (y x), and"),
+    "turned by 90 degrees": (written(1, LIT[1].T), "32x24 pixels (y x), and"),
+    "another depth": (written(1, (LIT[1] >> 8).astype(np.uint8)), "8 bits a pixel"),
+    "floats beside integers": (written(1, LIT[1].astype(np.float32)), "values of float32, and"),
+    "whole numbers with a sign": (written(1, LIT[1].astype(np.int32)), "values of int32, and"),
+    "a NaN": (nan_pixel, "1 pixel(s) are no numbers"),
+    "below zero": (written(1, LIT[1].astype(np.int32) - 30_000), "black level still in them"),
+    "above white": (written(1, LIT[1].astype(np.uint32) * 2), "above sensor.noise.white_level_dn"),
+    "complex values": (written(1, LIT[1] * 1j), "holds no real numbers"),
+    "truths": (written(1, LIT[1] > 9), "holds no real numbers"),
+    "a line of values": (written(1, LIT[1].ravel()), "not frames (y, x) or (frame, y, x)"),
+    "five axes": (written(1, LIT[1][None, None, None]), "not frames (y, x) or (frame, y, x)"),
+    "nothing in it": (written(1, LIT[1][:0]), "holds an array of 0x32"),
+    "a colour picture": (picture((24, 32, 3)), "its red, green and blue are three shots"),
+    "a colour array": (written(1, np.stack(LIT[:3], -1)), "its red, green and blue are three"),
+    "a grey picture in colour": (written(1, np.stack([LIT[1]] * 3, -1)), "in three equal colours"),
+    "a picture of 8 bits": (picture((24, 32), np.uint8), "8 bits a pixel, which never reach"),
+    "a text": (file_written(1, "t.txt", b"words"), "t.txt: "),
+    "an empty file": (file_written(1, "e.npy", b""), "e.npy: cannot be read"),
+    "a torn file": (file_written(1, "e.npy", b"\x93NUMPY\x01\x00v\x00{"), "e.npy: cannot be read"),
+    "a torn picture": (file_written(1, "e.png", b"\x89PNG\r\n\x1a\n123"), "cut short or damaged"),
+    "a torn DNG": (file_written(1, "e.dng", b"II*\x00123"), "e.dng: unusable RAW frame"),
+    "no MAT": (file_written(1, "e.mat", b"MATLAB"), "e.mat: cannot be read"),
+    "a folder": (changed(1, file="."), "no Zarr"),
+    "wrong colours": (raw_file(1, "bggr"), "its colours are bggr, the camera's sensor.cfa is rggb"),
+    "another exposure": (raw_file(1, exposure_s=0.05), "exposure_s 0.02, but its file states 0.05"),
+    "ms for s of an OME-TIFF": (ome, "exposure_s 20, but its file states 0.02 s: ms for s?"),
+    "ms for s of the shots": (
+        lambda folder, rows: [row.update(exposure_s=20) for row in rows[:2]],
+        "darks of 0.02 s and shots of 20 s: ms for s",
+    ),
+    "ms for s of the darks": (
+        lambda folder, rows: [row.update(exposure_s=20) for row in rows[2:]],
+        "darks of 20 s and shots of 0.02 s: ms for s",
+    ),
+    "hours for s": (changed(0, exposure_s=1e5), "exposure_s: input should be less than or equal"),
+    "an exposure of nothing": (changed(0, exposure_s=0), "exposure_s: input should be greater"),
+    "an exposure in words": (changed(0, exposure_s="20 ms"), "exposure_s: input should be a"),
+    "an exposure that is no number": (changed(0, exposure_s="nan"), "exposure_s: input should"),
+    "a decimal comma": (changed(0, exposure_s="0,02"), "exposure_s: input should be a"),
+    "milliseconds by the column": (renamed("exposure_ms"), "did you mean 'exposure_s'?"),
+    "millimetres by the column": (renamed("mask_x_mm"), "did you mean 'mask_x_um'?"),
+    "a misspelt column": (renamed("temprature_c"), "did you mean 'temperature_c'?"),
+    "a column of another program": (renamed("qwxz"), "unknown key 'qwxz'"),
+    "mm for um of the mask": (changed(1, mask_x_um=0.01), "mm for um? write um"),
+    "a mask place that is no number": (changed(1, mask_x_um="nan"), "mask_x_um: input should be"),
+    "mm for um of the pinhole": (
+        changed(2, kind="whiteboard", aperture_x_um=0.5, aperture_y_um=0.5),
+        "mm for um? write um",
+    ),
+    "a pinhole beside the aperture": (
+        changed(2, kind="whiteboard", aperture_x_um=1e6), "from the nearest of the camera's 5x5"
+    ),
+    "a kind that is none": (changed(0, kind="light"), "kind: input should be 'shot', 'dark'"),
+    "no kind": (changed(0, kind=""), "kind: field required"),
+    "no file": (changed(0, file=""), "file: field required"),
+    "shots from 1": (
+        lambda folder, rows: [row.update(shot=row["shot"] + 1) for row in rows[:2]],
+        "shot 0 has no file, of shots 0 to 2",
+    ),
+    "a shot left out": (changed(1, shot=2), "shot 1 has no file, of shots 0 to 2"),
+    "a negative shot": (changed(1, shot=-1), "shot: input should be greater than or equal to 0"),
+    "half a shot": (changed(1, shot=0.5), "shot: input should be a whole number"),
+    "shots without and with a number": (changed(1, shot=""), "other shots have a number"),
+    "a dark of no shot": (changed(2, shot=7), "there is no shot 7, only 0 to 1"),
+    "no shots": (lambda folder, rows: rows.__delitem__(slice(0, 2)), "no file is a shot"),
+    "no rows": (lambda folder, rows: rows.clear(), "no row below the names"),
+    "a shot as a dark": (changed(1, kind="dark", shot=""), "a dark that is"),
+    "an ISO as a gain": (changed(0, gain=800), "gain: input should be less than or equal to 100"),
+    "a gain below 1": (changed(0, gain=0.5), "gain: input should be greater than or equal to 1"),
+    "a gain of darks": (changed(2, gain=4), "gain 4; only shots may have another than 1"),
+    "a gain that differs in a shot": (
+        lambda folder, rows: rows[1].update(shot=0, gain=2), "gain differs within shot 0"
+    ),
+    "two places in a shot": (
+        lambda folder, rows: [
+            rows[0].update(mask_x_um=24), rows[1].update(shot=0, mask_x_um=48)
+        ],
+        "the mask's place differs within a shot",
+    ),
+    "a lamp of no colour": (changed(0, lamp="amber"), "lamp: input should be 'white', 'red'"),
+    "a lit dark": (changed(2, lamp="white"), "kind dark with the lamp white"),
+    "a shot with the lamp off": (changed(0, lamp="off"), "kind shot with the lamp off"),
+    "colder than cold": (changed(0, temperature_c=-300), "temperature_c: input should be greater"),
+    "a time in words": (changed(0, time="noon"), "time: input should be a"),
+    "a reference of no exposure": (
+        changed(2, kind="reference", exposure_s=""), "its exposure is not known"
+    ),
+    "an array that is not there": (changed(0, file="s0.npz@a"), "s0.npz: no such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named_in_one_line_and_nothing_is_written(mistake, tmp_path, run):
+    change, words = MISTAKES[mistake]
+    rows = world(tmp_path)
+    change(tmp_path, rows)
+    table = table_of(tmp_path, rows)
+    before = sorted(tmp_path.rglob("*"))
+    code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
+    assert code == 1
+    assert words in one_line(err)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_same_table_without_a_mistake_is_imported(tmp_path, run):
+    table = table_of(tmp_path, world(tmp_path))
+    code, out, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
+    assert code == 0, err
+    assert "4 frames of 4 files imported and verified" in out
