@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import EXPOSURE_AGREEMENT
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import figures
+from emmc_rig.acquisition.checks import BRIGHT_PERCENTILE, figures
 from emmc_rig.acquisition.expand import fittings, mask_offsets_um
 from emmc_rig.acquisition.import_table import LONGEST_S, Listed
 from emmc_rig.acquisition.plan import Checks, Plan, planned_camera
@@ -48,6 +48,9 @@ KIND_ORDER = ("dark", "reference", "whiteboard", "open", "held-out", "shot")
 TOP_DN = 65_535
 BRIGHTEST = 0.9
 """What the brightest part of a scene is taken for where nothing states how bright white is."""
+FAIR_NOISE = 0.01
+"""Of the brightest reading, for values of an unknown unit: three published cameras of other groups
+have 0.008 to 0.01."""
 PROBE = 64
 """Rows and columns at most of the Psi that says how much light a camera's masks let through."""
 FEWEST_TO_HOLD_OUT = 3
@@ -310,8 +313,8 @@ class _Import:
         scaled = any(own) and _close((UNIT * place[0], UNIT * place[1]), own)
         if small or (scaled and largest):
             raise AppError(
-                f"{where}: mask at {place[0]:g}, {place[1]:g} um, far less than its cells: mm for um? "
-                "write um"
+                f"{where}: mask at {place[0]:g}, {place[1]:g} um, far less than its cells: mm "
+                "for um? write um"
             )
         if any(own) and _close((place[0] / UNIT, place[1] / UNIT), own):
             raise AppError(f"{where}: mask at {place[0]:g}, {place[1]:g} um: nm for um? write um")
@@ -466,9 +469,15 @@ class _Import:
         """Write the session under its name, verified, or nothing; raises AppError."""
         planned, scale = self._frames(), self._scale()
         noise = self._camera.sensor.noise
+        gain = noise.gain_dn_per_electron
+        if scale != 1 and "gain_dn_per_electron" not in noise.model_fields_set:
+            shots = [item for frame, item in planned if frame.kind == "shot"]
+            brightest = max(float(np.percentile(item.read(), BRIGHT_PERCENTILE)) for item in shots)
+            gain = brightest * FAIR_NOISE**2
+            self._note(f"the noise is taken as {FAIR_NOISE:.0%} of the brightest reading")
         noise = noise.model_copy(
             update={
-                "gain_dn_per_electron": noise.gain_dn_per_electron * scale,
+                "gain_dn_per_electron": gain * scale,
                 "black_level_dn": noise.black_level_dn * scale,
                 "white_level_dn": noise.white_level_dn * scale,
             }

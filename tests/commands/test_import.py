@@ -168,7 +168,6 @@ def test_shots_of_every_format_read_as_those_of_the_captured_session(shots_only,
     assert np.array_equal(frames.deviation, own_frames.deviation)
 
 
-MILLI = 1000
 NAMES = ("s0.npy", "s1.npy", "d0.npy", "d1.npy")
 KINDS = ("shot", "shot", "dark", "dark")
 
@@ -368,3 +367,100 @@ def test_the_same_table_without_a_mistake_is_imported(tmp_path, run):
     code, out, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
     assert code == 0, err
     assert "4 frames of 4 files imported and verified" in out
+
+
+def imported(run, folder, *arguments):
+    """Import into `out` of a folder; returns the session and what the program said."""
+    code, _, err = run("import", *arguments, "--out", folder / "out")
+    assert code == 0, err
+    return Session(folder / "out"), err
+
+
+def mosaics(session, kind):
+    frames = [frame for frame in session.frames if frame.kind == kind]
+    return np.stack([raw.mosaic for raw, _ in decoded(session, frames)])
+
+
+def test_pages_of_an_ome_tiff_are_shots_with_its_exposures_and_times(tmp_path, run):
+    plane = {"ExposureTime": [20.0, 40.0], "ExposureTimeUnit": ["ms"] * 2, "DeltaT": [0.5, 2.0]}
+    tifffile.imwrite(tmp_path / "s.ome.tif", LIT[:2], metadata={"axes": "TYX", "Plane": plane})
+    np.save(tmp_path / "d.npy", DARK)
+    session, _ = imported(
+        run, tmp_path, "--shots", "s.ome.tif", "--darks", "d.npy", "--camera", CAMERA
+    )
+    assert np.array_equal(mosaics(session, "shot"), LIT[:2])
+    assert np.array_equal(mosaics(session, "dark"), DARK)
+    shots = [session.stored[frame.id] for frame in session.frames if frame.kind == "shot"]
+    assert [(one.exposure_s, one.host_time_s) for one in shots] == [(0.02, 0.5), (0.04, 2.0)]
+
+
+def test_a_zarr_array_is_read(tmp_path, run):
+    zarr = pytest.importorskip("zarr")
+    zarr.create_group(tmp_path / "s.zarr").create_array("data", data=LIT[:2])
+    session, _ = imported(run, tmp_path, "--shots", "s.zarr", "--camera", CAMERA)
+    assert np.array_equal(mosaics(session, "shot"), LIT[:2])
+
+
+def test_planes_of_a_colour_picture_are_three_shots_red_first(tmp_path, run):
+    (tmp_path / "mono.yaml").write_text(
+        "title: three openings\nsensor: {cfa: mono}\nshots: [{}, {}, {}]\n"
+    )
+    cv2.imwrite(str(tmp_path / "c.png"), np.moveaxis(LIT[[2, 1, 0]], 0, -1))
+    session, _ = imported(run, tmp_path, "--shots", "c.png", "--planes", "--camera", "mono.yaml")
+    assert np.array_equal(mosaics(session, "shot"), LIT[:3])
+
+
+def test_fractions_without_darks_read_as_they_are_to_one_factor(tmp_path, run):
+    noise = {"black_level_dn": 0, "white_level_dn": 1}
+    camera = {"title": "of fractions", "sensor": {"cfa": "mono", "noise": noise}}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(camera))
+    values = (LIT[0] / 65_535).astype(np.float32)
+    np.save(tmp_path / "s.npy", values)
+    session, said = imported(run, tmp_path, "--shots", "s.npy", "--camera", "mine.yaml")
+    assert "stored 65535 times as large" in said
+    assert "noise is taken as 1%" in said
+    readings = open_frames(session.folder)[1].readings[0]
+    factor = np.median(readings / values)
+    assert np.allclose(readings, factor * values, atol=factor / 65_535)
+
+
+def test_without_exposure_the_mask_place_of_the_table_is_that_of_the_camera(tmp_path, run):
+    rows = world(tmp_path)
+    rows[1] |= {"mask_x_um": 12.0, "mask_y_um": -36.0}
+    table = table_of(tmp_path, rows)
+    session, _ = imported(run, tmp_path, table, "--camera", CAMERA)
+    (offset,) = session.camera["shots"][1]["offset_um"].values()
+    assert list(offset) == [12.0, -36.0]
+
+
+def test_milliseconds_that_only_the_light_shows_are_named(tmp_path, run):
+    camera = yaml.safe_load(shipped_camera_files()[CAMERA].read_text())
+    camera["sensor"]["noise"] = {"electrons_per_s": 5_000_000.0}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(camera))
+    rows = world(tmp_path)
+    all_rows(exposure_s=20)(tmp_path, rows)
+    table = table_of(tmp_path, rows)
+    code, _, err = run("import", table, "--camera", "mine.yaml", "--out", "out")
+    assert code == 1
+    assert "ms for s in exposure_s?" in one_line(err)
+
+
+def test_frames_cannot_be_added_to_an_imported_session(tmp_path, run):
+    session, _ = imported(run, tmp_path, table_of(tmp_path, world(tmp_path)), "--camera", CAMERA)
+    code, _, err = run("capture", session.folder)
+    assert code == 1
+    assert "an imported session takes no further frames" in one_line(err)
+
+
+def test_a_disk_that_fails_leaves_nothing(tmp_path, run, monkeypatch):
+    table = table_of(tmp_path, world(tmp_path))
+    before = sorted(tmp_path.rglob("*"))
+
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Session, "store", full)
+    code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
+    assert code == 1
+    assert "nothing was imported" in one_line(err)
+    assert sorted(tmp_path.rglob("*")) == before
