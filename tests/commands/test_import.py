@@ -3,6 +3,7 @@
 import csv
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -173,7 +174,9 @@ KINDS = ("shot", "shot", "dark", "dark")
 
 
 def good_rows():
-    rows = [{"file": name, "kind": kind} for name, kind in zip(NAMES, KINDS, strict=True)]
+    rows: list[dict[str, Any]] = [
+        {"file": name, "kind": kind} for name, kind in zip(NAMES, KINDS, strict=True)
+    ]
     for shot, row in enumerate(rows[:2]):
         row |= {"shot": shot, "exposure_s": 0.02}
     for row in rows[2:]:
@@ -221,12 +224,12 @@ def file_written(row, name, content):
     return change
 
 
-def picture(shape, dtype=np.uint16, name="c.png"):
+def picture(shape, dtype: type = np.uint16, name="c.png"):
     """Return what names a picture of noise in the row of shot 1."""
 
     def change(folder, rows):
         top = min(np.iinfo(dtype).max, 40_000)
-        codes = np.random.default_rng(8).integers(0, top, shape, dtype)
+        codes = np.random.default_rng(8).integers(0, top, shape).astype(dtype)
         assert cv2.imwrite(str(folder / name), codes)
         rows[1]["file"] = name
 
@@ -271,8 +274,8 @@ MISTAKES = {
     "five axes": (written(1, LIT[1][None, None, None]), "not frames (y, x) or (frame, y, x)"),
     "nothing in it": (written(1, LIT[1][:0]), "holds an array of 0x32"),
     "a colour picture": (picture((24, 32, 3)), "its red, green and blue are three shots"),
-    "a colour array": (written(1, np.stack(LIT[:3], -1)), "its red, green and blue are three"),
-    "a grey picture in colour": (written(1, np.stack([LIT[1]] * 3, -1)), "in three equal colours"),
+    "a colour array": (written(1, np.moveaxis(LIT[:3], 0, -1)), "its red, green and blue are three"),
+    "a grey picture in colour": (written(1, np.repeat(LIT[1][..., None], 3, -1)), "in three equal colours"),
     "a picture of 8 bits": (picture((24, 32), np.uint8), "8 bits a pixel, which never reach"),
     "a text": (file_written(1, "t.txt", b"words"), "t.txt: "),
     "an empty file": (file_written(1, "e.npy", b""), "e.npy: cannot be read"),
