@@ -36,6 +36,7 @@ PLAN = {
 }
 LIT = np.random.default_rng(3).integers(300, 40_000, (4, 24, 32), np.uint16)
 DARK = np.random.default_rng(4).integers(250, 262, (2, 24, 32), np.uint16)
+COLOURS, GREY = np.moveaxis(LIT[:3], 0, -1), np.repeat(LIT[1][..., None], 3, -1)
 CAMERA = "rgbw-bayer-2shots"
 
 
@@ -274,8 +275,8 @@ MISTAKES = {
     "five axes": (written(1, LIT[1][None, None, None]), "not frames (y, x) or (frame, y, x)"),
     "nothing in it": (written(1, LIT[1][:0]), "holds an array of 0x32"),
     "a colour picture": (picture((24, 32, 3)), "its red, green and blue are three shots"),
-    "a colour array": (written(1, np.moveaxis(LIT[:3], 0, -1)), "its red, green and blue are three"),
-    "a grey picture in colour": (written(1, np.repeat(LIT[1][..., None], 3, -1)), "in three equal colours"),
+    "a colour array": (written(1, COLOURS), "its red, green and blue are three"),
+    "a grey picture in colour": (written(1, GREY), "in three equal colours"),
     "a picture of 8 bits": (picture((24, 32), np.uint8), "8 bits a pixel, which never reach"),
     "a text": (file_written(1, "t.txt", b"words"), "t.txt: "),
     "an empty file": (file_written(1, "e.npy", b""), "e.npy: cannot be read"),
