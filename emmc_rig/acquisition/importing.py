@@ -32,7 +32,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import refuse_inside_session
 from emmc_rig.files.own_arrays import OwnFrames, read_own
 from emmc_rig.files.results import command_line, versions
-from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.settings import validated
@@ -586,6 +586,7 @@ class _Import:
         k = self._camera.sensor.binning
         size = min(rows * k, PROBE), min(columns * k, PROBE)
         light = build_imaging_matrix(self._camera, size).light_efficiency() or 1.0
+        light *= float(pixel_light(self._camera, size).mean())
         electrons_per_s = brightest_per_s / noise.gain_dn_per_electron / (BRIGHTEST * light)
         if electrons_per_s <= 0:
             raise AppError("no shot is brighter than the camera's sensor.noise.black_level_dn")

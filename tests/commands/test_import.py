@@ -426,6 +426,7 @@ def test_fractions_without_darks_read_as_they_are_to_one_factor(tmp_path, run):
     readings = open_frames(session.folder)[1].readings[0]
     factor = np.median(readings / values)
     assert np.allclose(readings, factor * values, atol=factor / 65_535)
+    assert np.percentile(readings, 99.9) == pytest.approx(0.9, rel=0.01)
 
 
 def test_without_exposure_the_mask_place_of_the_table_is_that_of_the_camera(tmp_path, run):
