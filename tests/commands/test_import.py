@@ -102,6 +102,7 @@ def test_an_imported_session_is_complete_and_says_that_it_was_imported(captured)
     assert entry.files[str(file)] == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_calibration_and_readings_are_those_of_the_captured_session_bit_for_bit(captured):
     (psi, frames), (own_psi, own_frames) = (
         open_frames(captured / name) for name in ("session", "imported")
