@@ -19,6 +19,7 @@ from emmc_rig.commands.design import design
 from emmc_rig.commands.devices import app as devices
 from emmc_rig.commands.export import export
 from emmc_rig.commands.figure import figure
+from emmc_rig.commands.import_ import import_
 from emmc_rig.commands.live import live
 from emmc_rig.commands.modes import ModalCommand
 from emmc_rig.commands.output import say
@@ -51,6 +52,7 @@ for command in (
     tables, stability, design,
 ):  # fmt: skip
     app.command(cls=ModalCommand)(command)
+app.command("import", cls=ModalCommand)(import_)
 
 
 @app.callback(invoke_without_command=True)

@@ -32,6 +32,8 @@ from simulators.effects import EFFECTS, TOGETHER, flawed
 from simulators.still import StillStage
 
 SIMULATED = "simulated"
+IMPORTED = "imported"
+"""What a session has for a rig whose frames are files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
 LATER = ("focus_um", "stands_um", "mask")
 NO_SETTINGS = ("kind", "trigger")
@@ -252,6 +254,8 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
     ask: tells a person what to do and returns when it is done. Raises AppError or what opening a
     device raises.
     """
+    if description["kind"] == IMPORTED:
+        raise AppError("an imported session takes no further frames: import them with the others")
     settings = {key: value for key, value in description.items() if key not in NO_SETTINGS}
     if description["kind"] == SIMULATED:
         imaged = validated(ImagedRig, settings, "the simulated rig", AppError)

@@ -11,7 +11,7 @@ import json
 import resource
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +26,23 @@ COPIES = 4
 PATIENCE_S = 600
 
 
-def read_in_child(kind: str, paths: Sequence[Path]) -> NDArray:
+def read_in_child(kind: str, paths: Sequence[Path], name: str = "") -> NDArray:
     """Return the array of a file, or of several stacked; kind: of READERS.
 
+    name: of the array, in a file that may hold several; "": the only one of two axes or more.
     Raises ValueError, with the complaint, for what cannot be read, or not within the memory that a
     data set of HDF5 may take.
     """
     size_bytes = sum(path.stat().st_size for path in paths)
     most_bytes = COPIES * (MOST_COMPRESSED * size_bytes + FREE_BYTES)
-    job = json.dumps({"kind": kind, "most_bytes": most_bytes, "paths": [str(p) for p in paths]})
+    job = json.dumps(
+        {
+            "kind": kind,
+            "most_bytes": most_bytes,
+            "paths": [str(path) for path in paths],
+            "name": name,
+        }
+    )
     command = [sys.executable, "-P", "-m", "emmc_rig.files.child"]
     try:
         done = subprocess.run(command, input=job.encode(), capture_output=True, timeout=PATIENCE_S)
@@ -46,19 +54,75 @@ def read_in_child(kind: str, paths: Sequence[Path]) -> NDArray:
     return np.lib.format.read_array(io.BytesIO(done.stdout), allow_pickle=False)
 
 
-def _reader_of_mat() -> Callable[[str], Any]:
+def only_array(shapes: Mapping[str, Sequence[int]], name: str) -> str:
+    """Return which array of a file is meant, by their shapes; raises ValueError.
+
+    name: as asked for; "": the only one with two axes or more.
+    """
+    known = [one for one, shape in shapes.items() if sum(size > 1 for size in shape) > 1]
+    if name in shapes:
+        return name
+    if name or len(known) != 1:
+        missing = f"no array '{name}'" if name else "not one array of two axes or more"
+        raise ValueError(f"it holds {missing}; write FILE@ARRAY with one of: {', '.join(shapes)}")
+    return known[0]
+
+
+def _reader_of_mat(name: str) -> Callable[[str], Any]:
     import scipy.io
 
-    return lambda path: scipy.io.loadmat(path, variable_names=["LF"])["LF"]
+    def read(path: str) -> NDArray:
+        shapes = {one: shape for one, shape, _ in scipy.io.whosmat(path)}
+        wanted = only_array(shapes, name)
+        return scipy.io.loadmat(path, variable_names=[wanted])[wanted]
+
+    return read
 
 
-def _reader_of_tiff() -> Callable[[str], Any]:
+def _reader_of_npz(name: str) -> Callable[[str], Any]:
+    def read(path: str) -> NDArray:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = dict(stored)
+        return arrays[only_array({one: array.shape for one, array in arrays.items()}, name)]
+
+    return read
+
+
+def _reader_of_tiff(name: str) -> Callable[[str], Any]:
     import tifffile
 
     return tifffile.imread
 
 
-def _reader_of_exr() -> Callable[[str], Any]:
+def _reader_of_tiff_times(name: str) -> Callable[[str], Any]:
+    """Read (page, 2): exposure and time of every page in seconds, NaN where it states none."""
+    import xml.etree.ElementTree
+
+    import tifffile
+
+    seconds = {"s": 1.0, "ms": 1e-3, "\u00b5s": 1e-6, "us": 1e-6, "ns": 1e-9}
+
+    def read(path: str) -> NDArray:
+        with tifffile.TiffFile(path) as tiff:
+            known = np.full((len(tiff.pages), 2), np.nan)
+            if tiff.ome_metadata:
+                root = xml.etree.ElementTree.fromstring(tiff.ome_metadata)
+                planes = [one for one in root.iter() if one.tag.endswith("}Plane")]
+                for place, plane in enumerate(planes[: len(known)]):
+                    for column, key in enumerate(("ExposureTime", "DeltaT")):
+                        unit = seconds[plane.get(f"{key}Unit", "s")]
+                        known[place, column] = float(plane.get(key, "nan")) * unit
+            for place, page in enumerate(tiff.pages):
+                tag = page.aspage().tags.get("MicroManagerMetadata")
+                if tag is not None:
+                    for column, key in enumerate(("Exposure-ms", "ElapsedTime-ms")):
+                        known[place, column] = float(tag.value.get(key, "nan")) / 1000
+        return known
+
+    return read
+
+
+def _reader_of_exr(name: str) -> Callable[[str], Any]:
     import OpenEXR
 
     def read(path: str) -> NDArray:
@@ -68,7 +132,13 @@ def _reader_of_exr() -> Callable[[str], Any]:
     return read
 
 
-READERS = {"mat": _reader_of_mat, "tif": _reader_of_tiff, "exr": _reader_of_exr}
+READERS = {
+    "mat": _reader_of_mat,
+    "npz": _reader_of_npz,
+    "tif": _reader_of_tiff,
+    "tif times": _reader_of_tiff_times,
+    "exr": _reader_of_exr,
+}
 
 
 def _data_bytes() -> int:
@@ -80,7 +150,7 @@ def _data_bytes() -> int:
 def main() -> int:
     """Read what standard input asks for; return the exit code."""
     job = parse_json(sys.stdin.buffer.read(), "the job", ValueError)
-    read = READERS[job["kind"]]()
+    read = READERS[job["kind"]](job["name"])
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + job["most_bytes"], hard))
     try:

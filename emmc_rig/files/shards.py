@@ -105,6 +105,10 @@ class StoredGroup:
         """Return an array, not read."""
         return self._group[name]
 
+    def arrays(self) -> Iterator[tuple[str, Any]]:
+        """Yield the arrays of the group itself by name, not read."""
+        return self._group.arrays()
+
     def array(self, name: str) -> NDArray:
         """Return an array, all of it; raises ValueError where its files cannot hold so much."""
         stored = self._group[name]

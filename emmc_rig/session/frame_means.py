@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.journal import FrameEntry
+from emmc_rig.session.journal import FrameEntry, ImportedEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
@@ -50,8 +51,11 @@ def references_of(session: Session) -> dict[tuple[int, str], list[PlannedFrame]]
 def session_darks(session: Session, of_shots: bool = True) -> tuple[MeanFrame, ...]:
     """Return the darks of each exposure; those taken before and after the whiteboards as one.
 
-    of_shots: those too that were taken for the shots of the scene.
+    of_shots: those too that were taken for the shots of the scene. Of an imported session what no
+    dark tells is the camera's: see `_imported_dark`.
     """
+    if is_imported(session) and not any(frame.kind == "dark" for frame in session.frames):
+        return (_imported_dark(session),)
     groups: dict[tuple[float, int], list[PlannedFrame]] = defaultdict(list)
     for frame in darks_of(session):
         if frame.is_dark_of_shots and not of_shots:
@@ -62,7 +66,29 @@ def session_darks(session: Session, of_shots: bool = True) -> tuple[MeanFrame, .
         mean = mean_of(session, frames)
         earlier = found.get(exposure_s)
         found[exposure_s] = mean if earlier is None else before_and_after(earlier, mean)
+    if is_imported(session):
+        known = _imported_dark(session).variance_dn2
+        return tuple(
+            replace(dark, variance_dn2=known) if dark.count == 1 else dark
+            for dark in found.values()
+        )
     return tuple(found.values())
+
+
+def is_imported(session: Session) -> bool:
+    """Return whether the frames are files of another program."""
+    return bool(of_kind(session.journal.entries, ImportedEntry))
+
+
+def _imported_dark(session: Session) -> MeanFrame:
+    """Return the dark that black level and read noise of the camera make."""
+    noise = camera_of(session).sensor.noise
+    entry = next(iter(session.stored.values()))
+    rows, columns = entry.shape
+    black = np.tile(entry.black_level_dn, (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
+    read_dn = noise.gain_dn_per_electron * noise.read_noise_electrons
+    # Reading out in whole DN adds a twelfth.
+    return MeanFrame(black.astype(np.float32), read_dn**2 + 1 / 12, 1, entry.exposure_s)
 
 
 def mean_dark(session: Session) -> MeanFrame:
@@ -80,7 +106,7 @@ def darks_of(session: Session) -> list[PlannedFrame]:
 
 def frame_shape(session: Session) -> tuple[int, int]:
     """Return rows and columns of the frames captured; raises AppError where no dark was."""
-    first = darks_of(session)[0]
+    first = (session.frames if is_imported(session) else darks_of(session))[0]
     exposure_of(session, first)
     rows, columns = session.stored[first.id].shape
     return rows, columns

@@ -87,6 +87,21 @@ class RunEntry(Entry):
         return f"{self.wall}: {self.command}"
 
 
+class ImportedEntry(Entry):
+    """The frames are of files that another program wrote.
+
+    files: by path, the SHA-256 of their bytes. notes: what was assumed that no file states.
+    """
+
+    kind: Literal["imported"] = "imported"
+    files: dict[str, str]
+    notes: list[str] = []
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return "; ".join((f"{self.wall}: {len(self.files)} files imported", *self.notes))
+
+
 class FrameEntry(Entry):
     """A frame is stored.
 

@@ -20,7 +20,7 @@ from emmc_rig.commands import output
 from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import save_hdf5
 
-SIZE = ("--size", "24x32")
+SIZE, SHAPE = ("--size", "24x32"), (24, 32)
 RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
 ONE_FILE = {
     "capture --new",
@@ -39,6 +39,7 @@ WRITERS = {
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
     "figure": ("scene.h5",),
+    "import": ("--shots", "shot.npy", "--camera", "rgbw-bayer-1shot"),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "session export": ("made-session",),
@@ -94,6 +95,7 @@ def world(tmp_path_factory):
     assert done[0] == 0, done
     field = np.random.default_rng(0).uniform(0, 1, (5, 5, 16, 16, 3)).astype(np.float32)
     save_hdf5(folder / "scene.h5", field, {})
+    np.save(folder / "shot.npy", np.random.default_rng(1).integers(256, 9000, SHAPE, np.uint16))
     (folder / "foreign").mkdir()
     (folder / "foreign/thesis.txt").write_text("years of work")
     (folder / "taken.h5").write_text("years of work")

@@ -43,7 +43,7 @@ GUARDED = {
     "scipy.io": (CHILD,),
     "OpenEXR": (CHILD,),
     "zarr": ("emmc_rig/files/shards.py",),
-    "numpy.load": ("emmc_rig/pages/pictures.py",),  # what a study keeps for itself
+    "numpy.load": ("emmc_rig/pages/pictures.py", CHILD),  # what a study keeps for itself
     "torch.load": (),
     "pickle.load": (),
 }

@@ -40,7 +40,7 @@ def _holds_mat(path: Path) -> bool:
 
 def _read_mat(path: Path) -> Array:
     try:
-        pictures = read_in_child("mat", [path])
+        pictures = read_in_child("mat", [path], "LF")
     except (OSError, ValueError) as fault:
         raise AppError(
             f"{path}: no MAT file of LFToolbox that holds LF ({fault}); save it again"

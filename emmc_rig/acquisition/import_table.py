@@ -1,0 +1,127 @@
+"""What the files of another program are: rows of a table, or one kind for all that a glob names."""
+
+from __future__ import annotations
+
+import csv
+import glob
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field
+
+from emmc_rig.errors import AppError
+from emmc_rig.model.json_text import shown_path
+from emmc_rig.model.settings import Settings, validated
+
+ImportedKind = Literal["shot", "dark", "reference", "whiteboard", "open", "held-out"]
+LONGEST_S = 3600.0
+MOST_TABLE_BYTES = 16_000_000
+
+
+def _seconds(value: object) -> object:
+    """Return a number, or the seconds of a date and time as ISO 8601 writes it."""
+    if isinstance(value, str) and re.match(r"\d{4}-", value):
+        return datetime.fromisoformat(value).timestamp()
+    return value
+
+
+class Row(Settings):
+    """One file; a column that is left empty is not known."""
+
+    file: str = Field(description="from the table's folder; FILE@ARRAY where it holds several")
+    kind: ImportedKind
+    shot: int | None = Field(default=None, ge=0, description="from 0, as in plans")
+    exposure_s: float | None = Field(default=None, gt=0, le=LONGEST_S)
+    gain: float = Field(default=1.0, ge=1, le=100, description="a factor, 1 at the lowest ISO")
+    mask_x_um: float | None = Field(default=None, description="from where the mask is centred")
+    mask_y_um: float | None = None
+    aperture_x_um: float | None = Field(default=None, description="of the pinhole, from the axis")
+    aperture_y_um: float | None = None
+    lamp: Literal["white", "red", "green", "blue", "off"] | None = None
+    time: Annotated[float | None, BeforeValidator(_seconds)] = Field(
+        default=None, description="seconds on any clock, or a date and time"
+    )
+    temperature_c: float | None = Field(default=None, ge=-273.15)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A row with where it stands, for messages, and the file that it names."""
+
+    row: Row
+    where: str
+    path: Path
+    array: str = ""
+
+
+def read_table(path: Path) -> list[Listed]:
+    """Return the rows of a CSV table; raises AppError with the line that is wrong."""
+    shown = shown_path(path)
+    try:
+        if path.stat().st_size > MOST_TABLE_BYTES:
+            raise AppError(f"{shown}: larger than {MOST_TABLE_BYTES // 10**6} MB: not a table")
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as fault:
+        raise AppError(f"{shown}: no such file") from fault
+    except OSError as fault:
+        raise AppError(f"{shown}: cannot be read ({fault.strerror})") from fault
+    except UnicodeDecodeError as fault:
+        raise AppError(f"{shown}: not text in UTF-8 (byte {fault.start})") from fault
+    head = text.partition("\n")[0]
+    separator = next((one for one in "\t;" if one in head and "," not in head), ",")
+    try:
+        lines = list(csv.reader(io.StringIO(text), delimiter=separator, strict=True))
+    except csv.Error as fault:
+        raise AppError(f"{shown}: not a table in CSV ({fault})") from fault
+    if not lines:
+        raise AppError(f"{shown}: empty; its first line names the columns: file,kind,exposure_s")
+    names = [name.strip() for name in lines[0]]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise AppError(f"{shown}: the column '{twice.pop()}' is there twice")
+    found = []
+    for number, line in enumerate(lines[1:], 2):
+        cells = [cell.strip() for cell in line]
+        if not any(cells):
+            continue
+        where = f"{shown}, line {number}"
+        if len(cells) != len(names):
+            raise AppError(f"{where}: {len(cells)} cells under {len(names)} columns")
+        given = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
+        # A column that nobody fills is checked too: it may be misspelt.
+        row = validated(Row, dict.fromkeys(set(names) - set(Row.model_fields), "") | given, where,
+                        AppError)  # fmt: skip
+        found.append(_listed(row, where, path.parent))
+    if not found:
+        raise AppError(f"{shown}: no row below the names of the columns")
+    return found
+
+
+def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
+    """Return a row for every file that a glob of its kind names, 2 before 10; raises AppError."""
+    found = []
+    for kind, patterns in globs.items():
+        for pattern in patterns:
+            names = sorted(glob.glob(pattern, recursive=True), key=_natural)
+            if not names:
+                raise AppError(f"{pattern}: no file is called so ({kind})")
+            found += [_listed(Row(file=name, kind=kind), name, Path()) for name in names]
+    return found
+
+
+def _listed(row: Row, where: str, beside: Path) -> Listed:
+    name, _, array = row.file.partition("@")
+    if (beside / row.file).exists():
+        name, array = row.file, ""
+    return Listed(row, where, beside / name, array)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Return a key by which the numbers in names sort as numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if place % 2 else (0, part) for place, part in enumerate(parts)]
