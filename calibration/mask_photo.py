@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import ndtr
 
 from calibration.errors import CalibrationError
@@ -32,8 +32,8 @@ INNER = 0.7
 FEWEST_CELLS = 4
 RING = 3
 """Cells around the mask that are looked at too; the outer two of them as the surround."""
-BLURS = (0.02, 0.05, 0.08, 0.11, 0.14, 0.18, 0.22, 0.27, 0.33)
-"""Of the photograph, deviations in cells, that are tried."""
+BLURS = (0.02, 0.4)
+"""Of a photograph, the least and the most, deviations in cells."""
 BOWS = 0.06
 """The strongest lens bow looked for, either way, at the photograph's corners."""
 LINE_SAMPLES = 6
@@ -87,10 +87,11 @@ class Grid:
         return middle + radius * flat * (1 + self.bow * squares)
 
     def samples(self, photo: Array, x: Array, y: Array) -> Array:
-        """Return a photograph (y, x[, colour]) at points of the mask, its edge beyond it."""
+        """Return a photograph (y, x, colour) at points of the mask; beyond it, its edge."""
         at = self.place(x, y).astype(np.float32)
         columns, rows = at[..., 0], at[..., 1]
-        return cv2.remap(photo, columns, rows, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        seen = cv2.remap(photo, columns, rows, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        return np.atleast_3d(seen)
 
     def pitch_px(self) -> float:
         """Return the smallest side of a cell in the photograph, px."""
@@ -148,16 +149,15 @@ def read_mask(
         raise CalibrationError(
             f"the mask as ordered has {_shown(ordered.shape)} cells, not {_shown(cells)}"
         )
-    grey = np.ascontiguousarray(light.mean(axis=-1))
-    corners = find_corners(grey, cells) if corners_px is None else np.asarray(corners_px, float)
-    _check_corners(corners, grey.shape)
-    start = Grid(cells, corners, 0.0, (grey.shape[0], grey.shape[1]))
+    corners = find_corners(light, cells) if corners_px is None else np.asarray(corners_px, float)
+    _check_corners(corners, light.shape)
+    start = Grid(cells, corners, 0.0, (light.shape[0], light.shape[1]))
     if start.pitch_px() < FEWEST_PX:
         raise CalibrationError(
             f"{start.pitch_px():.1f} pixels a cell of {_shown(cells)}, at least {FEWEST_PX:g} are "
             "needed: photograph it closer, or correct --cells"
         )
-    grid = _fitted(grey, _bowed(grey, start))
+    grid = _fitted(light, _bowed(light, start))
     values, sigma, spread, blur = _cell_values(light, grid)
     level, light_sigma, clear = _light(values, grid)
     inner = (slice(RING, -RING),) * 2
@@ -177,13 +177,14 @@ def _shown(shape: tuple[int, ...]) -> str:
     return f"{shape[0]}x{shape[1]}"
 
 
-def find_corners(grey: Array, cells: tuple[int, int]) -> Array:
+def find_corners(light: Array, cells: tuple[int, int]) -> Array:
     """Return the mask's outer corners (4, 2), x and y in px, from its outline in a photograph.
 
+    light: (y, x, colour).
     The photograph must show some of an even surround, dark or clear, on all sides, and the mask
     upright within 45 degrees. Raises CalibrationError where no such outline is there.
     """
-    differs = _differs_from_surround(grey)
+    differs = _differs_from_surround(light)
     points = np.argwhere(differs)
     nothing = CalibrationError(
         "no mask with an even surround on all sides is seen: give its --corners, clockwise from "
@@ -199,7 +200,7 @@ def find_corners(grey: Array, cells: tuple[int, int]) -> Array:
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     points = np.argwhere((labels == largest) & (differs > 0))[:, ::-1].astype(float)
     beside = points.min(axis=0) <= 1
-    beyond = points.max(axis=0) >= np.array(grey.shape[::-1]) - 2
+    beyond = points.max(axis=0) >= np.array(light.shape[1::-1]) - 2
     if beside.any() or beyond.any():
         raise nothing
     angle = np.radians((cv2.minAreaRect(points.astype(np.float32))[2] + 45) % 90 - 45)
@@ -214,16 +215,16 @@ def find_corners(grey: Array, cells: tuple[int, int]) -> Array:
     return np.array([_crossing(x_of, y_of, middle) for x_of, y_of in pairs]) @ along
 
 
-def _differs_from_surround(grey: Array) -> NDArray[np.uint8]:
+def _differs_from_surround(light: Array) -> NDArray[np.uint8]:
     """Return where a photograph differs from its border's light (a quadratic), without specks."""
-    rows, columns = grey.shape
-    y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : columns * 1j]
-    border = np.maximum(abs(x), abs(y)) > 0.95
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-    some = np.flatnonzero(border)[:: max(1, int(border.sum()) // 20000)]
-    by = terms.reshape(6, -1)[:, some].T
-    surround = np.tensordot(np.linalg.lstsq(by, grey.flat[some], rcond=None)[0], terms, 1)
-    difference = np.abs(cv2.GaussianBlur(grey, (0, 0), 0.8) - surround)
+    size = light.shape[1::-1]
+    small = np.atleast_3d(cv2.resize(light, np.minimum(size, 400), interpolation=cv2.INTER_AREA))
+    y, x = np.mgrid[-1 : 1 : small.shape[0] * 1j, -1 : 1 : small.shape[1] * 1j]
+    border = np.broadcast_to((np.maximum(abs(x), abs(y)) > 0.95)[..., None], small.shape)
+    surround = cv2.resize(_surface(small, border, x, y, 2).astype(np.float32), size)
+    difference = np.abs(cv2.GaussianBlur(light - surround.reshape(light.shape), (0, 0), 0.8))
+    if difference.ndim == 3:
+        difference = difference.max(axis=-1)
     differs = (difference > 0.3 * np.quantile(difference, 0.99)).astype(np.uint8)
     return cv2.morphologyEx(differs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
 
@@ -287,7 +288,7 @@ def _check_corners(corners: Array, photo: tuple[int, ...]) -> None:
         )
 
 
-def _bowed(grey: Array, start: Grid) -> Grid:
+def _bowed(light: Array, start: Grid) -> Grid:
     """Return the grid with the bow for which edges lie on its lines most regularly.
 
     Raises CalibrationError where they lie on the lines of another number of cells.
@@ -298,7 +299,7 @@ def _bowed(grey: Array, start: Grid) -> Grid:
         Grid(start.cells, start.corners_px, bow, start.photo)
         for bow in np.linspace(-BOWS, BOWS, 2 * count + 1).tolist()
     ]
-    spectra = [_line_spectra(grey, grid) for grid in tried]
+    spectra = [_line_spectra(light, grid) for grid in tried]
     strength = [sum(_at(one, n) for one, n in zip(by, start.cells, strict=True)) for by in spectra]
     strongest = [np.max([by[axis] for by in spectra], axis=0) for axis in (0, 1)]
     seen = tuple(_line_count(by, n) for by, n in zip(strongest, start.cells, strict=True))
@@ -317,7 +318,7 @@ def _bowed(grey: Array, start: Grid) -> Grid:
     return tried[int(np.argmax(strength))]
 
 
-def _line_spectra(grey: Array, grid: Grid) -> tuple[Array, Array]:
+def _line_spectra(light: Array, grid: Grid) -> tuple[Array, Array]:
     """Return how strongly edges repeat n times over the mask's height, and width: (n,) each."""
     rows, columns = grid.cells
     spectra = []
@@ -326,8 +327,8 @@ def _line_spectra(grey: Array, grid: Grid) -> tuple[Array, Array]:
         coarse = (np.arange(4 * min(along, 64)) + 0.5) * along / (4 * min(along, 64))
         over, beside = np.meshgrid(fine, coarse, indexing="ij")
         x, y = (over, beside) if spectra else (beside, over)
-        seen = grid.samples(grey, x, y)
-        edges = np.abs(seen[2:] - seen[:-2]).mean(axis=1)
+        seen = grid.samples(light, x, y)
+        edges = np.abs(seen[2:] - seen[:-2]).mean(axis=(1, 2))
         spectrum = np.abs(np.fft.rfft(edges - edges.mean(), LINE_SAMPLES * across))
         spectra.append(spectrum / (edges.sum() + 1e-12))
     return spectra[0], spectra[1]
@@ -339,7 +340,8 @@ def _at(spectrum: Array, n: int) -> float:
 
 def _line_count(spectrum: Array, asked: int) -> int:
     """Return the number of cells along a side: `asked` where the spectrum bears it out, 0: none."""
-    strongest = FEWEST_CELLS + int(np.argmax(spectrum[FEWEST_CELLS : 2 * asked + asked // 2]))
+    least = max(FEWEST_CELLS, asked // 4)
+    strongest = least + int(np.argmax(spectrum[least : 2 * asked + asked // 2]))
     if spectrum[strongest] < 0.12:
         return 0
     for part in range(strongest // FEWEST_CELLS, 1, -1):
@@ -351,7 +353,7 @@ def _line_count(spectrum: Array, asked: int) -> int:
     )
 
 
-def _fitted(grey: Array, start: Grid) -> Grid:
+def _fitted(light: Array, start: Grid) -> Grid:
     """Return the grid whose cells are most even within; raises CalibrationError for none."""
     every = int(np.ceil(np.sqrt(np.prod(start.cells) / FIT_CELLS)))
     rows, columns = (np.arange(0, count, every) for count in start.cells)
@@ -359,7 +361,7 @@ def _fitted(grey: Array, start: Grid) -> Grid:
     y, x = np.meshgrid(
         (rows[:, None] + inside).ravel(), (columns[:, None] + inside).ravel(), indexing="ij"
     )
-    shape = (rows.size, FIT_SAMPLES, columns.size, FIT_SAMPLES)
+    shape = (rows.size, FIT_SAMPLES, columns.size, FIT_SAMPLES, light.shape[-1])
     pitch_px = start.pitch_px()
     bow_unit = pitch_px / np.hypot(*start.photo)
 
@@ -368,7 +370,7 @@ def _fitted(grey: Array, start: Grid) -> Grid:
         return Grid(start.cells, corners, start.bow + bow_unit * float(change[8]), start.photo)
 
     def uneven(change: Array) -> Array:
-        seen = grid_of(change).samples(grey, x, y).reshape(shape)
+        seen = grid_of(change).samples(light, x, y).reshape(shape)
         return np.asarray((seen - seen.mean(axis=(1, 3), keepdims=True)).ravel(), np.float64)
 
     def slopes(change: Array) -> Array:
@@ -395,15 +397,15 @@ def _cell_values(light: Array, grid: Grid) -> tuple[Array, Array, Array, float]:
     inside = 0.5 + INNER * ((np.arange(count) + 0.5) / count - 0.5)
     rows, columns = ((np.arange(-RING, n + RING)[:, None] + inside).ravel() for n in grid.cells)
     y, x = np.meshgrid(rows, columns, indexing="ij")
-    seen = np.atleast_3d(grid.samples(light, x, y)).astype(np.float64)
+    seen = grid.samples(light, x, y).astype(np.float64)
     few = [min(n, 48) for n in grid.cells]
-    some = seen[: few[0] * count, : few[1] * count].mean(axis=-1, keepdims=True)
+    some = seen[: few[0] * count, : few[1] * count]
 
     def misfit(blur: float) -> float:
         down, across = (_blurred_boxes(n, inside, blur) for n in few)
         return float((_residual(some, down, across)[1] ** 2).sum())
 
-    blur = min(BLURS, key=misfit)
+    blur = float(minimize_scalar(misfit, bounds=BLURS, options={"xatol": 0.005}).x)
     down, across = (_blurred_boxes(n + 2 * RING, inside, blur) for n in grid.cells)
     values, residual = _residual(seen, down, across)
     by_cell = residual.reshape(len(values), count, -1, count, values.shape[-1])
@@ -493,11 +495,16 @@ def _clear_cells(relative: Array, inner: Array, within: float) -> NDArray[np.boo
 
     Where some are clear in all colours, those alone: a filter in its own colour is no clear part.
     """
-    near = inner[..., None] & (abs(relative - 1) < within)
-    below = inner[..., None] & (abs(relative - 1 + 2 * within) < within)
-    near &= near.sum(axis=(0, 1)) > 2 * below.sum(axis=(0, 1))
-    white = near.all(axis=-1, keepdims=True)
-    return np.broadcast_to(white, near.shape) if white.sum() > max(11, inner.sum() / 100) else near
+
+    def standing_out(of: Array) -> NDArray[np.bool_]:
+        near, below = (inner[..., None] & (abs(of - at) < within) for at in (1, 1 - 2 * within))
+        return near & (near.sum(axis=(0, 1)) > 2 * below.sum(axis=(0, 1)))
+
+    lowest = relative.min(axis=-1, keepdims=True)
+    white = standing_out(lowest) & (relative.max(axis=-1, keepdims=True) < 1 + within)
+    if white.sum() > max(11, inner.sum() / 100):
+        return np.broadcast_to(white, relative.shape)
+    return standing_out(relative)
 
 
 def _spread_out(clear: Array) -> bool:
@@ -586,7 +593,7 @@ def _defects(cells: Array, spread: Array, ordered: Array | None) -> Iterator[Def
         is_open = level > (level.min() + level.max()) / 2
         ends = [np.median(level[part]) if part.any() else np.nan for part in (is_open, ~is_open)]
         between = np.minimum(*(abs(level - end) for end in ends)) > 1.5 * SAME_AS
-        if between.mean() < 0.2:
+        if between.mean() < 0.03:
             kinds.append((between, "partly open, where all others are open or shut"))
     for where, what in kinds:
         for row, column in np.argwhere(where):
