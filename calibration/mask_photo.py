@@ -27,8 +27,10 @@ from emmc_rig.model.masks import fiducial_marks
 
 FEWEST_PX = 5.0
 """Of a cell's side: with 4, blur of one pixel leaves nothing in a cell that is its own."""
-INNER = 0.7
-"""Of a cell's side is sampled: a grid that is off by a seventh of a cell mixes no neighbour in."""
+INNER, INNER_CHECK = 0.7, 0.45
+"""Of a cell's side is sampled: a grid that is off by a seventh of a cell mixes no neighbour in. How
+far the cells are others by the inner samples alone, part of their deviation, is what blur and grid
+leave in error."""
 FEWEST_CELLS = 4
 RING = 3
 """Cells around the mask that are looked at too; the outer two of them as the surround."""
@@ -44,6 +46,11 @@ are moved for a slope, cells."""
 SAME_AS = 0.1
 """In transmittance: from here on a cell is not what the others of its kind are."""
 FACES = ("top left", "top right", "bottom right", "bottom left")
+
+FARTHEST = 0.45
+"""Cells that a corner may be moved: with one row too few or too many, one moves by half a cell."""
+OVEREXPOSED, SATURATED = 0.005, 0.99
+"""The share of a mask's pixels that may lie at the photograph's upper end, and where that begins."""
 
 Array = NDArray[np.floating]
 
@@ -132,7 +139,7 @@ def read_mask(
     """Return what a photograph says of the cells of a mask.
 
     Args:
-        photo: linear light, 0 without any, (y, x) or (y, x, colour).
+        photo: linear light, 0 without any, 1 where saturated, (y, x) or (y, x, colour).
         cells: rows and columns of the mask's cells.
         corners_px: (4, 2), x and y of the mask's outer corners, px, from its top left clockwise as
             the mask is to be seen; None: they are found from the mask's outline.
@@ -143,6 +150,8 @@ def read_mask(
             or without clear parts; what does not fit to another.
     """
     light = np.atleast_3d(np.asarray(photo, np.float32))
+    if light.ndim != 3 or light.size == 0 or not (light.min() >= -1 and light.max() <= 1):
+        raise CalibrationError("a photograph is light (y, x) or (y, x, colour), 1 where saturated")
     if min(cells) < FEWEST_CELLS:
         raise CalibrationError(f"{_shown(cells)} cells: at least {FEWEST_CELLS} a side are needed")
     if ordered is not None and ordered.shape[:2] != tuple(cells):
@@ -151,6 +160,13 @@ def read_mask(
         )
     corners = find_corners(light, cells) if corners_px is None else np.asarray(corners_px, float)
     _check_corners(corners, light.shape)
+    (left, top), (right, bottom) = corners.min(axis=0).astype(int), corners.max(axis=0).astype(int)
+    at_end = (light[max(top, 0) : bottom + 1, max(left, 0) : right + 1] > SATURATED).mean()
+    if at_end > OVEREXPOSED:
+        raise CalibrationError(
+            f"{at_end:.0%} of the mask's pixels are saturated: photograph it with less exposure, "
+            "clear parts at two thirds of the brightest code"
+        )
     start = Grid(cells, corners, 0.0, (light.shape[0], light.shape[1]))
     if start.pitch_px() < FEWEST_PX:
         raise CalibrationError(
@@ -158,7 +174,9 @@ def read_mask(
             "needed: photograph it closer, or correct --cells"
         )
     grid = _fitted(light, _bowed(light, start))
-    values, sigma, spread, blur = _cell_values(light, grid)
+    values, sigma, spread, blur = _cell_values(light, grid, INNER)
+    fewer = _cell_values(light, grid, INNER_CHECK)[0]
+    sigma = np.hypot(sigma, np.sqrt(((fewer - values) ** 2).mean(axis=(0, 1))))
     level, light_sigma, clear = _light(values, grid)
     inner = (slice(RING, -RING),) * 2
     found, sigma = (values / level)[inner], (sigma / level)[inner]
@@ -311,7 +329,7 @@ def _bowed(light: Array, start: Grid) -> Grid:
     if seen != tuple(start.cells):
         turned = seen == tuple(start.cells)[::-1]
         raise CalibrationError(
-            f"{_shown(seen)} cells are seen (rows x columns), not {_shown(start.cells)}: "
+            f"about {_shown(seen)} cells are seen (rows x columns), not {_shown(start.cells)}: "
             + ("the photograph is turned, or" if turned else "correct")
             + (" --cells are columns x rows" if turned else " --cells, or the corners")
         )
@@ -380,21 +398,22 @@ def _fitted(light: Array, start: Grid) -> Grid:
         return np.stack(rows, axis=1) / (2 * FIT_STEP)
 
     found = least_squares(uneven, np.zeros(9), slopes, xtol=1e-3, ftol=1e-5, max_nfev=30)
-    if abs(found.x[:8]).max() > 2:
+    if abs(found.x[:8]).max() > FARTHEST:
         raise CalibrationError(
-            "the grid of cells lies more than two cells away from the corners: give them as the "
-            "outer corners of the outermost cells"
+            f"a grid of {_shown(start.cells)} cells fits only {abs(found.x[:8]).max():.1f} cells "
+            "beside the corners: correct --cells, or the corners to a third of a cell"
         )
     return grid_of(found.x)
 
 
-def _cell_values(light: Array, grid: Grid) -> tuple[Array, Array, Array, float]:
+def _cell_values(light: Array, grid: Grid, width: float) -> tuple[Array, Array, Array, float]:
     """Return cells and RING around them: values, their deviation, residual rms; and the blur.
 
-    Arrays are (row, column, colour), in the photograph's units; the blur in cells.
+    Arrays are (row, column, colour), in the photograph's units; the blur in cells. width: of a
+    cell, that is sampled.
     """
-    count = int(np.clip(INNER * grid.pitch_px(), 3, 16))
-    inside = 0.5 + INNER * ((np.arange(count) + 0.5) / count - 0.5)
+    count = int(np.clip(width * grid.pitch_px(), 3, 16))
+    inside = 0.5 + width * ((np.arange(count) + 0.5) / count - 0.5)
     rows, columns = ((np.arange(-RING, n + RING)[:, None] + inside).ravel() for n in grid.cells)
     y, x = np.meshgrid(rows, columns, indexing="ij")
     seen = grid.samples(light, x, y).astype(np.float64)
