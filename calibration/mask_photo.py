@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
-from scipy.optimize import least_squares, minimize_scalar
+from scipy.optimize import fminbound, least_squares
 from scipy.special import ndtr
 
 from calibration.errors import CalibrationError
@@ -45,14 +46,17 @@ FIT_CELLS, FIT_SAMPLES, FIT_STEP = 4096, 6, 0.05
 are moved for a slope, cells."""
 SAME_AS = 0.1
 """In transmittance: from here on a cell is not what the others of its kind are."""
+NO_LIGHT = 1e-3
+"""Of what saturates: clear parts are brighter everywhere."""
 FACES = ("top left", "top right", "bottom right", "bottom left")
 
 FARTHEST = 0.45
 """Cells that a corner may be moved: with one row too few or too many, one moves by half a cell."""
 OVEREXPOSED, SATURATED = 0.005, 0.99
-"""The share of a mask's pixels that may lie at the photograph's upper end, and where that begins."""
+"""The share of a mask's pixels that may lie at a photograph's upper end, and where that begins."""
 
 Array = NDArray[np.floating]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,7 @@ class Grid:
         at = self.place(x, y).astype(np.float32)
         columns, rows = at[..., 0], at[..., 1]
         seen = cv2.remap(photo, columns, rows, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-        return np.atleast_3d(seen)
+        return np.atleast_3d(np.asarray(seen, np.float32))
 
     def pitch_px(self) -> float:
         """Return the smallest side of a cell in the photograph, px."""
@@ -133,7 +137,7 @@ class MaskReading:
 def read_mask(
     photo: Array,
     cells: tuple[int, int],
-    corners_px: Array | None = None,
+    corners_px: ArrayLike | None = None,
     ordered: Array | None = None,
 ) -> MaskReading:
     """Return what a photograph says of the cells of a mask.
@@ -174,6 +178,7 @@ def read_mask(
             "needed: photograph it closer, or correct --cells"
         )
     grid = _fitted(light, _bowed(light, start))
+    _check_count(_line_spectra(light, grid), cells)
     values, sigma, spread, blur = _cell_values(light, grid, INNER)
     fewer = _cell_values(light, grid, INNER_CHECK)[0]
     sigma = np.hypot(sigma, np.sqrt(((fewer - values) ** 2).mean(axis=(0, 1))))
@@ -236,7 +241,9 @@ def find_corners(light: Array, cells: tuple[int, int]) -> Array:
 def _differs_from_surround(light: Array) -> NDArray[np.uint8]:
     """Return where a photograph differs from its border's light (a quadratic), without specks."""
     size = light.shape[1::-1]
-    small = np.atleast_3d(cv2.resize(light, np.minimum(size, 400), interpolation=cv2.INTER_AREA))
+    few = (min(size[0], 400), min(size[1], 400))
+    small = np.asarray(cv2.resize(light, few, interpolation=cv2.INTER_AREA), np.float32)
+    small = np.atleast_3d(small)
     y, x = np.mgrid[-1 : 1 : small.shape[0] * 1j, -1 : 1 : small.shape[1] * 1j]
     border = np.broadcast_to((np.maximum(abs(x), abs(y)) > 0.95)[..., None], small.shape)
     surround = cv2.resize(_surface(small, border, x, y, 2).astype(np.float32), size)
@@ -244,7 +251,8 @@ def _differs_from_surround(light: Array) -> NDArray[np.uint8]:
     if difference.ndim == 3:
         difference = difference.max(axis=-1)
     differs = (difference > 0.3 * np.quantile(difference, 0.99)).astype(np.uint8)
-    return cv2.morphologyEx(differs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    opened = cv2.morphologyEx(differs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return np.asarray(opened, np.uint8)
 
 
 def _side(points: Array, outward: int, count: int) -> NDArray[np.float64]:
@@ -327,13 +335,31 @@ def _bowed(light: Array, start: Grid) -> Grid:
             "photograph sharp, and are the corners those of the outermost cells?"
         )
     if seen != tuple(start.cells):
-        turned = seen == tuple(start.cells)[::-1]
-        raise CalibrationError(
-            f"about {_shown(seen)} cells are seen (rows x columns), not {_shown(start.cells)}: "
-            + ("the photograph is turned, or" if turned else "correct")
-            + (" --cells are columns x rows" if turned else " --cells, or the corners")
-        )
+        raise _other_count(seen, start.cells)
     return tried[int(np.argmax(strength))]
+
+
+def _other_count(seen: tuple[int, ...], asked: tuple[int, int]) -> CalibrationError:
+    turned = seen == asked[::-1]
+    remedy = (
+        "the photograph is turned, or --cells are columns x rows" if turned
+        else "correct --cells, or the corners to a third of a cell"
+    )  # fmt: skip
+    return CalibrationError(
+        f"about {_shown(seen)} cells are seen (rows x columns), not {_shown(asked)}: {remedy}"
+    )
+
+
+def _check_count(spectra: tuple[Array, Array], cells: tuple[int, int]) -> None:
+    """Raise CalibrationError unless edges in the fitted grid repeat as often as it has cells.
+
+    With one cell more or fewer they repeat at several neighbouring numbers (ratio 0.7 to 2.7 of
+    these to the one asked for; below 0.06 where it is right).
+    """
+    near = [by[n - 2 : n + 3] / by[n] for by, n in zip(spectra, cells, strict=True)]
+    if any(np.sort(one)[-2] > 0.4 or one.max() > 1 for one in near):
+        seen = tuple(n - 2 + int(one.argmax()) for n, one in zip(cells, near, strict=True))
+        raise _other_count(seen, cells)
 
 
 def _line_spectra(light: Array, grid: Grid) -> tuple[Array, Array]:
@@ -397,7 +423,9 @@ def _fitted(light: Array, start: Grid) -> Grid:
         rows = [uneven(change + step) - uneven(change - step) for step in steps]
         return np.stack(rows, axis=1) / (2 * FIT_STEP)
 
-    found = least_squares(uneven, np.zeros(9), slopes, xtol=1e-3, ftol=1e-5, max_nfev=30)
+    found = least_squares(
+        uneven, np.zeros(9), cast("Any", slopes), xtol=1e-3, ftol=1e-5, max_nfev=30
+    )
     if abs(found.x[:8]).max() > FARTHEST:
         raise CalibrationError(
             f"a grid of {_shown(start.cells)} cells fits only {abs(found.x[:8]).max():.1f} cells "
@@ -424,7 +452,7 @@ def _cell_values(light: Array, grid: Grid, width: float) -> tuple[Array, Array, 
         down, across = (_blurred_boxes(n, inside, blur) for n in few)
         return float((_residual(some, down, across)[1] ** 2).sum())
 
-    blur = float(minimize_scalar(misfit, bounds=BLURS, options={"xatol": 0.005}).x)
+    blur = float(cast("Any", fminbound(misfit, *BLURS, xtol=0.005)))
     down, across = (_blurred_boxes(n + 2 * RING, inside, blur) for n in grid.cells)
     values, residual = _residual(seen, down, across)
     by_cell = residual.reshape(len(values), count, -1, count, values.shape[-1])
@@ -473,10 +501,10 @@ def _light(values: Array, grid: Grid) -> tuple[Array, float, float]:
     clear = around if lit else _brightest(values, inner, x, y)
     degree = 2
     for _ in range(4):
-        level = _surface(values, clear, x, y, degree)
+        level = np.maximum(_surface(values, clear, x, y, degree), NO_LIGHT)
         among = _clear_cells(values / level, inner, 0.5 * SAME_AS if lit else SAME_AS)
         clear, degree = around | among, 4 if _spread_out(among) else 2
-    if not clear.any(axis=(0, 1)).all() or level.min() <= 0:
+    if not clear.any(axis=(0, 1)).all() or level.min() <= NO_LIGHT:
         raise CalibrationError(
             "no clear parts are seen, neither around the mask nor among its cells: photograph it "
             "with clear glass around it"
@@ -487,7 +515,7 @@ def _light(values: Array, grid: Grid) -> tuple[Array, float, float]:
     return level, light_sigma, float(among[inner].any(axis=-1).mean())
 
 
-def _surface(values: Array, where: Array, x: Array, y: Array, degree: int) -> NDArray[np.float64]:
+def _surface(values: Array, where: Flags, x: Array, y: Array, degree: int) -> NDArray[np.float64]:
     """Return the polynomial of x and y through values (row, column, colour) where so marked."""
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], -1)
     fits = [
@@ -497,7 +525,7 @@ def _surface(values: Array, where: Array, x: Array, y: Array, degree: int) -> ND
     return np.stack([terms @ fit for fit in fits], axis=-1)
 
 
-def _brightest(values: Array, inner: Array, x: Array, y: Array) -> NDArray[np.bool_]:
+def _brightest(values: Array, inner: Flags, x: Array, y: Array) -> Flags:
     """Return each colour's brightest cells under uneven light: a fit leaves out what is below."""
     bright = np.repeat(inner[..., None], values.shape[-1], axis=-1)
     for _ in range(20):
@@ -509,13 +537,13 @@ def _brightest(values: Array, inner: Array, x: Array, y: Array) -> NDArray[np.bo
     return bright
 
 
-def _clear_cells(relative: Array, inner: Array, within: float) -> NDArray[np.bool_]:
+def _clear_cells(relative: Array, inner: Flags, within: float) -> Flags:
     """Return the cells (row, column, colour) at 1, as far as they stand out from those below.
 
     Where some are clear in all colours, those alone: a filter in its own colour is no clear part.
     """
 
-    def standing_out(of: Array) -> NDArray[np.bool_]:
+    def standing_out(of: Array) -> Flags:
         near, below = (inner[..., None] & (abs(of - at) < within) for at in (1, 1 - 2 * within))
         return near & (near.sum(axis=(0, 1)) > 2 * below.sum(axis=(0, 1)))
 
@@ -526,7 +554,7 @@ def _clear_cells(relative: Array, inner: Array, within: float) -> NDArray[np.boo
     return standing_out(relative)
 
 
-def _spread_out(clear: Array) -> bool:
+def _spread_out(clear: Flags) -> bool:
     """Return whether clear cells lie in most of the 16 parts of a mask, in every colour."""
     parts = [
         part.any(axis=(0, 1))
@@ -602,7 +630,7 @@ def _defects(cells: Array, spread: Array, ordered: Array | None) -> Iterator[Def
     usual = np.empty(level.size)
     usual[order] = median_filter(rough.ravel()[order], size=min(101, level.size // 4 * 2 + 1))
     dirty = rough > np.maximum(4 * usual.reshape(rough.shape), 0.05)
-    kinds: list[tuple[Array, str]] = [(dirty, "uneven within: dust, a scratch or a hole")]
+    kinds: list[tuple[Flags, str]] = [(dirty, "uneven within: dust, a scratch or a hole")]
     if ordered is not None:
         wanted = np.atleast_3d(ordered).mean(axis=-1)
         fit = np.polyfit(wanted.ravel(), level.ravel(), 1)
@@ -614,6 +642,8 @@ def _defects(cells: Array, spread: Array, ordered: Array | None) -> Iterator[Def
         between = np.minimum(*(abs(level - end) for end in ends)) > 1.5 * SAME_AS
         if between.mean() < 0.03:
             kinds.append((between, "partly open, where all others are open or shut"))
+    known = np.zeros(level.shape, bool)
     for where, what in kinds:
-        for row, column in np.argwhere(where):
+        new, known = where & ~known, where | known
+        for row, column in np.argwhere(new):
             yield Defect(int(row), int(column), f"{what} ({level[row, column]:.2f})")

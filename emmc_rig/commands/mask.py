@@ -80,6 +80,6 @@ def _corners(text: str) -> list[tuple[float, float]]:
         points = []
     if len(points) != 4 or any(len(one) != 2 for one in points):
         raise typer.BadParameter(
-            f"--corners {text}: write four points in quotes, for instance '12,9 620,14 611,630 8,622'"
+            f"--corners {text}: write four points in quotes, such as '12,9 620,14 611,630 8,622'"
         )
     return [(one[0], one[1]) for one in points]

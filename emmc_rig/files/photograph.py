@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from drivers.errors import RawFrameError
 from drivers.raw import RAW_SUFFIXES, decode_raw
 from emmc_rig.errors import AppError
-from emmc_rig.model.masks import CFA
 from emmc_rig.model.reading import decode_picture
 from emmc_rig.model.srgb import linear_of
 
@@ -43,7 +42,7 @@ def read_photograph(path: Path, linear: bool | None = None) -> NDArray[np.float3
     values = np.atleast_3d(codes).astype(np.float32) / np.iinfo(codes.dtype).max
     if linear is None:
         linear = codes.dtype == np.uint16
-    return values if linear else linear_of(values).astype(np.float32)
+    return np.asarray(values if linear else linear_of(values), np.float32)
 
 
 def _raw_light(content: bytes, path: Path) -> NDArray[np.float32]:
@@ -51,7 +50,7 @@ def _raw_light(content: bytes, path: Path) -> NDArray[np.float32]:
         frame = decode_raw(content)
     except RawFrameError as fault:
         raise AppError(f"{path}: {fault}") from fault
-    if frame.cfa not in CFA or frame.cfa not in ("mono", *DEMOSAICING):
+    if frame.cfa not in ("mono", *DEMOSAICING):
         raise AppError(f"{path}: a sensor with the colour tile {frame.cfa}; develop it as a TIFF")
     black = np.tile(frame.black_level_dn, [-(-side // 2) for side in frame.mosaic.shape])
     black = black[: frame.mosaic.shape[0], : frame.mosaic.shape[1]]
@@ -59,4 +58,4 @@ def _raw_light(content: bytes, path: Path) -> NDArray[np.float32]:
     if frame.cfa == "mono":
         return np.atleast_3d(light.astype(np.float32))
     codes = np.rint(light * 65535).astype(np.uint16)
-    return cv2.cvtColor(codes, DEMOSAICING[frame.cfa]).astype(np.float32) / 65535
+    return np.asarray(cv2.cvtColor(codes, DEMOSAICING[frame.cfa]), np.float32) / np.float32(65535)

@@ -21,6 +21,7 @@ MARK = COLOURS[1]
 MOST_LINES = 16
 """Of the grid, each way, that are drawn."""
 LONGEST_PX = 1600
+WIDE_IN = 5.2
 
 
 def write_mask(
@@ -64,8 +65,9 @@ def draw_mask(photo: NDArray[np.floating], mask: MaskReading) -> Figure:
 
     photo: linear light, (y, x, colour). Defects are ringed in the first two.
     """
-    figure, (seen, cells, sure) = sheet(3, 5.2, 5.2, label="")
     rows, columns = mask.grid.cells
+    high = WIDE_IN * max(photo.shape[0] / photo.shape[1], rows / columns)
+    figure, (seen, cells, sure) = sheet(3, WIDE_IN, min(high, 2 * WIDE_IN), label="")
     for axes in (seen, cells, sure):
         axes.grid(visible=False)
     every = max(1, int(np.ceil(max(photo.shape[:2]) / LONGEST_PX)))
