@@ -48,7 +48,6 @@ SAME_AS = 0.1
 """In transmittance: from here on a cell is not what the others of its kind are."""
 NO_LIGHT = 1e-3
 """Of what saturates: clear parts are brighter everywhere."""
-FACES = ("top left", "top right", "bottom right", "bottom left")
 
 FARTHEST = 0.45
 """Cells that a corner may be moved: with one row too few or too many, one moves by half a cell."""
@@ -343,7 +342,7 @@ def _other_count(seen: tuple[int, ...], asked: tuple[int, int]) -> CalibrationEr
     turned = seen == asked[::-1]
     remedy = (
         "the photograph is turned, or --cells are columns x rows" if turned
-        else "correct --cells, or the corners to a third of a cell"
+        else "correct --cells, or give --corners to a third of a cell"
     )  # fmt: skip
     return CalibrationError(
         f"about {_shown(seen)} cells are seen (rows x columns), not {_shown(asked)}: {remedy}"
@@ -429,7 +428,7 @@ def _fitted(light: Array, start: Grid) -> Grid:
     if abs(found.x[:8]).max() > FARTHEST:
         raise CalibrationError(
             f"a grid of {_shown(start.cells)} cells fits only {abs(found.x[:8]).max():.1f} cells "
-            "beside the corners: correct --cells, or the corners to a third of a cell"
+            "beside the corners: correct --cells, or give --corners to a third of a cell"
         )
     return grid_of(found.x)
 
@@ -615,11 +614,12 @@ def _check_ring(grey: Array) -> None:
     ]
     if len(seen[0]) != 1 or len(seen[1]) != 3:
         return
-    (down, across) = seen[0][0] > seen[1].mean(axis=0)
-    if down or across:
+    low, right = seen[0][0] > seen[1].mean(axis=0)
+    if low or right:
+        where = f"{'bottom' if low else 'top'} {'right' if right else 'left'}"
         raise CalibrationError(
-            f"the ring among the fiducials is at the {FACES[3 - across if down else across]}, not "
-            "at the top left: the photograph is turned or mirrored"
+            f"the ring among the fiducials is at the {where}, not at the top left: the photograph "
+            "is turned or mirrored"
         )
 
 

@@ -98,7 +98,7 @@ def rms(values):
         {},
         {"surround": 1.0},
         {"tilt": (-7, 7, -9), "bow": -0.02, "surround": 1.0},
-        {"tilt": (0, -10, 14), "uneven": 0.2},
+        {"tilt": (0, -10, 14), "uneven": 0.2, "margin": 1.5},
         {"px": 6.0},
         {"px": 12.0, "blur_px": 2.5},
     ],
@@ -261,7 +261,7 @@ def test_wrong_corners_are_refused(corners, complaint):
 @pytest.mark.parametrize(
     ("photo", "complaint"),
     [
-        (lambda: photograph(binary(), px=4), r"4\.\d pixels a cell of 40x52, at least 5"),
+        (lambda: photograph(binary(), px=4), r"3\.\d pixels a cell of 40x52, at least 5"),
         (lambda: np.clip(1.6 * plain(), 0, 1), "saturated: .* less exposure"),
         (lambda: np.full((300, 300), 0.5), "no mask"),
         (lambda: np.random.default_rng(0).random((300, 300)), "no mask"),
