@@ -28,7 +28,7 @@ from emmc_rig.model.masks import fiducial_marks
 
 FEWEST_PX = 5.0
 """Of a cell's side: with 4, blur of one pixel leaves nothing in a cell that is its own."""
-INNER, INNER_CHECK = 0.7, 0.45
+INNER, INNER_CHECK = 0.7, 0.25
 """Of a cell's side is sampled: a grid that is off by a seventh of a cell mixes no neighbour in. How
 far the cells are others by the inner samples alone, part of their deviation, is what blur and grid
 leave in error."""
