@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.output import give_result, say, tell
+from emmc_rig.commands.output import give_result, say, shown_progress, tell
 
 SHOWN_DEFECTS = 10
 
@@ -45,18 +45,20 @@ def mask(
 ) -> None:  # fmt: skip
     """Read a mask's cells from its photograph: a picture of one pixel a cell, for cameras."""
     from calibration.mask_photo import read_mask
+    from emmc_rig.errors import WrongUsageError
     from emmc_rig.files.photograph import read_photograph
     from emmc_rig.files.results import parse_size
     from emmc_rig.pages.mask_drawing import write_mask
 
     size = parse_size(cells, "--cells", "64x64") or (0, 0)
     at = None if corners is None else _corners(corners)
-    if out.suffix.lower() != ".png":
-        raise typer.BadParameter(f"--out {out}: name a .png")
-    light = read_photograph(photo, linear)
-    wanted = None if ordered is None else read_photograph(ordered, linear=True)
-    found = read_mask(light, size, at, wanted)
-    listed, checked = write_mask(light, found, out, cell_um)
+    with shown_progress("read the mask"):
+        if out.suffix.lower() != ".png":
+            raise WrongUsageError(f"--out {out}: name a .png")
+        light = read_photograph(photo, linear)
+        wanted = None if ordered is None else read_photograph(ordered, linear=True)
+        found = read_mask(light, size, at, wanted)
+        listed, checked = write_mask(light, found, out, cell_um)
     sigma = float((found.sigma**2).mean() ** 0.5)
     height, width = (count * cell_um / 1e3 for count in size)
     tell(

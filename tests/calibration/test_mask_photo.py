@@ -199,7 +199,15 @@ def test_cells_that_are_not_as_ordered_are_defects():
 
 
 @pytest.mark.parametrize(
-    "asked", [(40, 51), (39, 52), (40, 53), (41, 52), (20, 52), (52, 40), (44, 48), (20, 26)]
+    "asked",
+    [
+        (40, 51),
+        (52, 40),
+        *(
+            pytest.param(asked, marks=pytest.mark.slow)
+            for asked in ((39, 52), (40, 53), (41, 52), (20, 52), (44, 48), (20, 26))
+        ),
+    ],
 )
 def test_another_number_of_cells_is_refused_with_the_one_seen(asked):
     with pytest.raises(CalibrationError, match=r"about (39|40|41)x(51|52|53) cells.*--cells"):

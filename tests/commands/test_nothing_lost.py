@@ -24,6 +24,7 @@ SIZE = ("--size", "24x32")
 RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
 ONE_FILE = {
     "capture --new",
+    "mask",
     "session export",
 }
 WRITERS = {
@@ -39,6 +40,7 @@ WRITERS = {
     "devices snap": ("--rig", "simulated"),
     "export": ("scene.h5", "--format", "png8"),
     "figure": ("scene.h5",),
+    "mask": ("taken.png", "--cells", "8x8", "--cell-um", "24"),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "session export": ("made-session",),
