@@ -21,6 +21,7 @@ from emmc_rig.commands.export import export
 from emmc_rig.commands.figure import figure
 from emmc_rig.commands.import_ import import_
 from emmc_rig.commands.live import live
+from emmc_rig.commands.mask import mask
 from emmc_rig.commands.modes import ModalCommand
 from emmc_rig.commands.output import say
 from emmc_rig.commands.reconstruct import reconstruct
@@ -49,7 +50,7 @@ for name, group in (("devices", devices), ("session", session)):
     app.add_typer(group, name=name)
 for command in (
     capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart,
-    tables, stability, design,
+    tables, stability, design, mask,
 ):  # fmt: skip
     app.command(cls=ModalCommand)(command)
 app.command("import", cls=ModalCommand)(import_)

@@ -44,6 +44,19 @@ def cfa_tile(cfa: str | tuple[str, ...]) -> NDArray[np.float32]:
     return np.array([[FILTERS[letter] for letter in row] for row in rows], dtype=np.float32)
 
 
+def fiducial_marks() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the fiducials of a designed mask, one ring and one cross, (9, 9) cells, 1 where open.
+
+    The ring is the top left one of four: a turned or mirrored mask shows.
+    """
+    cross = np.ones((9, 9), dtype=np.uint8)
+    cross[4, 1:-1] = cross[1:-1, 4] = 0
+    ring = np.ones_like(cross)
+    ring[1:-1, 1:-1] = 0
+    ring[2:-2, 2:-2] = 1
+    return ring, cross
+
+
 class Pattern(Settings):
     """A mask pattern; `draw` makes its cells."""
 

@@ -24,6 +24,7 @@ SIZE, SHAPE = ("--size", "24x32"), (24, 32)
 RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)
 ONE_FILE = {
     "capture --new",
+    "mask",
     "session export",
 }
 WRITERS = {
@@ -40,6 +41,7 @@ WRITERS = {
     "export": ("scene.h5", "--format", "png8"),
     "figure": ("scene.h5",),
     "import": ("--shots", "shot.npy", "--camera", "rgbw-bayer-1shot"),
+    "mask": ("taken.png", "--cells", "8x8", "--cell-um", "24"),
     "reconstruct": ("frames",),
     "reconstruct SESSION": ("made-session",),
     "session export": ("made-session",),

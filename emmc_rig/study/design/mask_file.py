@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from calibration.shadow import SPARE_UM
 from emmc_rig.model.camera import Camera, draw_plates
-from emmc_rig.model.masks import FILTERS, Picture
+from emmc_rig.model.masks import FILTERS, Picture, fiducial_marks
 from emmc_rig.study.design.bench import DesignBench
 from emmc_rig.study.design.search import MASK
 
 LAYERS = {"W": 1, "R": 2, "G": 3, "B": 4}
-CROSS = 9
-"""Cells a side of a fiducial: an opaque cross, one cell wide, on clear ground."""
 PLACES = 0.35
 """Of the picture's sides, from the middle to the fiducials: inside what the sensor sees."""
 MADE = datetime.datetime(2000, 1, 1)
@@ -45,7 +43,7 @@ def mask_cells(camera: Camera, bench: DesignBench) -> NDArray[np.uint8]:
     whole = camera.model_copy(update={"masks": {MASK: roomy}})
     cells = draw_plates(whole, bench.size)[MASK].cells[0].astype(np.uint8)
     for row, column, shape in _fiducials(cells.shape[:2], bench, mask.cell_um):
-        cells[row : row + CROSS, column : column + CROSS] = shape[..., None]
+        cells[row : row + len(shape), column : column + len(shape)] = shape[..., None]
     return cells
 
 
@@ -53,18 +51,14 @@ def _fiducials(
     shape: tuple[int, ...], bench: DesignBench, cell_um: float
 ) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
     """Yield the first row and column of every fiducial, and its cells."""
-    cross = np.ones((CROSS, CROSS), dtype=np.uint8)
-    cross[CROSS // 2, 1:-1] = cross[1:-1, CROSS // 2] = 0
-    ring = np.ones_like(cross)
-    ring[1:-1, 1:-1] = 0
-    ring[2:-2, 2:-2] = 1
+    ring, cross = fiducial_marks()
     per_cell = bench.sensor.sample_pitch_um / cell_um
     far = [round(PLACES * count * per_cell) for count in bench.size]
     for down in (-1, 1):
         for across in (-1, 1):
             row, column = shape[0] // 2 + down * far[0], shape[1] // 2 + across * far[1]
             marks = ring if (down, across) == (-1, -1) else cross
-            yield row - CROSS // 2, column - CROSS // 2, marks
+            yield row - len(marks) // 2, column - len(marks) // 2, marks
 
 
 def with_picture(camera: Camera) -> Camera:

@@ -1,0 +1,87 @@
+"""The command `emmc-rig mask`: a mask's cells from its photograph."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emmc_rig.commands.output import give_result, say, shown_progress, tell
+
+SHOWN_DEFECTS = 10
+
+
+def mask(
+    photo: Annotated[Path, typer.Argument(help="a picture of 8 or 16 bits, or a RAW file")],
+    cells: Annotated[str, typer.Option("--cells", help="ROWSxCOLUMNS of the mask")],
+    cell_um: Annotated[
+        float, typer.Option("--cell-um", min=1e-3, help="side of a cell, um: for the camera's file")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="the mask's picture to write, .png")],
+    corners: Annotated[
+        str | None,
+        typer.Option(
+            "--corners",
+            metavar="'X,Y X,Y X,Y X,Y'",
+            help="outer corners of the cells in the photograph, px, clockwise from the mask's top "
+            "left (default: found from its outline)",
+        ),
+    ] = None,
+    ordered: Annotated[
+        Path | None,
+        typer.Option(
+            "--ordered", help="the mask as it should be, a picture of one pixel a cell: a turned "
+            "or mirrored photograph and cells that are otherwise show"
+        ),
+    ] = None,
+    linear: Annotated[
+        bool | None,
+        typer.Option(
+            "--linear/--srgb", help="a picture's codes are light, or sRGB (default: by 16 or 8 "
+            "bits)"
+        ),
+    ] = None,
+) -> None:  # fmt: skip
+    """Read a mask's cells from its photograph: a picture of one pixel a cell, for cameras."""
+    from calibration.mask_photo import read_mask
+    from emmc_rig.errors import WrongUsageError
+    from emmc_rig.files.photograph import read_photograph
+    from emmc_rig.files.results import parse_size
+    from emmc_rig.pages.mask_drawing import write_mask
+
+    size = parse_size(cells, "--cells", "64x64") or (0, 0)
+    at = None if corners is None else _corners(corners)
+    with shown_progress("read the mask"):
+        if out.suffix.lower() != ".png":
+            raise WrongUsageError(f"--out {out}: name a .png")
+        light = read_photograph(photo, linear)
+        wanted = None if ordered is None else read_photograph(ordered, linear=True)
+        found = read_mask(light, size, at, wanted)
+        listed, checked = write_mask(light, found, out, cell_um)
+    sigma = float((found.sigma**2).mean() ** 0.5)
+    height, width = (count * cell_um / 1e3 for count in size)
+    tell(
+        f"{cells} cells, {height:g} x {width:g} mm: transmittance within "
+        f"{sigma:.3f} rms, {found.clear:.0%} clear, blur {found.blur_cells:.2f} cells"
+    )
+    for one in found.defects[:SHOWN_DEFECTS]:
+        say("defect", f"row {one.row}, column {one.column}: {one.what}")
+    if len(found.defects) > SHOWN_DEFECTS:
+        say("defect", f"and {len(found.defects) - SHOWN_DEFECTS} more, see {listed}")
+    tell(f"in a camera's file: pattern: {{kind: picture, path: {out.name}}}, cell_um: {cell_um:g}")
+    tell(f"wrote {out} and {listed}; look at {checked}")
+    give_result(out, figures=str(listed), drawing=str(checked), sigma=sigma)
+
+
+def _corners(text: str) -> list[tuple[float, float]]:
+    """Return four points from "X,Y X,Y X,Y X,Y"; raises BadParameter."""
+    try:
+        points = [tuple(map(float, one.split(","))) for one in text.split()]
+    except ValueError:
+        points = []
+    if len(points) != 4 or any(len(one) != 2 for one in points):
+        raise typer.BadParameter(
+            f"--corners {text}: write four points in quotes, such as '12,9 620,14 611,630 8,622'"
+        )
+    return [(one[0], one[1]) for one in points]

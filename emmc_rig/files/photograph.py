@@ -1,0 +1,61 @@
+"""A photograph as linear light: pictures of 8 or 16 bits, and RAW files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import RawFrameError
+from drivers.raw import RAW_SUFFIXES, decode_raw
+from emmc_rig.errors import AppError
+from emmc_rig.model.reading import decode_picture
+from emmc_rig.model.srgb import linear_of
+
+DEMOSAICING = {
+    "rggb": cv2.COLOR_BayerRGGB2RGB,
+    "grbg": cv2.COLOR_BayerGRBG2RGB,
+    "gbrg": cv2.COLOR_BayerGBRG2RGB,
+    "bggr": cv2.COLOR_BayerBGGR2RGB,
+}
+
+
+def read_photograph(path: Path, linear: bool | None = None) -> NDArray[np.float32]:
+    """Return a photograph's light, (y, x, colour) with one colour or three, 1 where saturated.
+
+    linear: whether a picture's codes are proportional to light, else they are sRGB; None: those of
+    16 bits are. RAW files always are; their black level is taken off. Raises AppError.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as fault:
+        raise AppError(f"{path}: cannot be read ({fault.strerror or fault})") from fault
+    if path.suffix.lower() in RAW_SUFFIXES:
+        return _raw_light(content, path)
+    codes = decode_picture(content, str(path), AppError)
+    if codes.dtype not in (np.uint8, np.uint16):
+        raise AppError(f"{path}: use a picture of 8 or 16 bits a channel, or a RAW file")
+    if codes.ndim == 3:
+        codes = codes[:, :, 2::-1]
+    values = np.atleast_3d(codes).astype(np.float32) / np.iinfo(codes.dtype).max
+    if linear is None:
+        linear = codes.dtype == np.uint16
+    return np.asarray(values if linear else linear_of(values), np.float32)
+
+
+def _raw_light(content: bytes, path: Path) -> NDArray[np.float32]:
+    try:
+        frame = decode_raw(content)
+    except RawFrameError as fault:
+        raise AppError(f"{path}: {fault}") from fault
+    if frame.cfa not in ("mono", *DEMOSAICING):
+        raise AppError(f"{path}: a sensor with the colour tile {frame.cfa}; develop it as a TIFF")
+    black = np.tile(frame.black_level_dn, [-(-side // 2) for side in frame.mosaic.shape])
+    black = black[: frame.mosaic.shape[0], : frame.mosaic.shape[1]]
+    light = np.clip((frame.mosaic - black) / (frame.white_level_dn - black), 0, 1)
+    if frame.cfa == "mono":
+        return np.atleast_3d(light.astype(np.float32))
+    codes = np.rint(light * 65535).astype(np.uint16)
+    return np.asarray(cv2.cvtColor(codes, DEMOSAICING[frame.cfa]), np.float32) / np.float32(65535)
