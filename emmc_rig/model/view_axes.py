@@ -41,11 +41,14 @@ def picture_name(axes: ViewAxes) -> str:
     return PICTURES[next((name for name in axes if name != "angle"), "angle")]
 
 
-def place_name(axes: ViewAxes, v: int, u: int) -> str:
-    """Return what the picture in row v, column u is called: `view (2, 3)`, `band 17`."""
+def axis_names(axes: ViewAxes, views: tuple[int, int]) -> list[str]:
+    """Return what a place along rows and along columns of views is called; "" where is but one."""
+    return ["" if count == 1 else PICTURES[name] for name, count in zip(axes, views, strict=True)]
+
+
+def place_name(axes: ViewAxes, views: tuple[int, int], place: tuple[int, int]) -> str:
+    """Return what the picture in a row and column of views is called: `view (2, 3)`, `band 17`."""
     if shows_parallax(axes):
-        return f"view ({v}, {u})"
-    named = zip(axes, (v, u), ("row", "column"), strict=True)
-    return ", ".join(
-        f"{name} {at}" if name != "angle" else f"{row} {at}" for name, at, row in named
-    )
+        return f"view {place}"
+    named = zip(axis_names(axes, views), place, strict=True)
+    return ", ".join(f"{name} {at}" for name, at in named if name)

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from emmc_rig.model.view_axes import picture_name, shows_parallax
 from reconstruction.method import Sensitivity
 from reconstruction.methods import METHODS
 from reconstruction.verdict.evidence import Evidence
