@@ -25,10 +25,11 @@ def stored_as(axes: ViewAxes) -> str:
 
 def axes_from(value: Any, source: object, error: type[Exception]) -> ViewAxes:
     """Return the axes of a file's attribute, None where it has none; raises `error`."""
-    axes = ANGLES if value is None else tuple(str(value).split(","))
-    if axes not in VIEW_AXES:
-        raise error(f"{source}: {ATTRIBUTE} '{value}': two of {', '.join(PICTURES)} are needed")
-    return axes
+    text = stored_as(ANGLES) if value is None else str(value)
+    for axes in VIEW_AXES:
+        if stored_as(axes) == text:
+            return axes
+    raise error(f"{source}: {ATTRIBUTE} '{text}': two of {', '.join(PICTURES)} are needed")
 
 
 def shows_parallax(axes: ViewAxes) -> bool:

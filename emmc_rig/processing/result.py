@@ -204,8 +204,9 @@ class Result:
 
     def __repr__(self) -> str:
         (v, u, rows, columns, _), level = self.light_field.shape, self.verdict.level
+        pictures = f"{v}x{u} {picture_name(self.psi.view_axes)}s"
         return (
-            f"Result({self.method}, {v}x{u} {picture_name(self.psi.view_axes)}s of {rows}x{columns}, {self.status} in "
+            f"Result({self.method}, {pictures} of {rows}x{columns}, {self.status} in "
             f"{self.seconds:.1f} s, verdict: {level})"
         )
 
