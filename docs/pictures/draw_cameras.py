@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
-INK, FAINT, GLASS, RAY = "#22303c", "#8a97a3", "#bfe3f2", "#d98200"
+INK, GLASS, RAY = "#22303c", 'fill="#bfe3f2" fill-opacity="0.65" stroke="#22303c"', "#d98200"
 SPECTRUM = ("#c8322d", "#e08a00", "#3f9b3a", "#1f6fb5", "#6b3fa0")
 WIDTH, HEIGHT, MIDDLE = 640, 220, 100
 POINT, LENS, MASK, SENSOR = 50, 260, 500, 560
@@ -29,6 +29,16 @@ def box(x: float, y: float, wide: float, high: float, fill: str, edge: str = INK
         f'<rect x="{x:.1f}" y="{y:.1f}" width="{wide}" height="{high}" fill="{fill}" '
         f'stroke="{edge}"/>'
     )
+
+
+def lens(x: float, y: float, wide: float, high: float) -> str:
+    """Return a lens; wide, high: half of what it measures."""
+    return f'<ellipse cx="{x}" cy="{y}" rx="{wide}" ry="{high}" {GLASS}/>'
+
+
+def glass(path: str) -> str:
+    """Return a piece of glass of another form."""
+    return f'<path d="{path}" {GLASS}/>'
 
 
 def words(x: float, text: str, y: float = HEIGHT - 16) -> str:
@@ -58,7 +68,7 @@ def lens_camera(openings: Sequence[str], rays: Sequence[str]) -> Parts:
         if ray:
             yield line(POINT, MIDDLE, LENS, y, ray)
             yield line(LENS, y, SENSOR, MIDDLE, ray)
-    yield f'<ellipse cx="{LENS}" cy="{MIDDLE}" rx="16" ry="76" fill="{GLASS}" fill-opacity="0.6" stroke="{INK}"/>'
+    yield lens(LENS, MIDDLE, 16, 76)
     yield from column(LENS - 4, openings)
     yield from column(SENSOR, ["#fff"] * 9, 14, 12)
     yield words(POINT, "scene")
@@ -95,7 +105,7 @@ def spectral() -> Parts:
     yield from column(200, [INK if (k + 1) % 3 else "#fff" for k in range(11)], 12)
     for k, colour in enumerate(SPECTRUM):
         yield line(330, MIDDLE, SENSOR, MIDDLE + (k - 2) * 18, colour, 2)
-    yield f'<path d="M330 50 L372 150 L288 150 Z" fill="{GLASS}" fill-opacity="0.7" stroke="{INK}"/>'
+    yield glass("M330 50 L372 150 L288 150 Z")
     yield from column(SENSOR, ["#fff"] * 11, 14, 12)
     labels = ((POINT, "scene"), (200, "mask"), (330, "prism"), (SENSOR, "sensor"))
     yield from (words(x, text) for x, text in labels)
@@ -125,7 +135,7 @@ def dense_psf() -> Parts:
         yield line(POINT, MIDDLE, 330, y, RAY, 0.8)
         yield line(330, y, SENSOR, MIDDLE + 66 * ((k * 5) % 13 - 6) / 6, RAY, 0.8)
     wave = " ".join(f"Q {322 + 16 * (k % 2)} {28 + 12 * k} 330 {34 + 12 * k}" for k in range(12))
-    yield f'<path d="M330 22 {wave} L340 166 L340 22 Z" fill="{GLASS}" stroke="{INK}"/>'
+    yield glass(f"M330 22 {wave} L340 166 L340 22 Z")
     yield from column(SENSOR, ["#fff"] * 11, 14, 12)
     labels = ((POINT, "scene"), (330, "diffuser, no lens"), (SENSOR, "sensor"))
     yield from (words(x, text) for x, text in labels)
@@ -136,7 +146,7 @@ def microlenses() -> Parts:
     rays = [SPECTRUM[0], "", SPECTRUM[2], "", SPECTRUM[3]]
     yield from lens_camera(["#fff"] * CELLS, rays)
     for y in heights(5, 28):
-        yield f'<ellipse cx="{SENSOR - 14}" cy="{y}" rx="5" ry="14" fill="{GLASS}" stroke="{INK}"/>'
+        yield lens(SENSOR - 14, y, 5, 14)
     for y, k in zip(heights(3, 8), (4, 2, 0), strict=True):
         yield box(SENSOR, y - 4, 12, 8, rays[k])
     yield words(LENS, "lens")
