@@ -1,5 +1,7 @@
 """Views that are bands or times, few or many, closed in part: Psi to files, pages and exports."""
 
+from typing import Any
+
 import cv2
 import h5py
 import numpy as np
@@ -15,7 +17,7 @@ from emmc_rig.model.lightfield import check_light_field
 from emmc_rig.model.sensing import ImagingMatrix, checksum_of
 from emmc_rig.model.view_axes import ANGLES
 from emmc_rig.pages.result_figure import draw_results
-from emmc_rig.pages.viewer import viewer_data
+from emmc_rig.pages.viewer import render_viewer, viewer_data
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.processing.reconstructing import reconstruct_folder
 from reconstruction.methods import MethodSettings
@@ -118,10 +120,13 @@ def test_a_result_of_bands_calls_them_so_in_every_file(bands, tmp_path):
     assert bands.metrics()["view_axes"] == list(BANDS)
     opened = open_export(str(tmp_path / "out"))
     assert opened.view_axes == BANDS
-    shown = viewer_data(opened)
+    shown: dict[str, Any] = viewer_data(opened)
     assert shown["axes"] == ["", "band"]
     assert shown["disparity"]["low"] == 0
     assert shown["disparity"]["high"] == 1e-3
+    page = render_viewer(opened)
+    assert "from band to band" in page
+    assert 'alt="Band 3"' in page
     caption = draw_results([opened]).caption
     assert caption.startswith("Band 3 of 1x6")
     assert "epipolar" not in caption.lower()
