@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import ANGLES, ViewAxes
 
 BANDS = {"tsa": (28, "meas_real"), "smem": (24, "meas")}
 """Of each spectral camera, and the name of its readings."""
@@ -92,13 +93,14 @@ def _spectral(folder: Path, name: str, size: tuple[int, int], mask: str) -> Code
     readings = frame[None, top : top + rows, left : left + columns]
     readings = readings / readings.max()
     kept = np.random.default_rng(SEED).random(readings.shape) < KEPT
-    return CodedCapture(name, _grey(weights), readings, NOISE, kept)
+    return CodedCapture(name, _grey(weights, ("angle", "band")), readings, NOISE, kept)
 
 
-def _grey(weights: NDArray[np.float32]) -> ImagingMatrix:
+def _grey(weights: NDArray[np.float32], view_axes: ViewAxes = ANGLES) -> ImagingMatrix:
     """Return the Psi of a sensor without colours: all that it sees is called red."""
     shots, _, _, rows, _, columns = weights.shape
-    return ImagingMatrix(weights, np.zeros((shots, rows, columns), np.uint8))
+    colour = np.zeros((shots, rows, columns), np.uint8)
+    return ImagingMatrix(weights, colour, view_axes=view_axes)
 
 
 def _colour_aperture(path: Path, name: str, size: tuple[int, int]) -> CodedCapture:

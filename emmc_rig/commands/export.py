@@ -50,7 +50,7 @@ def export(
     with result_folder(out, f"export --format {form}") as folder, shown_progress("read") as bars:
         opened = open_export(result, truth, parse_size(size))
         bars.begin("write")
-        known[form].write(folder, opened)
+        known[form].write_whole(folder, opened)
         files = [path for path in folder.rglob("*") if path.is_file()]
         written = sum(path.stat().st_size for path in files)
         write_metrics(

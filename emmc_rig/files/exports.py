@@ -17,8 +17,9 @@ from emmc_rig.files.results import METRICS
 from emmc_rig.files.scenes import fine_scene, open_scene, path_in
 from emmc_rig.model.errors import SceneError, nearest_of
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.lightfield import load_hdf5
+from emmc_rig.model.lightfield import load_hdf5, load_view_axes
 from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxes, stored_as
 from simulators.scenes import SCENES
 
 LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
@@ -33,12 +34,14 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     keep theirs. Raises AppError or SceneError.
     """
     folder = path_in(spec)
+    axes = ANGLES
     if is_session(folder):
         folder = folder / IN_SESSION
         if not (folder / LIGHT_FIELD).is_file():
             raise AppError(f"{spec}: not reconstructed yet; run: emmc-rig reconstruct {spec}")
     if (folder / LIGHT_FIELD).is_file():
         light_field, maps = load_hdf5(folder / LIGHT_FIELD), read_maps(folder)
+        axes = load_view_axes(folder / LIGHT_FIELD)
         metrics = _metrics(folder)
         caption = _caption(metrics)
     elif (folder / FRAMES).is_file():
@@ -59,7 +62,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     return Export(
         folder.resolve().name, caption, light_field, true, metrics=metrics, source=spec, **{
             name: fitting.get(name) for name in ("disparity", "sigma", "misfit")
-        },
+        }, view_axes=axes,
     )  # fmt: skip
 
 
@@ -80,9 +83,10 @@ def read_maps(folder: Path) -> dict[str, NDArray]:
         return {name: stored.array(name) for name in map(str, stored.file)}
 
 
-def save_maps(folder: Path, maps: Mapping[str, NDArray]) -> None:
+def save_maps(folder: Path, maps: Mapping[str, NDArray], view_axes: ViewAxes = ANGLES) -> None:
     """Write the maps of a result into its folder."""
     with h5py.File(folder / MAPS, "w") as file:
+        file.attrs[ATTRIBUTE] = stored_as(view_axes)
         for name, values in maps.items():
             file.create_dataset(name, data=values, compression="lzf")
 

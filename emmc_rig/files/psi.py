@@ -25,6 +25,7 @@ from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiSizes, checksum_of
+from emmc_rig.model.view_axes import ATTRIBUTE, axes_from, stored_as
 
 PSI_GROUP = "psi.zarr"
 AGAIN = "measure Psi again"
@@ -48,6 +49,7 @@ class SavedPsi(PsiSizes):
             self.shape = weights.shape
             self.binning = int(np.asarray(stored.attributes["binning"]))
             self.checksum = str(stored.attributes["sha256"])
+            self.view_axes = axes_from(stored.attributes.get(ATTRIBUTE), path, SensingError)
             if len(self.shape) != 6 or self.binning < 1:
                 raise SensingError(f"{path}: damaged (no shape of an imaging matrix); {AGAIN}")
 
@@ -62,7 +64,8 @@ class SavedPsi(PsiSizes):
             camera, weights = str(stored.attributes["camera"]), stored.dataset("weights")
             planes = (self._whole(weights[place]) for place in np.ndindex(self.weights_shape[:3]))
             colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
-            checksum = checksum_of(self.binning, camera, planes, self._whole(colour))
+            colour = self._whole(colour)
+            checksum = checksum_of(self.binning, camera, planes, colour, self.view_axes)
         if checksum != self.checksum:
             raise SensingError(f"{self._path}: damaged (its checksum differs); {AGAIN}")
 
@@ -78,7 +81,8 @@ class SavedPsi(PsiSizes):
             if "colour" in stored:
                 colour = self._whole(stored.dataset("colour")[:, rows, columns])
             camera = str(stored.attributes["camera"])
-            return ImagingMatrix(self._whole(weights), colour, self.binning, camera)
+            weights = self._whole(weights)
+            return ImagingMatrix(weights, colour, self.binning, camera, self.view_axes)
 
     def _whole(self, values: NDArray) -> NDArray:
         """Return values that were read, after a check that none is missing."""
@@ -137,8 +141,9 @@ def save_shards(psi: ImagingMatrix, folder: Path) -> None:
             )  # fmt: skip
             made[...] = values
     group.attrs.update(
-        format=FORMAT, binning=psi.binning, camera=psi.camera_json, sha256=psi.checksum()
-    )
+        format=FORMAT, binning=psi.binning, camera=psi.camera_json, sha256=psi.checksum(),
+        view_axes=stored_as(psi.view_axes),
+    )  # fmt: skip
 
 
 def read_frames(folder: Path) -> Frames:

@@ -18,7 +18,14 @@ from emmc_rig.files import shards
 from emmc_rig.files.formats import FORMATS
 from emmc_rig.model.arguments import NAMES, numbers_of, pair_of, required
 from emmc_rig.model.errors import SceneError, ViewOrderWarning, did_you_mean
-from emmc_rig.model.lightfield import check_light_field, load_hdf5, load_views, shifted
+from emmc_rig.model.lightfield import (
+    check_light_field,
+    load_hdf5,
+    load_view_axes,
+    load_views,
+    shifted,
+)
+from emmc_rig.model.view_axes import ANGLES, shows_parallax
 from emmc_rig.model.view_order import ViewOrder, order_of
 from simulators.raycaster import World
 from simulators.scenes import SCENES, render
@@ -239,7 +246,7 @@ def _described(name: str, views: tuple[int, int], size: tuple[int, int], seed: i
 
 def _measured(spec: str) -> tuple[np.ndarray, str]:
     """The light field in a folder or file, and a sentence about it."""
-    path = path_in(spec)
+    path, axes = path_in(spec), ANGLES
     held = next((form for form in FORMATS.values() if form.holds and form.holds(path)), None)
     if held is not None and held.read is not None:
         light_field = check_light_field(held.read(path), spec)
@@ -249,7 +256,7 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
     elif path.is_dir():
         light_field, kind = load_views(path), "folder"
     elif path.suffix.lower() in _HDF5_ENDINGS:
-        light_field, kind = load_hdf5(path), "file"
+        light_field, kind, axes = load_hdf5(path), "file", load_view_axes(path)
     elif path.exists():
         raise SceneError(
             f"{spec}: a scene file ends in .h5, .hdf5 or .mat, or is an ESLF picture named "
@@ -262,7 +269,7 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
         )
     n_v, n_u, height, width, _ = light_field.shape
     described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels"
-    order = order_of(light_field)
+    order = order_of(light_field) if shows_parallax(axes) else ViewOrder.AS_NAMED
     if order == ViewOrder.AS_NAMED:
         return light_field, described
     described += f": {order.words}, says their parallax"

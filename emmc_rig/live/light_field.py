@@ -33,6 +33,7 @@ from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.pages.display import PART_PIXELS
 from emmc_rig.pages.viewer import viewer_data
 from emmc_rig.session.measured_psi import Scale, session_scale
@@ -153,7 +154,8 @@ class LiveLightField:
             missed = missed_readings(
                 run.psi, found.light_field, taken.readings, taken.noise_sigma, taken.usable
             )
-            self._draw(export_of(found.light_field, found.maps, missed))
+            axes = self.psi.view_axes
+            self._draw(export_of(found.light_field, found.maps, missed, axes))
         return self._report("")
 
     def _give_up(self) -> None:
@@ -208,7 +210,9 @@ class LiveLightField:
         self.preview.follow(readings, STEPS)
         coarse = self.preview.light_field
         block = max(1, self.psi.size[1] // coarse.shape[3])
-        self._draw(export_of(coarse, {"disparity": disparity_of(coarse)}), block)
+        axes = self.psi.view_axes
+        maps = {"disparity": disparity_of(coarse)} if shows_parallax(axes) else {}
+        self._draw(export_of(coarse, maps, view_axes=axes), block)
 
     _shots = 0
 
@@ -338,11 +342,14 @@ class Pictures:
 
 
 def export_of(
-    light_field: Array, maps: Mapping[str, NDArray], misfit: Array | None = None
+    light_field: Array,
+    maps: Mapping[str, NDArray],
+    misfit: Array | None = None,
+    view_axes: ViewAxes = ANGLES,
 ) -> Export:
     """Return a light field with those of a method's maps that the viewer shows."""
     disparity, sigma = (maps.get(name) for name in ("disparity", "sigma"))
-    return Export("", "", light_field, None, disparity, sigma, misfit)
+    return Export("", "", light_field, None, disparity, sigma, misfit, view_axes=view_axes)
 
 
 def field_pictures(

@@ -8,7 +8,7 @@ linear values themselves, with no gamma.
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,6 +19,14 @@ import numpy as np
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.reading import decode_picture, one_line, stored_arrays
+from emmc_rig.model.view_axes import (
+    ANGLES,
+    ATTRIBUTE,
+    ViewAxes,
+    axes_from,
+    picture_name,
+    shows_parallax,
+)
 
 _DATASET = "light_field"
 _VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.png")
@@ -35,7 +43,7 @@ def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
     """Return `lf` as contiguous float32, or say what keeps it from being a light field.
 
     Args:
-        lf: anything; right is a floating (v, u, y, x, 3) array in [0, 1] of 2x2 views or more.
+        lf: anything; right is a floating (v, u, y, x, 3) array in [0, 1] of two views or more.
         source: where it came from, for the message.
 
     Raises:
@@ -44,8 +52,8 @@ def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
     lf = np.asarray(lf)
     if lf.ndim != 5:
         raise SceneError(f"{source}: shape {lf.shape} is not (v, u, y, x, c)")
-    if min(lf.shape[:2]) < 2:
-        raise SceneError(f"{source}: {lf.shape[0]}x{lf.shape[1]} views, needs 2x2 or more")
+    if lf.shape[0] * lf.shape[1] < 2:
+        raise SceneError(f"{source}: {lf.shape[0]}x{lf.shape[1]} views, needs two or more")
     if lf.shape[4] != 3:
         raise SceneError(f"{source}: {lf.shape[4]} colours, needs 3 (RGB)")
     if lf.size == 0:
@@ -171,6 +179,13 @@ def load_hdf5(path: str | os.PathLike) -> np.ndarray:
         lf = lf.astype(np.float32)
         lf /= full_scale
     return check_light_field(lf, str(path))
+
+
+def load_view_axes(path: str | os.PathLike) -> ViewAxes:
+    """Return what rows and columns of views of `load_hdf5`'s file are; raises SceneError."""
+    path = Path(path)
+    with stored_arrays(path, SceneError, "copy it again") as stored:
+        return axes_from(stored.dataset(_DATASET).attrs.get(ATTRIBUTE), path, SceneError)
 
 
 def save_hdf5(
@@ -383,20 +398,25 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
 
 
 def export_pictures(
-    folder: str | os.PathLike, lf: np.ndarray, disparities_px: tuple[float, float, float]
+    folder: str | os.PathLike,
+    lf: np.ndarray,
+    disparities_px: tuple[float, float, float] | None = None,
+    view_axes: ViewAxes = ANGLES,
 ) -> dict[str, Path]:
     """Write what a person wants to see of a light field, for any picture viewer.
 
     Args:
         folder: created where missing.
         lf: (v, u, y, x, 3); values outside [0, 1] are clipped.
-        disparities_px: back, middle and front focus in pixels per view step; where they are
-            unknown, `focus_disparities(lf)`.
+        disparities_px: back, middle and front focus in pixels per view step; by default
+            `focus_disparities(lf)`.
+        view_axes: what rows and columns of views are.
 
     Returns:
         What was written: `views` (a folder), `parallax`, `epi_horizontal`, `epi_vertical`
         (through the centre, each view's line repeated to be visible), `refocus_back`,
-        `refocus_middle`, `refocus_front`.
+        `refocus_middle`, `refocus_front`. Of bands or times `views`, and `bands` or `times`, an
+        animation of all in order.
 
     Raises:
         SceneError: something cannot be written.
@@ -404,7 +424,12 @@ def export_pictures(
     folder = _make_folder(folder)
     n_v, n_u, height, width, _ = lf.shape
     save_views(folder / "views", lf)
-    _write_parallax(folder / "parallax.webp", lf)
+    if not shows_parallax(view_axes):
+        name = f"{picture_name(view_axes)}s"
+        _write_walk(folder / f"{name}.webp", lf, list(np.ndindex(n_v, n_u)))
+        return {"views": folder / "views", name: folder / f"{name}.webp"}
+    disparities_px = disparities_px or focus_disparities(lf)
+    _write_walk(folder / "parallax.webp", lf, _circular_walk(n_v, n_u))
     pictures = {
         "epi_horizontal": np.repeat(epi_horizontal(lf, n_v // 2, height // 2), 8, axis=0),
         "epi_vertical": np.repeat(epi_vertical(lf, n_u // 2, width // 2), 8, axis=0),
@@ -443,9 +468,8 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
         raise SceneError(f"{path}: cannot be written")
 
 
-def _write_parallax(path: Path, lf: np.ndarray) -> None:
-    """Write an endless animation that walks in a circle over the outer views of (v, u, y, x, 3)."""
-    walk = _circular_walk(lf.shape[0], lf.shape[1])
+def _write_walk(path: Path, lf: np.ndarray, walk: Sequence[tuple[int, ...]]) -> None:
+    """Write an endless animation of some views, (v, u) each, of a light field (v, u, y, x, 3)."""
     animation = cv2.Animation()
     animation.frames = [_to_codes(lf[place]) for place in walk]
     animation.durations = [max(60, 1600 // len(walk))] * len(walk)

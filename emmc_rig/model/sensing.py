@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -25,6 +25,14 @@ from emmc_rig.model.files import whole_file
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.view_axes import (
+    ANGLES,
+    ATTRIBUTE,
+    VIEW_AXES,
+    ViewAxes,
+    axes_from,
+    stored_as,
+)
 
 Array = NDArray[np.floating]
 WEIGHTS_TAKE = "an array (shot, v, u, y, stored colour, x), float32 or float64"
@@ -32,12 +40,20 @@ NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
 FORMAT = "emmc-rig imaging matrix 1"
 
 
-def checksum_of(binning: int, camera_json: str, planes: Iterable[Array], colour: NDArray) -> str:
+def checksum_of(
+    binning: int,
+    camera_json: str,
+    planes: Iterable[Array],
+    colour: NDArray,
+    view_axes: ViewAxes = ANGLES,
+) -> str:
     """Return the SHA-256 of a Psi; planes, colour: as `view_planes` and `colour_map`.
 
     A damaged file's text may hold what no UTF-8 is; it then has another checksum.
     """
     head = f"{FORMAT}|{binning}|{camera_json}"
+    if view_axes != ANGLES:  # earlier versions' Psi keep theirs
+        head += f"|{stored_as(view_axes)}"
     digest = hashlib.sha256(head.encode(errors="surrogatepass"))
     for plane in planes:
         digest.update(np.ascontiguousarray(plane).view(np.uint8).data)
@@ -109,6 +125,7 @@ class ImagingMatrix(PsiSizes):
     colour: (shot, y, x) uint8, the colour stored there; None when three are stored.
     binning: k; a pixel sums k x k samples.
     camera_json: the description of the camera, or "" when unknown.
+    view_axes: what rows and columns of views are, each "angle", "band" or "time".
 
     Psi is an operator: `psi @ light_field` are frames, `psi.T @ frames` is a light field, in their
     natural shapes; `scipy.sparse.linalg.aslinearoperator(psi)` takes them flattened.
@@ -126,8 +143,11 @@ class ImagingMatrix(PsiSizes):
     colour: NDArray[np.uint8] | None
     binning: int = 1
     camera_json: str = ""
+    view_axes: ViewAxes = ANGLES
 
     def __post_init__(self) -> None:
+        if self.view_axes not in VIEW_AXES:
+            raise refusal(self.view_axes, "view_axes", "a pair such as ('angle', 'band')")
         if getattr(self.weights, "dtype", np.dtype(object)).kind != "f":
             raise refusal(self.weights, "weights", WEIGHTS_TAKE)
         if self.weights.ndim != 6 or self.weights.shape[4] != (1 if self.colour is not None else 3):
@@ -145,8 +165,9 @@ class ImagingMatrix(PsiSizes):
         shots, (v, u), (rows, columns) = self.shots, self.views, self.size
         megabytes = self.weights.nbytes / 1e6
         memory = f"{megabytes:.2g} MB" if megabytes < 1000 else f"{megabytes / 1000:.2g} GB"
+        named = "" if self.view_axes == ANGLES else f" ({', '.join(self.view_axes)})"
         return (
-            f"Psi({shots} shot{'s' * (shots > 1)}, {v}x{u} views, {rows}x{columns}, "
+            f"Psi({shots} shot{'s' * (shots > 1)}, {v}x{u} views{named}, {rows}x{columns}, "
             f"{self._sensor()}, {memory})"
         )
 
@@ -203,6 +224,7 @@ class ImagingMatrix(PsiSizes):
             None if self.colour is None else np.ascontiguousarray(self.colour[:, rows, columns]),
             self.binning,
             self.camera_json,
+            self.view_axes,
         )
 
     def of_shots(self, shots: Sequence[int], camera_json: str = "") -> ImagingMatrix:
@@ -213,6 +235,7 @@ class ImagingMatrix(PsiSizes):
             None if self.colour is None else self.colour[chosen],
             self.binning,
             camera_json,
+            self.view_axes,
         )
 
     def forward(self, light_field: Array) -> Array:
@@ -309,6 +332,7 @@ class ImagingMatrix(PsiSizes):
         size: tuple[int, int],
         cfa: str | tuple[str, ...] = "mono",
         binning: int = 1,
+        view_axes: ViewAxes = ANGLES,
     ) -> ImagingMatrix:
         """Return Psi from an explicit sparse matrix, such as another program's.
 
@@ -320,6 +344,7 @@ class ImagingMatrix(PsiSizes):
             size: rows and columns of samples of a view.
             cfa: the colour filters, where the columns have no colour.
             binning: k; a pixel sums k x k samples.
+            view_axes: what rows and columns of views are, each "angle", "band" or "time".
 
         Raises:
             SensingError: a shape that does not fit, entries that are no finite numbers, a reading
@@ -360,13 +385,13 @@ class ImagingMatrix(PsiSizes):
         weights = np.zeros((shots, *views, size[0], 3, size[1]), dtype=np.float32)
         if per_sample == 3:
             weights[shot, v, u, y, c, x] = entries.data
-            return cls(weights, None, binning)._compact()
+            return cls(weights, None, binning, view_axes=view_axes)._compact()
         tile = cfa_tile(cfa)
         of_pixel = tile[pixel_y % tile.shape[0], pixel_x % tile.shape[1]]
         shares = of_pixel / of_pixel.sum(axis=-1, keepdims=True)
         for colour in range(3):
             weights[shot, v, u, y, colour, x] = entries.data * shares[:, colour]
-        return cls(weights, None, binning)._compact()
+        return cls(weights, None, binning, view_axes=view_axes)._compact()
 
     def _compact(self) -> ImagingMatrix:
         """Return Psi with one stored colour where every sample's pixel sees one at most."""
@@ -375,8 +400,8 @@ class ImagingMatrix(PsiSizes):
             return self
         colour = seen.argmax(axis=2).astype(np.uint8)
         chosen = colour[:, None, None, :, None, :].astype(np.intp)
-        return ImagingMatrix(
-            np.take_along_axis(self.weights, chosen, axis=4), colour, self.binning, self.camera_json
+        return replace(
+            self, weights=np.take_along_axis(self.weights, chosen, axis=4), colour=colour
         )
 
     def relative_difference(self, reference: ImagingMatrix) -> float:
@@ -391,8 +416,9 @@ class ImagingMatrix(PsiSizes):
         return (self.weights[place] for place in np.ndindex(*self.weights.shape[:3]))
 
     def checksum(self) -> str:
-        """Return the SHA-256 of weights, colours, binning and camera."""
-        return checksum_of(self.binning, self.camera_json, self.view_planes(), self.colour_map)
+        """Return the SHA-256 of weights, colours, binning, camera and names of the view axes."""
+        planes, colour = self.view_planes(), self.colour_map
+        return checksum_of(self.binning, self.camera_json, planes, colour, self.view_axes)
 
     def save(self, path: str | Path) -> None:
         """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
@@ -407,7 +433,7 @@ class ImagingMatrix(PsiSizes):
     def describe(self, file: h5py.File) -> None:
         """Write what makes a file that holds the weights one of Psi."""
         facts = {"format": FORMAT, "binning": self.binning, "camera": self.camera_json}
-        file.attrs.update(**facts, sha256=self.checksum())
+        file.attrs.update(**facts, view_axes=stored_as(self.view_axes), sha256=self.checksum())
         if self.colour is not None:
             file["colour"] = self.colour
 
@@ -423,6 +449,7 @@ class ImagingMatrix(PsiSizes):
                 stored.array("colour") if "colour" in stored else None,
                 int(np.asarray(stored.attributes["binning"])),
                 str(stored.attributes["camera"]),
+                axes_from(stored.attributes.get(ATTRIBUTE), path, SensingError),
             )
             expected = stored.attributes["sha256"]
         if matrix.checksum() != expected:

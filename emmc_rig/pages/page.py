@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from emmc_rig.files.results import stated_words
+from emmc_rig.model.view_axes import picture_name, shows_parallax
 from emmc_rig.version import __version__
 
 KINDS = {
@@ -70,7 +71,7 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
     verdict = metrics.get("verdict")
     if not isinstance(verdict, dict):
         why = "this light field was not reconstructed from frames, or they were not checked"
-        return Head("no verdict", why, _uses(source, viewer))
+        return Head("no verdict", why, _uses(metrics, source, viewer))
     level, reasons = verdict["level"], verdict["reasons"]
     why = [reason["what"] for reason in reasons]
     agree = "frames, Psi and light field agree"
@@ -87,7 +88,7 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
     return Head(
         level,
         "; ".join(why) or agree,
-        [one for one in remedies if one] or _uses(source, viewer),
+        [one for one in remedies if one] or _uses(metrics, source, viewer),
         "watch" if tone == "good" and lost_db > 0 else tone,
     )
 
@@ -100,9 +101,13 @@ def _below_copied_db(metrics: Mapping[str, object]) -> float:
     return 0.0
 
 
-def _uses(source: str, viewer: bool) -> list[str]:
+def _uses(metrics: Mapping[str, object], source: str, viewer: bool) -> list[str]:
     """Return what a light field can be used for."""
     look = "drag the picture to turn it, click to focus, turn the wheel to open the aperture"
+    match metrics.get("view_axes"):
+        case [str(rows), str(columns)] if not shows_parallax((rows, columns)):
+            named = picture_name((rows, columns))
+            look = f"drag the picture from {named} to {named}, turn the wheel for a mean of several"
     if not source:
         return [look]
     named = shlex.quote(source)

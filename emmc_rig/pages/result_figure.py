@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.formats import Export
 from emmc_rig.model.lightfield import epi_horizontal, psnr_db, ssim
+from emmc_rig.model.view_axes import picture_name, place_name, shows_parallax
 from emmc_rig.pages.display import DisplayCurve, ends, finite, round_up, three_colours
 from emmc_rig.pages.drawing import FAINT, INK, save_publication
 from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
@@ -97,7 +98,9 @@ def draw_results(
     """
     settings = settings or FigureSettings()
     truth = results[0].truth
-    columns = list(results) if truth is None else [Export("true", "", truth), *results]
+    axes = results[0].view_axes
+    true = [] if truth is None else [Export("true", "", truth, view_axes=axes)]
+    columns = [*true, *results]
     reference = columns[0].light_field
     for one in results:
         if one.light_field.shape != reference.shape:
@@ -105,6 +108,9 @@ def draw_results(
                 f"{one.title} has shape {one.light_field.shape}, {results[0].title} has "
                 f"{reference.shape}: name results of one capture"
             )
+    if any(one.view_axes != axes for one in results):
+        raise AppError("views are angles of one result, bands or times of another")
+    parallax, (rows_of_views, columns_of_views) = shows_parallax(axes), reference.shape[:2]
     view = _view(reference, settings.view)
     pieces = _pieces(reference[view], settings)
     curve = DisplayCurve.fitted_to(reference)
@@ -145,12 +151,14 @@ def draw_results(
         for name, one in zip(names, columns, strict=True)
         if one.title != "true"
     ]
+    name, picture = place_name(axes, (rows_of_views, columns_of_views), view), picture_name(axes)
     caption = " ".join([
-        f"View {view} of {reference.shape[0]}x{reference.shape[1]}, "
+        f"{name[0].upper()}{name[1:]} of {rows_of_views}x{columns_of_views}, "
         f"{reference.shape[2]}x{reference.shape[3]} pixels.",
-        f"Epipolar plane image of row {line} (dotted), all views of a row downwards.",
-        *(["Error: root mean square over colours, of this view. PSNR and SSIM are of all views, "
-           "peak 1."] if measured else []),
+        f"Epipolar plane image of row {line} (dotted), all views of a row downwards." if parallax
+        else f"Row {line} (dotted) of every {picture}, downwards.",
+        *([f"Error: root mean square over colours, of this {picture}. PSNR and SSIM are of all "
+           f"{picture}s, peak 1."] if measured else []),
         f"Close-ups of {pieces[0].side}x{pieces[0].side} pixels around (y, x) = "
         + ", ".join(f"({one.y + one.side // 2}, {one.x + one.side // 2})" for one in pieces) + ".",
         f"Linear values x are shown as {_shown_as(curve)}, cut at 1.",
@@ -294,7 +302,7 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
         for one in results
     ]  # fmt: skip
     deviations = [None if one.sigma is None else one.sigma[view] for one in results]
-    disparities = [one.disparity for one in results]
+    disparities = [one.disparity if shows_parallax(one.view_axes) else None for one in results]
     top = round_up(ends([*errors, *deviations])[1])
     low, high = ends(disparities)
     if high - low < LEAST_RANGE_PX:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from emmc_rig.files.formats import Export, Format
 from emmc_rig.model.files import write_text
 from emmc_rig.model.novel_view import centre_disparity, view_disparities
+from emmc_rig.model.view_axes import axis_names, place_name, shows_parallax
 from emmc_rig.pages.display import (
     HEAT,
     SPRITE_PIXELS,
@@ -92,7 +93,13 @@ def poster(content: Export, most_pixels: int = SPRITE_PIXELS) -> dict[str, objec
     curve = DisplayCurve.fitted_to(views if content.truth is None else content.truth)
     codes = three_colours(curve.encode(shown))
     picture = sprite(codes, int(BYTES_PER_PIXEL * codes.size / 3), tile=1)
-    return {"picture": picture, "height": shown.shape[2], "width": shown.shape[3]}
+    name = "centre view"
+    if not shows_parallax(content.view_axes):
+        name = place_name(content.view_axes, (rows, columns), (rows // 2, columns // 2))
+    return {
+        "picture": picture, "height": shown.shape[2], "width": shown.shape[3],
+        "name": name[0].upper() + name[1:],
+    }  # fmt: skip
 
 
 def viewer_data(
@@ -100,16 +107,20 @@ def viewer_data(
 ) -> dict[str, object]:
     """Return what viewer.js reads.
 
-    Disparity is estimated where the light field comes without. most_pixels: of all views.
+    Disparity is estimated where the light field comes without; bands and times have none.
+    most_pixels: of all views.
     """
     shown = reduced(content.light_field, most_pixels)
     rows, columns, height, width, _ = shown.shape
     shrink = width / content.light_field.shape[3]
     truth = content.truth
     curve = DisplayCurve.fitted_to(content.light_field if truth is None else truth)
-    centre = _resized(centre_disparity(content.light_field, content.disparity), shown) * np.float32(
-        shrink
-    )
+    parallax = shows_parallax(content.view_axes)
+    if parallax:
+        centre = _resized(centre_disparity(content.light_field, content.disparity), shown)
+    else:
+        centre = np.zeros((height, width), np.float32)
+    centre = centre * np.float32(shrink)
     maps = view_disparities(centre, (rows, columns))
     low, high = float(maps.min()), float(maps.max())
     span = max(high - low, 1e-3)
@@ -119,6 +130,7 @@ def viewer_data(
     )
     return {
         "views": {"rows": rows, "columns": columns, "height": height, "width": width},
+        "axes": None if parallax else axis_names(content.view_axes, (rows, columns)),
         "scale": shrink,
         "tile": TILE_MULTIPLE_PX,
         "gamma": curve.gamma,
@@ -134,7 +146,7 @@ def overlays_of(content: Export) -> list[Overlay]:
     """Return the maps that there are, ready to be drawn."""
     found = []
     rows, columns = content.light_field.shape[:2]
-    if content.disparity is not None:
+    if content.disparity is not None and shows_parallax(content.view_axes):
         low, high = ends([content.disparity])
         found.append(
             Overlay("disparity", "disparity", "px per view", content.disparity, low, high, DEPTH)

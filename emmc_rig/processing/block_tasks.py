@@ -32,6 +32,7 @@ from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.processing.memory import peak_memory_mib, task_bytes
 from emmc_rig.processing.pool import Pool
 from emmc_rig.version import __version__
@@ -338,6 +339,7 @@ class Blocks:
     def write_shards(self, folder: Path, pool: Pool) -> None:
         """Write all arrays into a Zarr group by the workers of a pool, a shard each."""
         tasks, group = [], created_group(folder)
+        group.attrs[ATTRIBUTE] = stored_as(self.job.psi.view_axes)
         for name, (shape, dtype) in self.shapes().items():
             for place in create_array(group, name, shape, dtype, AXES.get(name, 0)):
                 tasks.append(ShardTask(self.grid, self.job.kept, name, place, folder.absolute()))

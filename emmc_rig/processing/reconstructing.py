@@ -29,6 +29,7 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiSizes
 from emmc_rig.model.settings import validated
+from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
 from emmc_rig.processing.memory import (
     BASE_BYTES,
@@ -274,6 +275,7 @@ def _write_blocks(
         **figures(blocks.result(), verdict, frames),
         "shots": psi.shots,
         "size": list(psi.size),
+        "view_axes": list(psi.view_axes),
         "psi_sha256": psi.checksum,
         "dictionary": blocks.job.dictionary,
         **further,
@@ -283,9 +285,13 @@ def _write_blocks(
     else:
         with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
             file.attrs["method"] = blocks.job.method
+            maps.attrs[ATTRIBUTE] = stored_as(psi.view_axes)
             for name, (shape, dtype) in blocks.shapes().items():
                 home = file if name == "light_field" else maps
-                blocks.write(name, home.create_dataset(name, shape, dtype))
+                made = home.create_dataset(name, shape, dtype)
+                if home is file:
+                    made.attrs[ATTRIBUTE] = stored_as(psi.view_axes)
+                blocks.write(name, made)
             metrics |= _compared(file["light_field"], truth, psi)
     write_metrics(out, metrics)
     return metrics

@@ -19,13 +19,13 @@ from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import (
     export_pictures,
-    focus_disparities,
     psnr_db,
     replicate_centre,
     save_hdf5,
     ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import ATTRIBUTE, picture_name, stored_as
 from emmc_rig.pages.viewer import render_viewer
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.kept import missed_readings
@@ -105,7 +105,10 @@ class Result:
 
     @property
     def disparity(self) -> NDArray[np.floating] | None:
-        """Disparity (y, x) of the centre view, pixels per view step; None without an estimate."""
+        """Disparity (y, x) of the centre view, pixels per view step; None without an estimate.
+
+        None where views are bands or times: `maps` has a `shift` then, pixels from one to the next.
+        """
         return self.maps.get("disparity")
 
     @cached_property
@@ -151,6 +154,7 @@ class Result:
             **self.solved.stated,
             "shots": self.psi.shots,
             "size": list(self.psi.size),
+            "view_axes": list(self.psi.view_axes),
             "psi_sha256": self.psi.checksum(),
             "dictionary": self.dictionary,
         }
@@ -165,9 +169,11 @@ class Result:
 
     def write(self, folder: Path, metrics: Mapping[str, Any]) -> None:
         """Write light_field.h5, pictures/, maps.h5 and metrics.json into an existing folder."""
-        save_hdf5(folder / LIGHT_FIELD, self.light_field, {"method": self.method})
-        export_pictures(folder / "pictures", self.light_field, focus_disparities(self.light_field))
-        save_maps(folder, {**self.maps, "misfit": self.misfit})
+        axes = self.psi.view_axes
+        facts = {"method": self.method, ATTRIBUTE: stored_as(axes)}
+        save_hdf5(folder / LIGHT_FIELD, self.light_field, facts)
+        export_pictures(folder / "pictures", self.light_field, view_axes=axes)
+        save_maps(folder, {**self.maps, "misfit": self.misfit}, axes)
         write_metrics(folder, metrics)
 
     def figure(
@@ -198,8 +204,9 @@ class Result:
 
     def __repr__(self) -> str:
         (v, u, rows, columns, _), level = self.light_field.shape, self.verdict.level
+        pictures = f"{v}x{u} {picture_name(self.psi.view_axes)}s"
         return (
-            f"Result({self.method}, {v}x{u} views of {rows}x{columns}, {self.status} in "
+            f"Result({self.method}, {pictures} of {rows}x{columns}, {self.status} in "
             f"{self.seconds:.1f} s, verdict: {level})"
         )
 
@@ -214,7 +221,7 @@ class Result:
         return Export(
             self.method, self.verdict.words, self.light_field,
             None if truth is None else np.asarray(truth), self.disparity, self.sigma,
-            self.misfit, self.metrics(),
+            self.misfit, self.metrics(), view_axes=self.psi.view_axes,
         )  # fmt: skip
 
     @cached_property

@@ -95,7 +95,7 @@ def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
     weights = [float(block.pixels) for block in blocks]
     evidence = [block.verdict.evidence for block in blocks]
     first = evidence[0]
-    same = {key: getattr(first, key) for key in ("method", "status")}
+    same = {key: getattr(first, key) for key in ("method", "status", "view_axes")}
     left_out = tuple(sorted({shot for figures in evidence for shot in figures.left_out}))
     figures = {
         key: _combined(key, [getattr(of_block, key) for of_block in evidence], weights)

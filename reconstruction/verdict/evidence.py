@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from reconstruction.colour import unseen_colour
 from reconstruction.flat import flat_psi
 from reconstruction.result import SCALE, Reconstruction
@@ -46,6 +47,7 @@ class Evidence:
     `over_baselines`. parallax: root mean square by which views differ from the middle one, over it.
     blockiness: see there. steps: noise by quantisation, over the noise stated. stated: standard
     deviation that held-out readings show, root mean square over the light field, over its mean.
+    view_axes: Psi's.
     """
 
     method: str
@@ -84,6 +86,7 @@ class Evidence:
     blockiness: float | None = None
     steps: float | None = None
     stated: float | None = None
+    view_axes: ViewAxes = ANGLES
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -170,11 +173,12 @@ def gathered(
         },
         short=read.short,
         gains=read.gains,
-        parallax=_parallax(result.light_field),
+        parallax=_parallax(result.light_field, psi.view_axes),
         **over_baselines(psi, frames, residual, noise_sigma, usable, read.kept),
         blockiness=blockiness(frames, usable),
         steps=None if step is None else step / np.sqrt(12) / max(noise_sigma, 1e-12),
         stated=_stated(result),
+        view_axes=psi.view_axes,
     )
 
 
@@ -194,8 +198,9 @@ def _stated(result: Reconstruction) -> float | None:
     return float(np.sqrt(square) / max(float(result.light_field.mean(dtype=np.float64)), 1e-12))
 
 
-def _parallax(light_field: Array) -> float | None:
-    if light_field.shape[0] * light_field.shape[1] == 1:
+def _parallax(light_field: Array, view_axes: ViewAxes) -> float | None:
+    """Return `Evidence.parallax`; bands and times are no angles, and show none."""
+    if not shows_parallax(view_axes) or light_field.shape[0] * light_field.shape[1] == 1:
         return None
     middle = centre_view(light_field)
     square = float(np.mean(np.square(middle, dtype=np.float64)))

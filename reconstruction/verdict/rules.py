@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from emmc_rig.model.view_axes import picture_name, shows_parallax
 from reconstruction.method import Sensitivity
 from reconstruction.methods import METHODS
 from reconstruction.verdict.evidence import Evidence
@@ -509,27 +510,29 @@ def _noise(e: Evidence) -> Iterator[Reason]:
 
 
 def _search(e: Evidence) -> Iterator[Reason]:
-    """Reasons from the figures of methods that search disparities."""
+    """Reasons from the figures of methods that search disparities, or shifts between bands."""
     decided, at_end = e.parameters.get("decided"), e.parameters.get("at_end", 0.0)
+    picture, parallax = picture_name(e.view_axes), shows_parallax(e.view_axes)
+    searched = "disparities" if parallax else f"shifts from {picture} to {picture}"
     if decided is not None:
         yield Reason(
-            f"{1 - decided:.0%} of the textured patches fit all disparities alike",
+            f"{1 - decided:.0%} of the textured patches fit all {searched} alike",
             decided,
-            "use a mask that differs from view to view, or more shots",
+            f"use a mask that differs from {picture} to {picture}, or more shots",
             UNDECIDED.level(1 - decided),
         )
         if e.noise > NOISY and UNDECIDED.doubt > 1 - decided > LEFT_OPEN:
             yield Reason(
                 f"noise is {e.noise:.0%} of the mean reading, and {1 - decided:.0%} of the "
-                "textured patches fit several disparities",
+                f"textured patches fit several {searched}",
                 e.noise,
                 "more light, longer exposure or more shots",
                 "doubt",
             )
     yield Reason(
-        f"{at_end:.0%} of the patches fit best at the end of the range of disparities searched",
+        f"{at_end:.0%} of the patches fit best at the end of the range of {searched} searched",
         at_end,
-        "raise furthest_px, or focus nearer to the scene",
+        "raise furthest_px" + (", or focus nearer to the scene" if parallax else ""),
         AT_END.level(at_end),
     )
 
@@ -563,7 +566,7 @@ def _fit(e: Evidence) -> Iterator[Reason]:
             UNEXPLAINED.level(1 - e.explained),
         )
     for over, what in (
-        (e.over_flat, "one picture for all views"),
+        (e.over_flat, f"one picture for all {picture_name(e.view_axes)}s"),
         (e.over_neighbours, "the mean of the readings beside"),
     ):
         if over is not None and over > 1:

@@ -9,13 +9,14 @@ than the others, its readings are left out, and it is fitted again, too.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import shows_parallax
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.methods import MethodSettings, reconstruct
@@ -84,8 +85,15 @@ def reconstruct_judged(
             f"left out {found.moved.mean():.1%} of the readings, where one shot saw another scene "
             "than the others",
         )
-    result = dataclasses.replace(result, screening=notes)
+    result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
     return result, verdict_from(gathered(psi, read, typical, result, found))
+
+
+def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDArray]:
+    """Return a method's maps; what it calls disparity is a shift where views are no angles."""
+    if shows_parallax(psi.view_axes):
+        return dict(maps)
+    return {name.replace("disparity", "shift"): values for name, values in maps.items()}
 
 
 def _motion(

@@ -5,9 +5,11 @@ takes minutes. EMMC_SIZE, which the README names, makes the rest small.
 """
 
 import re
+import runpy
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from placed import files_of, listed
@@ -75,6 +77,42 @@ def test_no_line_that_is_a_command_is_passed_over(document):
     lines = re.findall(r"^(?:pip install .* && )?emmc-rig .*$", document.read_text(), re.M)
     found = [words for _, commands in blocks(document) for words in commands]
     assert len(found) == len(lines) > 0
+
+
+PAGE = ROOT / "docs" / "which-cameras.md"
+EXAMPLES = {
+    re.findall(r"^## (.*)$", PAGE.read_text()[: found.start()], re.M)[-1]: found["text"]
+    for found in BLOCK.finditer(PAGE.read_text())
+    if found["language"] == "python"
+}
+"""The page's Python, by the heading above."""
+
+
+@pytest.mark.parametrize("camera", EXAMPLES)
+def test_every_camera_of_the_page_is_a_dozen_lines_that_run(camera, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    lines = [line for line in EXAMPLES[camera].splitlines() if line and "import" not in line]
+    assert len(lines) <= 12
+    names: dict = {}
+    exec(compile(EXAMPLES[camera], camera, "exec"), names)
+    if camera == "One dense point spread function":
+        assert "entries lie off their pixel" in capsys.readouterr().out
+    elif camera == "Microlens array":
+        assert np.abs(names["scene"].light_field - names["views"]).max() < 0.02
+    else:
+        result = names["result"]
+        assert result.verdict.level != "do not use"
+        frames = np.asarray(names["frames"])
+        assert (names["psi"] @ result.light_field - frames).std() < 0.2 * frames.std()
+
+
+def test_every_camera_of_the_page_is_drawn_as_the_script_draws_it(tmp_path):
+    pictures = ROOT / "docs" / "pictures"
+    script = runpy.run_path(str(pictures / "draw_cameras.py"))
+    assert len(script["PICTURES"]) == len(EXAMPLES)
+    for name in script["PICTURES"]:
+        assert f"pictures/camera-{name}.svg" in PAGE.read_text()
+        assert (pictures / f"camera-{name}.svg").read_text() == script["drawn"](name)
 
 
 @pytest.fixture

@@ -235,7 +235,7 @@ def test_the_focus_of_two_planes_is_found_at_both():
     ("shape", "complaint"),
     [
         ((5, 5, 8, 8), "shape (5, 5, 8, 8) is not (v, u, y, x, c)"),
-        ((1, 5, 8, 8, 3), "1x5 views, needs 2x2"),
+        ((1, 1, 8, 8, 3), "1x1 views, needs two"),
         ((2, 2, 8, 8, 4), "4 colours, needs 3"),
         ((2, 2, 0, 8, 3), "0x8 pixels"),
     ],

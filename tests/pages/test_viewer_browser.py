@@ -222,3 +222,20 @@ def test_every_control_has_a_name_for_screen_readers(page):
         ".map((e) => e.id)"
     )
     assert nameless == []
+
+
+def test_bands_are_called_so_and_have_no_focus(browser, tmp_path):
+    light_field = np.random.default_rng(1).random((1, 24, 32, 40, 3), dtype=np.float32)
+    path = tmp_path / "bands.html"
+    content = Export("bands", "", light_field, view_axes=("angle", "band"))
+    path.write_text(render_viewer(content), encoding="utf-8")
+    page = opened(browser, path.as_uri())
+    status = page.find_element(By.ID, "viewer-status")
+    assert status.text.startswith("Band 12; at x 20, y 16")
+    page.find_element(By.ID, "viewer-picture").send_keys(Keys.ARROW_RIGHT)
+    WebDriverWait(page, 30).until(lambda _: status.text.startswith("Band 13;"))
+    assert not page.find_element(By.ID, "viewer-focus").is_displayed()
+    assert page.find_element(By.ID, "viewer-epi-h-name").text == "Row by band"
+    words = page.find_element(By.TAG_NAME, "body").text.lower()
+    assert not re.search(r"disparity|parallax|epipolar|view [vu] ", words)
+    assert complaints(page) == []

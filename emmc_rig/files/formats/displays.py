@@ -81,15 +81,17 @@ def _write_gif(folder: Path, export: Export) -> None:
 FORMATS = (
     Format(
         "quilt", f"quilt of {QUILT_COLUMNS * QUILT_ROWS} views for light-field displays",
-        "8-bit sRGB, views of the middle row and between them", _write_quilt,
+        "8-bit sRGB, views of the middle row and between them", _write_quilt, parallax=True,
     ),
     Format(
         "video", "parallax.mp4, a round over the views", "8-bit video",
-        partial(_write_video, ending="mp4", codec="mp4v"),
+        partial(_write_video, ending="mp4", codec="mp4v"), parallax=True,
     ),
     Format(
         "webm", "parallax.webm (VP8), the same for web pages", "8-bit video",
-        partial(_write_video, ending="webm", codec="VP80"),
+        partial(_write_video, ending="webm", codec="VP80"), parallax=True,
     ),
-    Format("gif", "parallax.gif, a round over the views", "256 colours", _write_gif),
+    Format(
+        "gif", "parallax.gif, a round over the views", "256 colours", _write_gif, parallax=True
+    ),
 )  # fmt: skip

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.view_axes import ANGLES, ViewAxes, picture_name, shows_parallax
 
 Array = NDArray[np.floating]
 
@@ -24,7 +25,7 @@ class Export:
     disparity: (y, x) of the centre view, pixels per view step. sigma: standard deviation
     (v, u, y, x). misfit: (y, x), readings missed, in deviations of their noise. truth: as
     light_field. caption: one line. metrics: what metrics.json says of a result. source: what was
-    opened, as typed.
+    opened, as typed. view_axes: what rows and columns of views are.
     """
 
     title: str
@@ -36,6 +37,7 @@ class Export:
     misfit: Array | None = None
     metrics: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
+    view_axes: ViewAxes = ANGLES
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class Format:
     """One format that others read.
 
     name: as typed after --format. title: what it is. keeps: what survives. write: an export into
-    an existing folder. holds: whether a path is of this format, and read: that path as a light
+    an existing folder. parallax: whether it shows views from where none was, or depth, which bands
+    and times do not have. holds: whether a path is of this format, and read: that path as a light
     field; None where it cannot be a scene.
     """
 
@@ -53,6 +56,17 @@ class Format:
     write: Callable[[Path, Export], None]
     holds: Callable[[Path], bool] | None = None
     read: Callable[[Path], Array] | None = None
+    parallax: bool = False
+
+    def write_whole(self, folder: Path, export: Export) -> None:
+        """Write an export; raises AppError where its views have not what the format shows."""
+        if self.parallax and not shows_parallax(export.view_axes):
+            named = picture_name(export.view_axes)
+            raise AppError(
+                f"--format {self.name} shows parallax, and {export.title} has {named}s for views: "
+                "choose another format"
+            )
+        self.write(folder, export)
 
 
 def extra_module(name: str, what: str) -> ModuleType:

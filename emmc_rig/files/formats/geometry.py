@@ -85,10 +85,11 @@ def _write_transforms(folder: Path, export: Export) -> None:
 
 FORMATS = (
     Format(
-        "ply", "points.ply, a point cloud of the centre view", "place, colour and sigma", _write_ply
+        "ply", "points.ply, a point cloud of the centre view", "place, colour and sigma",
+        _write_ply, parallax=True,
     ),
     Format(
         "transforms", "images and transforms.json for radiance-field tools",
-        "8-bit sRGB, nominal poses", _write_transforms,
+        "8-bit sRGB, nominal poses", _write_transforms, parallax=True,
     ),
 )  # fmt: skip

@@ -120,7 +120,7 @@ def _read_hdf5(path: Path) -> Array:
 FORMATS = (
     Format(
         "hci", "folder of the HCI 4D benchmark: input_Cam###.png, parameters.cfg, PFM disparity",
-        "8-bit sRGB; disparity", _write_folder, _holds_folder, _read_folder,
+        "8-bit sRGB; disparity", _write_folder, _holds_folder, _read_folder, parallax=True,
     ),
     Format("hci-hdf5", "HDF5 of HCI's: LF", "8-bit sRGB", _write_hdf5, _holds_hdf5, _read_hdf5),
 )  # fmt: skip

@@ -31,7 +31,11 @@ def _write(folder: Path, export: Export) -> None:
     ngff.to_ngff_zarr(str(folder / NAME), multiscales, version="0.4")
     path = folder / NAME / ".zattrs"
     attributes = parse_json(path.read_bytes(), path.name, AppError)
-    attributes["emmc_rig"] = {"views": [rows, columns], "colour": "linear RGB, 1 is white"}
+    attributes["emmc_rig"] = {
+        "views": [rows, columns],
+        "view_axes": list(export.view_axes),
+        "colour": "linear RGB, 1 is white",
+    }
     path.write_text(json.dumps(attributes))
     # Where Zarr keeps its metadata together too, both must agree.
     (folder / NAME / ".zmetadata").unlink(missing_ok=True)

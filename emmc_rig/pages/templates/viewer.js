@@ -27,7 +27,8 @@ const picture = byId("picture");
 const state = { overlay: -1 };
 let data, rows, columns, width, height, tileWidth, tileHeight, count, farthest; // of what is shown
 let renderer, atlases = {}, depth, overlayLevels = [];
-const home = () => ({ v: (rows - 1) / 2, u: (columns - 1) / 2, focus: data.focus.at, aperture: 0, wipe: 0 });
+const middle = (count) => (data.axes ? Math.floor(count / 2) : (count - 1) / 2);
+const home = () => ({ v: middle(rows), u: middle(columns), focus: data.focus.at, aperture: 0, wipe: 0 });
 const breath = () => new Promise((done) => setTimeout(done)); // lets the page answer in between
 
 const VERTEX = `#version 300 es
@@ -329,8 +330,16 @@ function draw() {
   }
   drawEpi();
   byId("status").textContent =
-    `View v ${state.v.toFixed(2)}, u ${state.u.toFixed(2)}; at x ${Math.round(state.x / data.scale)}, ` +
-    `y ${Math.round(state.y / data.scale)}: ${reading()}`;
+    [`${viewpoint()}; at x ${Math.round(state.x / data.scale)}, y ${Math.round(state.y / data.scale)}`, reading()]
+      .filter(Boolean).join(": ");
+}
+
+// Bands and times are called so, and counted; views at angles have coordinates.
+function viewpoint() {
+  if (!data.axes) return `View v ${state.v.toFixed(2)}, u ${state.u.toFixed(2)}`;
+  const named = data.axes.map((name, k) => name && `${name} ${[state.v, state.u][k].toFixed(2).replace(/\.?0+$/, "")}`);
+  const words = named.filter(Boolean).join(", ");
+  return words[0].toUpperCase() + words.slice(1);
 }
 
 function depthHere() {
@@ -341,7 +350,7 @@ function depthHere() {
 }
 
 function reading() {
-  const d = depthHere(), here = [`disparity ${(d / data.scale).toFixed(2)} px`];
+  const d = depthHere(), here = data.axes ? [] : [`disparity ${(d / data.scale).toFixed(2)} px`];
   const middle = [Math.floor(columns / 2), Math.floor(rows / 2)];
   const x = clamp(Math.round(state.x + d * (middle[0] - state.u)), 0, width - 1);
   const y = clamp(Math.round(state.y + d * (middle[1] - state.v)), 0, height - 1);
@@ -442,6 +451,7 @@ function place(event) {
 let gliding = 0;
 function focusOn(x, y, event) {
   Object.assign(state, { x, y });
+  if (data.axes) { changed(); return; }
   const from = state.focus, to = depthHere(), begun = performance.now();
   const mark = byId("mark"), stage = byId("stage").getBoundingClientRect();
   mark.style.left = `${event.clientX - stage.left}px`;
@@ -521,10 +531,11 @@ function listen() {
     event.preventDefault();
     set({ aperture: state.aperture - Math.sign(event.deltaY) * 0.25 });
   }, { passive: false });
+  const next = () => (data.axes ? 1 : 0.1);
   const step = () => (data.focus.high - data.focus.low) / 60;
   const keys = {
-    ArrowLeft: () => set({ u: state.u - 0.1 }), ArrowRight: () => set({ u: state.u + 0.1 }),
-    ArrowUp: () => set({ v: state.v - 0.1 }), ArrowDown: () => set({ v: state.v + 0.1 }),
+    ArrowLeft: () => set({ u: state.u - next() }), ArrowRight: () => set({ u: state.u + next() }),
+    ArrowUp: () => set({ v: state.v - next() }), ArrowDown: () => set({ v: state.v + next() }),
     "+": () => set({ aperture: state.aperture + 0.25 }), "=": () => set({ aperture: state.aperture + 0.25 }),
     "-": () => set({ aperture: state.aperture - 0.25 }),
     PageUp: () => set({ focus: state.focus + step() }), PageDown: () => set({ focus: state.focus - step() }),
@@ -558,6 +569,8 @@ function prepareControls() {
   byId("focus").min = data.focus.low;
   byId("focus").max = data.focus.high;
   for (const element of document.querySelectorAll(".viewer-with-truth")) element.hidden = !data.truth;
+  for (const element of document.querySelectorAll(".viewer-angles")) element.hidden = Boolean(data.axes);
+  if (data.axes) nameAxes(data.axes);
   const choices = ["nothing", ...data.overlays.map((one) => one.label)];
   const there = [...byId("overlays").querySelectorAll("label")];
   if (choices.join() === there.map((row) => row.textContent).join()) return; // one of them may have the focus
@@ -569,6 +582,21 @@ function prepareControls() {
     input.addEventListener("change", () => choose(k - 1));
     row.append(label);
   });
+}
+
+// Where views are bands or times: their names in place of viewpoint, aperture and epipolar images.
+function nameAxes(axes) {
+  const names = axes.filter(Boolean), words = names.join(" and ");
+  picture.setAttribute("aria-label", `Pictures by ${words}. Arrow keys change it, plus and minus take a mean over several.`);
+  byId("aperture-name").textContent = "Mean over";
+  byId("turn").textContent = `change the ${words}`;
+  byId("open").textContent = "take a mean over more or fewer";
+  byId("epi-v-name").textContent = `Column by ${axes[0]}`;
+  byId("epi-h-name").textContent = `Row by ${axes[1]}`;
+  byId("epi-v").parentElement.hidden = !axes[0];
+  byId("epi-h").parentElement.hidden = !axes[1];
+  byId("epi-v").setAttribute("aria-label", `Column under the pointer, by ${axes[0]}`);
+  byId("epi-h").setAttribute("aria-label", `Row under the pointer, by ${axes[1]}`);
 }
 
 // What the pictures are of; a place, a focus and an overlay stay chosen from one light field to the next.

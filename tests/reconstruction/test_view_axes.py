@@ -1,0 +1,251 @@
+"""Views that are bands or times, few or many, closed in part: Psi to files, pages and exports."""
+
+import hashlib
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from programs import program
+
+import emmc_rig as emmc
+from emmc_rig.files.exports import MAPS, open_export
+from emmc_rig.files.formats import FORMATS
+from emmc_rig.files.psi import FRAMES, PSI, open_psi, save_shards
+from emmc_rig.model.errors import SensingError, ViewOrderWarning
+from emmc_rig.model.lightfield import check_light_field, save_hdf5
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import ANGLES
+from emmc_rig.pages.result_figure import draw_results
+from emmc_rig.pages.viewer import render_viewer, viewer_data
+from emmc_rig.processing.pool import opened_pool
+from emmc_rig.processing.reconstructing import reconstruct_folder
+from reconstruction.methods import MethodSettings
+
+SIZE = (24, 32)
+BANDS, TIMES = ("angle", "band"), ("time", "angle")
+NOISE = 0.003
+
+
+def psi_of(views, axes, shots=1, closed=False, size=SIZE):
+    """Return the Psi of a random binary code; closed: half of the views let no light through."""
+    rng = np.random.default_rng(3)
+    weights = rng.integers(0, 2, (shots, *views, size[0], 1, size[1])).astype(np.float32)
+    if closed:
+        weights[:, :, ::2] = 0
+    weights /= weights.sum(axis=(1, 2)).mean()
+    return ImagingMatrix(weights, np.zeros((shots, *size), np.uint8), view_axes=axes)
+
+
+def light_of(views, axes, size=SIZE):
+    """Return a light field: disparity 0.5 of angles; pictures that dim one after the other."""
+    rng = np.random.default_rng(4)
+    fine = cv2.GaussianBlur(rng.random((2 * size[0] + 60, 2 * size[1] + 60)), (0, 0), 4)
+    fine = (fine - fine.min()) / (fine.max() - fine.min())
+    light = np.empty((*views, *size, 3), np.float32)
+    for k, (v, u) in enumerate(np.ndindex(*views)):
+        down, right = (v, u) if axes == ANGLES else (0, 0)
+        seen = fine[30 - down :, 30 - right :][: 2 * size[0] : 2, : 2 * size[1] : 2]
+        light[v, u] = (seen * (1 if axes == ANGLES else 1 - 0.5 * k / views[0] / views[1]))[
+            ..., None
+        ]
+    return light
+
+
+def frames_of(psi, light):
+    rng = np.random.default_rng(5)
+    return (psi @ light + rng.normal(0, NOISE, psi.frames_shape)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def bands():
+    """A light field of 6 bands, reconstructed."""
+    psi = psi_of((1, 6), BANDS)
+    frames = frames_of(psi, light_of((1, 6), BANDS))
+    return emmc.reconstruct(psi, frames, "tv", noise_sigma=NOISE)
+
+
+@pytest.mark.parametrize("axes", [BANDS, TIMES, ("time", "band")])
+def test_the_names_of_the_view_axes_are_kept_by_files_and_parts_of_psi(tmp_path, axes):
+    psi = psi_of((2, 3), axes, shots=2)
+    psi.save(tmp_path / "psi.h5")
+    pytest.importorskip("zarr")
+    save_shards(psi, tmp_path / "psi.zarr")
+    for path in (tmp_path / "psi.h5", tmp_path / "psi.zarr"):
+        saved = open_psi(path)
+        assert saved.load().view_axes == saved.view_axes == axes
+        assert saved.window(slice(0, 8), slice(0, 8)).view_axes == axes
+        assert saved.checksum == psi.checksum()
+    assert psi.of_shots([1]).view_axes == psi.window(slice(0, 8), slice(0, 8)).view_axes == axes
+    assert ", ".join(axes) in repr(psi)
+    again = ImagingMatrix.from_scipy(psi.to_scipy(), (2, 3), SIZE, view_axes=axes)
+    assert again.view_axes == axes
+
+
+def test_a_psi_of_an_earlier_version_has_its_views_at_angles(tmp_path):
+    psi = psi_of((2, 3), ANGLES)
+    psi.save(tmp_path / "psi.h5")
+    with h5py.File(tmp_path / "psi.h5", "r+") as file:
+        del file.attrs["view_axes"]
+    assert ImagingMatrix.load(tmp_path / "psi.h5").view_axes == ANGLES
+    content = b"emmc-rig imaging matrix 1|1|" + psi.weights.tobytes() + psi.colour_map.tobytes()
+    assert psi.checksum() == hashlib.sha256(content).hexdigest()
+
+
+def test_other_names_of_view_axes_are_refused_in_one_line(tmp_path):
+    with pytest.raises(emmc.ERRORS, match=r"view_axes.*'angle', 'band'"):
+        ImagingMatrix(np.ones((1, 1, 2, 4, 3, 4)), None, view_axes=("angle", "colour"))
+    path = tmp_path / "psi.h5"
+    psi_of((1, 3), BANDS).save(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["view_axes"] = "angle,colour"
+    for opened in (ImagingMatrix.load, open_psi):
+        with pytest.raises(SensingError, match=r"psi\.h5: view_axes 'angle,colour': two of angle"):
+            opened(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["view_axes"] = "angle,time"
+    with pytest.raises(SensingError, match="checksum"):
+        ImagingMatrix.load(path)
+
+
+def test_a_result_of_bands_calls_them_so_in_every_file(bands, tmp_path):
+    bands.save(tmp_path / "out")
+    with (
+        h5py.File(tmp_path / "out/light_field.h5") as file,
+        h5py.File(tmp_path / "out" / MAPS) as maps,
+    ):
+        assert file["light_field"].attrs["view_axes"] == maps.attrs["view_axes"] == "angle,band"
+    names = {path.name for path in (tmp_path / "out/pictures").iterdir()}
+    assert names == {"views", "bands.webp"}
+    assert "1x6 bands" in repr(bands)
+    assert bands.metrics()["view_axes"] == list(BANDS)
+    opened = open_export(str(tmp_path / "out"))
+    assert opened.view_axes == BANDS
+    shown: dict[str, Any] = viewer_data(opened)
+    assert shown["axes"] == ["", "band"]
+    assert shown["disparity"]["low"] == 0
+    assert shown["disparity"]["high"] == 1e-3
+    page = render_viewer(opened)
+    assert "from band to band" in page
+    assert 'alt="Band 3"' in page
+    caption = draw_results([opened]).caption
+    assert caption.startswith("Band 3 of 1x6")
+    assert "epipolar" not in caption.lower()
+
+
+def test_a_scene_of_bands_is_not_put_into_the_order_of_its_parallax(tmp_path):
+    picture = light_of((1, 1), ANGLES, (48, 64))[0, 0]
+    light = np.stack([np.roll(picture, (-k, -2 * k), (0, 1)) for k in range(3)])[None]
+    light = np.concatenate([np.roll(light, 2 * k, axis=2) for k in range(3)])
+    path = tmp_path / "light_field.h5"
+    save_hdf5(path, light, {"view_axes": "band,time"})
+    np.testing.assert_array_equal(emmc.scene(path).light_field, light)
+    save_hdf5(path, light, {})
+    with pytest.warns(ViewOrderWarning):
+        emmc.scene(path)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_bands_are_exported_unless_a_format_shows_parallax(bands, tmp_path, name):
+    if name in ("exr", "ome-zarr"):
+        pytest.importorskip("OpenEXR" if name == "exr" else "ngff_zarr")
+    bands.save(tmp_path / "out")
+    code, _, error = program(
+        "export", str(tmp_path / "out"), "--format", name, "--out", str(tmp_path / "exported")
+    )
+    if FORMATS[name].parallax:
+        assert code == 1
+        assert f"--format {name} shows parallax, and out has bands for views" in error
+        assert not (tmp_path / "exported").exists()
+    else:
+        assert code == 0
+        assert any((tmp_path / "exported").iterdir())
+
+
+@pytest.mark.parametrize("axes", [ANGLES, BANDS])
+def test_pictures_that_are_alike_lack_parallax_only_where_they_are_angles(axes):
+    coded = psi_of((1, 6), axes)
+    psi = replace(coded, weights=np.full_like(coded.weights, 1 / 6))  # no code tells views apart
+    light = np.repeat(light_of((1, 1), ANGLES), 6, axis=1)
+    verdict = emmc.reconstruct(psi, frames_of(psi, light), "tv", noise_sigma=NOISE).verdict
+    said = [reason.what for reason in verdict.reasons if "parallax" in reason.what]
+    assert bool(said) == (axes == ANGLES)
+    assert (verdict.evidence.parallax is None) == (axes != ANGLES)
+
+
+def test_what_a_method_calls_disparity_is_a_shift_between_times():
+    psi = psi_of((6, 1), TIMES)
+    frames = frames_of(psi, light_of((6, 1), TIMES))
+    result = emmc.reconstruct(psi, frames, "adaptive-fast", noise_sigma=NOISE)
+    assert result.disparity is None
+    assert {"shift", "shift_sigma"} <= set(result.maps)
+    assert not any("disparit" in name for name in result.maps)
+    assert "disparit" not in result.verdict.words
+
+
+@pytest.mark.parametrize("views", [(1, 2), (2, 1), (1, 24)])
+def test_a_row_of_views_is_a_light_field(views):
+    light = light_of(views, ANGLES)
+    np.testing.assert_array_equal(check_light_field(light, "a row"), light)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["tv", "adaptive-fast", "dict-omp", "tv-dict"])
+@pytest.mark.parametrize(
+    ("views", "axes", "shots", "closed"),
+    [
+        ((3, 3), ANGLES, 2, False),
+        ((3, 3), ANGLES, 3, True),
+        ((7, 7), ANGLES, 1, True),
+        ((9, 9), ANGLES, 1, False),
+        ((1, 24), BANDS, 1, False),
+        ((1, 28), BANDS, 1, True),
+        ((8, 1), TIMES, 1, False),
+    ],
+)
+def test_every_grid_of_views_is_reconstructed_and_kept(
+    tmp_path, method, views, axes, shots, closed
+):
+    psi, light = psi_of(views, axes, shots, closed), light_of(views, axes)
+    frames = frames_of(psi, light)
+    result = emmc.reconstruct(psi, frames, method, noise_sigma=NOISE)
+    result.save(tmp_path / "out")
+    opened = open_export(str(tmp_path / "out"))
+    assert opened.light_field.shape == light.shape
+    assert opened.view_axes == axes
+    result.figure()
+    assert '"axes": null' in result.viewer() or axes != ANGLES
+    # Of opened views, better than the mean brightness says; closed ones are neighbours' guesses.
+    seen = psi.weights.any(axis=(0, 3, 4, 5))
+    off = (result.light_field - light)[seen][..., 0]
+    assert np.sqrt(np.mean(np.square(off))) < 0.9 * light[seen][..., 0].std()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("as_zarr", [False, True])
+def test_blocks_of_a_capture_of_bands_are_kept_as_bands(tmp_path, as_zarr):
+    psi = psi_of((1, 6), BANDS, size=(64, 96))
+    psi.save(tmp_path / PSI)
+    frames = frames_of(psi, light_of((1, 6), BANDS, (64, 96)))
+    with h5py.File(tmp_path / FRAMES, "w") as file:
+        file["readings"] = frames
+        file["deviation"] = np.full(frames.shape, NOISE)
+        file["usable"] = np.ones(frames.shape, bool)
+    settings = MethodSettings.model_validate({"blocks": {"side": 32, "whole": 32 * 32}})
+    (tmp_path / "out").mkdir()
+    with opened_pool(1) as pool:
+        metrics = reconstruct_folder(
+            tmp_path, tmp_path / "out", "adaptive-fast", settings=settings, pool=pool,
+            as_zarr=as_zarr,
+        )  # fmt: skip
+    assert metrics["view_axes"] == list(BANDS)
+    assert metrics["blocks"] == [1, 2]
+    assert "disparit" not in str(metrics["verdict"]["reasons"])
+    if not as_zarr:
+        with h5py.File(tmp_path / "out" / MAPS) as maps:
+            assert maps.attrs["view_axes"] == "angle,band"
+            assert "shift" in maps
+            assert "disparity" not in maps
+        assert open_export(str(tmp_path / "out")).view_axes == BANDS
