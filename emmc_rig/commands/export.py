@@ -115,7 +115,6 @@ def _export_psi(source: Path, form: str, out: Path | None) -> None:
             folder,
             {"source": str(source), "format": form, "shape": list(psi.shape), "bytes": written},
         )
-    tell(
-        f"wrote {psi!r}{' and its frames' if frames is not None else ''} to {out}, {shown_bytes(written)}"
-    )
+    what = f"{psi!r}{'' if frames is None else ' and its frames'}"
+    tell(f"wrote {what} to {out}, {shown_bytes(written)}")
     give_result(out)

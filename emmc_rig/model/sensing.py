@@ -367,7 +367,7 @@ class ImagingMatrix(PsiSizes):
 
     @classmethod
     def from_weights(
-        cls, weights: ArrayLike, cfa: str | tuple[str, ...] = "mono", binning: int = 1
+        cls, weights: ArrayLike, cfa: str | tuple[str, ...] | None = None, binning: int = 1
     ) -> ImagingMatrix:
         """Return Psi from what every pixel sees of every view, such as a mask's transmittances.
 
@@ -377,11 +377,12 @@ class ImagingMatrix(PsiSizes):
         a white board's without masks.
 
         Args:
-            weights: (shot, v, u, y, x), of the colour that the pixel sees, of a monochrome
-                sensor's white light; or (shot, v, u, y, x, 3), of linear red, green and blue. The
-                views are what a code multiplies: angles, bands or times, any number, and bands
-                are views (1, count).
-            cfa: the colour filters, where the weights have no colours.
+            weights: (shot, v, u, y, x), of the light that the pixel sees; or (shot, v, u, y, x, 3),
+                of linear red, green and blue. The views are what a code multiplies: angles, bands
+                or times, any number, and bands are views (1, count).
+            cfa: the colour filters, where the weights have no colours. None: the light has none
+                either, as a monochrome sensor sees it. It is held as red, which is faster and surer
+                than three unknown colours, and `reconstruct` returns three that are alike.
             binning: k; a pixel sums k x k samples, y and x count the samples.
 
         Raises:
@@ -393,7 +394,7 @@ class ImagingMatrix(PsiSizes):
         >>> opened[0, 0, 0] = opened[1, 0, 1] = 1
         >>> psi = ImagingMatrix.from_weights(opened)
         >>> psi, round(psi.light_efficiency(), 6)
-        (Psi(2 shots, 1x2 views, 4x6, three colours a pixel, 0.0012 MB), 1.0)
+        (Psi(2 shots, 1x2 views, 4x6, one colour a pixel, 0.00038 MB), 1.0)
         """
         takes = "an array (shot, v, u, y, x) or (shot, v, u, y, x, 3) of real numbers"
         given = numbers_of(weights, "weights", takes)
@@ -404,14 +405,15 @@ class ImagingMatrix(PsiSizes):
         given = given.astype(np.float32, copy=False)
         if not given.any():
             raise SensingError("weights that are all 0: no pixel sees any light")
-        coloured = given
-        if given.ndim == 5:
+        if given.ndim == 5 and cfa is None:
+            red = np.zeros((len(given), *given.shape[3:]), dtype=np.uint8)
+            return cls(np.ascontiguousarray(given[:, :, :, :, None]), red, binning)
+        if given.ndim == 5 and cfa is not None:
             tile = cfa_tile(cfa)
             at = (np.arange(side) // binning for side in given.shape[3:])
             seen = tile[np.ix_(*(i % n for i, n in zip(at, tile.shape[:2], strict=True)))]
-            coloured = given[..., None] * (seen / seen.sum(axis=-1, keepdims=True))
-        rows = np.ascontiguousarray(rows_of_colours(coloured))
-        return cls(rows, None, binning)._compact()
+            given = given[..., None] * (seen / seen.sum(axis=-1, keepdims=True))
+        return cls(np.ascontiguousarray(rows_of_colours(given)), None, binning)._compact()
 
     def _compact(self) -> ImagingMatrix:
         """Return Psi with one stored colour where every sample's pixel sees one at most."""

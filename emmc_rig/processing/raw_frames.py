@@ -35,7 +35,9 @@ SMOOTHEST_READS = 1 - 1.2816 * np.sqrt(2 * (70 / 36) ** 2) / BLOCK_PX
 """Of the true variance, that the 10 % quantile of blocks without structure has: 1.28 deviations
 below, of which BLOCK_PX^2 values have sqrt(2 / their number), less what neighbours share by SECOND,
 whose squared autocorrelations sum to 70 / 36 along each axis."""
-LEVELS, FEWEST_BLOCKS = 8, 16
+LEAST_ELECTRONS = 1.0
+"""Of read noise: few sensors have less, and a line through brighter parts hardly tells."""
+LEVELS, FEWEST_BLOCKS, ROUNDS = 8, 16, 4
 CLIPPED = 4
 """Times as many pixels as at each of as many levels below read the level where they saturate."""
 
@@ -91,7 +93,7 @@ def frames(
     >>> emmc.frames(dn, dark=64, white_level=4095, gain=0.8, read_noise=2.5)
     MeasuredFrames(2 shots of 128x256 pixels, noise 0.0078, 100.0% usable)
     >>> emmc.frames(dn, dark=64, white_level=4095).estimates
-    ('noise (at most): variance 0.776 DN per DN of signal and 0 DN^2',)
+    ('noise (at most): variance 0.819 DN per DN of signal and 13.4 DN^2',)
     """
     takes = "raw values, an array (shot, y, x) or (y, x) of real numbers"
     taken = numbers_of(dn, "dn", takes)
@@ -120,7 +122,7 @@ def frames(
             values if gamma == 1 else white_level * (np.maximum(values, 0) / white_level) ** gamma
         )
 
-    taken = linear(taken)
+    taken, raw = linear(taken), whole and gamma == 1
     black, black_variance, dark_variance = _black(
         dark, taken, whole and gamma == 1, linear, estimates
     )
@@ -128,13 +130,13 @@ def frames(
     if signal[usable].mean() < 0:
         raise AppError("dn: darker than dark on average: are frames and darks swapped?")
     if gain is not None and read_noise is not None:
-        floor = (gain * read_noise) ** 2 + whole / 12
+        floor = (gain * read_noise) ** 2 + raw / 12
     else:
         known = dark_variance if read_noise is None or gain is None else (gain * read_noise) ** 2
-        slope, floor = _noise_line(signal, usable, gain, known)
-        gain = slope
+        gain, floor = _noise_line(signal, usable, gain, known)
+        floor = max(floor, (LEAST_ELECTRONS * gain) ** 2, raw / 12)
         estimates.append(
-            f"noise (at most): variance {slope:.3g} DN per DN of signal and {floor:.3g} DN^2"
+            f"noise (at most): variance {gain:.3g} DN per DN of signal and {floor:.3g} DN^2"
         )
     variance = gain * np.maximum(signal, 0) + floor + black_variance
     span, span_variance = white_level - float(np.mean(black)), 0.0
@@ -235,16 +237,22 @@ def _noise_line(
             f"dn: too few pixels that are not saturated to estimate their noise ({len(rough)} "
             f"blocks of {BLOCK_PX}^2): give gain and read_noise"
         )
-    groups = np.array_split(np.argsort(levels), min(LEVELS, 2 * len(rough) // FEWEST_BLOCKS))
-    x = np.array([np.mean(np.take(levels, group)) for group in groups])
-    y = [np.quantile(np.take(rough, group), SMOOTHEST) / SMOOTHEST_READS for group in groups]
-    y = np.array(y)
-    # By relative deviations, as a variance is sure to a share of itself.
-    weight = 1 / np.maximum(y, 1e-12 + 1e-6 * y.max())
-    known = np.zeros_like(y) if slope is None else slope * x
-    known = known + (0.0 if floor is None else floor)
-    unknown = [one for one, value in ((x, slope), (np.ones_like(x), floor)) if value is None]
-    left = np.maximum(y - known, 0) * weight
-    found = list(nnls(np.stack(unknown, axis=1) * weight[:, None], left)[0]) if unknown else []
-    slope = float(found.pop(0)) if slope is None else slope
-    return slope, float(found.pop(0)) if floor is None else floor
+    mean_squares, level = np.array(rough), np.array(levels)
+    groups = np.array_split(np.argsort(level), min(LEVELS, 2 * len(rough) // FEWEST_BLOCKS))
+    x = np.array([level[group].mean() for group in groups])
+    columns = [one for one, known in ((x, slope), (np.ones_like(x), floor)) if known is None]
+    line, expected = (slope or 0.0, floor or 0.0), np.ones_like(level)
+    for _ in range(ROUNDS if columns else 0):
+        # Within a group the smoothest are not to be the darkest: against what each has to have.
+        low = [np.quantile(mean_squares[one] / expected[one], SMOOTHEST) for one in groups]
+        y = np.array(low) / SMOOTHEST_READS * [expected[one].mean() for one in groups]
+        # A variance is sure to a share of itself.
+        weight = 1 / np.maximum(y, 1e-12 + 1e-6 * y.max())
+        left = np.maximum(y - (slope or 0) * x - (floor or 0), 0)
+        found = list(nnls(np.stack(columns, axis=1) * weight[:, None], left * weight)[0])
+        line = (
+            float(found.pop(0)) if slope is None else slope,
+            float(found.pop(0)) if floor is None else floor,
+        )
+        expected = np.maximum(line[0] * level + line[1], 1e-12 + 1e-6 * y.max())
+    return line

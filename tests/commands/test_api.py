@@ -447,6 +447,21 @@ def test_readings_are_the_sum_over_views_of_weight_times_the_light_that_filters_
     np.testing.assert_array_equal(back.to_scipy().toarray(), psi.to_scipy().toarray())
 
 
+def test_light_without_colours_is_reconstructed_as_grey():
+    rng = np.random.default_rng(1)
+    weights = rng.uniform(0, 1, (3, 1, 3, 24, 32))
+    psi = emmc.Psi.from_weights(weights / weights.sum(axis=(1, 2)).mean())
+    assert psi.weights.shape[4] == 1
+    y, x = np.indices((24, 32))
+    grey = 0.5 + 0.3 * np.sin(x / 5 + np.arange(3)[:, None, None]) * np.cos(y / 7)
+    light = np.repeat(grey[None, ..., None], 3, axis=-1)
+    result = emmc.reconstruct(psi, psi @ light, "tv", noise_sigma=1e-3)
+    found = result.light_field
+    np.testing.assert_array_equal(found, np.repeat(found[..., :1], 3, axis=-1))
+    np.testing.assert_allclose(psi @ found, psi @ light, atol=0.02)
+    assert np.sqrt(np.mean((found - light) ** 2)) < 0.1
+
+
 def test_weights_of_every_colour_are_psi_s_own(taken):
     _, psi, _ = taken
     dense = psi.to_scipy().toarray().reshape(*psi.frames_shape, *psi.light_field_shape)

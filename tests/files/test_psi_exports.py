@@ -62,7 +62,7 @@ def read_mat(path):
 
 
 def product(starts, others, values, x, rows):
-    """Return the product of a matrix, stored by rows or by columns, with a vector, entry by entry."""
+    """Return a matrix, stored by rows (rows=None) or by columns, times a vector, by entries."""
     line = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     y = np.zeros(len(starts) - 1 if rows is None else rows)
     if rows is None:
@@ -123,7 +123,7 @@ def test_the_file_of_a_psi_is_exported_without_frames(tmp_path, monkeypatch):
     psi.save("psi.h5")
     code, said, err = program("export", "psi", "psi.h5")
     assert code == 0, err
-    assert "wrote Psi(1 shot, 1x3 views, 4x6, three colours a pixel" in said
+    assert "wrote Psi(1 shot, 1x3 views, 4x6, one colour a pixel" in said
     written = {path.name for path in (tmp_path / "emmc-psi-npz").iterdir()}
     assert written == {"psi.npz", "layout.json", "metrics.json", "files.json"}
     assert program("export", "psi", "--out", "again")[0] == 0  # the one in this folder
