@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
     from emmc_rig.model.frames import Frames
     from emmc_rig.model.sensing import ImagingMatrix as Psi
+    from emmc_rig.processing.calibrating import calibrate
     from emmc_rig.processing.raw_frames import frames
     from emmc_rig.processing.reconstructing import open_frames, reconstruct
     from emmc_rig.processing.result import Result
-    from emmc_rig.processing.session_calibration import calibrate
     from emmc_rig.session.session import Session
 
 _HOME = {
-    "calibrate": "emmc_rig.processing.session_calibration:calibrate",
+    "calibrate": "emmc_rig.processing.calibrating:calibrate",
     "camera": "emmc_rig.files.cameras:find_camera",
     "capture": "emmc_rig.acquisition.command:capture",
     "frames": "emmc_rig.processing.raw_frames:frames",
