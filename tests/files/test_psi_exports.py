@@ -76,7 +76,7 @@ def product(starts, others, values, x, rows):
 def folder(request, tmp_path_factory):
     """The folder of `simulate`."""
     folder = tmp_path_factory.mktemp(request.param) / "frames"
-    how = ("--camera", request.param, "--size", "12x16", "--out", str(folder))
+    how = ("--camera", request.param, "--size", "24x32", "--out", str(folder))
     assert program("simulate", *how)[0] == 0
     return folder
 
