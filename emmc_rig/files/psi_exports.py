@@ -46,12 +46,17 @@ def write_mat(folder: Path, psi: ImagingMatrix, frames: Frames | None) -> None:
             f"Psi has {matrix.nnz} entries, more than a MAT file holds: use --format npz, or a "
             "window of it"
         )
+    # Of double precision: MATLAB does not multiply a sparse matrix with singles.
     columns = {} if frames is None else _arrays(frames)
     layout = _layout(psi)
     layout["order"] += IN_MATLAB
     scipy.io.savemat(
         folder / "psi.mat",
-        {"Psi": matrix, **layout, **{name: one.reshape(-1, 1) for name, one in columns.items()}},
+        {
+            "Psi": matrix,
+            **layout,
+            **{name: one.reshape(-1, 1).astype(float) for name, one in columns.items()},
+        },
         do_compression=True,
     )
 

@@ -182,14 +182,15 @@ def _as_frames(
 
 def _refuse_codes(readings: NDArray) -> None:
     """Raise AppError for an array of raw values, or of a picture's codes scaled to [0, 1]."""
-    top = float(np.nanmax(readings)) if readings.size else 0.0
-    if top > LARGEST_READING and not np.mod(readings, 1).any():
+    finite = readings[np.isfinite(readings)]
+    top = float(finite.max(initial=0))
+    if top > LARGEST_READING and not np.mod(finite, 1).any():
         gamma = "; codes of a picture have a gamma: gamma=2.2" if top <= CODES else ""
         raise AppError(
             f"frames: whole numbers up to {top:.0f} are raw values, no readings: "
             f"emmc_rig.frames(dn, dark=..., white_level=...) makes readings of them{gamma}"
         )
-    codes = CODES * readings
+    codes = CODES * finite
     if np.abs(codes - np.round(codes)).max(initial=0) < 1e-3 and len(np.unique(codes)) > FEW_CODES:
         raise AppError(
             "frames: multiples of 1/255 are codes of a picture, whose light has a gamma: "

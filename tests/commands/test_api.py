@@ -470,8 +470,8 @@ def test_light_without_colours_is_reconstructed_as_grey():
     assert np.sqrt(np.mean((found - light) ** 2)) < 0.1
 
 
-def test_weights_of_every_colour_are_psi_s_own(taken):
-    _, psi, _ = taken
+def test_weights_of_every_colour_are_psi_s_own():
+    psi = emmc.camera("rgbw-bayer-2shots").psi((6, 8))
     dense = psi.to_scipy().toarray().reshape(*psi.frames_shape, *psi.light_field_shape)
     weights = np.einsum("syxvuyxc->svuyxc", dense)
     again = emmc.Psi.from_weights(weights)

@@ -12,7 +12,8 @@ import emmc_rig as emmc
 from emmc_rig.errors import AppError
 from emmc_rig.files import psi_exports
 
-MAT_TYPES = {1: "i1", 2: "u1", 4: "<u2", 5: "<i4", 6: "<u4", 9: "<f8", 16: "S1", 12: "<i8"}
+MAT_TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8"}
+MAT_TYPES |= {12: "<i8", 13: "<u8", 16: "u1", 17: "<u2"}
 MATRIX, COMPRESSED = 14, 15
 SPARSE, CHARACTERS = 5, 4
 
@@ -54,7 +55,7 @@ def read_mat(path):
         if cls == SPARSE:
             value = (shape, *parts)
         elif cls == CHARACTERS:
-            value = "".join(map(chr, parts[0])) if parts[0].dtype != "S1" else parts[0].tobytes()
+            value = "".join(map(chr, parts[0]))
         else:
             value = parts[0].reshape(shape, order="F")
         found[name[1].decode()] = value
@@ -110,7 +111,7 @@ def test_a_reader_of_mat_files_gets_the_frames_of_psi(folder, tmp_path):
     shape, rows, starts, values = held["Psi"]
     light_field = np.random.default_rng(0).random(held["light_field_shape"].ravel())
     x = np.transpose(light_field, (4, 3, 2, 1, 0)).ravel(order="F")  # as `order` has it in MATLAB
-    assert b"permute(light_field, 5:-1:1)" in held["order"]
+    assert "permute(light_field, 5:-1:1)" in held["order"]
     y = product(starts, rows, values, x, shape[0])
     np.testing.assert_allclose(y, (psi @ light_field).ravel(), rtol=1e-6)
     np.testing.assert_array_equal(held["readings"].ravel(), frames.readings.ravel())

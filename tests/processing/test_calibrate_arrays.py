@@ -66,7 +66,7 @@ def test_arrays_make_the_psi_of_the_bench(bench, calibrated):
     assert psi.relative_difference(exact) < 0.02
     assert build_imaging_matrix(CAMERA, SIZE).relative_difference(exact) > 0.1
     assert report.psi is psi
-    assert report.held_out_error < 0.01
+    assert report.held_out_error < 0.02
     assert "route, whiteboard held out to" in repr(report)
 
 
