@@ -123,18 +123,18 @@ def frames(
         )
 
     taken, raw = linear(taken), whole and gamma == 1
-    black, black_variance, dark_variance = _black(
-        dark, taken, whole and gamma == 1, linear, estimates
-    )
+    black, black_variance, dark_variance = _black(dark, taken, raw, linear, estimates)
     signal = taken - black
     if signal[usable].mean() < 0:
         raise AppError("dn: darker than dark on average: are frames and darks swapped?")
     if gain is not None and read_noise is not None:
         floor = (gain * read_noise) ** 2 + raw / 12
     else:
-        known = dark_variance if read_noise is None or gain is None else (gain * read_noise) ** 2
-        gain, floor = _noise_line(signal, usable, gain, known)
-        floor = max(floor, (LEAST_ELECTRONS * gain) ** 2, raw / 12)
+        gain, floor = _noise_line(signal, usable, gain, dark_variance)
+        if read_noise is not None:
+            floor = (gain * read_noise) ** 2 + raw / 12
+        elif dark_variance is None:
+            floor = max(floor, (LEAST_ELECTRONS * gain) ** 2, raw / 12)
         estimates.append(
             f"noise (at most): variance {gain:.3g} DN per DN of signal and {floor:.3g} DN^2"
         )
@@ -142,11 +142,13 @@ def frames(
     span, span_variance = white_level - float(np.mean(black)), 0.0
     if white is not None:
         board, repeats = _stacked(white, "white", taken.shape[1:])
+        if saturates is not None and (board >= saturates).mean() > 0.5:
+            raise AppError(f"white: most of it reads the white level, {saturates:g} DN, or more")
         span = linear(board).mean(axis=0) - black
         span_variance = (gain * np.maximum(span, 0) + floor) / repeats + black_variance
     lit = np.broadcast_to(np.asarray(span) > 0, taken.shape)
     if not lit.mean() > 0.5:
-        raise AppError("white: no brighter than the dark: was the lamp on?")
+        raise AppError("white, or the white level, is no brighter than the dark: was the lamp on?")
     safe = np.where(span > 0, span, 1)
     readings = np.where(lit, signal / safe, 0)
     deviation = np.sqrt(variance + np.square(readings) * span_variance) / safe

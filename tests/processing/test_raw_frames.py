@@ -47,8 +47,10 @@ def test_noise_is_estimated_where_frames_are_smooth_and_said_to_be(exposed):
     assert [words.split()[0] for words in frames.estimates] == ["noise"]
     assert "estimated: noise (at most)" in repr(frames)
     assert spread_of(frames, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.1)
-    half = emmc.frames(dn, dark=BLACK, white_level=WHITE, gain=GAIN)
-    assert spread_of(half, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.1)
+    for known in ({"gain": GAIN}, {"read_noise": READ}):
+        half = emmc.frames(dn, dark=BLACK, white_level=WHITE, **known)
+        assert spread_of(half, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.1)
+    assert half.deviation.min() * (WHITE - BLACK) == pytest.approx(GAIN * READ, rel=0.1)
 
 
 def test_what_a_mosaic_s_colours_differ_by_is_no_noise(exposed):
@@ -145,7 +147,13 @@ MISTAKES = {
         lambda: emmc.frames(
             FLAT, dark=0, white=np.zeros((64, 64)), white_level=999, gain=1, read_noise=2
         ),
-        "white: no brighter than the dark",
+        "is no brighter than the dark",
+    ),
+    "a white board that is saturated": (
+        lambda: emmc.frames(
+            FLAT, dark=0, white=np.full((64, 64), 1023), white_level=1023, gain=1, read_noise=2
+        ),
+        "white: most of it reads the white level, 1023 DN",
     ),
     "gain of nothing": (lambda: emmc.frames(FLAT, gain=0), "gain: got 0; it takes a number above"),
     "noise below nothing": (lambda: emmc.frames(FLAT, read_noise=-1), "read_noise: got -1"),
