@@ -46,7 +46,7 @@ def test_noise_is_estimated_where_frames_are_smooth_and_said_to_be(exposed):
     frames = emmc.frames(dn, dark=BLACK, white_level=WHITE)
     assert [words.split()[0] for words in frames.estimates] == ["noise"]
     assert "estimated: noise (at most)" in repr(frames)
-    assert spread_of(frames, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.1)
+    assert spread_of(frames, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.06)
     for known in ({"gain": GAIN}, {"read_noise": READ}):
         half = emmc.frames(dn, dark=BLACK, white_level=WHITE, **known)
         assert spread_of(half, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.1)
