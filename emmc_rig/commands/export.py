@@ -26,7 +26,8 @@ def export(
         ),
     ] = None,
     form: Annotated[
-        str | None, typer.Option("--format", help="see --list (default: viewer; of psi: npz)")
+        str | None,
+        typer.Option("--format", help="see --list (default: viewer); of psi: npz (default), mat"),
     ] = None,
     list_formats: Annotated[
         bool, typer.Option("--list", help="the formats: what each is, and keeps")
@@ -43,7 +44,6 @@ def export(
     from emmc_rig.files.exports import LIGHT_FIELD, open_export
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats import FORMATS
-    from emmc_rig.files.psi_exports import PSI_FORMATS
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
     from emmc_rig.pages.viewer import VIEWER
 
@@ -57,7 +57,6 @@ def export(
         for one in known.values():
             scene = "; --scene reads it" if one.read else ""
             tell(f"{one.name:<10} {one.title}: {one.keeps}{scene}")
-        tell(f"psi: {', '.join(PSI_FORMATS)}, sparse matrices: emmc-rig export psi")
         give_result(formats={one.name: one.keeps for one in known.values()})
         return
     form = form or VIEWER.name
