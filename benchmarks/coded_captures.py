@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_axes import ANGLES, ViewAxes
+import emmc_rig as emmc
 
 BANDS = {"tsa": (28, "meas_real"), "smem": (24, "meas")}
 """Of each spectral camera, and the name of its readings."""
@@ -42,7 +41,7 @@ class CodedCapture:
     """
 
     name: str
-    psi: ImagingMatrix
+    psi: emmc.Psi
     readings: NDArray[np.float32]
     noise: float
     kept: NDArray[np.bool_]
@@ -85,22 +84,14 @@ def _spectral(folder: Path, name: str, size: tuple[int, int], mask: str) -> Code
         code = np.roll(code, int(mask.split()[0]), axis=0)
     rows, columns = size
     top, left = _middle(frame.shape[0], rows), _middle(frame.shape[1], columns)
-    weights = np.empty((1, 1, bands, rows, 1, columns), np.float32)
-    for band in range(bands):
-        first = left - PRISM_PX * band
-        weights[0, 0, band, :, 0] = code[top : top + rows, first : first + columns]
-    weights /= weights.sum(axis=(1, 2)).mean()
+    firsts = [left - PRISM_PX * band for band in range(bands)]
+    weights = np.stack([code[top : top + rows, first : first + columns] for first in firsts])
+    weights = weights[None, None] / weights.sum(axis=0).mean()
+    psi = emmc.Psi.from_weights(weights, view_axes=("angle", "band"))
     readings = frame[None, top : top + rows, left : left + columns]
     readings = readings / readings.max()
     kept = np.random.default_rng(SEED).random(readings.shape) < KEPT
-    return CodedCapture(name, _grey(weights, ("angle", "band")), readings, NOISE, kept)
-
-
-def _grey(weights: NDArray[np.float32], view_axes: ViewAxes = ANGLES) -> ImagingMatrix:
-    """Return the Psi of a sensor without colours: all that it sees is called red."""
-    shots, _, _, rows, _, columns = weights.shape
-    colour = np.zeros((shots, rows, columns), np.uint8)
-    return ImagingMatrix(weights, colour, view_axes=view_axes)
+    return CodedCapture(name, psi, readings, NOISE, kept)
 
 
 def _colour_aperture(path: Path, name: str, size: tuple[int, int]) -> CodedCapture:
@@ -111,7 +102,7 @@ def _colour_aperture(path: Path, name: str, size: tuple[int, int]) -> CodedCaptu
     top, left = (_middle(have, want) for have, want in zip(light.shape[:2], size, strict=True))
     light = light[top : top + size[0], left : left + size[1]]
     light = light / light.mean(axis=(0, 1)) * light.mean()
-    weights = np.zeros((3, 3, 3, size[0], 1, size[1]), np.float32)
+    weights = np.zeros((3, 3, 3, *size))
     for shot, (v, u) in enumerate(OPENINGS):
         weights[shot, v, u] = 1
     readings = np.moveaxis(light / light.max(), -1, 0).astype(np.float32)
@@ -119,4 +110,4 @@ def _colour_aperture(path: Path, name: str, size: tuple[int, int]) -> CodedCaptu
     cells = tuple(-(-side // BLOCK_PX) for side in size)
     blocks = np.random.default_rng(SEED).random(cells) < KEPT
     kept[1] = np.kron(blocks, np.ones((BLOCK_PX, BLOCK_PX)))[: size[0], : size[1]] > 0
-    return CodedCapture(name, _grey(weights), readings, NOISE, kept)
+    return CodedCapture(name, emmc.Psi.from_weights(weights), readings, NOISE, kept)

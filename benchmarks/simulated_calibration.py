@@ -27,7 +27,8 @@ from emmc_rig.processing.board_plan import (
     few_plan,
     plan_light,
 )
-from emmc_rig.processing.session_calibration import SessionCalibration, calibrate
+from emmc_rig.processing.calibrating import calibrate
+from emmc_rig.processing.session_calibration import SessionCalibration
 from emmc_rig.progress import Silent, Watcher
 from simulators.bench import Bench
 from simulators.effects import ORDINARY, Flaws, flawed

@@ -9,7 +9,8 @@
 >>> result.light_field.shape, result.verdict.level != "do not use"
 ((5, 5, 24, 32, 3), True)
 
-Functions: `camera`, `scene`, `reconstruct`, `rig`, `capture`, `calibrate`, `open_frames`.
+Functions: `camera`, `scene`, `frames`, `reconstruct`, `rig`, `capture`, `calibrate`,
+`open_frames`.
 What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. Faults that the user can
 mend are of the classes in `ERRORS`, each one line that says what to do.
 """
@@ -31,15 +32,17 @@ if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
     from emmc_rig.model.frames import Frames
     from emmc_rig.model.sensing import ImagingMatrix as Psi
+    from emmc_rig.processing.calibrating import calibrate
+    from emmc_rig.processing.raw_frames import frames
     from emmc_rig.processing.reconstructing import open_frames, reconstruct
     from emmc_rig.processing.result import Result
-    from emmc_rig.processing.session_calibration import calibrate
     from emmc_rig.session.session import Session
 
 _HOME = {
-    "calibrate": "emmc_rig.processing.session_calibration:calibrate",
+    "calibrate": "emmc_rig.processing.calibrating:calibrate",
     "camera": "emmc_rig.files.cameras:find_camera",
     "capture": "emmc_rig.acquisition.command:capture",
+    "frames": "emmc_rig.processing.raw_frames:frames",
     "rig": "emmc_rig.bench.rig_config:rig",
     "scene": "emmc_rig.files.scenes:open_scene",
     "open_frames": "emmc_rig.processing.reconstructing:open_frames",
@@ -66,6 +69,7 @@ __all__ = [
     "calibrate",
     "camera",
     "capture",
+    "frames",
     "open_frames",
     "reconstruct",
     "rig",

@@ -18,8 +18,35 @@ def check_frames(shape: tuple[int, int, int], frames: Array) -> None:
     if frames.shape != shape:
         raise ReconstructionError(
             f"frames of shape {frames.shape} given, Psi needs {shape} "
-            "(shot, row, column): use the Psi measured with these shots"
+            f"(shot, row, column): {_unlike(frames.shape, shape)}"
         )
+
+
+def _unlike(given: tuple[int, ...], needed: tuple[int, int, int]) -> str:
+    """Return how another shape differs from the one that Psi needs, and what to do."""
+    shots, *size = needed
+    if list(given) == size:
+        return "an axis of shots is missing: frames[None]"
+    if len(given) == 3 and list(given[:2]) == size:
+        if given[2] == 3 != shots:
+            return (
+                "a picture of three colours, where Psi is of the sensor's mosaic or of one colour"
+            )
+        return "the axis of shots comes first: np.moveaxis(frames, -1, 0)"
+    if len(given) != 3:
+        return f"{len(given)} axes instead of three"
+    if list(given[1:]) == size:
+        return f"{given[0]} shot(s), Psi is of {shots}: use the Psi measured with these shots"
+    if list(given[:0:-1]) == size:
+        return "rows and columns are swapped: frames.swapaxes(1, 2)"
+    for k in range(2, 17):
+        if list(given[1:]) == [k * side for side in size]:
+            return f"{k} times as many pixels along each side: bin them, or use a Psi of that size"
+        if [k * side for side in given[1:]] == size:
+            return f"{k} times fewer pixels along each side: use a Psi of the binned sensor"
+    if all(have >= need for have, need in zip(given[1:], size, strict=True)):
+        return "more pixels than Psi: cut out the part that Psi is of"
+    return "frames of another sensor or part of it: use the Psi measured with it"
 
 
 def checked_inputs(

@@ -1,4 +1,4 @@
-"""The command `emmc-rig export`: a light field in a format that others read."""
+"""The command `emmc-rig export`: a light field, or Psi, in a format that others read."""
 
 from __future__ import annotations
 
@@ -14,9 +14,21 @@ from emmc_rig.commands.output import give_result, shown_progress, tell
 def export(
     result: Annotated[
         str | None,
-        typer.Argument(help="a folder of `reconstruct` or `demo`, a session, or a scene's name"),
+        typer.Argument(
+            help="a folder of `reconstruct` or `demo`, a session, or a scene's name; or `psi`"
+        ),
     ] = None,
-    form: Annotated[str, typer.Option("--format", help="see --list")] = "viewer",
+    of: Annotated[
+        Path | None,
+        typer.Argument(
+            help="after `psi`: its file, or a session, or a folder of `simulate`, `demo` or "
+            "`calibrate`; frames there are exported, too"
+        ),
+    ] = None,
+    form: Annotated[
+        str | None,
+        typer.Option("--format", help="see --list (default: viewer); of psi: npz (default), mat"),
+    ] = None,
     list_formats: Annotated[
         bool, typer.Option("--list", help="the formats: what each is, and keeps")
     ] = False,
@@ -28,13 +40,18 @@ def export(
         Path | None, typer.Option("--out", help="folder to write (default: emmc-FORMAT)")
     ] = None,
 ) -> None:
-    """Write a light field in a format that others read, or as a viewer: one HTML file."""
-    from emmc_rig.files.exports import open_export
+    """Write a light field, or Psi, in a format that others read, or a viewer: one HTML file."""
+    from emmc_rig.files.exports import LIGHT_FIELD, open_export
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats import FORMATS
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
     from emmc_rig.pages.viewer import VIEWER
 
+    if of is not None and result != "psi":
+        raise typer.BadParameter(f"one light field at a time; '{of}' goes with `psi` alone")
+    if result == "psi" and (of is not None or not Path("psi", LIGHT_FIELD).is_file()):
+        _export_psi(of or Path("psi" if Path("psi").exists() else "."), form or "npz", out)
+        return
     known = {VIEWER.name: VIEWER, **FORMATS}
     if list_formats:
         for one in known.values():
@@ -42,6 +59,7 @@ def export(
             tell(f"{one.name:<10} {one.title}: {one.keeps}{scene}")
         give_result(formats={one.name: one.keeps for one in known.values()})
         return
+    form = form or VIEWER.name
     if form not in known:
         raise typer.BadParameter(f"no format {form!r}; there are {', '.join(known)}")
     if result is None:
@@ -65,4 +83,37 @@ def export(
         )
         shown = files[0].relative_to(folder) if len(files) == 1 else None
     tell(f"wrote {out / shown if shown else out}, {shown_bytes(written)} in {len(files)} file(s)")
+    give_result(out)
+
+
+def _export_psi(source: Path, form: str, out: Path | None) -> None:
+    """Write the Psi of a file or folder, and its frames if it has any, as a sparse matrix."""
+    import emmc_rig as emmc
+    from emmc_rig.files.folders import is_session, result_folder
+    from emmc_rig.files.psi import FRAMES, FRAMES_GROUP, PSI_GROUP, open_psi, psi_beside
+    from emmc_rig.files.psi_exports import PSI_FORMATS
+    from emmc_rig.files.results import shown_bytes, write_metrics
+
+    if form not in PSI_FORMATS:
+        raise typer.BadParameter(f"no format {form!r} of psi; there are {', '.join(PSI_FORMATS)}")
+    out = out or Path(f"emmc-psi-{form}")
+    with (
+        result_folder(out, f"export psi --format {form}") as folder,
+        shown_progress("read") as bars,
+    ):
+        frames = None
+        if is_session(source) or any((source / name).exists() for name in (FRAMES, FRAMES_GROUP)):
+            psi, frames = emmc.open_frames(source)
+        else:
+            inside = source.is_dir() and source.name != PSI_GROUP
+            psi = open_psi(psi_beside(source) if inside else source).load()
+        bars.begin("write")
+        PSI_FORMATS[form](folder, psi, frames)
+        written = sum(path.stat().st_size for path in folder.iterdir())
+        write_metrics(
+            folder,
+            {"source": str(source), "format": form, "shape": list(psi.shape), "bytes": written},
+        )
+    what = f"{psi!r}{'' if frames is None else ' and its frames'}"
+    tell(f"wrote {what} to {out}, {shown_bytes(written)}")
     give_result(out)

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from emmc_rig.model.arguments import NAMES, required
 from emmc_rig.model.camera import Camera, load_camera, shipped_camera_files
 from emmc_rig.model.errors import CameraError, did_you_mean
@@ -18,7 +20,8 @@ def find_camera(spec: str | Path | Mapping[str, Any] | Camera, shots: int | None
 
     Args:
         spec: a shipped camera's name, the path of a YAML file, a dict with the keys of such a
-            file, or a camera.
+            file, or a camera. In a dict, what a file lists may be arrays: the cells of a mask are
+            (row, column) or (row, column, 3), transmittances in [0, 1], or booleans.
         shots: how many (default: the camera's own).
 
     Raises:
@@ -33,11 +36,16 @@ def find_camera(spec: str | Path | Mapping[str, Any] | Camera, shots: int | None
     2
     >>> emmc.camera({"title": "no mask", "sensor": {"cfa": "mono"}})
     Camera('no mask', 1 shot, 5x5 views, mono, 0 masks)
+    >>> cells = np.random.default_rng(0).random((64, 80)) < 0.5
+    >>> pattern = {"kind": "parameters", "cells": cells}
+    >>> code = {"distance_mm": 1.0, "cell_um": 24, "pattern": pattern}
+    >>> emmc.camera({"title": "mine", "masks": {"code": code}}).psi((24, 32))
+    Psi(1 shot, 5x5 views, 24x32, mono, 0.23 MB)
     """
     if isinstance(spec, Camera):
         camera = spec
     elif isinstance(spec, Mapping):
-        camera = validated(Camera, dict(spec), "the camera", CameraError)
+        camera = validated(Camera, _plain(spec), "the camera", CameraError)
     else:
         takes = "a shipped camera's name, a YAML file's path, a dict as in such a file, or a camera"
         required(spec, NAMES, "camera", takes)
@@ -45,6 +53,19 @@ def find_camera(spec: str | Path | Mapping[str, Any] | Camera, shots: int | None
     if shots is not None:
         required(shots, int, "shots", "a number of shots, such as 3")
     return camera if shots is None else camera.with_shots(shots)
+
+
+def _plain(described: Any) -> Any:
+    """Return a description with lists in place of arrays, 0 and 1 in place of booleans in them."""
+    if isinstance(described, np.ndarray):
+        return (described * 1 if described.dtype == bool else described).tolist()
+    if isinstance(described, np.generic):
+        return described.item()
+    if isinstance(described, Mapping):
+        return {key: _plain(value) for key, value in described.items()}
+    if isinstance(described, (list, tuple)):
+        return [_plain(one) for one in described]
+    return described
 
 
 def camera_file(spec: str) -> Path:

@@ -361,7 +361,9 @@ class ImagingMatrix(PsiSizes):
         size = pair_of(size, "size", "rows and columns of samples, such as (192, 256)")
         if not isinstance(binning, int) or binning < 1:
             raise refusal(binning, "binning", "the number of samples along a pixel's side")
-        entries = sparse.coo_array(sparse.csr_array(matrix, dtype=np.float32))
+        summed = sparse.csr_array(matrix, dtype=np.float32, copy=True)
+        summed.sum_duplicates()
+        entries = sparse.coo_array(summed)
         pixels = size[0] // binning, size[1] // binning
         readings, samples = int(np.prod(pixels)), int(np.prod((*views, *size)))
         rows, columns = entries.shape  # pyright: ignore[reportGeneralTypeIssues]
@@ -382,16 +384,68 @@ class ImagingMatrix(PsiSizes):
                 f"{column[n]}: pixel ({pixel_y[n]}, {pixel_x[n]}) would see the sample ({y[n]}, "
                 f"{x[n]}); Psi here is of cameras whose pixels see the views at their own place"
             )
-        weights = np.zeros((shots, *views, size[0], 3, size[1]), dtype=np.float32)
+        weights = np.zeros((shots, *views, *size, per_sample), dtype=np.float32)
+        weights[shot, v, u, y, x, c] = entries.data
         if per_sample == 3:
-            weights[shot, v, u, y, c, x] = entries.data
-            return cls(weights, None, binning, view_axes=view_axes)._compact()
-        tile = cfa_tile(cfa)
-        of_pixel = tile[pixel_y % tile.shape[0], pixel_x % tile.shape[1]]
-        shares = of_pixel / of_pixel.sum(axis=-1, keepdims=True)
-        for colour in range(3):
-            weights[shot, v, u, y, colour, x] = entries.data * shares[:, colour]
-        return cls(weights, None, binning, view_axes=view_axes)._compact()
+            return cls.from_weights(weights, binning=binning, view_axes=view_axes)
+        return cls.from_weights(weights[..., 0], cfa, binning, view_axes)
+
+    @classmethod
+    def from_weights(
+        cls,
+        weights: ArrayLike,
+        cfa: str | tuple[str, ...] | None = None,
+        binning: int = 1,
+        view_axes: ViewAxes = ANGLES,
+    ) -> ImagingMatrix:
+        """Return Psi from what every pixel sees of every view, such as a mask's transmittances.
+
+        A reading is the sum over the views of weight times light, so that weights that sum to 1 at
+        a typical pixel keep light and readings within [0, 1]: divide transmittances by
+        `transmittances.sum(axis=(1, 2)).mean()`, or by the number of views where a reading of 1 is
+        a white board's without masks.
+
+        Args:
+            weights: (shot, v, u, y, x), of the light that the pixel sees; or (shot, v, u, y, x, 3),
+                of linear red, green and blue. The views are what a code multiplies: angles, bands
+                or times, any number, and bands are views (1, count).
+            cfa: the colour filters, where the weights have no colours. None: the light has none
+                either, as a monochrome sensor sees it. It is held as red, which is faster and surer
+                than three unknown colours, and `reconstruct` returns three that are alike.
+            binning: k; a pixel sums k x k samples, y and x count the samples.
+            view_axes: what v and u are: `angle`, `band` or `time`.
+
+        Raises:
+            SensingError: weights that are not finite, or all 0; pixels that do not divide the
+                samples.
+            ArgumentError: an argument of another type or number of axes.
+
+        >>> opened = np.zeros((2, 1, 2, 4, 6))  # two shots, each through one of two openings
+        >>> opened[0, 0, 0] = opened[1, 0, 1] = 1
+        >>> psi = ImagingMatrix.from_weights(opened)
+        >>> psi, round(psi.light_efficiency(), 6)
+        (Psi(2 shots, 1x2 views, 4x6, one colour a pixel, 0.00038 MB), 1.0)
+        """
+        takes = "an array (shot, v, u, y, x) or (shot, v, u, y, x, 3) of real numbers"
+        given = numbers_of(weights, "weights", takes)
+        if given.ndim not in (5, 6) or not given.size or given.shape[5:] not in ((), (3,)):
+            raise refusal(weights, "weights", takes)
+        if not isinstance(binning, int) or binning < 1:
+            raise refusal(binning, "binning", "the number of samples along a pixel's side")
+        given = given.astype(np.float32, copy=False)
+        if not given.any():
+            raise SensingError("weights that are all 0: no pixel sees any light")
+        if given.ndim == 5 and cfa is None:
+            red = np.zeros((len(given), *given.shape[3:]), dtype=np.uint8)
+            stored = np.ascontiguousarray(given[:, :, :, :, None])
+            return cls(stored, red, binning, view_axes=view_axes)
+        if given.ndim == 5 and cfa is not None:
+            tile = cfa_tile(cfa)
+            at = (np.arange(side) // binning for side in given.shape[3:])
+            seen = tile[np.ix_(*(i % n for i, n in zip(at, tile.shape[:2], strict=True)))]
+            given = given[..., None] * (seen / seen.sum(axis=-1, keepdims=True))
+        stored = np.ascontiguousarray(rows_of_colours(given))
+        return cls(stored, None, binning, view_axes=view_axes)._compact()
 
     def _compact(self) -> ImagingMatrix:
         """Return Psi with one stored colour where every sample's pixel sees one at most."""

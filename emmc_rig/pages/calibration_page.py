@@ -97,6 +97,8 @@ def _head(outcome: Outcome, metrics: Mapping) -> Head:
 
 
 def _use(metrics: Mapping) -> str:
+    if not metrics["session"]:
+        return "get the light field with this Psi: `emmc_rig.reconstruct(psi, report.frames(dn))`"
     return f"get the light field with this Psi: `emmc-rig reconstruct {typed(metrics['session'])}`"
 
 

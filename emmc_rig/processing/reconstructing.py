@@ -52,8 +52,15 @@ from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
-PSI_TAKES = "an imaging matrix: camera.psi(size), Psi.load(file), or Psi.from_scipy(matrix, ...)"
+PSI_TAKES = (
+    "an imaging matrix: camera.psi(size), Psi.load(file), Psi.from_scipy(matrix, ...), or "
+    "Psi.from_weights(weights)"
+)
 FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
+LARGEST_READING = 8.0
+"""A white board without masks reads 1; a reading that large is none."""
+CODES, FEW_CODES = 255, 32
+"""Of pictures of 8 bits; fewer different ones may be a drawing in readings."""
 RESULT_GROUP = "result.zarr"
 """Light field and maps, where they are written as Zarr."""
 Place = tuple[Path, Path]
@@ -75,8 +82,8 @@ def reconstruct(
 
     Args:
         psi: the imaging matrix of the camera that took the frames.
-        frames: what `Camera.expose` or `open_frames` return, or an array (shot, pixel_y, pixel_x)
-            of readings, such as `psi @ scene`.
+        frames: what `Camera.expose`, `open_frames` or `frames` return, or an array (shot, pixel_y,
+            pixel_x) of readings, such as `psi @ scene`.
         method: a name that `emmc-rig reconstruct --list` lists.
         noise_sigma: standard deviation of the readings, all alike. By default that of the frames;
             of an array, what the sensor of Psi's camera has at these readings.
@@ -86,7 +93,8 @@ def reconstruct(
         on_step: is called with the progress after each step.
 
     Raises:
-        AppError: an array without `noise_sigma`, where Psi does not know its camera.
+        AppError: an array without `noise_sigma`, where Psi does not know its camera; an array of
+            raw values of a sensor, or of the codes of a picture.
         ReconstructionError: a method that is not known, frames that do not fit Psi.
         ArgumentError: an argument of another type.
 
@@ -152,6 +160,8 @@ def _as_frames(
         taken = frames
     else:
         readings = numbers_of(frames, "frames", FRAMES_TAKES)
+        check_frames(psi.frames_shape, readings)
+        _refuse_codes(readings)
         everywhere = np.ones(readings.shape, dtype=bool)
         if noise_sigma is None:
             deviation = sensor_deviation(psi, readings)
@@ -171,17 +181,37 @@ def _as_frames(
     return replace(taken, usable=usable)
 
 
+def _refuse_codes(readings: NDArray) -> None:
+    """Raise AppError for an array of raw values, or of a picture's codes scaled to [0, 1]."""
+    finite = readings[np.isfinite(readings)]
+    top = float(finite.max(initial=0))
+    if top > LARGEST_READING and not np.mod(finite, 1).any():
+        gamma = "; codes of a picture have a gamma: gamma=2.2" if top <= CODES else ""
+        raise AppError(
+            f"frames: whole numbers up to {top:.0f} are raw values, no readings: "
+            f"emmc_rig.frames(dn, dark=..., white_level=...) makes readings of them{gamma}"
+        )
+    codes = CODES * finite
+    if np.abs(codes - np.round(codes)).max(initial=0) < 1e-3 and len(np.unique(codes)) > FEW_CODES:
+        raise AppError(
+            "frames: multiples of 1/255 are codes of a picture, whose light has a gamma: "
+            "emmc_rig.frames(codes, gamma=2.2) makes readings of them, or with gamma=1 where the "
+            "sensor itself writes 8 bits"
+        )
+
+
 def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the standard deviation that the sensor of Psi's camera adds to readings.
 
     Infinite where no light reaches a pixel. Raises AppError where Psi does not know its camera.
     """
     if not psi.camera_json:
-        raise AppError("this Psi does not know its camera: give the readings' noise_sigma")
+        raise AppError(
+            "this Psi does not know its camera: give the readings' noise_sigma, or make frames of "
+            "raw values by emmc_rig.frames, which estimates it"
+        )
     camera = camera_of(psi)
     light = pixel_light(camera, psi.size)
-    if readings.shape != light.shape:
-        return np.zeros(readings.shape)  # the method refuses these frames, and says why
     variance = camera.sensor.noise.variance(readings, camera.exposures_s()[:, None, None], light)
     return np.sqrt(variance)
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibration.placement import SCALARS, labels
 from calibration.routes import Outcome
@@ -21,8 +21,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.psi import PSI
 from emmc_rig.files.results import command_line, metrics_text, versions, write_metrics
-from emmc_rig.model.arguments import path_of
+from emmc_rig.model.arguments import numbers_of, path_of
 from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.camera import camera_of as camera_of_psi
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
@@ -31,6 +33,7 @@ from emmc_rig.session.frame_means import camera_of
 from emmc_rig.session.measured_psi import session_outcome
 from emmc_rig.session.readings import camera_json_of, taken_shots
 from emmc_rig.session.session import CALIBRATION, Session
+from reconstruction.inputs import check_frames
 
 SENSOR = "sensor.json"
 ROUTES = {
@@ -52,7 +55,7 @@ def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SessionCalibration:
-    """Psi as a session's whiteboards measure it.
+    """Psi as whiteboards measure it, those of a session or arrays.
 
     outcome: all routes tried, and the choice among them. calibration: the one chosen, of the shots
     that the session has. metrics: what metrics.json says.
@@ -72,6 +75,24 @@ class SessionCalibration:
     def held_out_error(self) -> float:
         """Relative error at which the whiteboard held out of the fit is predicted."""
         return self.outcome.judged[self.outcome.chosen].relative_error
+
+    def frames(self, dn: ArrayLike, exposures_s: float | Sequence[float] = 1.0) -> Frames:
+        """Return the readings of raw frames by these whiteboards, with deviations.
+
+        dn: (shot, pixel_y, pixel_x), of the shots of Psi. exposures_s: of all, or of each; in the
+        unit of the whiteboards' exposures. Raises ReconstructionError for another shape, and
+        ArgumentError for what are no numbers.
+        """
+        taken = numbers_of(dn, "dn", "raw values, an array (shot, pixel_y, pixel_x)")
+        check_frames(self.psi.frames_shape, taken)
+        known, times_s = self.calibration, np.broadcast_to(exposures_s, len(taken))
+        lit = known.white_dn_per_s > 0
+        safe = replace(known, white_dn_per_s=np.where(lit, known.white_dn_per_s, 1))
+        white_dn = camera_of_psi(self.psi).sensor.noise.white_level_dn
+        usable = known.usable(taken, white_dn) & lit
+        variance = safe.reading_variance(taken, times_s)
+        good = lit if known.good is None else lit & known.good
+        return Frames(safe.readings(taken, times_s) * good, np.sqrt(variance), usable)
 
     def save(self, out: str | Path) -> None:
         """Write psi.h5, calibration.h5, metrics.json and report.html as the folder `out`.
@@ -104,22 +125,13 @@ class SessionCalibration:
         )
 
 
-def calibrate(
-    session: Session | str | Path,
-    route: str = "auto",
-    *,
-    sensor: bool = False,
-    watcher: Watcher | None = None,
+def calibrate_session(
+    session: Session | str | Path, route: str, sensor: bool, watcher: Watcher | None
 ) -> SessionCalibration:
-    """Return Psi as a session's whiteboards measure it; `.save(folder)` writes it with a report.
-
-    session: itself, or its folder. route: parametric, mixed or free; `auto` takes every one that
-    the session has whiteboards for, and chooses. sensor: its figures too, from the darks and the
-    references at several exposures.
-    Raises AppError or CalibrationError.
-    """
+    """Return Psi as a session's whiteboards measure it, see `calibrating.calibrate`."""
     if not isinstance(session, Session):
-        session = Session(path_of(session, "session", "a session, or its folder"))
+        takes = "a session, or its folder; or whiteboards as arrays, with poses and a camera"
+        session = Session(path_of(session, "session", takes))
     return _calibrated(session, route, sensor, watcher or Silent(), in_memory)
 
 
@@ -156,16 +168,8 @@ def _calibrated(
         empty,
         watcher.step,
     )
-    metrics = {
-        "camera": session.header["title"] or session.folder.name,
-        "session": str(session.folder),
-        "size": list(outcome.calibration.psi.size),
-        "route": route,
-        **outcome_figures(outcome),
-        "calibration_seconds": time.perf_counter() - started,
-        "command": command_line(),
-        "versions": versions(),
-    }
+    title = session.header["title"] or session.folder.name
+    metrics = calibration_metrics(outcome, title, str(session.folder), route, started)
     shots = taken_shots(session)
     chosen = outcome.calibration
     if len(shots) < chosen.psi.shots:
@@ -177,6 +181,22 @@ def _calibrated(
         white_dn = camera_of(session).sensor.noise.white_level_dn
         sheet = characterise(*sensor_pairs(session), white_dn)
     return SessionCalibration(outcome, chosen, metrics, sheet)
+
+
+def calibration_metrics(
+    outcome: Outcome, title: str, session: str, route: str, started: float
+) -> dict[str, Any]:
+    """Return what metrics.json says; title: of the camera, started: by `time.perf_counter`."""
+    return {
+        "camera": title,
+        "session": session,
+        "size": list(outcome.calibration.psi.size),
+        "route": route,
+        **outcome_figures(outcome),
+        "calibration_seconds": time.perf_counter() - started,
+        "command": command_line(),
+        "versions": versions(),
+    }
 
 
 def outcome_figures(outcome: Outcome) -> dict:

@@ -15,7 +15,7 @@ from calibration.whiteboard import Calibration, NewArray, in_memory, measure_psi
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light, psi_layout
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.board_sets import board_sets, whiteboards
+from emmc_rig.session.board_sets import SessionBoards, board_sets, whiteboards
 from emmc_rig.session.frame_means import (
     camera_of,
     frame_shape,
@@ -66,14 +66,32 @@ def session_outcome(
 
     Raises AppError where the session has not what a route needs, or CalibrationError.
     """
-    camera = camera_of(session)
-    k = camera.sensor.binning
+    camera, k = camera_of(session), camera_of(session).sensor.binning
     rows, columns = frame_shape(session)
     size = k * rows, k * columns
+    boards = board_sets(session, channels_of(psi_layout(camera, size)))
+    where = f"{session.folder}: its plan has", "`emmc-rig calibrate --plan` writes a plan that has"
+    return boards_outcome(camera, size, boards, where, routes, on_stage, empty, on_plane)
+
+
+def boards_outcome(
+    camera: Camera,
+    size: tuple[int, int],
+    boards: SessionBoards,
+    where: tuple[str, str],
+    routes: Sequence[str] | None = None,
+    on_stage: Callable[[str], None] = lambda name: None,
+    empty: NewArray = in_memory,
+    on_plane: Callable[[str], None] = lambda what: None,
+) -> Outcome:
+    """Return Psi of whiteboards, see `session_outcome`.
+
+    size: rows and columns of the light field. where: the beginning of an error's line, what has not
+    the whiteboards that a route needs, and its end, what to do.
+    """
     # Only where a pixel has several samples does the design say more than its layout.
-    design = psi_layout(camera, size) if k == 1 else build_imaging_matrix(camera, size)
-    layout = psi_layout(camera, size)
-    boards = board_sets(session, channels_of(layout))
+    whole = camera.sensor.binning > 1
+    design = build_imaging_matrix(camera, size) if whole else psi_layout(camera, size)
     few, pinholes, held_out = boards.fit, boards.pinholes, boards.held_out
     if routes is None:
         routes = ("parametric", "mixed") if few is not None else ("free",)
@@ -90,8 +108,7 @@ def session_outcome(
     ]
     if wanting:
         raise AppError(
-            f"{session.folder}: its plan has no {' and no '.join(wanting)}, which this route "
-            "needs; `emmc-rig calibrate --plan` writes a plan that has"
+            f"{where[0]} no {' and no '.join(wanting)}, which this route needs; {where[1]}"
         )
     assert held_out is not None
     return calibrate(

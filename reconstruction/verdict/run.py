@@ -48,7 +48,7 @@ def reconstruct_judged(
 
     frames: what a pixel reads that is not usable is the least that it can be, see `Read.clipped`; 0
     says nothing. The light field is that of all readings but the few kept, which costs it next to
-    nothing.
+    nothing. Where every pixel sees the same colour, its three colours are alike.
     """
     settings = settings or MethodSettings()
     typical, _ = checked_noise(psi, noise_sigma, usable)
@@ -86,7 +86,11 @@ def reconstruct_judged(
             "than the others",
         )
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
-    return result, verdict_from(gathered(psi, read, typical, result, found))
+    verdict = verdict_from(gathered(psi, read, typical, result, found))
+    if psi.colour is not None and (psi.colour == psi.colour.flat[0]).all():
+        # Nothing was seen of the others: light without colours, or a picture in one.
+        result.light_field[...] = result.light_field[..., psi.colour.flat[0], None]
+    return result, verdict
 
 
 def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDArray]:

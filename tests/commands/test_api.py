@@ -172,7 +172,8 @@ def test_what_the_api_returns_is_shown_in_one_line(taken):
 def test_public_names_are_functions_and_classes_and_no_folder_is_called_as_one():
     folders = {path.name for path in Path(emmc.__path__[0]).iterdir()}
     assert folders.isdisjoint(emmc.__all__)
-    for name in ("calibrate", "camera", "capture", "open_frames", "reconstruct", "rig", "scene"):
+    functions = "calibrate camera capture frames open_frames reconstruct rig scene"
+    for name in functions.split():
         assert isinstance(getattr(emmc, name), FunctionType)
         assert getattr(emmc, name).__doc__
     for name in ("Camera", "Frames", "Psi", "Result", "Scene", "Session"):
@@ -205,6 +206,7 @@ def test_a_module_loads_only_what_it_needs(module, unwanted):
         "emmc_rig.files.cameras",
         "emmc_rig.files.scenes",
         "emmc_rig.model.sensing",
+        "emmc_rig.processing.raw_frames",
         "emmc_rig.processing.reconstructing",
         "emmc_rig.bench.rig_config",
     ],
@@ -215,9 +217,36 @@ def test_the_examples_in_docstrings_give_what_they_show(module):
     assert tested.failed == 0
 
 
+@pytest.mark.slow
+def test_the_page_for_those_with_a_pipeline_of_their_own_gives_what_it_shows():
+    page = Path(__file__).parents[2] / "docs/api.md"
+    tested = doctest.testfile(str(page), module_relative=False)
+    assert tested.attempted > 10
+    assert tested.failed == 0
+
+
 CAMERA = {"title": "no mask", "sensor": {"cfa": "mono"}}
 api: Any = emmc
 """The package, for calls that its types forbid."""
+
+
+def mask_of(cells):
+    """A mask before the sensor whose cells are an array."""
+    pattern = {"kind": "parameters", "cells": cells}
+    return {"distance_mm": 1.0, "cell_um": 24, "pattern": pattern}
+
+
+def codes_of(frames):
+    """Frames as a picture has them: 8 bits, with a gamma."""
+    light = np.clip(frames.readings / frames.readings.max(), 0, 1)
+    return np.round(255 * light ** (1 / 2.2)).astype(np.uint8)
+
+
+def sized(change):
+    """Reconstruct readings of another shape."""
+    return lambda t: api.reconstruct(t[1], change(t[2].readings))
+
+
 MISTAKES = {
     "a camera of no name": (lambda t: api.camera(3), "camera: got 3; it takes a shipped camera's"),
     "a camera without title": (lambda t: api.camera({}), "the camera: title: field required"),
@@ -277,6 +306,71 @@ MISTAKES = {
         lambda t: api.Psi.from_scipy(sparse.eye_array(6, k=1), (1, 1), (2, 3)),
         r"5 entries lie off their pixel, the first in row 0, column 1: pixel \(0, 0\)",
     ),
+    "weights of no shots": (
+        lambda t: api.Psi.from_weights(np.ones((2, 2, 4, 6))),
+        r"weights: got ndarray of shape \(2, 2, 4, 6\), float64; it takes an array \(shot, v, u, y",
+    ),
+    "weights of four colours": (
+        lambda t: api.Psi.from_weights(np.ones((1, 2, 2, 4, 6, 4))),
+        "weights: got ndarray of shape",
+    ),
+    "weights that are not finite": (
+        lambda t: api.Psi.from_weights(np.full((1, 1, 1, 4, 6), np.nan)),
+        "entries that are not finite",
+    ),
+    "a mask that lets nothing through": (
+        lambda t: api.Psi.from_weights(np.zeros((1, 1, 1, 4, 6))),
+        "weights that are all 0",
+    ),
+    "pixels that cut samples": (
+        lambda t: api.Psi.from_weights(np.ones((1, 1, 1, 5, 6)), binning=2),
+        r"pixels of 2\^2 samples do not divide \(5, 6\)",
+    ),
+    "a mask of three values a cell by twos": (
+        lambda t: api.camera({**CAMERA, "masks": {"code": mask_of(np.ones((4, 4, 2)))}}),
+        "masks.code.pattern.parameters: expected a 2-dimensional array",
+    ),
+    "a mask with a hole in its numbers": (
+        lambda t: api.camera({**CAMERA, "masks": {"code": mask_of(np.full((4, 4), np.nan))}}),
+        "masks.code.pattern.parameters: transmittance must lie in",
+    ),
+    "raw values": (
+        lambda t: api.reconstruct(t[1], t[2].frames_dn),
+        r"frames: whole numbers up to \d+ are raw values, no readings: emmc_rig.frames\(dn",
+    ),
+    "raw values as floating ones": (
+        lambda t: api.reconstruct(t[1], t[2].frames_dn.astype(float)),
+        "are raw values, no readings",
+    ),
+    "a picture's codes": (
+        lambda t: api.reconstruct(t[1], codes_of(t[2]), noise_sigma=0.01),
+        "are raw values, no readings.*codes of a picture have a gamma",
+    ),
+    "a picture's codes from 0 to 1": (
+        lambda t: api.reconstruct(t[1], codes_of(t[2]) / np.float32(255), noise_sigma=0.01),
+        r"multiples of 1/255 are codes of a picture, whose light has a gamma: .*gamma=2.2",
+    ),
+    "one shot without its axis": (
+        sized(lambda r: r[0]),
+        "2 axes instead of three|an axis of shots",
+    ),
+    "frames with the shots last": (
+        sized(lambda r: np.moveaxis(r, 0, -1)),
+        r"the axis of shots comes first: np.moveaxis\(frames, -1, 0\)",
+    ),
+    "a colour picture": (
+        sized(lambda r: np.repeat(r[0][..., None], 3, axis=-1)),
+        "a picture of three colours",
+    ),
+    "one shot of two": (sized(lambda r: r[:1]), r"1 shot\(s\), Psi is of 2: use the Psi"),
+    "rows as columns": (sized(lambda r: r.swapaxes(1, 2)), r"swapped: frames.swapaxes\(1, 2\)"),
+    "frames not binned": (
+        sized(lambda r: np.kron(r, np.ones((1, 2, 2)))),
+        "2 times as many pixels along each side: bin them",
+    ),
+    "frames binned": (sized(lambda r: r[:, ::2, ::2]), "2 times fewer pixels along each side"),
+    "frames with a border": (sized(lambda r: np.pad(r, 1)[1:-1]), "cut out the part that Psi is"),
+    "frames of another sensor": (sized(lambda r: r[:, :-3]), "frames of another sensor or part"),
     "a light field as text": (lambda t: t[1] @ "scene", "light field: got 'scene'"),
     "frames as text": (lambda t: t[1].T @ "frames", "frames: got 'frames'"),
     "Psi of one side": (lambda t: api.camera("rgbw-mono").psi(24), "size: got 24; it takes"),
@@ -337,6 +431,69 @@ def test_a_matrix_without_colours_gets_those_of_the_filters():
     grey = light_field.mean(axis=-1)
     np.testing.assert_allclose(
         (mono @ light_field)[0], (weights * grey).sum(axis=(0, 1)), rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+@pytest.mark.parametrize("cfa", ["mono", "rggb", ("RW", "GB")])
+def test_readings_are_the_sum_over_views_of_weight_times_the_light_that_filters_let_through(
+    cfa, binning
+):
+    rng = np.random.default_rng(0)
+    weights, light = rng.normal(size=(2, 1, 7, 4, 6)), rng.uniform(size=(1, 7, 4, 6, 3))
+    psi = emmc.Psi.from_weights(weights, cfa, binning)
+    tile = {"mono": ["W"], "rggb": ["RG", "GB"], ("RW", "GB"): ["RW", "GB"]}[cfa]
+    passed = {"R": (1, 0, 0), "G": (0, 1, 0), "B": (0, 0, 1), "W": np.full(3, 1 / 3)}
+    expected = np.zeros((2, 4 // binning, 6 // binning))
+    for y, x in np.ndindex(4, 6):
+        row, column = y // binning, x // binning
+        letter = tile[row % len(tile)][column % len(tile[0])]
+        seen = light[:, :, y, x] @ np.asarray(passed[letter])
+        expected[:, row, column] += (weights[..., y, x] * seen).sum(axis=(1, 2))
+    np.testing.assert_allclose(psi @ light, expected, atol=1e-5)
+    back = emmc.Psi.from_scipy(psi.to_scipy(), (1, 7), (4, 6), binning=binning)
+    np.testing.assert_array_equal(back.to_scipy().toarray(), psi.to_scipy().toarray())
+
+
+def test_light_without_colours_is_reconstructed_as_grey():
+    rng = np.random.default_rng(1)
+    weights = rng.uniform(0, 1, (3, 1, 3, 24, 32))
+    psi = emmc.Psi.from_weights(weights / weights.sum(axis=(1, 2)).mean())
+    assert psi.weights.shape[4] == 1
+    y, x = np.indices((24, 32))
+    grey = 0.5 + 0.3 * np.sin(x / 5 + np.arange(3)[:, None, None]) * np.cos(y / 7)
+    light = np.repeat(grey[None, ..., None], 3, axis=-1)
+    result = emmc.reconstruct(psi, psi @ light, "tv", noise_sigma=1e-3)
+    found = result.light_field
+    np.testing.assert_array_equal(found, np.repeat(found[..., :1], 3, axis=-1))
+    assert np.sqrt(np.mean((psi @ found - psi @ light) ** 2)) < 0.003
+    assert np.sqrt(np.mean((found - light) ** 2)) < 0.1
+
+
+def test_weights_of_every_colour_are_psi_s_own():
+    psi = emmc.camera("rgbw-bayer-2shots").psi((6, 8))
+    dense = psi.to_scipy().toarray().reshape(*psi.frames_shape, *psi.light_field_shape)
+    weights = np.einsum("syxvuyxc->svuyxc", dense)
+    again = emmc.Psi.from_weights(weights)
+    np.testing.assert_array_equal(again.weights, psi.weights)
+    np.testing.assert_array_equal(again.colour, psi.colour)
+
+
+def test_a_matrix_that_names_a_place_twice_means_the_sum():
+    twice = sparse.csr_array((np.ones(3), [0, 0, 1], [0, 2, 3]), shape=(2, 2))
+    psi = emmc.Psi.from_scipy(twice, (1, 1), (1, 2))
+    np.testing.assert_allclose(psi @ np.ones((1, 1, 1, 2, 3)), [[[2, 1]]], rtol=1e-6)
+
+
+def test_the_cells_of_a_mask_are_an_array_as_well_as_lists():
+    cells = np.random.default_rng(0).random((64, 80)) < 0.5
+    views = np.array([3, 3])
+    listed = mask_of(cells.astype(int).tolist())
+    camera = {**CAMERA, "masks": {"code": listed}, "views": [3, 3]}
+    given = emmc.camera({**camera, "masks": {"code": mask_of(cells)}, "views": views})
+    assert given == emmc.camera(camera)
+    np.testing.assert_array_equal(
+        given.psi((12, 16)).weights, emmc.camera(camera).psi((12, 16)).weights
     )
 
 

@@ -1,0 +1,260 @@
+"""Raw values of anybody's sensor to readings with their deviation; what is not given is estimated.
+
+The estimates are of what frames themselves tell. Saturated pixels share one value, far more of them
+than the values below. Of raw values, which are whole numbers, the darkest see hardly any light.
+Noise is what neighbours of one colour differ by where a frame is smoothest: its variance over the
+signal is a line whose slope is the gain (mean-variance method, EMVA 1288, 6.6). A coded mask leaves
+no part of a frame smooth, so that this is the most that noise can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import nnls
+from scipy.signal import convolve2d
+
+from emmc_rig.errors import AppError
+from emmc_rig.model.arguments import numbers_of, refusal
+from emmc_rig.model.frames import Frames
+
+Array = NDArray[np.floating]
+FULL_RANGES = tuple(2.0**bits - 1 for bits in (8, 10, 12, 14, 16))
+DARKEST = 0.001
+"""Share of the pixels whose level is taken for the black level."""
+BLOCK_PX = 16
+SECOND = np.array([1.0, 0, -2, 0, 1]) / np.sqrt(6)
+"""Second difference of every other pixel, of one colour in a Bayer mosaic; it keeps the variance of
+noise. Source: Immerkaer, "Fast noise variance estimation", CVIU 64 (1996) 300."""
+SMOOTHEST = 0.1
+SMOOTHEST_READS = 1 - 1.2816 * np.sqrt(2 * (70 / 36) ** 2) / BLOCK_PX
+"""Of the true variance, that the 10 % quantile of blocks without structure has: 1.28 deviations
+below, of which BLOCK_PX^2 values have sqrt(2 / their number), less what neighbours share by SECOND,
+whose squared autocorrelations sum to 70 / 36 along each axis."""
+LEAST_ELECTRONS = 1.0
+"""Of read noise: few sensors have less, and a line through brighter parts hardly tells."""
+LEVELS, FEWEST_BLOCKS, ROUNDS = 8, 16, 4
+CLIPPED = 4
+"""Times as many pixels as at each of as many levels below read the level where they saturate."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MeasuredFrames(Frames):
+    """Frames of raw values, with what of their black level, range and noise was estimated."""
+
+    estimates: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        told = f"; estimated: {'; '.join(self.estimates)}" if self.estimates else ""
+        return super().__repr__().removesuffix(")") + told + ")"
+
+
+def frames(
+    dn: ArrayLike,
+    dark: ArrayLike | None = None,
+    white_level: float | None = None,
+    gain: float | None = None,
+    read_noise: float | None = None,
+    *,
+    white: ArrayLike | None = None,
+    gamma: float = 1.0,
+) -> MeasuredFrames:
+    """Return the readings of raw frames, with the deviation of each and which are usable.
+
+    What is not given is estimated from the frames, see `estimates` of what is returned, and what an
+    estimate of the black level may be off by is part of the deviation. Estimated noise is the most
+    that it can be, as the structure of mask and scene is in it.
+
+    Args:
+        dn: (shot, y, x), or (y, x) of one shot, raw values of the sensor, all of one exposure.
+        dark: the lamp off or the lens covered, at the same exposure: (y, x), (repeat, y, x), or the
+            black level, a number. DN.
+        white_level: the value at which the sensor saturates. DN.
+        gain: DN per electron.
+        read_noise: standard deviation in the dark, in electrons.
+        white: a white board through the open aperture without masks, (y, x) or (repeat, y, x), or
+            one number; it reads 1. Default: the white level does. DN.
+        gamma: of codes that are light ** (1 / gamma), such as those of pictures: about 2.2.
+
+    Raises:
+        AppError: values that are not finite, of another size, or above the white level; darks that
+            are brighter than the frames; frames too small to estimate their noise.
+        ArgumentError: an argument of another type.
+
+    >>> import emmc_rig as emmc
+    >>> rng = np.random.default_rng(0)
+    >>> electrons = np.broadcast_to(np.linspace(100, 3000, 256), (2, 128, 256))
+    >>> read = rng.normal(0, 2.5, electrons.shape)
+    >>> dn = np.round(64 + 0.8 * (rng.poisson(electrons) + read))
+    >>> emmc.frames(dn, dark=64, white_level=4095, gain=0.8, read_noise=2.5)
+    MeasuredFrames(2 shots of 128x256 pixels, noise 0.0078, 100.0% usable)
+    >>> emmc.frames(dn, dark=64, white_level=4095).estimates
+    ('noise (at most): variance 0.819 DN per DN of signal and 13.4 DN^2',)
+    """
+    takes = "raw values, an array (shot, y, x) or (y, x) of real numbers"
+    taken = numbers_of(dn, "dn", takes)
+    if taken.ndim not in (2, 3) or not taken.size:
+        raise refusal(dn, "dn", takes)
+    for name, number in (("white_level", white_level), ("gain", gain), ("gamma", gamma)):
+        if number is not None and not (isinstance(number, Real) and 0 < number < np.inf):
+            raise refusal(number, name, "a number above 0")
+    if read_noise is not None and not (isinstance(read_noise, Real) and 0 <= read_noise < np.inf):
+        raise refusal(read_noise, "read_noise", "electrons, 0 or more")
+    taken = _finite(taken.reshape(-1, *taken.shape[-2:]), "dn")
+    estimates: list[str] = []
+    whole, top = not np.mod(taken, 1).any(), float(taken.max())
+    saturates = white_level
+    if white_level is None:
+        white_level, saturates, words = _white_level(taken, whole)
+        estimates.append(words)
+    elif top > white_level:
+        raise AppError(f"dn: values up to {top:g} DN, above the white level, {white_level:g}")
+    usable = taken < (np.inf if saturates is None else saturates)
+    if not usable.any():
+        raise AppError(f"dn: every pixel reads the white level, {saturates:g} DN, or more")
+
+    def linear(values: Array) -> Array:
+        return (
+            values if gamma == 1 else white_level * (np.maximum(values, 0) / white_level) ** gamma
+        )
+
+    taken, raw = linear(taken), whole and gamma == 1
+    black, black_variance, dark_variance = _black(dark, taken, raw, linear, estimates)
+    signal = taken - black
+    if signal[usable].mean() < 0:
+        raise AppError("dn: darker than dark on average: are frames and darks swapped?")
+    if gain is not None and read_noise is not None:
+        floor = (gain * read_noise) ** 2 + raw / 12
+    else:
+        gain, floor = _noise_line(signal, usable, gain, dark_variance)
+        if read_noise is not None:
+            floor = (gain * read_noise) ** 2 + raw / 12
+        elif dark_variance is None:
+            floor = max(floor, (LEAST_ELECTRONS * gain) ** 2, raw / 12)
+        estimates.append(
+            f"noise (at most): variance {gain:.3g} DN per DN of signal and {floor:.3g} DN^2"
+        )
+    variance = gain * np.maximum(signal, 0) + floor + black_variance
+    span, span_variance = white_level - float(np.mean(black)), 0.0
+    if white is not None:
+        board, repeats = _stacked(white, "white", taken.shape[1:])
+        if saturates is not None and (board >= saturates).mean() > 0.5:
+            raise AppError(f"white: most of it reads the white level, {saturates:g} DN, or more")
+        span = linear(board).mean(axis=0) - black
+        span_variance = (gain * np.maximum(span, 0) + floor) / repeats + black_variance
+    lit = np.broadcast_to(np.asarray(span) > 0, taken.shape)
+    if not lit.mean() > 0.5:
+        raise AppError("white, or the white level, is no brighter than the dark: was the lamp on?")
+    safe = np.where(span > 0, span, 1)
+    readings = np.where(lit, signal / safe, 0)
+    deviation = np.sqrt(variance + np.square(readings) * span_variance) / safe
+    return MeasuredFrames(
+        readings.astype(np.float32), deviation.astype(np.float32), usable & lit, tuple(estimates)
+    )
+
+
+def _finite(values: NDArray, name: str) -> Array:
+    """Return floating values; raises AppError where one is not finite, and says where."""
+    wrong = np.argwhere(~np.isfinite(values))
+    if len(wrong):
+        place = tuple(int(i) for i in wrong[0])
+        raise AppError(
+            f"{name}: {len(wrong)} values are not finite, the first at {place}: put numbers there, "
+            "and leave these pixels out by `usable` of `reconstruct`"
+        )
+    return values.astype(np.float64)
+
+
+def _stacked(given: ArrayLike, name: str, size: tuple[int, ...]) -> tuple[Array, int]:
+    """Return frames (repeat, y, x) of a size, given so, as one frame, or as one number."""
+    takes = "DN: an array (y, x) or (repeat, y, x), or a number"
+    array = numbers_of(np.atleast_1d(given), name, takes)  # pyright: ignore[reportArgumentType]
+    if isinstance(given, Real):
+        array = np.full((1, 1, 1), array[0])
+    if array.ndim not in (2, 3) or not array.size:
+        raise refusal(given, name, takes)
+    array = _finite(array.reshape(-1, *array.shape[-2:]), name)
+    if not isinstance(given, Real) and array.shape[1:] != size:
+        raise AppError(f"{name}: frames of {array.shape[1:]} pixels, dn has {size}")
+    return array, len(array)
+
+
+def _black(
+    dark: ArrayLike | None,
+    dn: Array,
+    raw: bool,
+    linear: Callable[[Array], Array],
+    estimates: list[str],
+) -> tuple[Array, float, float | None]:
+    """Return the black level, (1, 1) or (y, x), its variance, and that of one dark if known."""
+    if dark is not None:
+        darks, repeats = _stacked(dark, "dark", dn.shape[1:])
+        darks = linear(darks)
+        if repeats == 1:
+            return darks[0], 0.0, None
+        spread = float(darks.var(axis=0, ddof=1).mean())
+        return darks.mean(axis=0), spread / repeats, spread
+    level = max(float(np.quantile(dn, DARKEST)), 0.0) if raw else 0.0
+    why = "what the darkest pixels read" if raw else "none assumed: these are no raw values"
+    estimates.append(f"black level {level:.4g} DN ({why})")
+    # Anywhere between nothing and the darkest pixels.
+    return np.full((1, 1), level), level**2 / 12, None
+
+
+def _white_level(dn: Array, whole: bool) -> tuple[float, float | None, str]:
+    """Return the white level, that at which pixels saturate (None: none does), and it in words."""
+    top = float(dn.max())
+    step = 1.0 if whole else (top - float(dn.min())) / FULL_RANGES[1]
+    below = np.count_nonzero((dn >= top - CLIPPED * step) & (dn < top)) / CLIPPED
+    if np.count_nonzero(dn == top) > CLIPPED * (1 + below):
+        return top, top, f"white level {top:.5g} DN (where values pile up)"
+    fitting = [level for level in FULL_RANGES if level >= top] if whole else []
+    level = fitting[0] if fitting else top
+    what = "the range of the values" if fitting else "the brightest value"
+    return level, None, f"white level {level:.5g} DN ({what}; none looks saturated)"
+
+
+def _noise_line(
+    signal: Array, usable: NDArray[np.bool_], slope: float | None, floor: float | None
+) -> tuple[float, float]:
+    """Return the variance of noise over the signal, as a line: slope and floor, DN and DN^2.
+
+    slope, floor: where known. Raises AppError where frames are too small to tell.
+    """
+    rough, levels = [], []
+    for frame, good in zip(signal, usable, strict=True):
+        apart = convolve2d(convolve2d(frame, SECOND[None], "valid"), SECOND[:, None], "valid")
+        for y, x in np.ndindex(*(side // BLOCK_PX for side in apart.shape)):
+            rows, columns = (slice(i * BLOCK_PX, (i + 1) * BLOCK_PX) for i in (y, x))
+            beside = slice(rows.start, rows.stop + 4), slice(columns.start, columns.stop + 4)
+            if good[beside].all():
+                rough.append(np.mean(np.square(apart[rows, columns])))
+                levels.append(max(frame[beside].mean(), 0.0))
+    if len(rough) < FEWEST_BLOCKS:
+        raise AppError(
+            f"dn: too few pixels that are not saturated to estimate their noise ({len(rough)} "
+            f"blocks of {BLOCK_PX}^2): give gain and read_noise"
+        )
+    mean_squares, level = np.array(rough), np.array(levels)
+    groups = np.array_split(np.argsort(level), min(LEVELS, 2 * len(rough) // FEWEST_BLOCKS))
+    x = np.array([level[group].mean() for group in groups])
+    columns = [one for one, known in ((x, slope), (np.ones_like(x), floor)) if known is None]
+    line, expected = (slope or 0.0, floor or 0.0), np.ones_like(level)
+    for _ in range(ROUNDS if columns else 0):
+        # Within a group the smoothest are not to be the darkest: against what each has to have.
+        low = [np.quantile(mean_squares[one] / expected[one], SMOOTHEST) for one in groups]
+        y = np.array(low) / SMOOTHEST_READS * [expected[one].mean() for one in groups]
+        # A variance is sure to a share of itself.
+        weight = 1 / np.maximum(y, 1e-12 + 1e-6 * y.max())
+        left = np.maximum(y - (slope or 0) * x - (floor or 0), 0)
+        found = list(nnls(np.stack(columns, axis=1) * weight[:, None], left * weight)[0])
+        line = (
+            float(found.pop(0)) if slope is None else slope,
+            float(found.pop(0)) if floor is None else floor,
+        )
+        expected = np.maximum(line[0] * level + line[1], 1e-12 + 1e-6 * y.max())
+    return line

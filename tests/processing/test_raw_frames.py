@@ -1,0 +1,168 @@
+"""Raw values to readings: against the values that made them, given and estimated."""
+
+import numpy as np
+import pytest
+
+import emmc_rig as emmc
+
+BLACK, GAIN, READ, WHITE = 64, 0.8, 2.5, 4095
+SIZE = (128, 192)
+
+
+@pytest.fixture(scope="module")
+def exposed():
+    """(frames in DN of two shots, the DN above black that they would have without noise)."""
+    rng = np.random.default_rng(3)
+    y, x = np.indices(SIZE) / max(SIZE)
+    smooth = np.stack([2 + 4000 * x**2, 50 + 3000 * y * x])  # electrons
+    return sensor(smooth, rng), GAIN * smooth
+
+
+def sensor(electrons, rng):
+    """Return what a sensor of the figures above reads."""
+    noise = rng.normal(0, READ, electrons.shape)
+    return np.floor(BLACK + GAIN * (rng.poisson(electrons) + noise) + 0.5)
+
+
+def spread_of(frames, truth):
+    """Return the deviation of (reading - truth) / stated deviation, of what is not nearly dark."""
+    counted = frames.usable & (truth > 0.005)
+    return float(((frames.readings - truth)[counted] / frames.deviation[counted]).std())
+
+
+def test_readings_are_shares_of_the_white_level_and_stray_as_their_deviation_says(exposed):
+    dn, signal = exposed
+    frames = emmc.frames(
+        dn.astype(np.uint16), dark=BLACK, white_level=WHITE, gain=GAIN, read_noise=READ
+    )
+    assert frames.estimates == ()
+    truth = signal / (WHITE - BLACK)
+    assert (frames.readings - truth).mean() == pytest.approx(0, abs=1e-4)
+    assert spread_of(frames, truth) == pytest.approx(1, abs=0.03)
+
+
+def test_noise_is_estimated_where_frames_are_smooth_and_said_to_be(exposed):
+    dn, signal = exposed
+    frames = emmc.frames(dn, dark=BLACK, white_level=WHITE)
+    assert [words.split()[0] for words in frames.estimates] == ["noise"]
+    assert "estimated: noise (at most)" in repr(frames)
+    assert spread_of(frames, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.06)
+    for known in ({"gain": GAIN}, {"read_noise": READ}):
+        half = emmc.frames(dn, dark=BLACK, white_level=WHITE, **known)
+        assert spread_of(half, signal / (WHITE - BLACK)) == pytest.approx(1, abs=0.1)
+    assert half.deviation.min() * (WHITE - BLACK) == pytest.approx(GAIN * READ, rel=0.1)
+
+
+def test_what_a_mosaic_s_colours_differ_by_is_no_noise(exposed):
+    _, signal = exposed
+    colours = np.tile([[0.3, 1.0], [1.0, 0.6]], (SIZE[0] // 2, SIZE[1] // 2))
+    dn = sensor(signal / GAIN * colours, np.random.default_rng(4))
+    frames = emmc.frames(dn, dark=BLACK, white_level=WHITE)
+    assert spread_of(frames, signal * colours / (WHITE - BLACK)) == pytest.approx(1, abs=0.1)
+
+
+def test_noise_is_not_stated_too_small_behind_a_mask(exposed):
+    _, signal = exposed
+    code = np.random.default_rng(5).random(SIZE)
+    dn = sensor(signal / GAIN * code, np.random.default_rng(6))
+    frames = emmc.frames(dn, dark=BLACK, white_level=WHITE)
+    assert spread_of(frames, signal * code / (WHITE - BLACK)) < 1
+
+
+def test_darks_give_the_level_of_every_pixel_and_the_noise_in_the_dark(exposed):
+    _, signal = exposed
+    rng = np.random.default_rng(7)
+    fixed = rng.uniform(0, 40, SIZE)
+    darks = np.stack([sensor(np.zeros(SIZE), rng) + np.floor(fixed) for _ in range(16)])
+    dn = sensor(signal / GAIN, rng) + np.floor(fixed)
+    frames = emmc.frames(dn, dark=darks, white_level=WHITE, gain=GAIN, read_noise=READ)
+    span = WHITE - darks.mean()
+    assert spread_of(frames, signal / span) == pytest.approx(1, abs=0.03)
+    assert frames.deviation.min() * span == pytest.approx(
+        np.sqrt(((GAIN * READ) ** 2 + 1 / 12) * (1 + 1 / 16)), rel=0.02
+    )
+
+
+def test_a_white_board_reads_one_whatever_the_lens_does(exposed):
+    _, signal = exposed
+    rng = np.random.default_rng(8)
+    falloff = np.linspace(0.4, 1, SIZE[1]) * np.ones(SIZE)
+    board = np.stack([sensor(3500 * falloff, rng) for _ in range(4)])
+    dn = sensor(signal / GAIN * falloff, rng)
+    given = {"dark": BLACK, "white_level": WHITE, "gain": GAIN, "read_noise": READ}
+    frames = emmc.frames(dn, white=board, **given)
+    truth = signal / (GAIN * 3500)
+    assert spread_of(frames, truth) == pytest.approx(1, abs=0.03)
+    level = emmc.frames(dn, white=BLACK + GAIN * 3500, **given)
+    np.testing.assert_allclose(level.readings, (dn - BLACK) / (GAIN * 3500), atol=1e-6)
+
+
+def test_saturated_pixels_are_found_where_their_level_is_not_given(exposed):
+    dn, _ = exposed
+    frames = emmc.frames(np.minimum(dn, 2000), dark=BLACK)
+    np.testing.assert_array_equal(frames.usable, dn < 2000)
+    assert frames.estimates[0] == "white level 2000 DN (where values pile up)"
+    open_ended = emmc.frames(dn, dark=BLACK)
+    assert open_ended.usable.all()
+    assert open_ended.estimates[0].startswith("white level 4095 DN (the range of the values")
+
+
+def test_a_black_level_that_nobody_gave_is_in_the_deviation(exposed):
+    dn, signal = exposed
+    given = {"white_level": WHITE, "gain": GAIN, "read_noise": READ}
+    frames = emmc.frames(dn, **given)
+    assert frames.estimates[0].startswith("black level 6")
+    off = frames.readings.mean() - (signal / (WHITE - BLACK)).mean()
+    assert abs(off) < frames.deviation.min()
+    assert frames.deviation.min() > 3 * emmc.frames(dn, dark=BLACK, **given).deviation.min()
+
+
+def test_codes_of_a_picture_become_light():
+    light = np.linspace(0.01, 1, 128**2).reshape(128, 128)
+    codes = np.round(255 * light ** (1 / 2.2)).astype(np.uint8)
+    frames = emmc.frames(codes, white_level=255.5, gamma=2.2)
+    np.testing.assert_allclose(frames.readings[0], light, atol=0.012)
+
+
+FLAT = np.full((1, 64, 64), 900.0)
+MISTAKES = {
+    "text": (lambda: emmc.frames("shot.tif"), "dn: got 'shot.tif'; it takes raw values"),
+    "a colour picture": (lambda: emmc.frames(np.ones((1, 8, 8, 3))), "dn: got ndarray of shape"),
+    "a hole": (
+        lambda: emmc.frames(np.where(np.eye(64, dtype=bool), np.nan, FLAT)),
+        r"dn: 64 values are not finite, the first at \(0, 0, 0\)",
+    ),
+    "above white": (lambda: emmc.frames(FLAT, white_level=255), "up to 900 DN, above the white"),
+    "all white": (lambda: emmc.frames(FLAT, white_level=900), "every pixel reads the white level"),
+    "small": (
+        lambda: emmc.frames(FLAT[:, :20], dark=0, white_level=1023),
+        "too few pixels that are not saturated to estimate their noise",
+    ),
+    "swapped": (lambda: emmc.frames(FLAT, dark=1000, white_level=4095), "frames and darks swapped"),
+    "a dark of another size": (
+        lambda: emmc.frames(FLAT, dark=np.ones((32, 64)), white_level=4095),
+        r"dark: frames of \(32, 64\) pixels, dn has \(64, 64\)",
+    ),
+    "no lamp": (
+        lambda: emmc.frames(
+            FLAT, dark=0, white=np.zeros((64, 64)), white_level=999, gain=1, read_noise=2
+        ),
+        "is no brighter than the dark",
+    ),
+    "a white board that is saturated": (
+        lambda: emmc.frames(
+            FLAT, dark=0, white=np.full((64, 64), 1023), white_level=1023, gain=1, read_noise=2
+        ),
+        "white: most of it reads the white level, 1023 DN",
+    ),
+    "gain of nothing": (lambda: emmc.frames(FLAT, gain=0), "gain: got 0; it takes a number above"),
+    "noise below nothing": (lambda: emmc.frames(FLAT, read_noise=-1), "read_noise: got -1"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_are_no_raw_frames_is_refused_in_one_line(mistake):
+    call, words = MISTAKES[mistake]
+    with pytest.raises(emmc.ERRORS, match=words) as refused:
+        call()
+    assert "\n" not in str(refused.value)
