@@ -332,7 +332,7 @@ def test_the_command_reads_srgb_pictures_and_colours(run):
     save("photo.jpg", photograph(truth), bits=8)
     code, _, err = run("mask", "photo.jpg", *MASK)
     assert code == 0, err
-    found = cv2.imread("mine.png", cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535
+    found = np.asarray(cv2.imread("mine.png", cv2.IMREAD_UNCHANGED))[..., ::-1] / 65535
     assert rms(found - truth) < 0.03  # JPEG halves the colours' resolution
 
 
@@ -342,7 +342,7 @@ def test_the_command_reads_raw_files(run, cfa):
     Path("photo.dng").write_bytes(encode_dng(codes, cfa, 64, 964, None))
     code, _, err = run("mask", "photo.dng", *MASK)
     assert code == 0, err
-    found = cv2.imread("mine.png", cv2.IMREAD_UNCHANGED) / 65535
+    found = np.asarray(cv2.imread("mine.png", cv2.IMREAD_UNCHANGED)) / 65535
     assert rms(found - binary()) < ACCURACY
 
 

@@ -93,7 +93,7 @@ def test_faults_of_scenes_are_one_line(run, tmp_path):
         "gap": "view_0_1",
         "mixed": "view_1_1",
         "broken": "view_1_0",
-        "single": "2x2",
+        "single": "1x2 views",
         "empty": "view_",
         "nowhere": "deep-occlusions",
     }.items():
