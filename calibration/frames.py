@@ -34,9 +34,9 @@ class MeanFrame:
     mean_dn: (y, x) float32. variance_dn2: variance of one frame, averaged over the pixels, from
     the spread between repeats; NaN with one frame. taken_s: when, on any clock of the capture.
     extra_variance_dn2: of the mean beyond its own noise, from what was subtracted of it.
-    row_variance_dn2: (y,), of a row's mean between repeats: lamp and shutter change whole rows
-    alike, which is no noise of single pixels. level_variance_dn2: of a frame's mean likewise.
-    rows_dn2: covariance of a row's mean between repeats with itself and with the next row's.
+    level_variance_dn2: of a frame's mean between repeats. rows_dn2: covariance of a row's mean
+    between repeats with itself and with the next row's: lamp and shutter change whole rows alike,
+    which is no noise of single pixels.
     """
 
     mean_dn: NDArray[np.float32]
@@ -45,7 +45,6 @@ class MeanFrame:
     exposure_s: float
     taken_s: float = 0.0
     extra_variance_dn2: float = 0.0
-    row_variance_dn2: NDArray[np.float64] | None = None
     level_variance_dn2: float = 0.0
     rows_dn2: tuple[float, float] = (0.0, 0.0)
 
@@ -69,11 +68,11 @@ class MeanFrame:
 
     def _of_rows(self, dark_dn: NDArray[np.floating] | float) -> NDArray[np.float64]:
         """Return the variance of pixels by what their rows do alike, (y,)."""
-        if self.row_variance_dn2 is None:
+        if not any(self.rows_dn2):
             return np.zeros(len(self.mean_dn))
         light = (self.mean_dn - dark_dn).astype(np.float64)
         mean, columns = light.mean(axis=1), light.shape[1]
-        alike = float(np.sum(self.row_variance_dn2 - self.variance_dn2 / columns))
+        alike = len(mean) * (self.rows_dn2[0] - self.variance_dn2 / columns)
         # A pixel that is brighter than others changes by more. Rows that see no light, as under a
         # lamp of another colour, tell nothing.
         relative = alike / max(float(np.sum(np.square(mean))), 1e-12)
@@ -117,16 +116,16 @@ def average(
         levels.append(float(rows[-1].mean()))
     if total is None:
         raise CalibrationError(f"{what}: no frame was taken")
-    spread, of_rows, of_levels, lags = np.nan, None, 0.0, (0.0, 0.0)
+    spread, of_levels, lags = np.nan, 0.0, (0.0, 0.0)
     if count > 1:
-        of_rows, of_levels = np.var(rows, axis=0, ddof=1), float(np.var(levels, ddof=1))
+        of_levels = float(np.var(levels, ddof=1))
         lags = _lags(np.array(rows) - np.mean(rows, axis=0), 1 - 1 / count)
         spread = (squares - _sum_of_squares(total) / count) / total.size / (count - 1)
         _check_steady(levels, float(np.sqrt(spread / total.size)), what, lit)
         if lit:
             _check_rows(np.array(rows), spread / total.shape[1], what)
     mean = (total / count).astype(np.float32)
-    return MeanFrame(mean, spread, count, exposure_s, taken_s, 0.0, of_rows, of_levels, lags)
+    return MeanFrame(mean, spread, count, exposure_s, taken_s, 0.0, of_levels, lags)
 
 
 def _lags(apart: NDArray[np.float64], freedom: float) -> tuple[float, float]:

@@ -439,11 +439,11 @@ def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
 
 def _judged(name: str, one: Parametric, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
-    every = [*judges, *seen]
+    slow2, fast2 = one.fit.brightness_spread**2, unsteadiness2([*judges, *seen])
 
     def judged(board: Board) -> HeldOut:
         predicted = predicted_by_shadow(one.shadow, board)
-        unsteady2 = one.fit.brightness_spread**2 + unsteadiness2(every) / board.repeats
+        unsteady2 = slow2 + fast2 / board.repeats
         return judge(name, board, predicted, unsteady=float(np.sqrt(unsteady2)))
 
     groups = {

@@ -40,8 +40,8 @@ def import_(
     ] = False,
 ) -> None:
     """Make a session of files that another program wrote."""
-    from emmc_rig.acquisition.import_table import ImportedKind, read_table, rows_of_globs
-    from emmc_rig.acquisition.importing import import_session
+    from emmc_rig.importing.session import import_session
+    from emmc_rig.importing.table import ImportedKind, read_table, rows_of_globs
 
     globs: dict[ImportedKind, list[str] | None] = {
         "shot": shots, "dark": darks, "open": whites, "reference": references

@@ -137,14 +137,16 @@ def gathered(
     read: Read,
     noise_sigma: float,
     result: Reconstruction,
+    found: Relief | None = None,
     moved: Motion | None = None,
 ) -> Evidence:
     """Return what there is to say of a light field that was fitted without the readings kept.
 
-    moved: where shots differ most in what they saw, if there are several.
+    found: what the masks make of the usable readings, where it is known. moved: where shots differ
+    most in what they saw, if there are several.
     """
     frames, usable = np.where(read.usable, read.frames, 0), read.usable
-    found = relief(psi, frames, noise_sigma, usable)
+    found = relief(psi, frames, noise_sigma, usable) if found is None else found
     masks = shadow(found)
     off = displaced(psi, found)
     shots = compared(found)

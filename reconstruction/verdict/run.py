@@ -26,7 +26,7 @@ from reconstruction.verdict.evidence import Read, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import Verdict, verdict_from
 from reconstruction.verdict.shadow import relief
-from reconstruction.verdict.shots import Motion, motion
+from reconstruction.verdict.shots import motion
 
 Array = NDArray[np.floating]
 FEWEST_SHORT = 1e-3
@@ -74,7 +74,11 @@ def reconstruct_judged(
             *notes,
             f"{read.short:.1%} of the readings are saturated and count as what they read at least",
         )
-    found = _motion(psi, read, typical, result)
+    shown = np.where(read.usable, read.frames, 0)
+    seen = relief(psi, shown, typical, read.usable)
+    found = None
+    if psi.shots > 1:
+        found = motion(seen, shown - psi.forward(result.light_field), typical)
     if found is not None and found.moved.any():
         took = result.seconds
         del result
@@ -86,7 +90,7 @@ def reconstruct_judged(
             "than the others",
         )
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
-    verdict = verdict_from(gathered(psi, read, typical, result, found))
+    verdict = verdict_from(gathered(psi, read, typical, result, seen, found))
     if psi.colour is not None and (psi.colour == psi.colour.flat[0]).all():
         # Nothing was seen of the others: light without colours, or a picture in one.
         result.light_field[...] = result.light_field[..., psi.colour.flat[0], None]
@@ -98,14 +102,6 @@ def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDA
     if shows_parallax(psi.view_axes):
         return dict(maps)
     return {name.replace("disparity", "shift"): values for name, values in maps.items()}
-
-
-def _motion(
-    psi: ImagingMatrix, read: Read, noise_sigma: float, result: Reconstruction
-) -> Motion | None:
-    frames = np.where(read.usable, read.frames, 0)
-    seen = relief(psi, frames, noise_sigma, read.usable)
-    return motion(seen, frames - psi.forward(result.light_field), noise_sigma)
 
 
 def _short(psi: ImagingMatrix, read: Read, result: Reconstruction) -> NDArray[np.bool_] | None:

@@ -24,7 +24,6 @@ from drivers.camera import EXPOSURE_AGREEMENT
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import BRIGHT_PERCENTILE, figures
 from emmc_rig.acquisition.expand import fittings, mask_offsets_um
-from emmc_rig.acquisition.import_table import LONGEST_S, Listed
 from emmc_rig.acquisition.plan import Checks, Plan, planned_camera
 from emmc_rig.bench.rig_config import IMPORTED
 from emmc_rig.errors import AppError
@@ -32,6 +31,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import refuse_inside_session
 from emmc_rig.files.own_arrays import OwnFrames, read_own
 from emmc_rig.files.results import command_line, versions
+from emmc_rig.importing.table import LONGEST_S, Listed
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.json_text import shown_path
@@ -93,7 +93,7 @@ def import_session(
 ) -> Imported:
     """Write the session of some files.
 
-    listed: the files, see `emmc_rig.acquisition.import_table`. camera: a shipped camera, or a YAML
+    listed: the files, see `emmc_rig.importing.table`. camera: a shipped camera, or a YAML
     file. planes: take the red, green and blue of a colour file as three shots of a monochrome
     sensor. on_file: gets the name of each file that was read. Raises AppError or CameraError,
     with nothing written.

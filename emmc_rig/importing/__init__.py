@@ -1,0 +1,1 @@
+"""Files of another program as a session."""
