@@ -292,7 +292,7 @@ class Bench:
         self.masks_in = True
         self.board_turn_deg = 0.0
         self.camera, self._scene, self._size, self._finer = camera, scene, size, finer
-        self._positions_um, self._window_um, self.rng = positions_um, window_um, rng
+        self.positions_um, self.window_um, self.rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
         self._sensor, self._board, self._lamp, self._seconds = sensor, board, lamp, seconds
         axes = 4 if self._errors.edge_blur_um == 0 else 6
@@ -325,7 +325,7 @@ class Bench:
 
     def _lit(self, lamp: tuple[float, ...]) -> Array:
         """Return the readings under a lamp of this level in red, green and blue."""
-        at_um = self._positions_um()
+        at_um = self.positions_um()
         state = (lamp, self.target, self.shot, self.masks_in, self.board_turn_deg, *at_um.values())
         if state not in self._seen:
             if sum(one.nbytes for one in self._seen.values()) > KEPT_BYTES:
@@ -367,7 +367,7 @@ class Bench:
         """
         camera, size = self.camera, self._size
         k = camera.sensor.binning
-        at_um = self._positions_um()
+        at_um = self.positions_um()
         standing = self.shot, self.masks_in
         psi = np.empty((*camera.views, size[0], 3, size[1]), np.float32)
         try:
@@ -506,6 +506,6 @@ class Bench:
         return np.array(
             [
                 (x_um, y_um, cell_um / 2),
-                (x_um - self._window_um, y_um, window_half_um),
+                (x_um - self.window_um, y_um, window_half_um),
             ]
         )

@@ -141,7 +141,8 @@ def refuse_impossible(rig: Rig, frames: Iterable[PlannedFrame]) -> None:
     exposures_s, gains = rig.camera.exposure_limits_s, rig.camera.gain_limits
     for frame in frames:
         for axis, offset_um in frame.bench.offsets_um.items():
-            _refuse_place(rig, frame, axis, offset_um)
+            if axis not in rig.hands | rig.left:
+                _refuse_place(rig, frame, axis, offset_um)
         exposure_s = frame.exposure_s
         # A camera whose exposure cannot be chosen says for each frame what it is.
         chosen = exposures_s[0] < exposures_s[1]

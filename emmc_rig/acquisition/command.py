@@ -15,6 +15,7 @@ from typing import Any
 
 from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.amend import amendment
+from emmc_rig.acquisition.by_hand import with_hands
 from emmc_rig.acquisition.checks import refuse_impossible
 from emmc_rig.acquisition.control import Control, interruptible
 from emmc_rig.acquisition.estimate import Estimate, known_exposures, pace_of
@@ -122,9 +123,8 @@ def request_from_session(
 
 def planned_frames(request: CaptureRequest, rig: Rig) -> tuple[PlannedFrame, ...]:
     """Return every frame of a request in the order of the capture."""
-    return ordered(
-        expand(request.plan, request.camera, rig.window_um, rig.window_side_um), request.plan.order
-    )
+    frames = expand(request.plan, request.camera, rig.window_um, rig.window_side_um)
+    return ordered(frames, request.plan.order, with_hands(rig, frames).hands)
 
 
 def still_possible(request: CaptureRequest, session: Session) -> tuple[PlannedFrame, ...]:
@@ -274,6 +274,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
         session = begun_session(request)
         rig = open_things.enter_context(opened_rig(request.rig, request.camera, front.ask))
         planned = planned_frames(request, rig)
+        rig = with_hands(rig, planned)
         edit = None
         if session is None:
             frames = tuple(frame for frame in planned if not frame.is_optional)

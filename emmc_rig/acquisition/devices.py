@@ -84,11 +84,15 @@ class Devices:
     def attend(self, planned: PlannedFrame) -> None:
         """Let lamp, board and masks be as a frame needs them; nobody is asked for a dark."""
         bench, sent, attendant = planned.bench, self.sent, self._rig.attendant
-        if bench.lamp != "off" and sent.bench != bench.set_by_hand:
+        wanted = bench.set_by_hand(self._rig.hands)
+        if bench.lamp != "off" and sent.bench != wanted:
             sent.bench = None
             attendant.place(bench.target, bench.board_turn_deg)
             attendant.fit_masks(bench.fitting, bench.masks_in)
-            sent.bench = bench.set_by_hand
+            by_hand = {a: um for a, um in bench.offsets_um.items() if a in self._rig.hands}
+            if by_hand:
+                attendant.move(by_hand)
+            sent.bench = wanted
         self.set_lamp(bench.lamp)
 
     def set_lamp(self, lamp: str) -> None:
@@ -129,7 +133,7 @@ class Devices:
     def read_back_um(self, planned: PlannedFrame) -> dict[str, float]:
         """Return where the axes stand after the exposure; raises when they do not stand there."""
         read_um = {}
-        for axis, offset_um in planned.bench.offsets_um.items():
+        for axis, offset_um in self._driven_um(planned).items():
             at_um = self._rig.stage.position_um(axis) - self._rig.zero_um[axis]
             if abs(at_um - offset_um) > self._plan.checks.stage_um:
                 raise FrameRefusedError(
@@ -178,7 +182,12 @@ class Devices:
     def _wanted_um(self, planned: PlannedFrame) -> dict[str, float]:
         """Return by axis where the stage does not stand yet, from each axis's zero."""
         sent = self.sent.offsets_um
-        return {axis: um for axis, um in planned.bench.offsets_um.items() if sent.get(axis) != um}
+        return {axis: um for axis, um in self._driven_um(planned).items() if sent.get(axis) != um}
+
+    def _driven_um(self, planned: PlannedFrame) -> dict[str, float]:
+        """Return a frame's place on the axes that the stage has."""
+        axes = self._rig.stage.axes
+        return {axis: um for axis, um in planned.bench.offsets_um.items() if axis in axes}
 
     def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
         """Expose one frame, or of a metering frame as many as it takes to find its exposure."""

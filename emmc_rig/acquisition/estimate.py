@@ -7,7 +7,7 @@ guess, and it is said how many.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from statistics import median
 
@@ -57,7 +57,8 @@ class Estimate:
 class Pace:
     """What frames cost in time, learnt from those that were taken.
 
-    waits: whether moves and exposures take their time; those of most simulated rigs do not.
+    waits: whether moves and exposures take their time; those of most simulated rigs do not. hands:
+    axes that somebody moves.
     """
 
     def __init__(
@@ -66,8 +67,10 @@ class Pace:
         settle_s: float,
         frame_bytes: int,
         waits: bool = True,
+        hands: Collection[str] = (),
     ) -> None:
         self._speeds_um_s, self._settle_s, self._waits = speeds_um_s, settle_s, waits
+        self._hands = hands
         self._bytes = frame_bytes + FILE_OVERHEAD_BYTES
         self._usual_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
         self._learnt_s: deque[float] = deque(maxlen=LEARNT_FROM)
@@ -80,9 +83,9 @@ class Pace:
     def moving_s(self, frame: PlannedFrame, at_um: Mapping[str, float]) -> float:
         """Return what it takes to bring the stage from where it stands to a frame's place."""
         moves_s = [
-            _move_s(goal - at_um.get(axis, goal), self._speeds_um_s.get(axis, USUAL_SPEED_UM_S))
+            _move_s(goal - at_um.get(axis, goal), self._speeds_um_s[axis])
             for axis, goal in frame.bench.offsets_um.items()
-            if at_um.get(axis) != goal
+            if axis in self._speeds_um_s and at_um.get(axis) != goal
         ]
         return max(moves_s) + MOVE_S + self._settle_s if moves_s else 0.0
 
@@ -102,8 +105,9 @@ class Pace:
             moving_s += self.moving_s(frame, here_um)
             here_um |= frame.bench.offsets_um
             if frame.bench.lamp != "off":
-                by_hand += stood is not None and stood != frame.bench.set_by_hand
-                stood = frame.bench.set_by_hand
+                wanted = frame.bench.set_by_hand(self._hands)
+                by_hand += stood is not None and stood != wanted
+                stood = wanted
             known_s = exposure_s(frame)
             guessed += known_s is None
             exposing_s += METERING_EXPOSURE_S * frame.light if known_s is None else known_s
@@ -118,7 +122,7 @@ def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
     """Return what frames cost on a rig before any is taken."""
     rows, columns = rig.camera.shape
     speeds_um_s = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
-    return Pace(speeds_um_s, plan.settle_s, 2 * rows * columns, waits)
+    return Pace(speeds_um_s, plan.settle_s, 2 * rows * columns, waits, rig.hands)
 
 
 def known_exposures(

@@ -9,7 +9,7 @@ again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,13 @@ APPROACH_UM = 10.0
 Array = NDArray[np.float64]
 
 
-def ordered(frames: Iterable[PlannedFrame], order: str) -> tuple[PlannedFrame, ...]:
-    """Return the frames in the order of the capture; order: "as-planned" or "least-travel"."""
+def ordered(
+    frames: Iterable[PlannedFrame], order: str, hands: Collection[str] = ()
+) -> tuple[PlannedFrame, ...]:
+    """Return the frames in the order of the capture.
+
+    order: "as-planned" or "least-travel". hands: axes that somebody moves, see `Rig`.
+    """
     frames = tuple(frames)
     if order == "as-planned":
         return frames
@@ -31,11 +36,11 @@ def ordered(frames: Iterable[PlannedFrame], order: str) -> tuple[PlannedFrame, .
         meters = frame.bench.target == "scene" and (
             frame.kind == "metering" or (frame.kind == "dark" and frame.is_exposed_as_shots)
         )
-        key = (frame.part, frame.bench.lamp == "off", meters, *frame.bench.set_by_hand)
+        key = (frame.part, frame.bench.lamp == "off", meters, *frame.bench.set_by_hand(hands))
         groups.setdefault(key, []).append(frame)
     found: list[PlannedFrame] = []
     at_um: dict[str, float] = {}
-    for group in groups.values():
+    for group in _open_before_holes(list(groups.values())) if hands else groups.values():
         places: dict[tuple[tuple[str, float], ...], list[PlannedFrame]] = {}
         checks = [frame for frame in group if frame.kind == "check" and frame.bench.masks_in]
         toured: list[PlannedFrame] = []
@@ -48,6 +53,21 @@ def ordered(frames: Iterable[PlannedFrame], order: str) -> tuple[PlannedFrame, .
             at_um |= dict(place)
         found += spread(toured, checks)
     return tuple(found)
+
+
+def _open_before_holes(groups: list[list[PlannedFrame]]) -> list[list[PlannedFrame]]:
+    """Return groups with open whiteboards before pinholes: they show where the mask stands."""
+    boards = [
+        place
+        for place, group in enumerate(groups)
+        if group[0].bench.target == "whiteboard" and group[0].bench.masks_in
+    ]
+    found = list(groups)
+    for place, other in zip(
+        boards, sorted(boards, key=lambda one: groups[one][0].view is not None), strict=True
+    ):
+        found[place] = groups[other]
+    return found
 
 
 def spread(frames: Sequence[PlannedFrame], checks: Sequence[PlannedFrame]) -> list[PlannedFrame]:

@@ -192,6 +192,10 @@ class Checks(Settings):
     )
     largest_dark: float = Field(default=0.05, gt=0, le=1, description="mean of a dark frame")
     stage_um: float = Field(default=2.0, gt=0, description="read-back after the exposure")
+    places_by_hand: bool = Field(
+        default=True,
+        description="whether whiteboards must show pinhole and mask where hands were to put them",
+    )
     registration_px: float = Field(
         default=0.5, gt=0, description="shift against the last good frame, on resuming"
     )

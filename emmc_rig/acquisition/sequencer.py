@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
+from emmc_rig.acquisition.by_hand import HandPlaces, WrongPlaceError
 from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
@@ -34,6 +35,8 @@ from emmc_rig.bench.hardware import Rig
 from emmc_rig.bench.registration import Shift, registered
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, shown_bytes, versions
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import decode_frame, frame_entry, frame_file
 from emmc_rig.session.journal import (
     ComparedEntry,
@@ -87,6 +90,7 @@ class Sequencer:
         self._devices = Devices(rig, plan)
         self._budget = Budget(plan.retries)
         self._writer = Writer()
+        self._places = self._hand_places()
         self._before: NDArray[np.uint16] | None = None
         self._metered: dict[str, FrameEntry] = {}
         self._left_of_shot: dict[int, set[str]] = {}
@@ -179,6 +183,22 @@ class Sequencer:
             f"the bench is no longer as it was: frame {planned.id}, taken again, {what}; put "
             "the masks back and check lamp and board, or begin another session with --out"
         )
+
+    def _hand_places(self) -> HandPlaces:
+        """Return what finds in frames where hands put things, as the frames so far show the mask.
+
+        Raises AppError where a frame of a session cannot be read.
+        """
+        session, rig = self._session, self._rig
+        hands = rig.hands if self._plan.checks.places_by_hand else frozenset()
+        camera = validated(Camera, session.camera, str(session.folder), AppError)
+        places = HandPlaces(camera, rig.camera.shape, hands)
+        by_id = {frame.id: frame for frame in session.frames}
+        for name, entry in session.stored.items() if hands else ():
+            if name in by_id and places.shows(by_id[name]):
+                places.stand(by_id[name], decode_frame(session.read(name), entry))
+                break
+        return places
 
     # What comes next.
 
@@ -293,15 +313,21 @@ class Sequencer:
             devices.attend(planned)
         frame, found = devices.move_and_expose(planned, self._exposure_s(planned), span)
         with span("read back", planned):
-            read_um = devices.read_back_um(planned)
+            read_um, unsure_um = devices.read_back_um(planned), {}
         with span("check", planned):
             may_saturate = planned.id in self._may_saturate
             check(planned, frame, found, self._before, self._plan.checks, may_saturate)
+            place = self._places.found(planned, frame)
+            if place is not None:
+                read_um |= place.um
+                unsure_um = dict.fromkeys(place.um, place.deviation_um)
         self._watcher.taken(planned, frame, found)
         span.seconds.update(self._handed)
         handing = Spans(self._now_s, self._watcher)
         with handing("hand over", planned):
-            self._hand_over(planned, frame, found, read_um, dict(span.seconds), attempts)
+            self._hand_over(
+                planned, frame, found, (read_um, unsure_um), dict(span.seconds), attempts
+            )
         self._handed, self._before = handing.seconds, frame.mosaic
 
     def _exposure_s(self, planned: PlannedFrame) -> float:
@@ -365,6 +391,8 @@ class Sequencer:
                 self._note(RetryEntry(id=name, fault=str(error), attempt=faults, at_s=at_s))
                 self._budget.spend(name, error, faults)
                 self._watcher.tell(f"{name}, try {faults}: {error}")
+                if isinstance(error, WrongPlaceError):
+                    self._rig.attendant.again()
                 todo = partial(self._devices.mend, mending(error, faults))
 
     # Store.
@@ -374,11 +402,14 @@ class Sequencer:
         planned: PlannedFrame,
         frame: RawFrame,
         found: Figures,
-        read_um: dict[str, float],
+        places_um: tuple[dict[str, float], dict[str, float]],
         spans_s: dict[str, tuple[float, float]],
         attempts: int,
     ) -> None:
-        """Give a frame to the writer's thread, with what its journal line says."""
+        """Give a frame to the writer's thread, with what its journal line says.
+
+        places_um: where axes read to stand, and the deviation of those that the frame shows.
+        """
         camera = self._devices.camera
         entry = frame_entry(
             frame,
@@ -389,7 +420,8 @@ class Sequencer:
             plan=self._session.amendments,
             lamp=planned.bench.lamp,
             commanded_um=dict(planned.bench.offsets_um),
-            read_um=read_um,
+            read_um=places_um[0],
+            deviation_um=places_um[1],
             figures=found,
             attempts=attempts,
             wall=self._wall(),

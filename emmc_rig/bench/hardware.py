@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from drivers.apt import identify as identify_apt
 from drivers.camera import Camera as CameraDevice
 from drivers.cameras import CAMERA_HELP, CAMERAS
 from drivers.clock import SYSTEM_CLOCK, Clock
+from drivers.combined import CombinedStage
 from drivers.dng import SMALLEST_SIDE_PX
 from drivers.errors import DriverError, TransportTimeoutError
 from drivers.grbl import GrblStage
@@ -43,6 +44,7 @@ from emmc_rig.bench.stage_config import (
     SerialConfig,
     ZaberConfig,
     parse_stage,
+    stage_of,
 )
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
@@ -54,7 +56,7 @@ from simulators.bench import RAYS_PER_VIEW, Bench, window_side_um
 from simulators.clock import ManualClock
 from simulators.effects import Flaws
 from simulators.firmware import SimulatedController
-from simulators.grbl import GrblController
+from simulators.grbl import LETTERS, GrblController
 from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
 from simulators.usb import SimulatedUsb
 from simulators.wire import PtyServer
@@ -73,6 +75,7 @@ FOCUS, FOCUS_ADDRESS = "focus", (3, 1)
 MASK_TRAVEL_UM = 25_400.0
 POSITION_TOLERANCE_UM = 0.5
 SIMULATED = "simulated"
+NO_STAGE = "none"
 PROBE_TIMEOUT_S = 0.2
 NO_FLAWS = Flaws()
 """But for a mask that sits a few um off, as every one does."""
@@ -99,6 +102,14 @@ class Attendant(Protocol):
         """Fit the masks and the filter of a shot; or only its filter, the masks taken out."""
         ...
 
+    def move(self, offsets_um: Mapping[str, float]) -> None:
+        """Bring axes that the stage has not to their places, from where each is centred."""
+        ...
+
+    def again(self) -> None:
+        """Take nothing for done any more: what was asked for is not what came."""
+        ...
+
 
 def _unheard(name: str) -> None:
     """Take no notice: real noise needs no name."""
@@ -114,7 +125,8 @@ class Rig:
     about_to_expose: called with a frame's name before its exposure. window_side_um: side of that
     square window, to put its edges between views; None: not known. stands_um: where axes that no
     plan moves stand in a capture, as the focus. recorded_s: of a recording that is replayed, the
-    exposure of each frame by its name.
+    exposure of each frame by its name. hands: axes that the stage has not, which the attendant
+    moves; left: such that stay where they are, as every frame wants them at one place.
     """
 
     stage: Stage
@@ -128,6 +140,23 @@ class Rig:
     window_side_um: float | None = None
     stands_um: Mapping[str, float] = field(default_factory=dict)
     recorded_s: Mapping[str, float] = field(default_factory=dict)
+    hands: frozenset[str] = frozenset()
+    left: frozenset[str] = frozenset()
+
+
+RigType = TypeVar("RigType", bound=Rig)
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Which of the four axes a simulated rig has, and those among them of a second controller.
+
+    hands_um: how far, at most, a hand that moves the others puts them off their places.
+    """
+
+    names: tuple[str, ...] = tuple(STAGE_AXES)
+    second: tuple[str, ...] = ()
+    hands_um: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -139,10 +168,14 @@ class SimulatedRig(Rig):
 
 
 class SimulatedAttendant:
-    """An `Attendant` that acts on the simulated bench."""
+    """An `Attendant` that acts on the simulated bench.
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    at_um: gets where a hand puts what no axis moves; hands_um: how far off at most.
+    """
+
+    def __init__(self, bench: Bench, at_um: dict[str, float], hands_um: float, seed: int) -> None:
+        self._bench, self._at_um, self._hands_um = bench, at_um, hands_um
+        self._rng = np.random.default_rng(seed)
 
     def set_lamp(self, colour: str) -> None:
         """Switch the bench's lamp."""
@@ -157,6 +190,17 @@ class SimulatedAttendant:
         self._bench.shot = shot
         self._bench.masks_in = fitted
 
+    def move(self, offsets_um: Mapping[str, float]) -> None:
+        """Put mask or pinhole there, as well as a hand does; an open aperture is just open."""
+        opened = offsets_um.get("aperture_x") == self._bench.window_um
+        for axis, um in offsets_um.items():
+            exact = opened and axis.startswith("aperture")
+            off_um = 0.0 if exact else self._rng.uniform(-self._hands_um, self._hands_um)
+            self._at_um[axis] = um + off_um
+
+    def again(self) -> None:
+        """Nothing is remembered."""
+
 
 def simulated_rig(
     camera: Camera,
@@ -168,6 +212,7 @@ def simulated_rig(
     flaws: Flaws = NO_FLAWS,
     focus_um: float | None = None,
     stands_um: Mapping[str, float] | None = None,
+    moved: Axes = Axes(),
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 
@@ -176,7 +221,7 @@ def simulated_rig(
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
     pixel; few are quick, and grainy beside a good sensor's noise. flaws: what is wrong with
     it. focus_um: where a fifth axis, `focus`, has the scene sharp; None: there is none. stands_um:
-    see `Rig`. Raises AppError for a size that the camera's RAW files cannot hold.
+    see `Rig`. moved: by what. Raises AppError for a size that the camera's RAW files cannot hold.
     """
     k = camera.sensor.binning
     if min(size) // k < SMALLEST_SIDE_PX:
@@ -188,19 +233,30 @@ def simulated_rig(
     clock = clock or ManualClock()
     aperture_um = max(camera.views) * camera.lens.aperture_cell_um
     travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um, 3: MASK_TRAVEL_UM}
-    axes = STAGE_AXES if focus_um is None else STAGE_AXES | {FOCUS: FOCUS_ADDRESS}
-    chain = ZaberChain(clock, {key: AxisSpec(travel_um=travel_um[key[0]]) for key in axes.values()})
-    zero_um = {
+    addresses = STAGE_AXES if focus_um is None else STAGE_AXES | {FOCUS: FOCUS_ADDRESS}
+    driven = {name for name in (*moved.names, FOCUS) if name not in moved.second}
+    axes = {name: address for name, address in addresses.items() if name in driven}
+    letters = dict(zip(moved.second, LETTERS, strict=False))
+    specs = {name: AxisSpec(travel_um=travel_um[addresses[name][0]]) for name in addresses}
+    chain = ZaberChain(clock, {addresses[name]: spec for name, spec in specs.items()})
+    second = GrblController(clock, {letter: specs[name] for name, letter in letters.items()})
+    middle_um = {
         name: (MASK_TRAVEL_UM / 2 if device == 1 else aperture_um)
         for name, (device, _) in STAGE_AXES.items()
     }
+    # What Grbl calls zero is the upper end of the travel; what a micrometer does, the middle.
+    zero_um = {
+        name: um - (specs[name].travel_um if name in letters else 0.0)
+        for name, um in middle_um.items()
+        if name in moved.names
+    }
+    by_hand_um = {name: 0.0 for name in STAGE_AXES if name not in moved.names}
 
     def positions_um() -> dict[str, float]:
-        sharp_um = {} if focus_um is None else {FOCUS: focus_um}
-        return {
-            name: chain.position_um(*address) - (zero_um | sharp_um)[name]
-            for name, address in axes.items()
-        }
+        real = {name: chain.position_um(*address) for name, address in axes.items()}
+        real |= {name: second.position_um(letter) for name, letter in letters.items()}
+        centred_um = middle_um if focus_um is None else middle_um | {FOCUS: focus_um}
+        return {name: um - centred_um[name] for name, um in real.items()} | by_hand_um
 
     window_um = 2 * aperture_um
     rng = np.random.default_rng(seed)
@@ -219,13 +275,14 @@ def simulated_rig(
         flaws.lamp,
         clock.now_s,
     )
-    stage = ZaberStage(
-        chain.transport(),
-        axes,
-        microstep_um=AxisSpec().microstep_um,
-        clock=clock,
-        settings=StageSettings(tolerance_um=POSITION_TOLERANCE_UM),
-    )
+    care = StageSettings(tolerance_um=POSITION_TOLERANCE_UM)
+    stages: list[Stage] = []
+    if axes:
+        scale_um = AxisSpec().microstep_um
+        stages.append(ZaberStage(chain.transport(), axes, scale_um, clock, care))
+    if letters:
+        stages.append(GrblStage(second.transport(), letters, clock, care))
+    stage = stages[0] if len(stages) == 1 else CombinedStage(stages)
     noise = camera.sensor.noise
     cfa = camera.sensor.cfa_name
     simulator = PtpCameraSimulator(
@@ -249,7 +306,7 @@ def simulated_rig(
     rig = SimulatedRig(
         stage,
         opened(),
-        SimulatedAttendant(bench),
+        SimulatedAttendant(bench, by_hand_um, moved.hands_um, seed),
         zero_um,
         window_um,
         clock,
@@ -263,19 +320,40 @@ def simulated_rig(
     return rig, bench
 
 
-def open_stage(spec: str, settings: Mapping[str, Any] | None = None) -> Stage:
+def open_stages(specs: Sequence[str | Mapping[str, Any]]) -> Stage:
+    """Return one stage of all that are named, each as `open_stage` takes it; it must be closed.
+
+    Raises AppError, also for an axis that two of them have, or a `DriverError`.
+    """
+    with ExitStack() as opened:
+        stages = [opened.enter_context(open_stage(one)) for one in specs if one != NO_STAGE]
+        if len(stages) == 1:
+            combined: Stage = stages[0]
+        else:
+            try:
+                combined = CombinedStage(stages)
+            except ValueError as fault:
+                raise AppError(f"the rig's stages: {fault}") from fault
+        opened.pop_all()
+    return combined
+
+
+def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None = None) -> Stage:
     """Return the stage that `spec` names, connected; it must be closed.
 
     spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
-    `emmc_rig.bench.stage_config`;
+    `emmc_rig.bench.stage_config`, or what such a file says;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
     once. settings: single settings that replace those of the file.
     Raises AppError or a `DriverError`.
     """
-    name, _, protocol = spec.partition(":")
-    if name == SIMULATED:
-        return open_simulated(protocol or "zaber", settings)[0]
-    config = parse_stage(spec, settings)
+    if isinstance(spec, str):
+        name, _, protocol = spec.partition(":")
+        if name == SIMULATED:
+            return open_simulated(protocol or "zaber", settings)[0]
+        config = parse_stage(spec, settings)
+    else:
+        config = stage_of({**spec, **(settings or {})}, "the rig's stage")
     if isinstance(config, PluginConfig):
         care = config.stage_settings()
         return open_plug_in(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,15 @@ from pydantic import Field, field_validator
 
 from drivers.clock import SYSTEM_CLOCK
 from drivers.stage import Stage
+from emmc_rig.bench.hands import Ask, AskingAttendant, NoAttendant
 from emmc_rig.bench.hardware import (
     NO_FLAWS,
+    NO_STAGE,
     STAGE_AXES,
+    Axes,
     Rig,
     open_camera,
-    open_stage,
+    open_stages,
     simulated_rig,
 )
 from emmc_rig.errors import AppError
@@ -35,10 +38,10 @@ SIMULATED = "simulated"
 IMPORTED = "imported"
 """What a session has for a rig whose frames are files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
-LATER = ("focus_um", "stands_um", "mask")
+LATER = ("focus_um", "stands_um", "mask", "axes", "second_stage", "hands_um")
+StageSpec = str | dict[str, Any]
 NO_SETTINGS = ("kind", "trigger")
 """What a description has, or had in version 0.2, beside the settings of a rig."""
-Ask = Callable[[str], None]
 
 
 class Mounting(Settings):
@@ -72,16 +75,18 @@ class AnyRig(Settings):
 class RealRig(AnyRig):
     """Real devices.
 
-    stage: as `--stage` of `emmc-rig devices`, with axes mask_x, mask_y, aperture_x, aperture_y as
-    far as the plan moves them. camera: as its `--camera`. zero_um: by axis, where the mask, or
-    the pinhole of the aperture plate, is centred. window_um: what aperture_x adds to that for the
+    stage: as `--stage` of `emmc-rig devices`, or what its YAML file says, or a list of several;
+    `none` where nothing moves. Its axes are called mask_x, mask_y, aperture_x, aperture_y, as many
+    of them as there are. camera: as its `--camera`. zero_um: by axis, where the mask, or
+    the pinhole of the aperture plate, is centred; of one that a hand moves, what its micrometer
+    reads there. window_um: what aperture_x adds to that for the
     plate's open window; window_side_um: its side, for plans that open parts of the aperture.
     Of a recording (camera `folder:DIR`, stage `simulated`) neither has to be given.
-    by_hand: somebody is asked for what no axis moves: lamp, board, masks; if
+    by_hand: somebody is asked for what no axis moves: lamp, board, masks, pinhole; if
     not, nothing of that changes, as in a recording that is replayed.
     """
 
-    stage: str
+    stage: StageSpec | list[StageSpec] = NO_STAGE
     camera: str
     zero_um: dict[str, float] = Field(default_factory=dict)
     window_um: float = 0.0
@@ -89,19 +94,39 @@ class RealRig(AnyRig):
     by_hand: bool = True
 
 
-class FocusedRig(AnyRig):
-    """A YAML file for the simulated rig with a focus axis."""
+class SimulatedAxes(AnyRig):
+    """Which axes a simulated rig has.
+
+    focus_um: where its focus axis, if it has one, has the scene sharp. axes: of mask_x, mask_y,
+    aperture_x and aperture_y. second_stage: those of them that a second controller moves. hands_um:
+    how far, at most, a hand that moves the others puts them off their places.
+    """
+
+    focus_um: float | None = Field(default=None, gt=0)
+    axes: tuple[str, ...] = tuple(STAGE_AXES)
+    second_stage: tuple[str, ...] = ()
+    hands_um: float = Field(default=0.0, ge=0)
+
+    @field_validator("axes", "second_stage")
+    @classmethod
+    def _of_the_bench(cls, axes: tuple[str, ...]) -> tuple[str, ...]:
+        for axis in axes:
+            if axis not in STAGE_AXES:
+                raise ValueError(f"{axis} is no axis of the bench: use {', '.join(STAGE_AXES)}")
+        return axes
+
+
+class SimulatedFile(SimulatedAxes):
+    """A YAML file for the simulated rig."""
 
     kind: Literal["simulated"]
-    focus_um: float = Field(gt=0)
 
 
-class ImagedRig(AnyRig):
+class ImagedRig(SimulatedAxes):
     """The simulated rig before a scene; size: rows and columns of the light field.
 
     rays: per view and pixel; calibration to a per cent needs 1024 or more. flaws: what is
-    wrong with it, by the names of `simulators.effects`. focus_um: where its focus axis, if it has
-    one, has the scene sharp.
+    wrong with it, by the names of `simulators.effects`.
     """
 
     scene: str
@@ -110,7 +135,6 @@ class ImagedRig(AnyRig):
     real_time: bool = False
     rays: int = Field(default=RAYS_PER_VIEW, ge=16)
     flaws: tuple[str, ...] = ()
-    focus_um: float | None = Field(default=None, gt=0)
 
     @field_validator("flaws")
     @classmethod
@@ -120,55 +144,6 @@ class ImagedRig(AnyRig):
             if name not in known:
                 raise ValueError(f"{name!r} is no flaw of the bench: use {', '.join(known)}")
         return flaws
-
-
-class AskingAttendant:
-    """An `Attendant` who is a person: asked, and asked again only when something changes."""
-
-    def __init__(self, camera: Camera, ask: Ask) -> None:
-        self._camera, self._ask = camera, ask
-        self._done: dict[str, str] = {}
-
-    def set_lamp(self, colour: str) -> None:
-        """Ask for the lamp."""
-        off = "switch the lamp off"
-        self._want("lamp", off if colour == "off" else f"switch the {colour} lamp on")
-
-    def place(self, target: str, turn_deg: float = 0.0) -> None:
-        """Ask for the scene or the board."""
-        turned = ""
-        if turn_deg:
-            turned = f", turned in its plane by {turn_deg:g} degrees from how it first stood"
-            turned += ", every time the same way round"
-        self._want("target", f"put the {target} before the camera{turned}")
-
-    def fit_masks(self, shot: int, fitted: bool = True) -> None:
-        """Ask for masks and filter."""
-        names = ", ".join(self._camera.shot_masks(shot)) if fitted else ""
-        chosen = self._camera.shots[shot].filter
-        masks = f"put in the masks {names}" if names else "take all masks out"
-        colour = "take any filter out" if chosen == "none" else f"put in the {chosen} filter"
-        self._want("masks", masks)
-        if any(one.filter != "none" for one in self._camera.shots):
-            self._want("filter", colour)
-
-    def _want(self, what: str, wish: str) -> None:
-        if self._done.get(what) != wish:
-            self._ask(wish)
-            self._done[what] = wish
-
-
-class NoAttendant:
-    """An `Attendant` of a bench on which nothing ever changes."""
-
-    def set_lamp(self, colour: str) -> None:
-        """Leave the lamp as it is."""
-
-    def place(self, target: str, turn_deg: float = 0.0) -> None:
-        """Leave the board or scene where it is."""
-
-    def fit_masks(self, shot: int, fitted: bool = True) -> None:
-        """Leave the masks in or out."""
 
 
 def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
@@ -185,22 +160,31 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
         )
     read = read_yaml(Path(spec), AppError)
     if isinstance(read, dict) and read.get("kind") == SIMULATED:
-        focused = validated(FocusedRig, read, spec, AppError)
-        more = {name: getattr(focused, name) for name in LATER}
+        given = validated(SimulatedFile, read, spec, AppError)
+        more = {name: getattr(given, name) for name in LATER}
         return _described(SIMULATED, imaged.model_copy(update=more))
-    config = validated(RealRig, read, spec, AppError)
-    described = _described("real", config)
-    beside = Path(spec).parent / config.stage
-    if beside.is_file():
-        described["stage"] = str(beside.resolve())
+    described = _described("real", validated(RealRig, read, spec, AppError))
+    found = [_stage_file(one, Path(spec).parent) for one in _several(described["stage"])]
+    described["stage"] = found if isinstance(described["stage"], list) else found[0]
     return described
+
+
+def _several(stages: StageSpec | list[StageSpec]) -> list[StageSpec]:
+    return stages if isinstance(stages, list) else [stages]
+
+
+def _stage_file(stage: StageSpec, beside: Path) -> StageSpec:
+    """Return a stage, the name of a file that lies beside the rig's as a whole path."""
+    if isinstance(stage, str) and (beside / stage).is_file():
+        return str((beside / stage).resolve())
+    return stage
 
 
 def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
     """Return a rig as plain data; without what came later it reads as before there was any."""
     described = config.model_dump(mode="json")
     for name in LATER:
-        if name in described and not described[name]:
+        if name in described and described[name] in (None, {}, [], 0.0, list(STAGE_AXES)):
             del described[name]
     return {"kind": kind, **described}
 
@@ -279,6 +263,7 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             flawed(NO_FLAWS, imaged.flaws),
             imaged.focus_um,
             imaged.stands_um,
+            Axes(imaged.axes, imaged.second_stage, imaged.hands_um),
         )
         _check_axes(imaged, rig)
         yield rig
@@ -290,12 +275,14 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
         still: Stage = StillStage((*STAGE_AXES, *real.stands_um), SYSTEM_CLOCK, 0.0, ANYWHERE_UM)
         zero_um = dict.fromkeys(STAGE_AXES, 0.0) | zero_um
     else:
-        still = open_stage(real.stage)
+        still = open_stages(_several(real.stage))
     with still as stage, closing(open_camera(real.camera)) as device:
         rig = Rig(
             stage,
             device,
-            AskingAttendant(camera, ask) if real.by_hand else NoAttendant(),
+            AskingAttendant(camera, ask, zero_um, real.window_um)
+            if real.by_hand
+            else NoAttendant(),
             zero_um,
             real.window_um,
             reopen_camera=lambda: open_camera(real.camera),

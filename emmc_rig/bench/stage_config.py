@@ -157,7 +157,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
             f"--stage {shown}: write PROTOCOL:PORT with one of {', '.join(known)}, such as "
             "zaber:/dev/ttyUSB0, or the name of a YAML file"
         )
-    return _validated(data | dict(overrides or {}), shown)
+    return stage_of(data | dict(overrides or {}), shown)
 
 
 def _require_actuators(axes: Any, source: str) -> None:
@@ -180,7 +180,8 @@ def _option(spec: str, text: str) -> tuple[str, Any]:
     return name.strip(), parse_yaml(value, f"--stage {spec}", AppError)
 
 
-def _validated(data: dict[str, Any], source: str) -> StageConfig:
+def stage_of(data: dict[str, Any], source: str) -> StageConfig:
+    """Return the stage that settings describe; raises AppError that begins with `source`."""
     protocol = str(data.get("protocol", ""))
     known = stage_protocols()
     if protocol not in known:

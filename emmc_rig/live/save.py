@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.acquisition.plan import Plan, load_plan
-from emmc_rig.bench.rig_config import SIMULATED, FocusedRig, RealRig
+from emmc_rig.bench.rig_config import SIMULATED, RealRig, SimulatedFile
 from emmc_rig.errors import AppError
 from emmc_rig.files.yaml_edit import Key, replace_text, with_values
 from emmc_rig.live.alignment import MaskPlace
@@ -80,7 +80,7 @@ class Files:
         before = path.read_text(encoding="utf-8")
         after = with_values(before, values, str(path))
         read = parse_yaml(after, str(path), AppError)
-        simulated = FocusedRig if _kind(read) == SIMULATED else RealRig
+        simulated = SimulatedFile if _kind(read) == SIMULATED else RealRig
         validated(Plan if path == self._plan else simulated, read, str(path), AppError)
         if after != before:
             self._previewed[path] = before, after

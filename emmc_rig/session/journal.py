@@ -106,8 +106,9 @@ class FrameEntry(Entry):
     """A frame is stored.
 
     run: counted from 1. plan: number of the amendment that it was taken by. camera_sha256: of the
-    camera's own bytes, where `file` is a DNG of the mosaic that holds them. spans_s: by step, its
-    begin and end in seconds of the run.
+    camera's own bytes, where `file` is a DNG of the mosaic that holds them. read_um: where the axes
+    read to stand; of one that a hand moved, where the frame shows it, to `deviation_um`. spans_s:
+    by step, its begin and end in seconds of the run.
     """
 
     kind: Literal["frame"] = "frame"
@@ -130,6 +131,7 @@ class FrameEntry(Entry):
     lamp: str = ""
     commanded_um: dict[str, float] = {}
     read_um: dict[str, float] = {}
+    deviation_um: dict[str, float] = {}
     figures: Figures
     triggered: bool = False
     attempts: int = 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
 
@@ -32,10 +32,13 @@ class Bench:
     offsets_um: Mapping[str, float] = field(default_factory=dict)
     board_turn_deg: float = 0.0
 
-    @property
-    def set_by_hand(self) -> tuple[str, int, bool, float]:
-        """What somebody has to do at the bench: the same for frames that need no hand between."""
-        return self.target, self.fitting, self.masks_in, self.board_turn_deg
+    def set_by_hand(self, axes: Collection[str] = ()) -> tuple:
+        """Return what somebody has to do at the bench: the same where no hand is needed between.
+
+        axes: those that a hand moves.
+        """
+        places = tuple(self.offsets_um.get(axis) for axis in sorted(axes))
+        return self.target, self.fitting, self.masks_in, self.board_turn_deg, *places
 
 
 @dataclass(frozen=True)

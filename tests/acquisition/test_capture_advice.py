@@ -32,7 +32,8 @@ from emmc_rig import cli
 from emmc_rig.acquisition import command, sequencer
 from emmc_rig.acquisition.checks import SaturatedError
 from emmc_rig.acquisition.retries import HOPELESS
-from emmc_rig.bench.rig_config import AskingAttendant, opened_rig
+from emmc_rig.bench.hands import AskingAttendant
+from emmc_rig.bench.rig_config import opened_rig
 from emmc_rig.session import session as session_module
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.journal import RetryEntry, of_kind

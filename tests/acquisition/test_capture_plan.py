@@ -126,7 +126,7 @@ def test_places_of_a_line_or_a_grid_are_hardly_more_than_a_step_from_the_one_bef
 
 def test_the_bench_is_changed_by_hand_as_rarely_as_can_be():
     def changes(frames):
-        stood = [f.bench.set_by_hand for f in frames if f.bench.lamp != "off"]
+        stood = [f.bench.set_by_hand() for f in frames if f.bench.lamp != "off"]
         return sum(a != b for a, b in pairwise(stood))
 
     assert changes(ordered(frames_of(plan_of()), "least-travel")) == 2

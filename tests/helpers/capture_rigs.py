@@ -71,6 +71,12 @@ class QuietAttendant:
     def fit_masks(self, shot, fitted=True):
         self.asked.append(("masks", shot, fitted))
 
+    def move(self, offsets_um):
+        self.asked.append(("move", dict(offsets_um)))
+
+    def again(self):
+        self.asked.append(("again",))
+
     @property
     def lamp(self):
         return [one[1] for one in self.asked if one[0] == "lamp"][-1]

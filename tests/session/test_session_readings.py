@@ -13,10 +13,10 @@ from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import NO_FLAWS, open_camera, simulated_rig
 from emmc_rig.bench.rig_config import (
     SIMULATED,
-    AskingAttendant,
     ImagedRig,
     RealRig,
     rig_description,
