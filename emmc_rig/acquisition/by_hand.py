@@ -213,22 +213,21 @@ class HandPlaces:
         centre_um = np.array([offsets.get(axis, 0.0) for axis in MASK])
         how = views_open(self._camera.views, view, planned.window)
 
-        def modelled(shadow: Shadow, at_um: NDArray[np.float64], every: int, slopes: bool) -> tuple:
+        def stands(at_um: NDArray[np.float64]) -> tuple[tuple[float, float], int]:
             x, y = centre_um + at_um
-            stage_um, pattern = (float(x), float(y)), shot % len(mask.cells)
-            ask = shadow.with_slopes if slopes else shadow.readings
-            return ask(pixels[::every], channels[::every], how, stage_um, pattern)
+            return (float(x), float(y)), shot % len(mask.cells)
 
         def explained(at_um: NDArray[np.float64], every: int = 1) -> float:
-            read_so = modelled(self._shadow, at_um, every, False)
-            return _explained(read[::every], read_so, channels[::every])
+            some, seen_by = pixels[::every], channels[::every]
+            shown = self._shadow.readings(some, seen_by, how, *stands(at_um))
+            return _explained(read[::every], shown, seen_by)
 
         few = max(1, len(read) // FEW_PIXELS)
         at_um = max(starts_um, key=lambda one: explained(one, few))
         chosen = [SCALARS.index(name) for name in fitted]
         deviation_um = np.inf
         for _ in range(ROUNDS):
-            now, slopes = modelled(self._shadow, at_um, 1, True)
+            now, slopes = self._shadow.with_slopes(pixels, channels, how, *stands(at_um))
             step, deviation_um = _step(read, now, slopes[:, chosen], channels)
             longest = float(np.abs(step[:2]).max())
             step *= min(1.0, mask.cell_um / 4 / max(longest, 1e-12))

@@ -184,7 +184,9 @@ def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
     """Return a rig as plain data; without what came later it reads as before there was any."""
     described = config.model_dump(mode="json")
     for name in LATER:
-        if name in described and described[name] in (None, {}, [], 0.0, list(STAGE_AXES)):
+        if name in described and getattr(config, name) == type(config).model_fields[
+            name
+        ].get_default(call_default_factory=True):
             del described[name]
     return {"kind": kind, **described}
 

@@ -127,6 +127,89 @@ def probe(
 
 
 @app.command()
+def check(
+    rig: Annotated[str, typer.Argument(help="simulated, or the YAML file of a rig")],
+    camera: Annotated[
+        str, typer.Option("--camera", help="only this one, in every way: shipped, or a YAML file")
+    ] = "",
+) -> None:
+    """Open a rig, and say what it can do: cameras, shots, calibration, what one part would buy."""
+    from emmc_rig.bench.hands import NoAttendant
+    from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
+    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.model.camera import shipped_camera_files
+    from emmc_rig.processing.bench_check import ability, shown_error
+
+    names = (
+        [camera]
+        if camera
+        else [name for name in sorted(shipped_camera_files()) if find_camera(name).masks]
+    )
+    described = rig_description(rig, ImagedRig(scene="deep-occlusions", size=(48, 64), rays=16))
+    with opened_rig(described, find_camera(names[0]), lambda wish: None) as opened:
+        axes = opened.stage.axes
+        hands = not isinstance(opened.attendant, NoAttendant)
+        identity = opened.camera.identity
+        show_table(
+            ("part", rig),
+            [
+                ("stage axes", ", ".join(axes) or "none"),
+                ("camera", f"{identity.maker} {identity.model} {identity.serial}".strip()),
+                ("moved by hand", "what no axis moves" if hands else "nothing (by_hand: false)"),
+            ],
+        )
+    with shown_progress() as progress:
+        progress.begin("cameras", len(names))
+        found = []
+        for name in names:
+            found.append(ability(name, find_camera(name), axes, hands))
+            progress.step(name)
+    if camera:
+        one = found[0]
+        tell(f"{camera}: {one.shots} of {one.of_shots} shots, {one.by_hand} mask moves by hand")
+        show_table(
+            ("calibration", "axes", "by hand", "error of Psi"),
+            [
+                (
+                    way.name,
+                    ", ".join(way.axes) or "none",
+                    f"{one.hands(way)} moves" if way.name in one.possible else "not possible",
+                    shown_error(way.error),
+                )
+                for way in one.calibrations
+            ],
+        )
+    else:
+        show_table(
+            ("camera", "shots", "calibration", "by hand", "error of Psi", "one more part"),
+            [
+                (
+                    one.camera,
+                    f"{one.shots} of {one.of_shots}",
+                    one.best.name,
+                    f"{one.hands(one.best) + one.by_hand} moves",
+                    shown_error(one.best.error),
+                    one.more(axes),
+                )
+                for one in found
+            ],
+        )
+    give_result(
+        rig=rig,
+        axes=list(axes),
+        cameras={
+            one.camera: {
+                "shots": one.shots,
+                "calibration": one.best.name,
+                "relative_error": one.best.error,
+                "moves_by_hand": one.hands(one.best) + one.by_hand,
+            }
+            for one in found
+        },
+    )
+
+
+@app.command()
 def info(stage: StageOption = None, rig: RigOption = None) -> None:
     """Show every axis of a stage: homed, position, limits, speed."""
     with _opened(stage, rig) as opened:

@@ -1,5 +1,6 @@
-"""A bench with fewer axes than the plan moves: a person moves the rest, and the frames show where."""
+"""A bench with fewer axes than the plan moves: a person moves the rest, frames show where."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,9 @@ from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.bench.hands import AskingAttendant, NoAttendant, hole_name
 from emmc_rig.bench.hardware import Axes, simulated_rig
 from emmc_rig.errors import AppError
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.processing.bench_check import ability
 from emmc_rig.session.journal import RetryEntry, of_kind
 from emmc_rig.session.session import Session
 
@@ -132,7 +135,7 @@ def test_wrong_holes_are_named_and_asked_for_again(tmp_path, monkeypatch, run):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
     (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_x, mask_y]\nhands_um: 100\n")
     plan, rig = tmp_path / "plan.yaml", tmp_path / "rig.yaml"
-    code, _, err = run("capture", plan, "--rig", rig, "--size", "48x64", "--rays", 64, "--yes")
+    code, _, err = run("capture", plan, "--rig", rig, "--size", "48x64", "--rays", 64)
     assert code == 0, err
     session = Session(tmp_path / "plan-session")
     faults = [entry.fault for entry in of_kind(session.journal.entries, RetryEntry)]
@@ -156,3 +159,33 @@ def test_a_simulated_rig_with_an_axis_that_no_bench_has_is_refused(tmp_path, run
     code, _, err = run("capture", tmp_path / "plan.yaml", "--rig", tmp_path / "rig.yaml")
     assert code == 1
     assert "mask_z is no axis of the bench: use mask_x, mask_y" in one_line(err)
+
+
+def test_a_bench_is_told_what_it_can_do_and_what_one_more_part_would_buy(tmp_path, run):
+    (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_x, mask_y]\n")
+    code, out, err = run("devices", "check", tmp_path / "rig.yaml", "--json",
+                         "--camera", "rgbw-bayer-3shots")  # fmt: skip
+    assert code == 0, err
+    found = json.loads(out.splitlines()[-1])["cameras"]["rgbw-bayer-3shots"]
+    assert found["shots"] == 3
+    assert found["calibration"] == "pinhole before every view"
+    assert found["moves_by_hand"] == 26
+    assert 0.001 < found["relative_error"] < 0.005
+
+
+@pytest.mark.parametrize(
+    ("axes", "hands", "best", "shots"),
+    [
+        ("", False, "aperture open, mask still", 1),
+        ("mask_x,mask_y", False, "aperture open, mask moved", 3),
+        ("mask_x,mask_y,aperture_x,aperture_y", False, "pinhole before every view", 3),
+        ("", True, "pinhole before every view", 3),
+    ],
+)
+def test_the_surest_calibration_is_one_that_stage_and_hands_allow(axes, hands, best, shots):
+    found = ability("x", find_camera("rgbw-bayer-3shots"), axes.split(",") if axes else [], hands)
+    assert found.best.name == best
+    assert found.shots == shots
+    errors = [way.error for way in found.calibrations if way.error is not None]
+    assert errors == sorted(errors)
+    assert bool(found.more(axes.split(","))) == ("aperture_x" not in axes)
