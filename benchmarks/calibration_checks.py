@@ -3,7 +3,7 @@
 Every session is planned, captured by the sequencer from the simulated rig and calibrated as a real
 one is; the truth is what the bench's own rays integrate to. One line runs it, from the repository:
 
-    python benchmarks/calibration_checks.py psi few effects session cost drift streamed
+    python benchmarks/calibration_checks.py psi hands few effects session cost drift streamed
 
 It writes docs/results/calibration_checks.csv and .png, and needs the extra `lab`. On the bench of
 `--smallest` the limits do not hold: it shows that every check runs.
@@ -50,6 +50,7 @@ from drivers.dng import encode_dng
 from drivers.raw import decode_raw
 from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.plan import Checks, Plan, PlannedShot
+from emmc_rig.bench.hardware import Axes
 from emmc_rig.demo import simulated_session
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import SavedPsi
@@ -83,6 +84,8 @@ DRIFTS = {
 """In the order of `calibration.drift.KINDS`."""
 COVERED, COVERED_TWICE, MARGIN = 0.683, 0.954, 0.03
 """Shares of a normal distribution within one and two deviations, and how far off is as asked."""
+HANDS_UM, HANDS_COST = 100.0, 1.5
+"""How far a hand puts a pinhole off its hole, and how much more Psi may then be off by."""
 STATED_TRUE = 1.25
 """Times the stated error: what Psi may be off by."""
 TRUE_ERROR, LARGEST_COST_DB, LARGEST_GIB, LEAST_RECOVERED = 0.01, 0.05, 4.0, 0.85
@@ -116,6 +119,7 @@ class Size:
 
 FULL = {
     "psi": Size((192, 256), 512),
+    "hands": Size((48, 64), 1024),
     "few": Size((96, 128), 4096),
     "effects": Size((48, 64), 256),
     "session": Size((48, 64), 1024),
@@ -177,6 +181,19 @@ def check_psi(size: Size, seed: int) -> Iterator[Row]:
     yield Row("shift, px", np.hypot(*off_um) / settings.camera.sensor.sample_pitch_um, 0.02)
     turn_rad = at.rotation_rad - truth["rotation_rad"]
     yield Row("rotation, degrees", abs(float(np.degrees(turn_rad))), 0.005)
+
+
+def check_hands(size: Size, seed: int) -> Iterator[Row]:
+    """The pinhole put on every hole by a hand, off by up to HANDS_UM, against by a stage."""
+    by_stage = calibrate_simulated(settings_for(size, seed)).found.metrics
+    axes = Axes(("mask_x", "mask_y"), hands_um=HANDS_UM)
+    by_hand = calibrate_simulated(settings_for(size, seed, axes=axes)).found.metrics
+    for route, error in by_hand["psi_relative_error"].items():
+        yield Row(
+            f"Psi by hand, {route}", error, HANDS_COST * by_stage["psi_relative_error"][route]
+        )
+        stated = by_hand["psi_stated_error"][route]
+        yield Row(f"Psi by hand, {route}: true over stated", error / stated, STATED_TRUE)
 
 
 def check_few(size: Size, seed: int) -> Iterator[Row]:
@@ -440,6 +457,7 @@ def _reading(planned: PlannedFrame, shadow: Shadow, channels: NDArray[np.uint8])
 
 CHECKS = {
     "psi": check_psi,
+    "hands": check_hands,
     "few": check_few,
     "effects": check_effects,
     "session": check_session,

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from calibration.shadow import shadow_mask
 from calibration.whiteboard import Calibration
+from emmc_rig.acquisition.by_hand import with_hands
 from emmc_rig.acquisition.command import CaptureRequest, planned_frames
-from emmc_rig.acquisition.expand import mask_offsets_um
+from emmc_rig.acquisition.expand import expand, mask_offsets_um
 from emmc_rig.acquisition.plan import Plan
-from emmc_rig.bench.hardware import Rig, simulated_rig
+from emmc_rig.bench.hardware import FOUR_AXES, Axes, Rig, simulated_rig
 from emmc_rig.demo import simulated_session
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, build_imaging_matrix
@@ -46,13 +47,14 @@ ORDINARY_BENCH = flawed(Flaws(), [ORDINARY])
 class CalibrateSettings(PlanSettings):
     """What to plan for, and the simulated bench: what is wrong with it, rays per view and pixel.
 
-    route: of `emmc_rig.calibrate`.
+    route: of `emmc_rig.calibrate`. axes: those of the stage; hands move what it lacks.
     """
 
     route: str = "auto"
     seed: int = 0
     flaws: Flaws = ORDINARY_BENCH
     rays: int = 512
+    axes: Axes = FOUR_AXES
 
 
 def place_masks(rig: Rig, camera: Camera, shot: int) -> None:
@@ -157,6 +159,7 @@ def rig_to_calibrate(settings: CalibrateSettings, scene: Array | None = None) ->
         settings.seed,
         rays_per_view=settings.rays,
         flaws=settings.flaws,
+        moved=settings.axes,
     )
     rig.stage.home()
     return rig, bench
@@ -193,6 +196,7 @@ def calibrate_simulated(
     watcher.begin("plan", None)
     plan = simulated_plan(settings)
     rig, bench = rig_to_calibrate(settings)
+    rig = with_hands(rig, expand(plan, camera, rig.window_um, rig.window_side_um))
     frames = planned_frames(CaptureRequest(Path(), plan, "", camera, Path(), {}), rig)
     watcher.begin("whiteboards", len(frames))
     started = time.perf_counter()

@@ -31,7 +31,8 @@ class BoardFrame:
     read: returns the mean frame; of a session, from its files each time, so that one whiteboard of
     many is in memory. count: frames taken. stage_um: where the mask stage stood, x and y, from
     where the design centres the mask; with the shot's own offset in it. pinhole: the one view (v,
-    u) open, or None: those that the window leaves open, moved by so many cells (x, y).
+    u) open, or None: those that the window leaves open, moved by so many cells (x, y). loose: a
+    hand put the pinhole there, which may be a little off.
     """
 
     read: Callable[[], MeanFrame]
@@ -41,6 +42,7 @@ class BoardFrame:
     pinhole: tuple[int, int] | None = None
     lamp: str = "white"
     window: Window = CENTRED
+    loose: bool = False
 
     @classmethod
     def held(cls, frame: MeanFrame, *how: Any, **named: Any) -> BoardFrame:
@@ -149,7 +151,7 @@ class Board:
     reading, variance: (pixel_y, pixel_x); the variance of a pixel that is not to be used is
     infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all). repeats: frames
     averaged. unsteady2: relative variance of the brightness between these, see `MeanFrame`. rows:
-    how rows err alike.
+    how rows err alike. loose: see `BoardFrame`.
     """
 
     name: str
@@ -163,6 +165,7 @@ class Board:
     repeats: int = 1
     unsteady2: float = 0.0
     rows: Rows | None = None
+    loose: bool = False
 
     @property
     def opening(self) -> Opening:
@@ -272,6 +275,7 @@ def _board(
         frame.count,
         frame.unsteady2(dark.mean_dn),
         _rows(frame, reference, dark),
+        one.loose,
     )
 
 

@@ -548,7 +548,9 @@ def fit_placement(
     lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE_BOARDS))
     kept = max(normal.kept, 1)
-    moved_um = _farthest_um(widths[1], checks)
+    # A pinhole that a hand put a little off looks like a mask that moved, and is none.
+    firm = [check for check, one in zip(checks, boards, strict=True) if not one.loose]
+    moved_um = _farthest_um(widths[1] if len(firm) == len(checks) else 0.0, firm)
     covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement,

@@ -77,16 +77,26 @@ def coefficient_planes(
     stages: per shot.
     """
     shots, views_v, views_u, _, stored_colours, _ = layout.shape
-    mask = replace(shadow.mask, binning=1)
-    samples_shadow = Shadow(mask, shadow.placement)
-    scale = stored_colours * layout.binning**2
-    for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
-        plane = np.empty(layout.size, dtype=np.float32)
-        chosen = views_open((views_v, views_u), (v, u))
-        for band, samples, channels in _bands(layout, shot, stored):
-            read = samples_shadow.readings(samples, channels, chosen, stages[shot], shot)
-            plane[band] = read.reshape(plane[band].shape) / scale
-        yield (shot, v, u, stored), plane
+    for place in np.ndindex(shots, views_v, views_u, stored_colours):
+        yield place, coefficient_plane(shadow, layout, place, stages[place[0]])
+
+
+def coefficient_plane(
+    shadow: Shadow,
+    layout: PsiLayout,
+    place: tuple[int, int, int, int],
+    stage_um: tuple[float, float],
+) -> NDArray[np.float32]:
+    """Return the coefficients (y, x) of one place, (shot, v, u, stored colour), of Psi."""
+    shot, v, u, stored = place
+    samples_shadow = Shadow(replace(shadow.mask, binning=1), shadow.placement)
+    scale = layout.shape[4] * layout.binning**2
+    plane = np.empty(layout.size, dtype=np.float32)
+    chosen = views_open((layout.shape[1], layout.shape[2]), (v, u))
+    for band, samples, channels in _bands(layout, shot, stored):
+        read = samples_shadow.readings(samples, channels, chosen, stage_um, shot)
+        plane[band] = read.reshape(plane[band].shape) / scale
+    return plane
 
 
 def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:

@@ -50,6 +50,7 @@ from calibration.openings import views_open
 from calibration.parametric import (
     Parametric,
     Stages,
+    coefficient_plane,
     coefficient_planes,
     psi_deviation,
     shot_stages,
@@ -65,7 +66,7 @@ from calibration.refusals import (
     refuse_unfit,
     refuse_without_mask,
 )
-from calibration.shadow import Shadow, shadow_mask
+from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import (
     LAMP_COLOURS,
     Calibration,
@@ -82,6 +83,8 @@ LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
 LARGEST_MOVE_UM = 1.0
+EDGE_UNSURE = 0.5
+"""Of the light lost at the aperture's edge: where that lies, and how sharp it is, nobody knows."""
 FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
 """Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 REGISTERED_MISS = 3.0
@@ -185,6 +188,12 @@ def calibrate(
         mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
         fit = fit_placement(seen, camera, mask)
         advice += fit_advice(fit)
+        if any(board.loose for board in seen):
+            seen = [
+                _with_light_lost(board, cut_off(check.moved_um, board, mask))
+                for check, board in zip(fit.boards, seen, strict=True)
+            ]
+            fit = fit_placement(seen, camera, mask, start=fit.placement)
         refuse_odd_fit(fit, seen)
         dusty = moved_dust(Shadow(mask, fit.placement), seen)
         if dusty.any():
@@ -212,6 +221,8 @@ def calibrate(
             raise CalibrationError("the free route was given no whiteboards")
         on_stage("Psi, free")
         free = replace(measure_psi(pinholes, design, empty, on_plane), good=good)
+        if (best := mixed or parametric) is not None:
+            findings += _put_right(free, best, seen, layout)
         calibrations["free"] = free
         still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
         if not still:
@@ -221,7 +232,6 @@ def calibrate(
             )
         judged["free"] = _judged_measured("free", free, still[0], layout.binning)
         frames["free"] = pinholes.exposures
-        best = mixed or parametric
         if "combined" in routes and best is not None and few is not None:
             on_stage("Psi, combined")
             model = bare["mixed" if mixed is not None else "parametric"]
@@ -477,6 +487,68 @@ def _make_less_sure(known: Calibration, missed: float) -> None:
     for place in np.ndindex(*known.deviation.shape[:3]):
         more = np.square(missed * known.psi.weights[place])
         known.deviation[place] = np.sqrt(np.square(known.deviation[place]) + more)
+
+
+def cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
+    """Return the share of a pinhole's light that the aperture's edge keeps from it; 0 elsewhere.
+
+    moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
+    pinhole pushed outward by d the middle of what is left is d / 2 further.
+    """
+    if not (board.loose and board.views_open.sum() == 1):
+        return 0.0
+    ratio = mask.distance_um / mask.lens_um
+    left = 1.0
+    view = np.argwhere(board.views_open)[0].tolist()
+    for place, count, moved in zip(view, mask.views, reversed(moved_um), strict=True):
+        # A pinhole further out shows the mask further in.
+        outward_um = -moved / ratio * (place == count - 1) + moved / ratio * (place == 0)
+        left *= 1 - min(max(2 * outward_um / mask.aperture_cell_um, 0.0), 0.5)
+    return 1 - left
+
+
+def _with_light_lost(board: Board, lost: float) -> Board:
+    whole = np.float32(1 / (1 - lost))
+    return replace(board, reading=board.reading * whole, variance=board.variance * whole**2)
+
+
+def _put_right(
+    known: Calibration, one: Parametric, seen: Sequence[Board], layout: PsiLayout
+) -> list[str]:
+    """Take out of a measured Psi that hands put the pinhole a little off, and say how far.
+
+    Each view changes by what the fitted mask says that the way to its hole changes.
+    """
+    farthest_um = 0.0
+    weights, deviation = known.psi.weights, known.deviation
+    for check, board in zip(one.fit.boards, seen, strict=True):
+        if not (board.loose and board.views_open.sum() == 1):
+            continue
+        (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
+        off_x, off_y = check.moved_um
+        unsure_um = check.moved_deviation_um
+        for stored in range(layout.shape[4]):
+            place = board.shot, v, u, stored
+
+            def at(x: float, y: float, place: tuple = place) -> NDArray[np.float32]:
+                return coefficient_plane(one.shadow, layout, place, (x, y))
+
+            right = at(x_um, y_um)
+            index = board.shot, v, u, slice(None), stored
+            lost = cut_off(check.moved_um, board, one.mask)
+            whole = weights[index] / np.float32(1 - lost)
+            weights[index] = whole + right - at(x_um + off_x, y_um + off_y)
+            variance = sum(
+                np.square(at(x_um + by_x, y_um + by_y) - right)
+                for by_x, by_y in ((unsure_um, 0.0), (0.0, unsure_um))
+            )
+            variance += np.square(EDGE_UNSURE * lost * whole)
+            deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
+        ratio = one.mask.distance_um / one.mask.lens_um
+        farthest_um = max(farthest_um, float(np.hypot(off_x, off_y)) / ratio)
+    if not farthest_um:
+        return []
+    return [f"hands put pinholes up to {farthest_um:.0f} um off their holes: taken out of Psi"]
 
 
 def _count_moves(known: Calibration, one: Parametric, layout: PsiLayout, stages: Stages) -> None:

@@ -159,6 +159,9 @@ class Axes:
     hands_um: float = 0.0
 
 
+FOUR_AXES = Axes()
+
+
 @dataclass(frozen=True)
 class SimulatedRig(Rig):
     """A rig, and the firmware of stage and camera (`still`), whose faults can be armed."""
@@ -212,7 +215,7 @@ def simulated_rig(
     flaws: Flaws = NO_FLAWS,
     focus_um: float | None = None,
     stands_um: Mapping[str, float] | None = None,
-    moved: Axes = Axes(),
+    moved: Axes = FOUR_AXES,
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 

@@ -98,7 +98,11 @@ def _board_frames(session: Session, kind: str) -> list[BoardFrame]:
     for frames in groups.values():
         alike, first = alike_frames(session, frames), frames[0]
         read, bench = partial(mean_of, session, alike), first.bench
-        how = stage_um_of(first), bench.shot, first.view, bench.lamp, first.window
+        places = [session.stored[frame.id].deviation_um for frame in alike]
+        loose = first.view is not None and any(
+            "aperture_x" in by or "aperture_y" in by for by in places
+        )
+        how = stage_um_of(first), bench.shot, first.view, bench.lamp, first.window, loose
         found.append(BoardFrame(read, len(alike), *how))
     return found
 
