@@ -83,8 +83,6 @@ LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
 LARGEST_MOVE_UM = 1.0
-EDGE_UNSURE = 0.5
-"""Of the light lost at the aperture's edge: where that lies, and how sharp it is, nobody knows."""
 FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
 """Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 REGISTERED_MISS = 3.0
@@ -188,12 +186,6 @@ def calibrate(
         mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
         fit = fit_placement(seen, camera, mask)
         advice += fit_advice(fit)
-        if any(board.loose for board in seen):
-            seen = [
-                _with_light_lost(board, cut_off(check.moved_um, board, mask))
-                for check, board in zip(fit.boards, seen, strict=True)
-            ]
-            fit = fit_placement(seen, camera, mask, start=fit.placement)
         refuse_odd_fit(fit, seen)
         dusty = moved_dust(Shadow(mask, fit.placement), seen)
         if dusty.any():
@@ -489,11 +481,12 @@ def _make_less_sure(known: Calibration, missed: float) -> None:
         known.deviation[place] = np.sqrt(np.square(known.deviation[place]) + more)
 
 
-def cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
+def _cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
     """Return the share of a pinhole's light that the aperture's edge keeps from it; 0 elsewhere.
 
     moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
-    pinhole pushed outward by d the middle of what is left is d / 2 further.
+    pinhole pushed outward by d the middle of what is left is d / 2 further. That is no more than a
+    guess, as the fit takes it for another distance too: it counts in the deviation.
     """
     if not (board.loose and board.views_open.sum() == 1):
         return 0.0
@@ -505,11 +498,6 @@ def cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> fl
         outward_um = -moved / ratio * (place == count - 1) + moved / ratio * (place == 0)
         left *= 1 - min(max(2 * outward_um / mask.aperture_cell_um, 0.0), 0.5)
     return 1 - left
-
-
-def _with_light_lost(board: Board, lost: float) -> Board:
-    whole = np.float32(1 / (1 - lost))
-    return replace(board, reading=board.reading * whole, variance=board.variance * whole**2)
 
 
 def _put_right(
@@ -535,14 +523,12 @@ def _put_right(
 
             right = at(x_um, y_um)
             index = board.shot, v, u, slice(None), stored
-            lost = cut_off(check.moved_um, board, one.mask)
-            whole = weights[index] / np.float32(1 - lost)
-            weights[index] = whole + right - at(x_um + off_x, y_um + off_y)
+            weights[index] = weights[index] + right - at(x_um + off_x, y_um + off_y)
             variance = sum(
                 np.square(at(x_um + by_x, y_um + by_y) - right)
                 for by_x, by_y in ((unsure_um, 0.0), (0.0, unsure_um))
             )
-            variance += np.square(EDGE_UNSURE * lost * whole)
+            variance += np.square(_cut_off(check.moved_um, board, one.mask) * right)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
         ratio = one.mask.distance_um / one.mask.lens_um
         farthest_um = max(farthest_um, float(np.hypot(off_x, off_y)) / ratio)

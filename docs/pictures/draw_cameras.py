@@ -166,12 +166,16 @@ PICTURES: dict[str, Callable[[], Parts]] = {
 
 def drawn(name: str) -> str:
     """Return a picture as SVG."""
+    return framed(PICTURES[name]())
+
+
+def framed(parts: Parts) -> str:
+    """Return a picture as SVG, on white."""
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" '
         f'font-family="sans-serif" font-size="14" fill="{INK}">'
     )
-    parts = [head, box(0, 0, WIDTH, HEIGHT, "#fff", "none"), *PICTURES[name](), "</svg>"]
-    return "\n".join(parts) + "\n"
+    return "\n".join([head, box(0, 0, WIDTH, HEIGHT, "#fff", "none"), *parts, "</svg>"]) + "\n"
 
 
 if __name__ == "__main__":
