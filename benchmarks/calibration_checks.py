@@ -50,7 +50,7 @@ from drivers.dng import encode_dng
 from drivers.raw import decode_raw
 from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.plan import Checks, Plan, PlannedShot
-from emmc_rig.bench.hardware import Axes
+from emmc_rig.bench.hardware import Fitted
 from emmc_rig.demo import simulated_session
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import SavedPsi
@@ -186,8 +186,8 @@ def check_psi(size: Size, seed: int) -> Iterator[Row]:
 def check_hands(size: Size, seed: int) -> Iterator[Row]:
     """The pinhole put on every hole by a hand, off by up to HANDS_UM, against by a stage."""
     by_stage = calibrate_simulated(settings_for(size, seed)).found.metrics
-    axes = Axes(("mask_x", "mask_y"), hands_um=HANDS_UM)
-    by_hand = calibrate_simulated(settings_for(size, seed, axes=axes)).found.metrics
+    fitted = Fitted(("mask_x", "mask_y"), hands_um=HANDS_UM)
+    by_hand = calibrate_simulated(settings_for(size, seed, fitted=fitted)).found.metrics
     for route, error in by_hand["psi_relative_error"].items():
         yield Row(
             f"Psi by hand, {route}", error, HANDS_COST * by_stage["psi_relative_error"][route]

@@ -16,7 +16,7 @@ from emmc_rig.acquisition.by_hand import with_hands
 from emmc_rig.acquisition.command import CaptureRequest, planned_frames
 from emmc_rig.acquisition.expand import expand, mask_offsets_um
 from emmc_rig.acquisition.plan import Plan
-from emmc_rig.bench.hardware import FOUR_AXES, Axes, Rig, simulated_rig
+from emmc_rig.bench.hardware import ALL_FITTED, Fitted, Rig, simulated_rig
 from emmc_rig.demo import simulated_session
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, build_imaging_matrix
@@ -47,14 +47,14 @@ ORDINARY_BENCH = flawed(Flaws(), [ORDINARY])
 class CalibrateSettings(PlanSettings):
     """What to plan for, and the simulated bench: what is wrong with it, rays per view and pixel.
 
-    route: of `emmc_rig.calibrate`. axes: those of the stage; hands move what it lacks.
+    route: of `emmc_rig.calibrate`. fitted: what of the bench is; hands move what it lacks.
     """
 
     route: str = "auto"
     seed: int = 0
     flaws: Flaws = ORDINARY_BENCH
     rays: int = 512
-    axes: Axes = FOUR_AXES
+    fitted: Fitted = ALL_FITTED
 
 
 def place_masks(rig: Rig, camera: Camera, shot: int) -> None:
@@ -159,7 +159,7 @@ def rig_to_calibrate(settings: CalibrateSettings, scene: Array | None = None) ->
         settings.seed,
         rays_per_view=settings.rays,
         flaws=settings.flaws,
-        moved=settings.axes,
+        fitted=settings.fitted,
     )
     rig.stage.home()
     return rig, bench

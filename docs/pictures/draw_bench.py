@@ -31,16 +31,13 @@ def mask_before_sensor() -> Parts:
             yield box(78 + 6 * k, 80, 6, 4, INK, "none")
     for x in (180, 220, 260):
         yield line(x, 20, 240 + (x - 220) * 0.2, 142, RAY, 1.2)
-    for y, text in ((42, "light"), (72, "mask: glass, its cells below"), (98, "spacer"),
+    for y, text in ((42, "light"), (72, "mask, its cells below"), (98, "spacer"),
                     (116, "cover glass"), (148, "sensor")):  # fmt: skip
-        yield label(440, y, text)
-    yield line(426, 84, 426, 142, INK, 1)
-    yield label(560, 118, "d")
-    yield line(420, 84, 432, 84)
-    yield line(420, 142, 432, 142)
-    yield line(540, 84, 540, 142, INK, 1)
-    yield line(534, 84, 546, 84)
-    yield line(534, 142, 546, 142)
+        yield label(424, y, text)
+    yield label(596, 118, "d")
+    yield line(584, 84, 584, 142, INK, 1)
+    yield line(578, 84, 590, 84)
+    yield line(578, 142, 590, 142)
 
 
 def plate_before_lens() -> Parts:
@@ -53,17 +50,17 @@ def plate_before_lens() -> Parts:
     yield line(40, 60, 250, heights()[1], RAY)
     yield line(250, heights()[1], 396, MIDDLE, RAY)
     yield from column(396, ["#fff"] * 9, 14, 12)
-    yield words(36, "white board")
+    yield words(52, "white board")
     yield words(225, "plate")
     yield words(270, "lens", 190)
-    yield words(402, "sensor")
+    yield words(396, "sensor")
     for row, y in enumerate(heights(5, 28)):
         for col in range(5):
             number = 5 * row + col + 1
             fill = RAY if number == 7 else "#fff"
             yield box(470 + 28 * col, y - 14, 28, 28, fill)
             yield f'<text x="{484 + 28 * col}" y="{y + 5}" text-anchor="middle">{number}</text>'
-    yield words(540, "holes, seen from the sensor's side")
+    yield words(540, "holes, from the sensor")
 
 
 PICTURES = {"mask": mask_before_sensor, "plate": plate_before_lens}

@@ -31,6 +31,7 @@ from drivers.ports import find_port, guess_of, list_serial_ports
 from drivers.ptp import open_camera as open_ptp
 from drivers.stage import HostStage, Stage, StageSettings
 from drivers.transport import SerialTransport, Transport
+from drivers.u3v import open_camera as open_u3v
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
 from emmc_rig.bench.camera_config import CameraChoice, parse_camera, settings_of
@@ -58,7 +59,8 @@ from simulators.effects import Flaws
 from simulators.firmware import SimulatedController
 from simulators.grbl import LETTERS, GrblController
 from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
-from simulators.usb import SimulatedUsb
+from simulators.u3v import U3vCameraSimulator
+from simulators.usb import SimulatedUsb, UsbFunction
 from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
@@ -148,18 +150,20 @@ RigType = TypeVar("RigType", bound=Rig)
 
 
 @dataclass(frozen=True)
-class Axes:
+class Fitted:
     """Which of the four axes a simulated rig has, and those among them of a second controller.
 
-    hands_um: how far, at most, a hand that moves the others puts them off their places.
+    hands_um: how far, at most, a hand that moves the others puts them off their places. camera:
+    what its camera speaks, ptp or u3v.
     """
 
     names: tuple[str, ...] = tuple(STAGE_AXES)
     second: tuple[str, ...] = ()
     hands_um: float = 0.0
+    camera: str = "ptp"
 
 
-FOUR_AXES = Axes()
+ALL_FITTED = Fitted()
 
 
 @dataclass(frozen=True)
@@ -167,7 +171,7 @@ class SimulatedRig(Rig):
     """A rig, and the firmware of stage and camera (`still`), whose faults can be armed."""
 
     chain: ZaberChain = field(kw_only=True)
-    still: PtpCameraSimulator = field(kw_only=True)
+    still: PtpCameraSimulator | U3vCameraSimulator = field(kw_only=True)
 
 
 class SimulatedAttendant:
@@ -215,7 +219,7 @@ def simulated_rig(
     flaws: Flaws = NO_FLAWS,
     focus_um: float | None = None,
     stands_um: Mapping[str, float] | None = None,
-    moved: Axes = FOUR_AXES,
+    fitted: Fitted = ALL_FITTED,
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 
@@ -224,7 +228,8 @@ def simulated_rig(
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
     pixel; few are quick, and grainy beside a good sensor's noise. flaws: what is wrong with
     it. focus_um: where a fifth axis, `focus`, has the scene sharp; None: there is none. stands_um:
-    see `Rig`. moved: by what. Raises AppError for a size that the camera's RAW files cannot hold.
+    see `Rig`. fitted: with which axes and camera. Raises AppError for a size that the camera's RAW
+    files cannot hold.
     """
     k = camera.sensor.binning
     if min(size) // k < SMALLEST_SIDE_PX:
@@ -237,9 +242,9 @@ def simulated_rig(
     aperture_um = max(camera.views) * camera.lens.aperture_cell_um
     travel_um = {1: MASK_TRAVEL_UM, 2: 4 * aperture_um, 3: MASK_TRAVEL_UM}
     addresses = STAGE_AXES if focus_um is None else STAGE_AXES | {FOCUS: FOCUS_ADDRESS}
-    driven = {name for name in (*moved.names, FOCUS) if name not in moved.second}
+    driven = {name for name in (*fitted.names, FOCUS) if name not in fitted.second}
     axes = {name: address for name, address in addresses.items() if name in driven}
-    letters = dict(zip(moved.second, LETTERS, strict=False))
+    letters = dict(zip(fitted.second, LETTERS, strict=False))
     specs = {name: AxisSpec(travel_um=travel_um[addresses[name][0]]) for name in addresses}
     chain = ZaberChain(clock, {addresses[name]: spec for name, spec in specs.items()})
     second = GrblController(clock, {letter: specs[name] for name, letter in letters.items()})
@@ -251,9 +256,9 @@ def simulated_rig(
     zero_um = {
         name: um - (specs[name].travel_um if name in letters else 0.0)
         for name, um in middle_um.items()
-        if name in moved.names
+        if name in fitted.names
     }
-    by_hand_um = {name: 0.0 for name in STAGE_AXES if name not in moved.names}
+    by_hand_um = {name: 0.0 for name in STAGE_AXES if name not in fitted.names}
 
     def positions_um() -> dict[str, float]:
         real = {name: chain.position_um(*address) for name, address in axes.items()}
@@ -288,17 +293,25 @@ def simulated_rig(
     stage = stages[0] if len(stages) == 1 else CombinedStage(stages)
     noise = camera.sensor.noise
     cfa = camera.sensor.cfa_name
-    simulator = PtpCameraSimulator(
-        bench.expose, clock, cfa, noise.black_level_dn, noise.white_level_dn, span=ANY_EXPOSURE
-    )
     shape = (size[0] // k, size[1] // k)
-    function = PtpUsbFunction(simulator)
+    black_dn, white_dn = noise.black_level_dn, noise.white_level_dn
+    if fitted.camera == "u3v":
+        bits = white_dn.bit_length()
+        simulator = U3vCameraSimulator(bench.expose, clock, shape, cfa, black_dn, bits)
+        function: UsbFunction = simulator
+    else:
+        simulator = PtpCameraSimulator(
+            bench.expose, clock, cfa, black_dn, white_dn, span=ANY_EXPOSURE
+        )
+        function = PtpUsbFunction(simulator)
     bus = SimulatedUsb(clock, function)
 
     def opened() -> CameraDevice:
         """Open the camera; one whose cable is out is plugged in first."""
         if not any(plug.function is function and plug.present for plug in bus.enumerate_devices()):
             bus.plug(function)
+        if fitted.camera == "u3v":
+            return open_u3v("", clock, bus)
         # The card lies in this computer's memory, hence from_card.
         return open_ptp("", clock, bus, shape, cfa, from_card=True)
 
@@ -309,7 +322,7 @@ def simulated_rig(
     rig = SimulatedRig(
         stage,
         opened(),
-        SimulatedAttendant(bench, by_hand_um, moved.hands_um, seed),
+        SimulatedAttendant(bench, by_hand_um, fitted.hands_um, seed),
         zero_um,
         window_um,
         clock,

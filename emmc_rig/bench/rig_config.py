@@ -17,7 +17,7 @@ from emmc_rig.bench.hardware import (
     NO_FLAWS,
     NO_STAGE,
     STAGE_AXES,
-    Axes,
+    Fitted,
     Rig,
     open_camera,
     open_stages,
@@ -38,7 +38,7 @@ SIMULATED = "simulated"
 IMPORTED = "imported"
 """What a session has for a rig whose frames are files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
-LATER = ("focus_um", "stands_um", "mask", "axes", "second_stage", "hands_um")
+LATER = ("focus_um", "stands_um", "mask", "axes", "second_stage", "hands_um", "usb_camera")
 StageSpec = str | dict[str, Any]
 NO_SETTINGS = ("kind", "trigger")
 """What a description has, or had in version 0.2, beside the settings of a rig."""
@@ -99,13 +99,15 @@ class SimulatedAxes(AnyRig):
 
     focus_um: where its focus axis, if it has one, has the scene sharp. axes: of mask_x, mask_y,
     aperture_x and aperture_y. second_stage: those of them that a second controller moves. hands_um:
-    how far, at most, a hand that moves the others puts them off their places.
+    how far, at most, a hand that moves the others puts them off their places. usb_camera: what the
+    camera speaks.
     """
 
     focus_um: float | None = Field(default=None, gt=0)
     axes: tuple[str, ...] = tuple(STAGE_AXES)
     second_stage: tuple[str, ...] = ()
     hands_um: float = Field(default=0.0, ge=0)
+    usb_camera: Literal["ptp", "u3v"] = "ptp"
 
     @field_validator("axes", "second_stage")
     @classmethod
@@ -265,7 +267,7 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
             flawed(NO_FLAWS, imaged.flaws),
             imaged.focus_um,
             imaged.stands_um,
-            Axes(imaged.axes, imaged.second_stage, imaged.hands_um),
+            Fitted(imaged.axes, imaged.second_stage, imaged.hands_um, imaged.usb_camera),
         )
         _check_axes(imaged, rig)
         yield rig

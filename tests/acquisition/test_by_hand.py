@@ -13,7 +13,7 @@ from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.order import ordered
 from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.bench.hands import AskingAttendant, NoAttendant, hole_name
-from emmc_rig.bench.hardware import Axes, simulated_rig
+from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
@@ -41,8 +41,8 @@ def bench_of(axes, hands_um=0.0, plan=PLAN, second=(), seed=0, rays=64):
     read = Plan.model_validate(plan)
     camera = planned_camera(read)
     fine = fine_scene("deep-occlusions", 1, 1, size=SIZE, views=camera.views, seed=0)
-    moved = Axes(tuple(axes), tuple(second), hands_um)
-    rig, bench = simulated_rig(camera, fine.samples, SIZE, seed, None, rays, moved=moved)
+    fitted = Fitted(tuple(axes), tuple(second), hands_um)
+    rig, bench = simulated_rig(camera, fine.samples, SIZE, seed, None, rays, fitted=fitted)
     frames = expand(read, camera, rig.window_um, rig.window_side_um)
     rig = with_hands(rig, frames)
     return rig, bench, camera, ordered(frames, read.order, rig.hands)

@@ -1,0 +1,71 @@
+"""Whatever axes and camera a bench has, the commands of docs/day-one.md lead to a light field."""
+
+import json
+
+import pytest
+import yaml
+
+from emmc_rig.session.session import Session
+
+SIZE = ("--size", "32x40")
+LEFT_OUT = "lamp,response,colours,turned"
+AXES = {
+    "none": [],
+    "one": ["mask_x"],
+    "two": ["mask_x", "mask_y"],
+    "four": ["mask_x", "mask_y", "aperture_x", "aperture_y"],
+}
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
+    """A plan with the pinhole before every view, and shots by the same camera."""
+    from programs import program
+
+    folder = tmp_path_factory.mktemp("planned")
+    code, _, err = program(
+        "calibrate", "--plan", "--camera", "rgbw-bayer-2shots", *SIZE, "--leave-out", LEFT_OUT,
+        "--out", str(folder / "first"),
+    )  # fmt: skip
+    assert code == 0, err
+    return folder / "first" / "plan.yaml"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["ptp", "u3v", "folder"])
+@pytest.mark.parametrize("axes", AXES)
+def test_a_bench_comes_to_a_light_field(axes, camera, planned, tmp_path, run):
+    described = {"kind": "simulated", "axes": AXES[axes], "hands_um": 100}
+    if camera == "u3v":
+        described["usb_camera"] = "u3v"
+        if axes == "four":
+            described["second_stage"] = AXES["four"][2:]
+    rig, folder = tmp_path / "rig.yaml", tmp_path / "bench"
+    rig.write_text(yaml.safe_dump(described))
+
+    def did(*words):
+        code, out, err = run(*words)
+        assert code == 0, err
+        return out
+
+    did("capture", planned, "--rig", rig, *SIZE, "--out", folder)
+    if camera == "folder":
+        rig.write_text(
+            yaml.safe_dump(
+                {"stage": "simulated", "camera": f"folder:{folder}/frames", "by_hand": False}
+            )
+        )
+        folder = tmp_path / "replayed"
+        did("capture", planned, "--rig", rig, "--out", folder)
+    session = Session(folder)
+    assert session.is_complete
+    by_hand = {axis for entry in session.stored.values() for axis in entry.deviation_um}
+    if camera != "folder":
+        lacking = {"aperture_x", "aperture_y"} - {*AXES[axes]}
+        assert by_hand & {"aperture_x", "aperture_y"} == lacking
+    did("calibrate", folder)
+    stated = json.loads((folder / "calibration" / "metrics.json").read_text())
+    assert 0 < stated["relative_error"][stated["route"]] < 0.05
+    did("reconstruct", folder, "--method", "adaptive-fast")
+    verdict = json.loads((folder / "reconstruction" / "metrics.json").read_text())["verdict"]
+    assert verdict["level"] in ("trust", "cannot tell")
