@@ -106,13 +106,17 @@ def test_every_camera_of_the_page_is_a_dozen_lines_that_run(camera, tmp_path, mo
         assert (names["psi"] @ result.light_field - frames).std() < 0.2 * frames.std()
 
 
-def test_every_camera_of_the_page_is_drawn_as_the_script_draws_it(tmp_path):
+def test_every_camera_and_bench_is_drawn_as_the_script_draws_it(tmp_path):
     pictures = ROOT / "docs" / "pictures"
     script = runpy.run_path(str(pictures / "draw_cameras.py"))
     assert len(script["PICTURES"]) == len(EXAMPLES)
     for name in script["PICTURES"]:
         assert f"pictures/camera-{name}.svg" in PAGE.read_text()
         assert (pictures / f"camera-{name}.svg").read_text() == script["drawn"](name)
+    script = runpy.run_path(str(pictures / "draw_bench.py"))
+    for name in script["PICTURES"]:
+        assert f"pictures/bench-{name}.svg" in (ROOT / "docs" / "day-one.md").read_text()
+        assert (pictures / f"bench-{name}.svg").read_text() == script["drawn"](name)
 
 
 @pytest.fixture
