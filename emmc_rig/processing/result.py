@@ -25,7 +25,7 @@ from emmc_rig.model.lightfield import (
     ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_axes import ATTRIBUTE, picture_name, stored_as
+from emmc_rig.model.view_axes import ATTRIBUTE, grid_name, stored_as
 from emmc_rig.pages.viewer import render_viewer
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.kept import missed_readings
@@ -204,7 +204,7 @@ class Result:
 
     def __repr__(self) -> str:
         (v, u, rows, columns, _), level = self.light_field.shape, self.verdict.level
-        pictures = f"{v}x{u} {picture_name(self.psi.view_axes)}s"
+        pictures = grid_name(self.psi.view_axes, (v, u))
         return (
             f"Result({self.method}, {pictures} of {rows}x{columns}, {self.status} in "
             f"{self.seconds:.1f} s, verdict: {level})"

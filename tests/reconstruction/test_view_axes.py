@@ -8,16 +8,20 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+import yaml
 from programs import program
 
 import emmc_rig as emmc
 from emmc_rig.files.exports import MAPS, open_export
 from emmc_rig.files.formats import FORMATS
 from emmc_rig.files.psi import FRAMES, PSI, open_psi, save_shards
-from emmc_rig.model.errors import SensingError, ViewOrderWarning
+from emmc_rig.model.camera import Camera, camera_of, psi_layout
+from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES
+from emmc_rig.pages.page import light_field_head
+from emmc_rig.pages.report import ReportContent, render
 from emmc_rig.pages.result_figure import draw_results
 from emmc_rig.pages.viewer import render_viewer, viewer_data
 from emmc_rig.processing.pool import opened_pool
@@ -57,6 +61,28 @@ def light_of(views, axes, size=SIZE):
 def frames_of(psi, light):
     rng = np.random.default_rng(5)
     return (psi @ light + rng.normal(0, NOISE, psi.frames_shape)).astype(np.float32)
+
+
+def cassi_file(folder, cells, bands=24, step=2):
+    """Write the YAML of a mask whose shadow moves by `step` pixels from band to band."""
+    lens_mm, mask_mm, pitch_um = 50, 0.5, 24
+    cell_um = (1 - mask_mm / lens_mm) * pitch_um  # one sample wide on the sensor
+    pattern = {"kind": "parameters", "cells": cells.tolist()}
+    camera = {
+        "title": "CASSI",
+        "views": [1, bands],
+        "view_axes": ["angle", "band"],
+        "lens": {
+            "distance_mm": lens_mm,
+            "aperture_cell_mm": step * cell_um * lens_mm / mask_mm / 1e3,
+            "aperture_fill": 0,
+        },
+        "sensor": {"sample_pitch_um": pitch_um},
+        "masks": {"code": {"distance_mm": mask_mm, "cell_um": cell_um, "pattern": pattern}},
+    }
+    path = folder / "cassi.yaml"
+    path.write_text(yaml.safe_dump(camera))
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +134,70 @@ def test_other_names_of_view_axes_are_refused_in_one_line(tmp_path):
         file.attrs["view_axes"] = "angle,time"
     with pytest.raises(SensingError, match="checksum"):
         ImagingMatrix.load(path)
+
+
+def test_a_cassi_described_by_a_file_has_the_matrix_of_its_shifted_masks(tmp_path):
+    (rows, columns), count, step = SIZE, 24, 2
+    cells = np.random.default_rng(6).integers(0, 2, (rows + 16, columns + step * (count - 1) + 16))
+    camera = emmc.camera(cassi_file(tmp_path, cells))
+    psi = camera.psi(SIZE)
+    shifted = [cells[8:, 8 + step * band :][:rows, :columns] for band in range(count)]
+    expected = emmc.Psi.from_weights(
+        np.stack(shifted)[None, None] / count, cfa="mono", view_axes=BANDS
+    )
+    np.testing.assert_allclose(psi.weights, expected.weights, atol=1e-7)
+    assert psi.view_axes == psi_layout(camera, SIZE).view_axes == psi.layout.view_axes == BANDS
+    assert psi.layout.psi(psi.weights).checksum() == psi.checksum()
+    assert camera_of(psi) == camera
+    assert "1x24 bands" in repr(camera)
+    assert emmc.camera(camera.model_dump()) == camera
+
+
+def test_a_camera_at_angles_is_described_and_hashed_as_by_earlier_versions():
+    camera = emmc.camera("rgbw-mono-3shots")
+    assert camera.view_axes == ANGLES
+    assert "view_axes" not in camera.model_dump()
+    assert "view_axes" not in camera.psi((8, 8)).camera_json
+    assert Camera.model_validate_json(camera.model_dump_json()) == camera
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("view_axes", ["angle", "colour"], "view_axes.1: .*'angle', 'band' or 'time'"),
+        ("view_axes", ["band"], "view_axes"),
+        ("view_axis", ["angle", "band"], "'view_axes'"),
+    ],
+)
+def test_a_camera_with_other_view_axes_is_refused_in_one_line(key, value, said):
+    with pytest.raises(CameraError, match=said) as fault:
+        emmc.camera({"title": "mine", key: value})
+    assert "\n" not in str(fault.value)
+
+
+def test_a_camera_of_bands_is_listed_as_such(tmp_path):
+    path = cassi_file(tmp_path, np.ones((90, 90), int), bands=3)
+    code, output, _ = program("cameras", str(path), "--out", str(tmp_path / "out"))
+    assert code == 0
+    assert "1x3 bands" in output
+
+
+def test_a_report_of_bands_speaks_of_no_view():
+    light = light_of((1, 6), BANDS)
+    metrics = {
+        "view_axes": list(BANDS), "psnr_db": 20.0, "replicate_psnr_db": 25.0, "size": [24, 32],
+        "verdict": {"level": "trust", "reasons": []},
+    }  # fmt: skip
+    content = ReportContent(
+        "t", "s", "c", "", "", light, light[0, :1, ..., 0], "mono", metrics, truth=light
+    )
+    page = render(content)
+    words = page.split("<script")[0]
+    for wrong in ("viewpoint, also", "parallax", "centre view", "over views"):
+        assert wrong not in words
+    assert "copied middle band" in words
+    assert "Over middle band" in words
+    assert "missed by 5.0 dB more than by the copied middle band" in str(light_field_head(metrics))
 
 
 def test_a_result_of_bands_calls_them_so_in_every_file(bands, tmp_path):
