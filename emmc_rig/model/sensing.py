@@ -465,6 +465,14 @@ class ImagingMatrix(PsiSizes):
             self, weights=np.take_along_axis(self.weights, chosen, axis=4), colour=colour
         )
 
+    def even_unseen_colours(self, light_field: Array) -> None:
+        """Where every pixel sees the same colour, make the others of (v, u, y, x, c) equal to it.
+
+        Nothing was seen of them: light without colours, or a picture in one.
+        """
+        if self.colour is not None and (self.colour == self.colour.flat[0]).all():
+            light_field[...] = light_field[..., self.colour.flat[0], None]
+
     def relative_difference(self, reference: ImagingMatrix) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""
         if self.weights.shape != reference.weights.shape:

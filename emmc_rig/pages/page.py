@@ -93,6 +93,14 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
     )
 
 
+def estimated(metrics: Mapping[str, object]) -> list[str]:
+    """Return a sentence with what of raw frames was estimated; none where all was given."""
+    found = metrics.get("estimated_from_frames")
+    if not isinstance(found, list) or not found:
+        return []
+    return [f"Estimated from the frames, as nobody gave it: {'; '.join(map(str, found))}."]
+
+
 def _below_copied_db(metrics: Mapping[str, object]) -> float:
     """Return by how much a result with a truth falls short of the copied view; 0: it does not."""
     found, copied = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")

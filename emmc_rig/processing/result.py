@@ -46,6 +46,12 @@ def compared(light_field: Any, truth: NDArray) -> dict[str, float]:
     }
 
 
+def estimates_of(frames: Frames) -> dict[str, list[str]]:
+    """Return what of raw frames was estimated, in words, as metrics.json has it."""
+    found = getattr(frames, "estimates", ())
+    return {"estimated_from_frames": list(found)} if found else {}
+
+
 def figures(solved: Reconstruction, verdict: Verdict, frames: Frames) -> dict[str, Any]:
     """Return what metrics.json has of a reconstruction, its verdict and its frames."""
     return {
@@ -59,6 +65,7 @@ def figures(solved: Reconstruction, verdict: Verdict, frames: Frames) -> dict[st
         "parameters": solved.parameters,
         "noise_sigma": frames.noise_sigma,
         "usable_share": float(frames.usable.mean()),
+        **estimates_of(frames),
         "command": command_line(),
         "versions": versions(),
     }

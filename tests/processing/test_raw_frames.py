@@ -124,6 +124,37 @@ def test_codes_of_a_picture_become_light():
     np.testing.assert_allclose(frames.readings[0], light, atol=0.012)
 
 
+def test_shots_of_other_exposures_read_alike_and_as_surely_as_their_light_says(exposed):
+    _, signal = exposed
+    rng = np.random.default_rng(9)
+    times_s = np.array([0.01, 0.04])
+    electrons = np.stack([signal[0] / GAIN / 8 * t / 0.01 for t in times_s])
+    given = {"dark": BLACK, "white_level": WHITE, "gain": GAIN, "read_noise": READ}
+    frames = emmc.frames(sensor(electrons, rng), exposure_s=times_s, **given)
+    truth = np.stack([GAIN * electrons[0] / (WHITE - BLACK)] * 2)
+    assert (frames.readings - truth).mean() == pytest.approx(0, abs=1e-4)
+    for shot in range(2):
+        one = frames.usable[shot] & (truth[shot] > 0.002)
+        scaled = (frames.readings[shot] - truth[shot])[one] / frames.deviation[shot][one]
+        assert scaled.std() == pytest.approx(1, abs=0.03)
+    assert frames.deviation[1].mean() < 0.6 * frames.deviation[0].mean()
+
+
+def test_what_was_estimated_stands_in_a_result_s_metrics_and_on_its_page(tmp_path):
+    light = np.linspace(0.1, 0.9, 96 * 96).reshape(1, 96, 96) * np.ones((2, 1, 1))
+    dn = sensor(4000 * light, np.random.default_rng(10))
+    psi = emmc.Psi.from_weights(np.ones((2, 1, 2, 96, 96)) / 2)
+    frames = emmc.frames(dn, white_level=WHITE)
+    result = emmc.reconstruct(psi, frames, "tv")
+    assert result.metrics()["estimated_from_frames"] == list(frames.estimates)
+    page = result.viewer().split("<script")[0]
+    assert "Estimated from the frames, as nobody gave it: black level" in page
+    given = emmc.frames(dn, dark=BLACK, white_level=WHITE, gain=GAIN, read_noise=READ)
+    told = emmc.reconstruct(psi, given, "tv")
+    assert "estimated_from_frames" not in told.metrics()
+    assert "Estimated from" not in told.viewer().split("<script")[0]
+
+
 FLAT = np.full((1, 64, 64), 900.0)
 MISTAKES = {
     "text": (lambda: emmc.frames("shot.tif"), "dn: got 'shot.tif'; it takes raw values"),
@@ -155,6 +186,11 @@ MISTAKES = {
         ),
         "white: most of it reads the white level, 1023 DN",
     ),
+    "an exposure too few": (
+        lambda: emmc.frames(FLAT, exposure_s=[0.1, 0.2]),
+        "exposure_s: 2 exposures of 1 shots",
+    ),
+    "no exposure": (lambda: emmc.frames(FLAT, exposure_s=[np.nan]), "seconds above 0"),
     "gain of nothing": (lambda: emmc.frames(FLAT, gain=0), "gain: got 0; it takes a number above"),
     "noise below nothing": (lambda: emmc.frames(FLAT, read_noise=-1), "read_noise: got -1"),
 }
