@@ -153,6 +153,19 @@ class Camera(Settings):
             del plain[ATTRIBUTE]
         return plain
 
+    def seen_tile(self) -> NDArray[np.float32]:
+        """Return which colours of a light field pixels see, a tile (row, column, colour), 0 or 1.
+
+        A band has no colours: a sensor without filters sees it as red, and red stands for all.
+        """
+        tile = cfa_tile(self.sensor.cfa)
+        without_filters = tile.all() and all(shot.filter == "none" for shot in self.shots)
+        return (
+            tile * np.array([1, 0, 0], np.float32)
+            if "band" in self.view_axes and without_filters
+            else tile
+        )
+
     def shot_masks(self, shot: int) -> tuple[str, ...]:
         """Return the names of the masks in the beam during a shot."""
         chosen = self.shots[shot].masks
@@ -423,7 +436,7 @@ def sensor_response(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32
             f"pixels of {k} x {k} samples do not divide a light field of {rows} x {columns}: "
             f"crop it to {rows // k * k} x {columns // k * k}"
         )
-    tile = cfa_tile(camera.sensor.cfa)
+    tile = camera.seen_tile()
     pixels = tile[(np.arange(rows) // k) % tile.shape[0]][
         :, (np.arange(columns) // k) % tile.shape[1]
     ]
@@ -507,7 +520,7 @@ def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
     Raises CameraError when the pixels do not divide the light field.
     """
     k = camera.sensor.binning
-    tile = cfa_tile(camera.sensor.cfa)
+    tile = camera.seen_tile()
     # One period of the filters shows whether pixels see one colour, and which.
     period = sensor_response(camera, (tile.shape[0] * k, tile.shape[1] * k))
     single = bool((period.sum(axis=-1) <= 1).all())

@@ -28,7 +28,7 @@ from emmc_rig.model.files import whole_file
 from emmc_rig.model.geometry import centred_grid, fresnel_number, mask_position
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_axes import grid_name, picture_name, place_name
+from emmc_rig.model.view_axes import grid_name, picture_name, place_name, shows_parallax
 
 SHEET_SAMPLES = 64
 LISTING_SAMPLES = 24
@@ -159,9 +159,9 @@ def _draw_axis(axes: Axes, camera: Camera) -> None:
     axes.set_xlim(-0.08 * lens_mm, 1.1 * lens_mm)
     axes.set_ylim(-1.3 * half_mm, 1.4 * half_mm)
     _label(axes, "optical axis, mm (sensor drawn larger)")
-    axes.set_title(
-        f"camera, shot 0, one pixel's rays to the {picture_name(camera.view_axes)}s", fontsize=10
-    )
+    kind = "camera" if shows_parallax(camera.view_axes) else "equivalent camera"
+    seen = f"{picture_name(camera.view_axes)}s"
+    axes.set_title(f"{kind}, shot 0, one pixel's rays to the {seen}", fontsize=10)
 
 
 def _label(axes: Axes, x: str) -> None:
@@ -280,4 +280,6 @@ def _transmittance(camera: Camera, psi: ImagingMatrix) -> NDArray[np.float32]:
     response = sensor_response(camera, psi.size)[0]
     scale = camera.views[0] * camera.views[1] * camera.sensor.binning**2
     weights = psi.weights[0].swapaxes(-1, -2) * scale
-    return weights * response.sum(axis=-1, keepdims=True) * (response > 0)
+    passed = weights * response.sum(axis=-1, keepdims=True) * (response > 0)
+    psi.even_unseen_colours(passed)
+    return passed

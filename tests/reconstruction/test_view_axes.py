@@ -15,7 +15,7 @@ import emmc_rig as emmc
 from emmc_rig.files.exports import MAPS, open_export
 from emmc_rig.files.formats import FORMATS
 from emmc_rig.files.psi import FRAMES, PSI, open_psi, save_shards
-from emmc_rig.model.camera import Camera, camera_of, psi_layout
+from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
 from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
 from emmc_rig.model.sensing import ImagingMatrix
@@ -142,15 +142,36 @@ def test_a_cassi_described_by_a_file_has_the_matrix_of_its_shifted_masks(tmp_pat
     camera = emmc.camera(cassi_file(tmp_path, cells))
     psi = camera.psi(SIZE)
     shifted = [cells[8:, 8 + step * band :][:rows, :columns] for band in range(count)]
-    expected = emmc.Psi.from_weights(
-        np.stack(shifted)[None, None] / count, cfa="mono", view_axes=BANDS
-    )
+    expected = emmc.Psi.from_weights(np.stack(shifted)[None, None] / count, view_axes=BANDS)
     np.testing.assert_allclose(psi.weights, expected.weights, atol=1e-7)
+    np.testing.assert_array_equal(psi.colour, expected.colour)
     assert psi.view_axes == psi_layout(camera, SIZE).view_axes == psi.layout.view_axes == BANDS
     assert psi.layout.psi(psi.weights).checksum() == psi.checksum()
     assert camera_of(psi) == camera
     assert "1x24 bands" in repr(camera)
     assert emmc.camera(camera.model_dump()) == camera
+
+
+def test_bands_that_are_darker_at_the_ends_are_no_vignetting(tmp_path):
+    cells = np.random.default_rng(7).integers(0, 2, (110, 170))
+    camera = emmc.camera(cassi_file(tmp_path, cells, bands=12))
+    picture = light_of((1, 1), ANGLES, (64, 96))[0, 0]
+    lit = 1 - 0.8 * np.abs(np.arange(12) - 6) / 6
+    light = (picture * lit[:, None, None, None]).astype(np.float32)[None]
+    psi = camera.psi((64, 96))
+    verdict = emmc.reconstruct(psi, camera.expose(light, psi=psi), "adaptive-fast").verdict
+    for wrong in ("outermost rays", "aperture", "colour"):
+        assert wrong not in verdict.words
+
+
+def test_a_sensor_without_filters_sees_bands_as_light_without_colours(tmp_path):
+    path = cassi_file(tmp_path, np.ones((90, 90), int), bands=3)
+    assert emmc.camera(path).psi((8, 8)).colour is not None
+    filtered = yaml.safe_load(path.read_text())
+    for more in ({"shots": [{"filter": "green"}]}, {"view_axes": ["angle", "time"]}):
+        described = {**filtered, **more}
+        seen = sensor_response(emmc.camera(described), (8, 8))
+        assert seen[..., 1].all()
 
 
 def test_a_camera_at_angles_is_described_and_hashed_as_by_earlier_versions():
