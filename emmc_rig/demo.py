@@ -151,6 +151,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             seed=settings.seed,
         )
         truth = fine.scene.light_field
+        if not camera.seen_tile()[..., 1:].any():  # light without colours is all that there is
+            truth = np.repeat(truth.mean(axis=-1, keepdims=True), 3, axis=-1)
         size = (truth.shape[2], truth.shape[3])
     with stages("design"):
         design = build_imaging_matrix(camera, size)

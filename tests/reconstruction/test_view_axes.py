@@ -335,6 +335,28 @@ def test_every_grid_of_views_is_reconstructed_and_kept(
 
 
 @pytest.mark.slow
+def test_a_demo_of_bands_is_grey_and_speaks_of_bands(tmp_path):
+    cells = np.random.default_rng(8).integers(0, 2, (70, 90))
+    path = cassi_file(tmp_path, cells, bands=3)
+    code, output, _ = program(
+        "demo", "--camera", str(path), "--scene", "near-planar", "--size", "24x32",
+        "--method", "tv", "--out", str(tmp_path / "out"),
+    )  # fmt: skip
+    assert code == 0
+    assert "against the copied middle band" in output
+    words = (tmp_path / "out/report.html").read_text().split("<script")[0]
+    assert "parallax" not in words
+    assert "Over middle band" in words
+    opened = open_export(str(tmp_path / "out"))
+    assert opened.view_axes == BANDS
+    light = opened.light_field
+    assert light.std() > 0.01
+    assert (light == light[..., :1]).all()
+    with h5py.File(tmp_path / "out/maps.h5") as maps:
+        assert maps.attrs["view_axes"] == "angle,band"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("as_zarr", [False, True])
 def test_blocks_of_a_capture_of_bands_are_kept_as_bands(tmp_path, as_zarr):
     psi = psi_of((1, 6), BANDS, size=(64, 96))
