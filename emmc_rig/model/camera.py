@@ -159,12 +159,10 @@ class Camera(Settings):
         A band has no colours: a sensor without filters sees it as red, and red stands for all.
         """
         tile = cfa_tile(self.sensor.cfa)
-        without_filters = tile.all() and all(shot.filter == "none" for shot in self.shots)
-        return (
-            tile * np.array([1, 0, 0], np.float32)
-            if "band" in self.view_axes and without_filters
-            else tile
-        )
+        filtered = not tile.all() or any(shot.filter != "none" for shot in self.shots)
+        if filtered or "band" not in self.view_axes:
+            return tile
+        return tile * np.array([1, 0, 0], np.float32)
 
     def shot_masks(self, shot: int) -> tuple[str, ...]:
         """Return the names of the masks in the beam during a shot."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, overload
 
@@ -135,7 +136,7 @@ def _of_arrays(
     _refuse_millimetres(stood, camera)
     exposed = darks if isinstance(darks, Mapping) else {stood[0].exposure_s: darks}
     for exposure_s in exposed:
-        required(exposure_s, (int, float), "an exposure of darks", "a number, as poses give it")
+        required(exposure_s, Real, "an exposure of darks", "a number, as poses give it")
     dark = tuple(
         _mean(frames, float(exposure_s), camera, f"darks at {exposure_s:g}", lit=False)
         for exposure_s, frames in exposed.items()
