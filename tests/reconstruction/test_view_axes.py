@@ -27,6 +27,7 @@ from emmc_rig.pages.viewer import render_viewer, viewer_data
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.processing.reconstructing import reconstruct_folder
 from reconstruction.methods import MethodSettings
+from reconstruction.preview import Preview
 
 SIZE = (24, 32)
 BANDS, TIMES = ("angle", "band"), ("time", "angle")
@@ -294,6 +295,16 @@ def test_what_a_method_calls_disparity_is_a_shift_between_times():
     assert {"shift", "shift_sigma"} <= set(result.maps)
     assert not any("disparit" in name for name in result.maps)
     assert "disparit" not in result.verdict.words
+
+
+def test_the_preview_of_a_camera_without_colours_is_grey():
+    psi = psi_of((1, 6), BANDS, size=(32, 48))
+    frames = frames_of(psi, light_of((1, 6), BANDS, (32, 48)))
+    preview = Preview(psi, 4, frames, NOISE)
+    preview.follow(frames, 5)
+    light = preview.light_field
+    assert light.std() > 0.01
+    assert (light == light[..., :1]).all()
 
 
 @pytest.mark.parametrize("views", [(1, 2), (2, 1), (1, 24)])
