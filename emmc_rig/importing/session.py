@@ -58,6 +58,18 @@ UNIT = 1000.0
 """Between ms and s, um and mm, which are mistaken for one another."""
 LEAST_MOVE = 50.0
 """Of a cell: nobody moves a mask or pinhole by less, but 0.02 to 2 cells in mm look like that."""
+MOST_MOVE = 500.0
+"""Cells: half a cell in nm looks like that, and masks are hardly larger."""
+TOO_BRIGHT = 20.0
+"""Times what the camera says of white: a minute has 60 s; only a lamp in the scene has as much."""
+ONE_CLOCK_S = 3e7
+"""Between the frames of a session: a year. Seconds from its start beside dates lie farther apart."""
+WHITE_ABOVE = 4.0
+"""Times the highest value: two bits that no frame uses are hardly a camera's."""
+MOST_SATURATED = 0.5
+"""Of a shot's pixels: what is left shows no scene."""
+FEWEST_PIXELS = 4
+"""Rows or columns: checks look at neighbours two pixels away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +111,23 @@ def import_session(
     with nothing written.
     """
     known = find_camera(camera)
+    if planes and known.sensor.cfa != "mono":
+        raise AppError(
+            f"--planes: three shots of a monochrome sensor, and the camera's sensor.cfa is "
+            f"{known.sensor.cfa_name}: leave --planes out, or write cfa: mono"
+        )
     refuse_inside_session(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not out.is_dir():
+        raise AppError(f"--out {out}: a file, where a folder is meant; name another --out")
+    if out.exists() and any(out.iterdir()):
         raise AppError(f"--out {out}: holds something already; name another --out")
-    with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
-        items = list(_items(listed, known, planes, Path(spool), on_file))
-        return _Import(items, known, camera).write(out)
+    try:
+        with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
+            items = list(_items(listed, known, planes, Path(spool), on_file))
+            return _Import(items, known, camera).write(out)
+    except OSError as fault:
+        why = fault.strerror or fault
+        raise AppError(f"{fault.filename or out}: {why}; nothing was imported") from fault
 
 
 # Read and check.
@@ -141,6 +164,9 @@ def _items(
         if frames.shape[1:] != first[1]:
             sizes = ["x".join(map(str, size)) for size in (frames.shape[1:], first[1])]
             raise AppError(f"{name}: {sizes[0]} pixels (y x), and {first[0]} has {sizes[1]}")
+        if min(first[1]) < FEWEST_PIXELS:
+            size = "x".join(map(str, first[1]))
+            raise AppError(f"{name}: {size} pixels (y x), fewer than a frame has")
         if kind.itemsize != first[2].itemsize or kind.kind != first[2].kind:
             raise AppError(
                 f"{name}: values of {kind.name}, and {first[0]} has {first[2].name}; write all "
@@ -243,12 +269,19 @@ class _Import:
                 raise AppError(
                     f"{item.listed.where}: there is no shot {shot}, only 0 to {count - 1}"
                 )
+        placed = [shot for item, shot in self._items if _placed(item.listed.row)]
+        if count > len(camera.shots) and count - 1 not in placed:
+            raise AppError(
+                f"shots 0 to {count - 1} have files, and the camera has {len(camera.shots)} shot(s): "
+                "write mask_x_um and mask_y_um of the others, or into the camera's file its shots"
+            )
         if count < len(camera.shots):
             self._notes.append(f"{count} of the camera's {len(camera.shots)} shots have files")
         self._own = camera
         self._plan = self._planned(count, spec)
         self._camera = planned_camera(self._plan)
         self._exposures_s = [self._exposure_s(item, shot) for item, shot in self._items]
+        self._check_times()
         self._check_exposures()
 
     def _numbered(self, items: list[_Item]) -> list[tuple[_Item, int]]:
@@ -263,6 +296,16 @@ class _Import:
                 )
             if row.lamp is not None and (row.lamp == "off") != (row.kind == "dark"):
                 raise AppError(f"{item.listed.where}: kind {row.kind} with the lamp {row.lamp}")
+            if row.kind != "whiteboard" and not row.aperture_x_um is row.aperture_y_um is None:
+                raise AppError(
+                    f"{item.listed.where}: a pinhole's place with kind {row.kind}; only a whiteboard "
+                    "is taken through one"
+                )
+            if row.kind == "reference" and (row.mask_x_um or row.mask_y_um):
+                raise AppError(
+                    f"{item.listed.where}: a mask's place with kind reference, which is without "
+                    "masks: is it open?"
+                )
             if row.kind != "shot":
                 found.append((item, row.shot or 0))
             elif free:
@@ -316,7 +359,8 @@ class _Import:
                 f"{where}: mask at {place[0]:g}, {place[1]:g} um, far less than its cells: mm "
                 "for um? write um"
             )
-        if any(own) and _close((place[0] / UNIT, place[1] / UNIT), own):
+        far = bool(cells) and largest > MOST_MOVE * max(cells) and not _close(place, own)
+        if far or (any(own) and _close((place[0] / UNIT, place[1] / UNIT), own)):
             raise AppError(f"{where}: mask at {place[0]:g}, {place[1]:g} um: nm for um? write um")
 
     def _exposure_s(self, item: _Item, shot: int) -> float:
@@ -362,6 +406,16 @@ class _Import:
                     "one of them? write seconds"
                 )
 
+    def _check_times(self) -> None:
+        times = [item.time_s if (own := item.listed.row.time) is None else own
+                 for item, _ in self._items]  # fmt: skip
+        known = [time for time in times if time is not None]
+        if known and max(known) - min(known) > ONE_CLOCK_S:
+            first, last = (
+                self._items[times.index(one)][0].listed.where for one in (min(known), max(known))
+            )
+            raise AppError(f"{last}: time is over a year after that of {first}: write one clock's")
+
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
@@ -379,6 +433,7 @@ class _Import:
             lamp = "off" if kind == "dark" else row.lamp or "white"
             at_um = mask_offsets_um(self._camera, shot)
             if _placed(row) and kind != "shot":
+                self._check_place((row.mask_x_um or 0.0, row.mask_y_um or 0.0), shot, where)
                 at_um = {"mask_x": row.mask_x_um or 0.0, "mask_y": row.mask_y_um or 0.0}
             view = None
             if kind == "whiteboard":
@@ -492,6 +547,16 @@ class _Import:
                     f"{item.listed.where}: a dark that is {found.mean_dn / span:.1%} of white on "
                     "average: is it another kind, or sensor.noise.black_level_dn wrong?"
                 )
+            self._check_light(frame, item, found.saturated, found.bright_dn / span)
+        highest = max(float(item.read().max()) for _, item in planned)
+        if "white_level_dn" not in self._own.sensor.noise.model_fields_set and (
+            highest * scale * WHITE_ABOVE < noise.white_level_dn and planned[0][1].raw is None
+        ):
+            self._note(
+                f"sensor.noise.white_level_dn is taken as {self._own.sensor.noise.white_level_dn}, "
+                f"as nothing states it, and no value is above {highest:g}: a camera of 12 bits has "
+                "4095"
+            )
         self._set_white(planned, scale)
         plan = yaml.safe_dump(self._plan.model_dump(mode="json", exclude_unset=True))
         plan = f"# Imported: what stood in a table or globs, as a plan.\n{plan}"
@@ -513,12 +578,27 @@ class _Import:
             self._store(session, planned, scale)
             session.disk.replace(part, out)
             session.disk.sync_folder(out.parent)
-        except OSError as fault:
-            raise AppError(f"{out}: {fault.strerror}; nothing was imported") from fault
         finally:
             with suppress(OSError):
                 shutil.rmtree(part)
         return Imported(Session(out), tuple(self._notes))
+
+    def _check_light(
+        self, frame: PlannedFrame, item: _Item, saturated: float, bright: float
+    ) -> None:
+        """Raise AppError for a shot, of a bracket the shortest, that shows nothing."""
+        if not frame.id.startswith(f"shot-{frame.bench.shot}-e0-"):
+            return
+        what = None
+        if saturated > MOST_SATURATED:
+            what = f"{saturated:.0%} of its pixels are at white"
+        elif bright < Checks().smallest_signal:
+            what = f"its brightest readings are {max(bright, 0):.1%} of white above black"
+        if what is not None:
+            raise AppError(
+                f"{item.listed.where}: shot {frame.bench.shot}: {what}: expose otherwise, or are "
+                "sensor.noise.black_level_dn and white_level_dn the file's?"
+            )
 
     def _store(
         self, session: Session, planned: list[tuple[PlannedFrame, _Item]], scale: int
@@ -553,7 +633,7 @@ class _Import:
             metadata["temperature_c"] = f"{row.temperature_c:g}"
         original, digest = b"", item.digest
         if whole:
-            original = path.read_bytes() if path.is_file() and item.place == 0 else b""
+            original = b"" if path.is_dir() or item.place else path.read_bytes()
             if original and hashlib.sha256(original).hexdigest() != digest:
                 raise AppError(f"{shown_path(path)}: changed while it was imported; try again")
             if not original:
@@ -591,10 +671,12 @@ class _Import:
         if electrons_per_s <= 0:
             raise AppError("no shot is brighter than the camera's sensor.noise.black_level_dn")
         if "electrons_per_s" in noise.model_fields_set:
-            if 0.02 < electrons_per_s * UNIT / noise.electrons_per_s < 2:
+            bright = electrons_per_s / noise.electrons_per_s
+            unit = "minutes" if bright > TOO_BRIGHT else "ms"
+            if unit == "minutes" or 0.02 < bright * UNIT < 2:
                 raise AppError(
-                    f"the shots are {electrons_per_s / noise.electrons_per_s:.2g} times as bright "
-                    "as the camera's electrons_per_s says: ms for s in exposure_s? write seconds"
+                    f"the shots are {bright:.2g} times as bright as the camera's electrons_per_s "
+                    f"says: {unit} for s in exposure_s? write seconds"
                 )
             return
         self._note(
