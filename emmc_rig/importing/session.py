@@ -63,7 +63,7 @@ MOST_MOVE = 500.0
 TOO_BRIGHT = 20.0
 """Times what the camera says of white: a minute has 60 s; only a lamp in the scene has as much."""
 ONE_CLOCK_S = 3e7
-"""Between the frames of a session: a year. Seconds from its start beside dates lie farther apart."""
+"""Between frames of a session: a year. Seconds from a start and dates lie farther apart."""
 WHITE_ABOVE = 4.0
 """Times the highest value: two bits that no frame uses are hardly a camera's."""
 MOST_SATURATED = 0.5
@@ -272,8 +272,8 @@ class _Import:
         placed = [shot for item, shot in self._items if _placed(item.listed.row)]
         if count > len(camera.shots) and count - 1 not in placed:
             raise AppError(
-                f"shots 0 to {count - 1} have files, and the camera has {len(camera.shots)} shot(s): "
-                "write mask_x_um and mask_y_um of the others, or into the camera's file its shots"
+                f"shots 0 to {count - 1} have files, and the camera has {len(camera.shots)} "
+                "shot(s): write mask_x_um and mask_y_um of the others, or more shots into its file"
             )
         if count < len(camera.shots):
             self._notes.append(f"{count} of the camera's {len(camera.shots)} shots have files")
@@ -296,10 +296,11 @@ class _Import:
                 )
             if row.lamp is not None and (row.lamp == "off") != (row.kind == "dark"):
                 raise AppError(f"{item.listed.where}: kind {row.kind} with the lamp {row.lamp}")
-            if row.kind != "whiteboard" and not row.aperture_x_um is row.aperture_y_um is None:
+            pinhole = (row.aperture_x_um, row.aperture_y_um) != (None, None)
+            if row.kind != "whiteboard" and pinhole:
                 raise AppError(
-                    f"{item.listed.where}: a pinhole's place with kind {row.kind}; only a whiteboard "
-                    "is taken through one"
+                    f"{item.listed.where}: a pinhole's place with kind {row.kind}; only a "
+                    "whiteboard is taken through one"
                 )
             if row.kind == "reference" and (row.mask_x_um or row.mask_y_um):
                 raise AppError(

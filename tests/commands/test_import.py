@@ -433,7 +433,7 @@ MISTAKES = {
     ),
     "a month that is none": (changed(0, time="2026-13-25T14:30:00"), "month must be in 1..12"),
     "a time without a date": (changed(0, time="14:30:00"), "time: input should be a number"),
-    "letters of another case": (changed(1, file="S1.npy"), "S1.npy: no such file; did you mean 's1"),
+    "letters of another case": (changed(1, file="S1.npy"), "no such file; did you mean 's1.npy'?"),
     "a name that is nearly right": (changed(1, file="s1.tif"), "did you mean 's1.npy'?"),
     "a plural as a kind": (changed(0, kind="shots"), "kind: input should be 'shot', 'dark'"),
     "a flat": (changed(2, kind="flat"), "kind: input should be 'shot', 'dark', 'reference'"),
