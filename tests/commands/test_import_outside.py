@@ -11,7 +11,7 @@ import pytest
 import tifffile
 import yaml
 from outside_bench import Bench, Optics, Sensor
-from outside_boards import camera_of
+from outside_boards import agreement, camera_of
 from test_docs import ROOT, blocks, written_files
 
 from calibration.shadow import shadow_mask
@@ -200,12 +200,11 @@ def test_psi_of_whiteboards_of_another_bench_errs_as_much_as_it_says(tmp_path, r
     ):
         code, _, err = run(*command)
         assert code == 0, err
-    found = parse_json((tmp_path / "bench/calibration/metrics.json").read_bytes(), "m", ValueError)
     psi, _ = open_frames(tmp_path / "bench")
-    truth = bench.psi()
-    true = np.sqrt(np.mean((psi.weights[0, :, :, :, 0] - truth) ** 2) / np.mean(truth**2))
-    stated = found["stated"]
-    print(true, stated, verdict(tmp_path / "bench"))
-    assert 0.4 < true / stated < 1.6
-    assert true < 0.01
+    with h5py.File(tmp_path / "bench/calibration/calibration.h5") as file:
+        found = agreement(bench, psi.weights, file["deviation"][()], file["good"][()])
+    assert 0.4 < found["true"] / found["stated"] < 1.6, found
+    assert 0.45 < found["one"] < 0.95, found
+    assert found["two"] > 0.88, found
+    assert found["true"] < 0.01, found
     assert verdict(tmp_path / "bench")["level"] != "do not use"
