@@ -634,8 +634,9 @@ class _Import:
             metadata["temperature_c"] = f"{row.temperature_c:g}"
         original, digest = b"", item.digest
         if whole:
-            original = b"" if path.is_dir() or item.place else path.read_bytes()
-            if original and hashlib.sha256(original).hexdigest() != digest:
+            is_kept = item.place == 0 and not path.is_dir()
+            original = path.read_bytes() if is_kept else b""
+            if is_kept and hashlib.sha256(original).hexdigest() != digest:
                 raise AppError(f"{shown_path(path)}: changed while it was imported; try again")
             if not original:
                 original = f"frame {item.place} of {path.name}, SHA-256 {item.digest}".encode()
