@@ -44,7 +44,7 @@ from emmc_rig.session.session import Frozen, Session, wall_time
 from emmc_rig.session.storage import part_of
 from emmc_rig.session.verify import verify_frames
 
-KIND_ORDER = ("dark", "reference", "whiteboard", "open", "held-out", "shot")
+KIND_ORDER = ("dark", "reference", "whiteboard", "open", "check", "turned", "held-out", "shot")
 TOP_DN = 65_535
 BRIGHTEST = 0.9
 """What the brightest part of a scene is taken for where nothing states how bright white is."""
@@ -282,6 +282,7 @@ class _Import:
         self._camera = planned_camera(self._plan)
         self._exposures_s = [self._exposure_s(item, shot) for item, shot in self._items]
         self._check_times()
+        self._check_turns()
         self._check_exposures()
 
     def _numbered(self, items: list[_Item]) -> list[tuple[_Item, int]]:
@@ -301,6 +302,11 @@ class _Import:
                 raise AppError(
                     f"{item.listed.where}: a pinhole's place with kind {row.kind}; only a "
                     "whiteboard is taken through one"
+                )
+            if row.turn_deg is not None and row.kind not in ("open", "reference"):
+                raise AppError(
+                    f"{item.listed.where}: turn_deg with kind {row.kind}; boards that are turned "
+                    "are open or reference"
                 )
             if row.kind == "reference" and (row.mask_x_um or row.mask_y_um):
                 raise AppError(
@@ -417,6 +423,19 @@ class _Import:
             )
             raise AppError(f"{last}: time is over a year after that of {first}: write one clock's")
 
+    def _check_turns(self) -> None:
+        """Raise AppError for a turned board that was not taken both with masks and without."""
+        kinds: dict[float, set[str]] = defaultdict(set)
+        for row in (item.listed.row for item, _ in self._items):
+            if row.turn_deg is not None:
+                kinds[row.turn_deg].add(row.kind)
+        for turn_deg, known in kinds.items():
+            if len(known) < 2:
+                raise AppError(
+                    f"the board turned by {turn_deg:g} degrees has kind {known.pop()} alone; it "
+                    "takes open and reference"
+                )
+
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
@@ -444,7 +463,11 @@ class _Import:
                     place = row.aperture_x_um or 0.0, row.aperture_y_um or 0.0
                     view = self._view(place, where)
                     at_um |= {"aperture_x": place[0], "aperture_y": place[1]}
-            if kind in ("open", "held-out") and shot:
+            masks_in = kind not in ("reference", "reference-check")
+            if row.turn_deg is not None:
+                kind = "turned"
+            kind = "check" if kind == "reference-check" else kind
+            if kind in ("open", "held-out", "check", "turned") and shot:
                 raise AppError(f"{where}: whiteboards of the whole aperture are of shot 0 alone")
 
             def group(name: str, key: object) -> str:
@@ -461,18 +484,22 @@ class _Import:
                 name = {
                     "reference": f"reference-s{shot}-{lamp}",
                     "whiteboard": f"board-s{shot}-v{view and view[0]}-u{view and view[1]}-{lamp}",
-                }.get(kind) or group(kind, tuple(at_um.items()))
-                masks_in = kind != "reference"
-                bench = Bench(
-                    "whiteboard", lamp, shot, fitted[shot], masks_in, at_um if masks_in else {}
-                )
+                }.get(kind) or group(kind, (masks_in, row.turn_deg, *at_um.items()))
+                at_um = at_um if masks_in else {}
+                turn_deg = row.turn_deg or 0.0
+                bench = Bench("whiteboard", lamp, shot, fitted[shot], masks_in, at_um, turn_deg)
             repeat = counts[name]
             counts[name] += 1
             frame = PlannedFrame(
                 f"{name}-r{repeat}", kind, bench, exposure_s, row.gain, repeat, view
             )
             named.append((KIND_ORDER.index(kind), frame, item))
-        named.sort(key=lambda one: (one[0], (one[1].bench.shot, one[1].id) if one[0] == 5 else ()))
+        named.sort(
+            key=lambda one: (
+                one[0],
+                (one[1].bench.shot, one[1].id) if one[1].kind == "shot" else (),
+            )
+        )
         return [(frame, item) for _, frame, item in named]
 
     def _held_out(self) -> _Item | None:
@@ -481,7 +508,7 @@ class _Import:
         whole = [
             item
             for item, row in rows
-            if row.kind == "open"
+            if (row.kind == "open" and row.turn_deg is None)
             or (row.kind == "whiteboard" and row.aperture_x_um is row.aperture_y_um is None)
         ]
         if len(whole) < FEWEST_TO_HOLD_OUT or any(row.kind == "held-out" for _, row in rows):

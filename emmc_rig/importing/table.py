@@ -20,7 +20,9 @@ from emmc_rig.model.errors import did_you_mean
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.settings import Settings, validated
 
-ImportedKind = Literal["shot", "dark", "reference", "whiteboard", "open", "held-out"]
+ImportedKind = Literal[
+    "shot", "dark", "reference", "whiteboard", "open", "held-out", "check", "reference-check"
+]
 LONGEST_S = 3600.0
 MOST_TABLE_BYTES = 16_000_000
 WORKBOOK = b"PK\x03\x04"
@@ -46,6 +48,9 @@ class Row(Settings):
     mask_y_um: float | None = None
     aperture_x_um: float | None = Field(default=None, description="of the pinhole, from the axis")
     aperture_y_um: float | None = None
+    turn_deg: float | None = Field(
+        default=None, gt=0, lt=360, description="by which the white board is turned in its plane"
+    )
     lamp: Literal["white", "red", "green", "blue", "off"] | None = None
     time: Annotated[float | None, BeforeValidator(_seconds)] = Field(
         default=None, description="seconds on any clock, or a date and time"

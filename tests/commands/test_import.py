@@ -31,6 +31,8 @@ PLAN = {
     "whiteboards": {
         "repeats": 1,
         "references": 2,
+        "lamp_checks": 2,
+        "turned": 2,
         "open": [{"held_out": True}, {"mask_um": [0, 0]}, {"mask_um": [24, 0]}],
     },
     "darks": {"repeats": 2, "of_shots": 2},
@@ -48,7 +50,13 @@ def exported(session, folder, write):
     rows = []
     for frame, (raw, exposure_s) in zip(frames, decoded(session, frames), strict=True):
         bench, um = frame.bench, frame.bench.offsets_um
-        row = {"file": write(folder / frame.id, raw.mosaic), "kind": frame.kind}
+        kind, turned = frame.kind, {}
+        if kind == "turned":
+            kind = "open" if bench.masks_in else "reference"
+            turned = {"turn_deg": bench.board_turn_deg}
+        elif kind == "check" and not bench.masks_in:
+            kind = "reference-check"
+        row = {"file": write(folder / frame.id, raw.mosaic), "kind": kind, **turned}
         row |= {"exposure_s": repr(exposure_s), "lamp": bench.lamp}
         if frame.kind != "dark" or frame.is_dark_of_shots:
             row["shot"] = bench.shot
@@ -407,6 +415,10 @@ MISTAKES = {
     "nm for um of the mask": (changed(1, mask_x_um=24_000), "mask at 24000, 0 um: nm for um?"),
     "mm for um of a whiteboard's mask": (
         changed(2, kind="open", mask_x_um=0.024), "mm for um? write um"
+    ),
+    "a shot that is turned": (changed(0, turn_deg=90), "turn_deg with kind shot"),
+    "a turned board without its reference": (
+        changed(2, kind="open", turn_deg=90), "turned by 90 degrees has kind open alone"
     ),
     "a pinhole before a shot": (changed(0, aperture_x_um=0), "a pinhole's place with kind shot"),
     "a mask in a reference": (
