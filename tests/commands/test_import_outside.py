@@ -3,6 +3,7 @@
 import csv
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import h5py
@@ -12,7 +13,6 @@ import tifffile
 import yaml
 from outside_bench import Bench, Optics, Sensor
 from outside_boards import agreement, camera_of
-from test_docs import ROOT, blocks, written_files
 
 from calibration.shadow import shadow_mask
 from emmc_rig.model.json_text import parse_json
@@ -20,7 +20,10 @@ from emmc_rig.processing.reconstructing import open_frames
 
 pytestmark = pytest.mark.slow
 
-PAGE = ROOT / "docs/own-data.md"
+PAGE = Path(__file__).parents[2] / "docs/own-data.md"
+SECTION = PAGE.read_text(encoding="utf-8").partition("## An example")[2].partition("\n## ")[0]
+BLOCKS = dict(re.findall(r"^```(\w*)\n(.*?)^```$", SECTION, re.M | re.S))
+COMMANDS = [line.split()[1:] for line in BLOCKS[""].splitlines()]
 CELLS = np.where(np.random.default_rng(1).random((64, 64)) < 0.5, 0.92, 0.02)
 OPTICS = Optics(
     mask_um=500, pitch_um=24, cell_um=24, aperture_cell_um=2000, offset_um=(0, 0), rotation_rad=0
@@ -56,23 +59,15 @@ def scene(size, views=(5, 5), disparity=0.6):
 
 def filmed(folder, sensor, change=lambda dn: dn):
     """Write what the page's example has in its folder; return the scene, (v, u, y, x, colour)."""
-    for name, text in written_files(PAGE):
-        (folder / name).write_text(text)
-    (table,) = re.findall(r"```csv\n(.*?)```", PAGE.read_text(), re.S)
-    (folder / "table.csv").write_text(table)
+    (folder / "mine.yaml").write_text(BLOCKS["yaml"])
+    (folder / "table.csv").write_text(BLOCKS["csv"])
     tifffile.imwrite(folder / "photo.tif", photograph(CELLS))
     bench, field = Bench(CELLS, (56, 56), optics=OPTICS, sensor=sensor), scene((56, 56))
-    for row in csv.DictReader(table.splitlines()):
+    for row in csv.DictReader(BLOCKS["csv"].splitlines()):
         lit = row["kind"] == "shot"
         dn = bench.take(float(row["exposure_s"]), lit=lit, scene=field if lit else None)
         tifffile.imwrite(folder / row["file"], change(dn))
     return field
-
-
-def example():
-    """Return the three commands of the page's example."""
-    (found,) = [list(some) for _, some in blocks(PAGE) if next(iter(some), [""])[0] == "mask"]
-    return found
 
 
 def verdict(session):
@@ -82,9 +77,8 @@ def verdict(session):
 
 def test_a_photograph_of_the_mask_and_four_files_become_the_light_field(tmp_path, run):
     truth = filmed(tmp_path, Sensor(bayer=False))[..., 1]
-    commands = example()
-    assert [one[0] for one in commands] == ["mask", "import", "reconstruct"]
-    for command in commands:
+    assert [one[0] for one in COMMANDS] == ["mask", "import", "reconstruct"]
+    for command in COMMANDS:
         code, _, err = run(*command)
         assert code == 0, err
     with h5py.File(tmp_path / "bench/reconstruction/light_field.h5") as file:
@@ -133,7 +127,7 @@ def test_a_mistake_that_no_file_shows_is_named_by_the_verdict(mistake, tmp_path,
     sensor, written, described, words = UNKNOWABLE[mistake]
     filmed(tmp_path, replace(sensor, electrons_per_s=400_000), written)
     camera_changed(tmp_path, described)
-    mask, imported, reconstruct = example()
+    mask, imported, reconstruct = COMMANDS
     for command in (mask, imported, [*reconstruct, "--method", "tv"]):
         code, _, err = run(*command)
         assert code == 0, err
