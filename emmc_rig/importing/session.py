@@ -111,7 +111,7 @@ def import_session(
     with nothing written.
     """
     known = find_camera(camera)
-    if planes and known.sensor.cfa != "mono":
+    if planes and known.sensor.cfa_name not in ("mono", "custom"):
         raise AppError(
             f"--planes: three shots of a monochrome sensor, and the camera's sensor.cfa is "
             f"{known.sensor.cfa_name}: leave --planes out, or write cfa: mono"
