@@ -22,6 +22,7 @@ from emmc_rig.cli import app
 
 BANDS = {"tsa": 28, "smem": 24}
 """Of each spectral camera."""
+ARRAYS = {"tsa": "meas_real", "smem": "meas"}
 PRISM_PX = 2
 """By which the prism displaces a band against the one before."""
 CASSI = """
@@ -94,7 +95,7 @@ def coded_capture(
         camera, session, psi_file = (Path(work) / one for one in ("mine.yaml", "s", "psi.h5"))
         camera.write_text(CAMERAS[kind], "utf-8")
         if kind in BANDS:
-            shots = folder / f"{name}.mat"
+            shots = folder / f"{name}.mat@{ARRAYS[kind]}"
             psi = spectral_psi(folder / kind / "mask.mat", BANDS[kind], mask)
         else:
             shots = Path(work) / "light.npy"
@@ -128,8 +129,9 @@ def spectral_psi(path: Path, bands: int, mask: str = "right") -> emmc.Psi:
         code = np.asarray(cv2.GaussianBlur(code, (0, 0), SOFTER_PX))
     elif mask != "right":
         code = np.roll(code, int(mask.split()[0]), axis=0)
-    shifts = PRISM_PX * np.arange(bands)
-    weights = np.stack([np.pad(code, ((0, 0), (t, shifts[-1] - t))) for t in shifts])
+    widest = PRISM_PX * (bands - 1)
+    shifts = range(0, widest + 1, PRISM_PX)
+    weights = np.stack([np.pad(code, ((0, 0), (t, widest - t))) for t in shifts])
     weights /= weights.sum(axis=0).mean()
     return emmc.Psi.from_weights(weights[None, None], view_axes=("angle", "band"))
 
