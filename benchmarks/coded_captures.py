@@ -107,8 +107,8 @@ def coded_capture(
         app(list(map(str, command)), standalone_mode=False)
         psi, frames = emmc.open_frames(session, psi_file)
     rows, columns = _middle(psi.size, size)
-    whole = frames.readings, frames.deviation, frames.usable
-    psi, frames = psi.window(rows, columns), emmc.Frames(*(one[:, rows, columns] for one in whole))
+    psi, place = psi.window(rows, columns), (slice(None), rows, columns)
+    frames = emmc.Frames(frames.readings[place], frames.deviation[place], frames.usable[place])
     by_blocks = kind not in BANDS if blocks is None else blocks
     return CodedCapture(psi, frames, frames.usable & _kept(frames.shape, by_blocks))
 
