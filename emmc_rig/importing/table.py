@@ -125,11 +125,18 @@ def read_table(path: Path) -> list[Listed]:
 
 
 def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
-    """Return a row for every file that a glob of its kind names, 2 before 10; raises AppError."""
+    """Return a row for every file that a glob of its kind names, 2 before 10; raises AppError.
+
+    GLOB@ARRAY names an array in each of its files.
+    """
     found = []
     for kind, patterns in globs.items():
         for pattern in patterns:
             names = sorted(glob.glob(pattern, recursive=True), key=_natural)
+            files, at, array = pattern.rpartition("@")
+            if at and not names:
+                matching = sorted(glob.glob(files, recursive=True), key=_natural)
+                names = [f"{name}@{array}" for name in matching]
             if not names:
                 raise AppError(f"{pattern}: no file is called so ({kind})")
             found += [_listed(Row(file=name, kind=kind), name, Path()) for name in names]
