@@ -150,7 +150,7 @@ class Camera(Settings):
         """Return what describes the camera; of angles as earlier versions wrote and hashed it."""
         plain = described(self)
         if self.view_axes == ANGLES:
-            del plain[ATTRIBUTE]
+            plain.pop(ATTRIBUTE, None)
         return plain
 
     def seen_tile(self) -> NDArray[np.float32]:
