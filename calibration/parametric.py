@@ -104,7 +104,7 @@ def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
     weights = np.empty(layout.shape, dtype=np.float32)
     for (shot, v, u, stored), plane in coefficient_planes(shadow, layout, stages):
         weights[shot, v, u, :, stored] = plane
-    return ImagingMatrix(weights, layout.colour, layout.binning, layout.camera_json)
+    return layout.psi(weights)
 
 
 def psi_deviation(

@@ -127,8 +127,7 @@ def measure_psi(
         for reference in _references(boards, gain, layout, shot):
             for rows in bands(reading):
                 reading[rows] += _bright(boards, gain, reference, rows)[0]
-    psi = ImagingMatrix(weights, layout.colour, layout.binning, layout.camera_json)
-    return Calibration(psi, deviation, boards.dark.mean_dn, white, gain)
+    return Calibration(layout.psi(weights), deviation, boards.dark.mean_dn, white, gain)
 
 
 def measured_planes(

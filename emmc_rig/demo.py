@@ -36,6 +36,7 @@ from emmc_rig.model.lightfield import (
     ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import whiteboards
@@ -150,6 +151,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             seed=settings.seed,
         )
         truth = fine.scene.light_field
+        if not camera.seen_tile()[..., 1:].any():  # light without colours is all that there is
+            truth = np.repeat(truth.mean(axis=-1, keepdims=True), 3, axis=-1)
         size = (truth.shape[2], truth.shape[3])
     with stages("design"):
         design = build_imaging_matrix(camera, size)
@@ -208,6 +211,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "camera": settings.camera_name,
             "shots": design.shots,
             "size": list(size),
+            "view_axes": list(camera.view_axes),
             "psnr_db": psnr,
             "ssim": ssim(estimate, truth),
             "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
@@ -232,9 +236,11 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "versions": versions(),
         }
     with stages("write"):
-        save_hdf5(folder / "light_field.h5", estimate, {"psnr_db": psnr})
+        axes = camera.view_axes
+        facts = {"psnr_db": psnr, ATTRIBUTE: stored_as(axes)}
+        save_hdf5(folder / "light_field.h5", estimate, facts)
         focus = focus_disparities(truth)
-        export_pictures(folder / "pictures", estimate, focus)
+        export_pictures(folder / "pictures", estimate, focus, axes)
         save_frames(
             folder / "frames.h5",
             frames_dn,
@@ -246,7 +252,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         calibration.psi.save(folder / "psi.h5")
         missed = missed_readings(calibration.psi, estimate, readings, sigma, usable)
         maps = {**result.maps, "misfit": missed}
-        save_maps(folder, maps)
+        save_maps(folder, maps, axes)
         metrics["seconds"] = dict(stages.seconds)
         write_report(
             folder / "report.html",

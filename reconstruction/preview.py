@@ -119,6 +119,7 @@ class Preview:
         self._picture = _Following(
             self._shared, frames, max(noise_sigma, PICTURE_NOISE * mean), good
         )
+        self._seen_by = coarse
         self._coarse = _Following(
             coarse, self._cut(frames), max(noise_sigma, COARSE_NOISE * mean), self._cut(good)
         )
@@ -146,4 +147,5 @@ class Preview:
         """The estimate so far, (v, u, y, x, c) in [0, 1], a copy."""
         found = np.ascontiguousarray(np.moveaxis(self._coarse.planar, -2, -1), dtype=np.float32)
         np.clip(found, 0, 1, out=found)
+        self._seen_by.even_unseen_colours(found)
         return found

@@ -19,7 +19,6 @@ from emmc_rig.acquisition.plan import AUTO, METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
-from emmc_rig.model.masks import cfa_tile
 from emmc_rig.session.planned import SHOT_DARK, Bench, Kind, PlannedFrame
 
 OPEN_LAMP = "white"
@@ -124,7 +123,7 @@ def lamps_of(plan: Plan, camera: Camera) -> tuple[str, ...]:
     """Return the lamps of the whiteboards: white alone where a pixel sees one colour only."""
     if plan.whiteboards is not None and plan.whiteboards.lamps is not None:
         return plan.whiteboards.lamps
-    several = cfa_tile(camera.sensor.cfa).sum(axis=-1).max() > 1
+    several = camera.seen_tile().sum(axis=-1).max() > 1
     filtered = all(shot.filter != "none" for shot in camera.shots)
     return LAMP_COLOURS if several and not filtered else ("white",)
 

@@ -57,6 +57,7 @@ def demo(
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size, stated_words
     from emmc_rig.model.settings import validated
+    from emmc_rig.model.view_axes import middle_name
     from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 
     method = method or DEFAULT_METHOD
@@ -95,7 +96,7 @@ def demo(
     gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
     tell(
         f"{metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB against the "
-        f"copied centre view; SSIM {metrics['ssim']:.3f}; "
+        f"copied {middle_name(described.view_axes)}; SSIM {metrics['ssim']:.3f}; "
         + (f"stated PSNR {stated}; " if stated else "")
         + f"Psi to {metrics['psi_relative_error']:.2%}; {metrics['status']}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")

@@ -146,6 +146,7 @@ def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
 
 def _say_result(metrics: dict, out: Path) -> None:
     from emmc_rig.files.results import stated_words
+    from emmc_rig.model.view_axes import axes_of, middle_name
 
     for line in metrics["screening"]:
         say("screening", line)
@@ -153,8 +154,8 @@ def _say_result(metrics: dict, out: Path) -> None:
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
         compared = (
-            f"; {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB against the copied centre view, "
-            f"SSIM {metrics['ssim']:.3f}"
+            f"; {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB against the copied "
+            f"{middle_name(axes_of(metrics))}, SSIM {metrics['ssim']:.3f}"
         )
     if stated := stated_words(metrics):
         compared += f"; stated PSNR {stated}"

@@ -24,6 +24,7 @@ from emmc_rig.model.reading import FAULTS, decode_picture, stored_arrays
 
 COLOURS = (3, 4)
 """How many values a pixel of a colour picture has, the fourth being how opaque it is."""
+_ZARR_FILES = (".zgroup", ".zattrs", "zarr.json")
 _HDF5_START = b"\x89HDF\r\n\x1a\n"
 
 
@@ -55,6 +56,8 @@ def read_own(path: Path, name: str = "") -> OwnFrames:
         raise AppError(f"{shown}: no such file") from fault
     except OSError as fault:
         raise AppError(f"{shown}: cannot be read ({fault.strerror})") from fault
+    if path.is_dir() and not any((path / name).is_file() for name in _ZARR_FILES):
+        raise AppError(f"{shown}: a folder, and no Zarr group: name a file, or the group itself")
     times = None
     try:
         if suffix in RAW_SUFFIXES:

@@ -44,7 +44,7 @@ from emmc_rig.session.session import Frozen, Session, wall_time
 from emmc_rig.session.storage import part_of
 from emmc_rig.session.verify import verify_frames
 
-KIND_ORDER = ("dark", "reference", "whiteboard", "open", "held-out", "shot")
+KIND_ORDER = ("dark", "reference", "whiteboard", "open", "check", "turned", "held-out", "shot")
 TOP_DN = 65_535
 BRIGHTEST = 0.9
 """What the brightest part of a scene is taken for where nothing states how bright white is."""
@@ -58,6 +58,18 @@ UNIT = 1000.0
 """Between ms and s, um and mm, which are mistaken for one another."""
 LEAST_MOVE = 50.0
 """Of a cell: nobody moves a mask or pinhole by less, but 0.02 to 2 cells in mm look like that."""
+MOST_MOVE = 500.0
+"""Cells: half a cell in nm looks like that, and masks are hardly larger."""
+TOO_BRIGHT = 20.0
+"""Times what the camera says of white: a minute has 60 s; only a lamp in the scene has as much."""
+ONE_CLOCK_S = 3e7
+"""Between frames of a session: a year. Seconds from a start and dates lie farther apart."""
+WHITE_ABOVE = 4.0
+"""Times the highest value: two bits that no frame uses are hardly a camera's."""
+MOST_SATURATED = 0.5
+"""Of a shot's pixels: what is left shows no scene."""
+FEWEST_PIXELS = 4
+"""Rows or columns: checks look at neighbours two pixels away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +111,23 @@ def import_session(
     with nothing written.
     """
     known = find_camera(camera)
+    if planes and known.sensor.cfa_name not in ("mono", "custom"):
+        raise AppError(
+            f"--planes: three shots of a monochrome sensor, and the camera's sensor.cfa is "
+            f"{known.sensor.cfa_name}: leave --planes out, or write cfa: mono"
+        )
     refuse_inside_session(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not out.is_dir():
+        raise AppError(f"--out {out}: a file, where a folder is meant; name another --out")
+    if out.exists() and any(out.iterdir()):
         raise AppError(f"--out {out}: holds something already; name another --out")
-    with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
-        items = list(_items(listed, known, planes, Path(spool), on_file))
-        return _Import(items, known, camera).write(out)
+    try:
+        with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
+            items = list(_items(listed, known, planes, Path(spool), on_file))
+            return _Import(items, known, camera).write(out)
+    except OSError as fault:
+        why = fault.strerror or fault
+        raise AppError(f"{fault.filename or out}: {why}; nothing was imported") from fault
 
 
 # Read and check.
@@ -141,6 +164,9 @@ def _items(
         if frames.shape[1:] != first[1]:
             sizes = ["x".join(map(str, size)) for size in (frames.shape[1:], first[1])]
             raise AppError(f"{name}: {sizes[0]} pixels (y x), and {first[0]} has {sizes[1]}")
+        if min(first[1]) < FEWEST_PIXELS:
+            size = "x".join(map(str, first[1]))
+            raise AppError(f"{name}: {size} pixels (y x), fewer than a frame has")
         if kind.itemsize != first[2].itemsize or kind.kind != first[2].kind:
             raise AppError(
                 f"{name}: values of {kind.name}, and {first[0]} has {first[2].name}; write all "
@@ -243,12 +269,20 @@ class _Import:
                 raise AppError(
                     f"{item.listed.where}: there is no shot {shot}, only 0 to {count - 1}"
                 )
+        placed = [shot for item, shot in self._items if _placed(item.listed.row)]
+        if count > len(camera.shots) and count - 1 not in placed:
+            raise AppError(
+                f"shots 0 to {count - 1} have files, and the camera has {len(camera.shots)} "
+                "shot(s): write mask_x_um and mask_y_um of the others, or more shots into its file"
+            )
         if count < len(camera.shots):
             self._notes.append(f"{count} of the camera's {len(camera.shots)} shots have files")
         self._own = camera
         self._plan = self._planned(count, spec)
         self._camera = planned_camera(self._plan)
         self._exposures_s = [self._exposure_s(item, shot) for item, shot in self._items]
+        self._check_times()
+        self._check_turns()
         self._check_exposures()
 
     def _numbered(self, items: list[_Item]) -> list[tuple[_Item, int]]:
@@ -263,6 +297,22 @@ class _Import:
                 )
             if row.lamp is not None and (row.lamp == "off") != (row.kind == "dark"):
                 raise AppError(f"{item.listed.where}: kind {row.kind} with the lamp {row.lamp}")
+            pinhole = (row.aperture_x_um, row.aperture_y_um) != (None, None)
+            if row.kind != "whiteboard" and pinhole:
+                raise AppError(
+                    f"{item.listed.where}: a pinhole's place with kind {row.kind}; only a "
+                    "whiteboard is taken through one"
+                )
+            if row.turn_deg is not None and row.kind not in ("open", "reference"):
+                raise AppError(
+                    f"{item.listed.where}: turn_deg with kind {row.kind}; boards that are turned "
+                    "are open or reference"
+                )
+            if row.kind == "reference" and (row.mask_x_um or row.mask_y_um):
+                raise AppError(
+                    f"{item.listed.where}: a mask's place with kind reference, which is without "
+                    "masks: is it open?"
+                )
             if row.kind != "shot":
                 found.append((item, row.shot or 0))
             elif free:
@@ -316,7 +366,8 @@ class _Import:
                 f"{where}: mask at {place[0]:g}, {place[1]:g} um, far less than its cells: mm "
                 "for um? write um"
             )
-        if any(own) and _close((place[0] / UNIT, place[1] / UNIT), own):
+        far = bool(cells) and largest > MOST_MOVE * max(cells) and not _close(place, own)
+        if far or (any(own) and _close((place[0] / UNIT, place[1] / UNIT), own)):
             raise AppError(f"{where}: mask at {place[0]:g}, {place[1]:g} um: nm for um? write um")
 
     def _exposure_s(self, item: _Item, shot: int) -> float:
@@ -362,6 +413,29 @@ class _Import:
                     "one of them? write seconds"
                 )
 
+    def _check_times(self) -> None:
+        times = [item.time_s if (own := item.listed.row.time) is None else own
+                 for item, _ in self._items]  # fmt: skip
+        known = [time for time in times if time is not None]
+        if known and max(known) - min(known) > ONE_CLOCK_S:
+            first, last = (
+                self._items[times.index(one)][0].listed.where for one in (min(known), max(known))
+            )
+            raise AppError(f"{last}: time is over a year after that of {first}: write one clock's")
+
+    def _check_turns(self) -> None:
+        """Raise AppError for a turned board that was not taken both with masks and without."""
+        kinds: dict[float, set[str]] = defaultdict(set)
+        for row in (item.listed.row for item, _ in self._items):
+            if row.turn_deg is not None:
+                kinds[row.turn_deg].add(row.kind)
+        for turn_deg, known in kinds.items():
+            if len(known) < 2:
+                raise AppError(
+                    f"the board turned by {turn_deg:g} degrees has kind {known.pop()} alone; it "
+                    "takes open and reference"
+                )
+
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
@@ -379,6 +453,7 @@ class _Import:
             lamp = "off" if kind == "dark" else row.lamp or "white"
             at_um = mask_offsets_um(self._camera, shot)
             if _placed(row) and kind != "shot":
+                self._check_place((row.mask_x_um or 0.0, row.mask_y_um or 0.0), shot, where)
                 at_um = {"mask_x": row.mask_x_um or 0.0, "mask_y": row.mask_y_um or 0.0}
             view = None
             if kind == "whiteboard":
@@ -388,7 +463,11 @@ class _Import:
                     place = row.aperture_x_um or 0.0, row.aperture_y_um or 0.0
                     view = self._view(place, where)
                     at_um |= {"aperture_x": place[0], "aperture_y": place[1]}
-            if kind in ("open", "held-out") and shot:
+            masks_in = kind not in ("reference", "reference-check")
+            if row.turn_deg is not None:
+                kind = "turned"
+            kind = "check" if kind == "reference-check" else kind
+            if kind in ("open", "held-out", "check", "turned") and shot:
                 raise AppError(f"{where}: whiteboards of the whole aperture are of shot 0 alone")
 
             def group(name: str, key: object) -> str:
@@ -405,18 +484,22 @@ class _Import:
                 name = {
                     "reference": f"reference-s{shot}-{lamp}",
                     "whiteboard": f"board-s{shot}-v{view and view[0]}-u{view and view[1]}-{lamp}",
-                }.get(kind) or group(kind, tuple(at_um.items()))
-                masks_in = kind != "reference"
-                bench = Bench(
-                    "whiteboard", lamp, shot, fitted[shot], masks_in, at_um if masks_in else {}
-                )
+                }.get(kind) or group(kind, (masks_in, row.turn_deg, *at_um.items()))
+                at_um = at_um if masks_in else {}
+                turn_deg = row.turn_deg or 0.0
+                bench = Bench("whiteboard", lamp, shot, fitted[shot], masks_in, at_um, turn_deg)
             repeat = counts[name]
             counts[name] += 1
             frame = PlannedFrame(
                 f"{name}-r{repeat}", kind, bench, exposure_s, row.gain, repeat, view
             )
             named.append((KIND_ORDER.index(kind), frame, item))
-        named.sort(key=lambda one: (one[0], (one[1].bench.shot, one[1].id) if one[0] == 5 else ()))
+        named.sort(
+            key=lambda one: (
+                one[0],
+                (one[1].bench.shot, one[1].id) if one[1].kind == "shot" else (),
+            )
+        )
         return [(frame, item) for _, frame, item in named]
 
     def _held_out(self) -> _Item | None:
@@ -425,7 +508,7 @@ class _Import:
         whole = [
             item
             for item, row in rows
-            if row.kind == "open"
+            if (row.kind == "open" and row.turn_deg is None)
             or (row.kind == "whiteboard" and row.aperture_x_um is row.aperture_y_um is None)
         ]
         if len(whole) < FEWEST_TO_HOLD_OUT or any(row.kind == "held-out" for _, row in rows):
@@ -492,6 +575,16 @@ class _Import:
                     f"{item.listed.where}: a dark that is {found.mean_dn / span:.1%} of white on "
                     "average: is it another kind, or sensor.noise.black_level_dn wrong?"
                 )
+            self._check_light(frame, item, found.saturated, found.bright_dn / span)
+        highest = max(float(item.read().max()) for _, item in planned)
+        if "white_level_dn" not in self._own.sensor.noise.model_fields_set and (
+            highest * scale * WHITE_ABOVE < noise.white_level_dn and planned[0][1].raw is None
+        ):
+            self._note(
+                f"sensor.noise.white_level_dn is taken as {self._own.sensor.noise.white_level_dn}, "
+                f"as nothing states it, and no value is above {highest:g}: a camera of 12 bits has "
+                "4095"
+            )
         self._set_white(planned, scale)
         plan = yaml.safe_dump(self._plan.model_dump(mode="json", exclude_unset=True))
         plan = f"# Imported: what stood in a table or globs, as a plan.\n{plan}"
@@ -513,12 +606,27 @@ class _Import:
             self._store(session, planned, scale)
             session.disk.replace(part, out)
             session.disk.sync_folder(out.parent)
-        except OSError as fault:
-            raise AppError(f"{out}: {fault.strerror}; nothing was imported") from fault
         finally:
             with suppress(OSError):
                 shutil.rmtree(part)
         return Imported(Session(out), tuple(self._notes))
+
+    def _check_light(
+        self, frame: PlannedFrame, item: _Item, saturated: float, bright: float
+    ) -> None:
+        """Raise AppError for a shot, of a bracket the shortest, that shows nothing."""
+        if not frame.id.startswith(f"shot-{frame.bench.shot}-e0-"):
+            return
+        what = None
+        if saturated > MOST_SATURATED:
+            what = f"{saturated:.0%} of its pixels are at white"
+        elif bright < Checks().smallest_signal:
+            what = f"its brightest readings are {max(bright, 0):.1%} of white above black"
+        if what is not None:
+            raise AppError(
+                f"{item.listed.where}: shot {frame.bench.shot}: {what}: expose otherwise, or are "
+                "sensor.noise.black_level_dn and white_level_dn the file's?"
+            )
 
     def _store(
         self, session: Session, planned: list[tuple[PlannedFrame, _Item]], scale: int
@@ -553,8 +661,9 @@ class _Import:
             metadata["temperature_c"] = f"{row.temperature_c:g}"
         original, digest = b"", item.digest
         if whole:
-            original = path.read_bytes() if path.is_file() and item.place == 0 else b""
-            if original and hashlib.sha256(original).hexdigest() != digest:
+            is_kept = item.place == 0 and not path.is_dir()
+            original = path.read_bytes() if is_kept else b""
+            if is_kept and hashlib.sha256(original).hexdigest() != digest:
                 raise AppError(f"{shown_path(path)}: changed while it was imported; try again")
             if not original:
                 original = f"frame {item.place} of {path.name}, SHA-256 {item.digest}".encode()
@@ -591,10 +700,12 @@ class _Import:
         if electrons_per_s <= 0:
             raise AppError("no shot is brighter than the camera's sensor.noise.black_level_dn")
         if "electrons_per_s" in noise.model_fields_set:
-            if 0.02 < electrons_per_s * UNIT / noise.electrons_per_s < 2:
+            bright = electrons_per_s / noise.electrons_per_s
+            unit = "minutes" if bright > TOO_BRIGHT else "ms"
+            if unit == "minutes" or 0.02 < bright * UNIT < 2:
                 raise AppError(
-                    f"the shots are {electrons_per_s / noise.electrons_per_s:.2g} times as bright "
-                    "as the camera's electrons_per_s says: ms for s in exposure_s? write seconds"
+                    f"the shots are {bright:.2g} times as bright as the camera's electrons_per_s "
+                    f"says: {unit} for s in exposure_s? write seconds"
                 )
             return
         self._note(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import glob
 import io
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +16,17 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.errors import did_you_mean
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.settings import Settings, validated
 
-ImportedKind = Literal["shot", "dark", "reference", "whiteboard", "open", "held-out"]
+ImportedKind = Literal[
+    "shot", "dark", "reference", "whiteboard", "open", "held-out", "check", "reference-check"
+]
 LONGEST_S = 3600.0
 MOST_TABLE_BYTES = 16_000_000
+WORKBOOK = b"PK\x03\x04"
+"""How .xlsx and .ods begin, which are ZIP."""
 
 
 def _seconds(value: object) -> object:
@@ -42,6 +48,9 @@ class Row(Settings):
     mask_y_um: float | None = None
     aperture_x_um: float | None = Field(default=None, description="of the pinhole, from the axis")
     aperture_y_um: float | None = None
+    turn_deg: float | None = Field(
+        default=None, gt=0, lt=360, description="by which the white board is turned in its plane"
+    )
     lamp: Literal["white", "red", "green", "blue", "off"] | None = None
     time: Annotated[float | None, BeforeValidator(_seconds)] = Field(
         default=None, description="seconds on any clock, or a date and time"
@@ -65,13 +74,20 @@ def read_table(path: Path) -> list[Listed]:
     try:
         if path.stat().st_size > MOST_TABLE_BYTES:
             raise AppError(f"{shown}: larger than {MOST_TABLE_BYTES // 10**6} MB: not a table")
-        text = path.read_text(encoding="utf-8-sig")
+        data = path.read_bytes()
+        if data.startswith(WORKBOOK):
+            raise AppError(f"{shown}: a workbook, not a table in CSV; save it as CSV UTF-8")
+        text = data.decode("utf-8-sig")
     except FileNotFoundError as fault:
         raise AppError(f"{shown}: no such file") from fault
     except OSError as fault:
         raise AppError(f"{shown}: cannot be read ({fault.strerror})") from fault
     except UnicodeDecodeError as fault:
-        raise AppError(f"{shown}: not text in UTF-8 (byte {fault.start})") from fault
+        raise AppError(
+            f"{shown}: not text in UTF-8 (byte {fault.start}); save it as CSV UTF-8"
+        ) from fault
+    if "\0" in text:
+        raise AppError(f"{shown}: not text: it holds a zero byte; save it as CSV UTF-8")
     head = text.partition("\n")[0]
     separator = next((one for one in "\t;" if one in head and "," not in head), ",")
     try:
@@ -84,9 +100,15 @@ def read_table(path: Path) -> list[Listed]:
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise AppError(f"{shown}: the column '{twice.pop()}' is there twice")
+    if not {"file", "kind"} & {name.lower() for name in names}:
+        raise AppError(
+            f"{shown}, line 1: names no column; the first line of a table is: file,kind,exposure_s"
+        )
     found = []
     for number, line in enumerate(lines[1:], 2):
         cells = [cell.strip() for cell in line]
+        if separator == ";":  # so write programs of countries whose decimal point is a comma
+            cells = [re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", cell) for cell in cells]
         if not any(cells):
             continue
         where = f"{shown}, line {number}"
@@ -103,11 +125,18 @@ def read_table(path: Path) -> list[Listed]:
 
 
 def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
-    """Return a row for every file that a glob of its kind names, 2 before 10; raises AppError."""
+    """Return a row for every file that a glob of its kind names, 2 before 10; raises AppError.
+
+    GLOB@ARRAY names an array in each of its files.
+    """
     found = []
     for kind, patterns in globs.items():
         for pattern in patterns:
             names = sorted(glob.glob(pattern, recursive=True), key=_natural)
+            files, at, array = pattern.rpartition("@")
+            if at and not names:
+                matching = sorted(glob.glob(files, recursive=True), key=_natural)
+                names = [f"{name}@{array}" for name in matching]
             if not names:
                 raise AppError(f"{pattern}: no file is called so ({kind})")
             found += [_listed(Row(file=name, kind=kind), name, Path()) for name in names]
@@ -116,9 +145,15 @@ def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
 
 def _listed(row: Row, where: str, beside: Path) -> Listed:
     name, _, array = row.file.partition("@")
-    if (beside / row.file).exists():
+    if os.path.exists(beside / row.file):
         name, array = row.file, ""
-    return Listed(row, where, beside / name, array)
+    elif "\\" in name and not os.path.exists(beside / name):
+        name = name.replace("\\", "/")  # a table written on Windows
+    path = beside / name
+    if not os.path.exists(path):
+        near = did_you_mean(path.name, os.listdir(path.parent)) if path.parent.is_dir() else ""
+        raise AppError(f"{where}: {shown_path(path)}: no such file; {near}".strip(" ;"))
+    return Listed(row, where, path, array)
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from scipy import sparse
 
 from emmc_rig.model.arguments import numbers_of, pair_of, refusal, required
@@ -33,6 +33,7 @@ from emmc_rig.model.noise import SensorNoise
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import Settings, validated
+from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxis, grid_name
 
 SHORTEST, LONGEST = 1e-6, 1e9
 """Of lengths (um or mm) and seconds: beyond them a unit was mistaken."""
@@ -106,6 +107,7 @@ class Shot(Settings):
 class Camera(Settings):
     """A camera with coded masks: `camera.psi(size)` models it, `camera.expose(scene)` uses it.
 
+    view_axes: what rows and columns of views are; bands lie as a mask's shadow shifts with them.
     total_exposure_s: divided evenly by the number of shots; a shot may name its own instead.
     footprint_splits: see `_transmittances`; more for two masks of cells as fine as their shadow.
     """
@@ -113,6 +115,7 @@ class Camera(Settings):
     title: str
     reference: str = ""
     views: tuple[int, int] = (5, 5)
+    view_axes: tuple[ViewAxis, ViewAxis] = ("angle", "angle")
     lens: Lens = Lens()
     sensor: Sensor = Sensor()
     masks: dict[str, Mask] = Field(default_factory=dict)
@@ -141,6 +144,25 @@ class Camera(Settings):
                 known = ", ".join(self.masks) or "none"
                 raise ValueError(f"{where} names mask '{name}', which is not among: {known}")
         return self
+
+    @model_serializer(mode="wrap")
+    def _as_before(self, described: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return what describes the camera; of angles as earlier versions wrote and hashed it."""
+        plain = described(self)
+        if self.view_axes == ANGLES:
+            plain.pop(ATTRIBUTE, None)
+        return plain
+
+    def seen_tile(self) -> NDArray[np.float32]:
+        """Return which colours of a light field pixels see, a tile (row, column, colour), 0 or 1.
+
+        A band has no colours: a sensor without filters sees it as red, and red stands for all.
+        """
+        tile = cfa_tile(self.sensor.cfa)
+        filtered = not tile.all() or any(shot.filter != "none" for shot in self.shots)
+        if filtered or "band" not in self.view_axes:
+            return tile
+        return tile * np.array([1, 0, 0], np.float32)
 
     def shot_masks(self, shot: int) -> tuple[str, ...]:
         """Return the names of the masks in the beam during a shot."""
@@ -236,10 +258,10 @@ class Camera(Settings):
         return repr(self)
 
     def __repr__(self) -> str:
-        shots, (v, u) = len(self.shots), self.views
+        shots, pictures = len(self.shots), grid_name(self.view_axes, self.views)
         masks = f"{len(self.masks)} mask{'s' * (len(self.masks) != 1)}"
         return (
-            f"Camera({self.title!r}, {shots} shot{'s' * (shots > 1)}, {v}x{u} views, "
+            f"Camera({self.title!r}, {shots} shot{'s' * (shots > 1)}, {pictures}, "
             f"{self.sensor.cfa_name}, {masks})"
         )
 
@@ -412,7 +434,7 @@ def sensor_response(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32
             f"pixels of {k} x {k} samples do not divide a light field of {rows} x {columns}: "
             f"crop it to {rows // k * k} x {columns // k * k}"
         )
-    tile = cfa_tile(camera.sensor.cfa)
+    tile = camera.seen_tile()
     pixels = tile[(np.arange(rows) // k) % tile.shape[0]][
         :, (np.arange(columns) // k) % tile.shape[1]
     ]
@@ -496,7 +518,7 @@ def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
     Raises CameraError when the pixels do not divide the light field.
     """
     k = camera.sensor.binning
-    tile = cfa_tile(camera.sensor.cfa)
+    tile = camera.seen_tile()
     # One period of the filters shows whether pixels see one colour, and which.
     period = sensor_response(camera, (tile.shape[0] * k, tile.shape[1] * k))
     single = bool((period.sum(axis=-1) <= 1).all())
@@ -508,7 +530,7 @@ def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
         rows, columns = np.arange(size[0]) % sides[0], np.arange(size[1]) % sides[1]
         colour = period.argmax(axis=-1).astype(np.uint8)[:, rows[:, None], columns]
     shape = (len(camera.shots), *camera.views, size[0], 1 if single else 3, size[1])
-    return PsiLayout(shape, colour, k, camera.model_dump_json())
+    return PsiLayout(shape, colour, k, camera.model_dump_json(), camera.view_axes)
 
 
 def build_imaging_matrix(
@@ -545,4 +567,5 @@ def build_imaging_matrix(
             raise CameraError(
                 f"no light reaches the sensor in shot {shot}: open its masks or change its filter"
             )
-    return ImagingMatrix(weights, colour, camera.sensor.binning, camera.model_dump_json())
+    k = camera.sensor.binning
+    return ImagingMatrix(weights, colour, k, camera.model_dump_json(), camera.view_axes)

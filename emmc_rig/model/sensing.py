@@ -101,18 +101,24 @@ class PsiSizes:
 class PsiLayout(PsiSizes):
     """What a Psi is for, without its coefficients: for sensors whose Psi does not fit into memory.
 
-    shape, colour, binning, camera_json: as `ImagingMatrix.weights`' and its other fields.
+    shape, colour, binning, camera_json, view_axes: as those of `ImagingMatrix`, and its weights'.
     """
 
     shape: tuple[int, ...]
     colour: NDArray[np.uint8] | None
     binning: int = 1
     camera_json: str = ""
+    view_axes: ViewAxes = ANGLES
 
     @property
     def weights_shape(self) -> tuple[int, ...]:
         """Shape of the weights."""
         return self.shape
+
+    def psi(self, weights: Array) -> ImagingMatrix:
+        """Return the Psi that this is the layout of."""
+        facts = self.colour, self.binning, self.camera_json, self.view_axes
+        return ImagingMatrix(weights, *facts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +187,8 @@ class ImagingMatrix(PsiSizes):
     @property
     def layout(self) -> PsiLayout:
         """What this Psi is for, without its coefficients."""
-        return PsiLayout(self.weights_shape, self.colour, self.binning, self.camera_json)
+        facts = self.colour, self.binning, self.camera_json, self.view_axes
+        return PsiLayout(self.weights_shape, *facts)
 
     @property
     def weights_shape(self) -> tuple[int, ...]:
@@ -457,6 +464,14 @@ class ImagingMatrix(PsiSizes):
         return replace(
             self, weights=np.take_along_axis(self.weights, chosen, axis=4), colour=colour
         )
+
+    def even_unseen_colours(self, light_field: Array) -> None:
+        """Where every pixel sees the same colour, make the others of (v, u, y, x, c) equal to it.
+
+        Nothing was seen of them: light without colours, or a picture in one.
+        """
+        if self.colour is not None and (self.colour == self.colour.flat[0]).all():
+            light_field[...] = light_field[..., self.colour.flat[0], None]
 
     def relative_difference(self, reference: ImagingMatrix) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""

@@ -6,9 +6,11 @@ page speaks of their disparity.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
+ViewAxis = Literal["angle", "band", "time"]
 ViewAxes = tuple[str, str]
 ANGLES: ViewAxes = ("angle", "angle")
 PICTURES = {"angle": "view", "band": "band", "time": "time"}
@@ -32,6 +34,12 @@ def axes_from(value: Any, source: object, error: type[Exception]) -> ViewAxes:
     raise error(f"{source}: {ATTRIBUTE} '{text}': two of {', '.join(PICTURES)} are needed")
 
 
+def axes_of(metrics: Mapping[str, object]) -> ViewAxes:
+    """Return the axes that metrics.json has; without any, views are at angles."""
+    named = metrics.get(ATTRIBUTE)
+    return next((axes for axes in VIEW_AXES if named in (axes, list(axes))), ANGLES)
+
+
 def shows_parallax(axes: ViewAxes) -> bool:
     """Return whether all views are at angles."""
     return axes == ANGLES
@@ -40,6 +48,16 @@ def shows_parallax(axes: ViewAxes) -> bool:
 def picture_name(axes: ViewAxes) -> str:
     """Return what one of the pictures is called: view, band or time."""
     return PICTURES[next((name for name in axes if name != "angle"), "angle")]
+
+
+def grid_name(axes: ViewAxes, views: tuple[int, int]) -> str:
+    """Return rows, columns and what they are of: `5x5 views`, `1x24 bands`."""
+    return f"{views[0]}x{views[1]} {picture_name(axes)}s"
+
+
+def middle_name(axes: ViewAxes) -> str:
+    """Return what the picture in the middle is called."""
+    return "centre view" if shows_parallax(axes) else f"middle {picture_name(axes)}"
 
 
 def axis_names(axes: ViewAxes, views: tuple[int, int]) -> list[str]:

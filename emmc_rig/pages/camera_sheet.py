@@ -28,6 +28,7 @@ from emmc_rig.model.files import whole_file
 from emmc_rig.model.geometry import centred_grid, fresnel_number, mask_position
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.view_axes import grid_name, picture_name, place_name, shows_parallax
 
 SHEET_SAMPLES = 64
 LISTING_SAMPLES = 24
@@ -83,6 +84,7 @@ def _sensor_name(camera: Camera) -> str:
 def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> dict[str, Any]:
     """Return what a camera measures, on a light field of `size` (rows, columns) samples.
 
+    views: rows and columns, and what they are.
     sampling_rate: measurements per light-field value (rows over columns of Psi).
     light_efficiency: reading from a white light field, 1 for the open camera behind its filters.
     dark_share: share of the measurements that no light reaches.
@@ -93,6 +95,7 @@ def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> dict[str
     """
     psi = build_imaging_matrix(camera, size)
     return {
+        "views": grid_name(camera.view_axes, camera.views),
         "sampling_rate": psi.shape[0] / psi.shape[1],
         "light_efficiency": psi.light_efficiency(),
         "dark_share": float(np.mean(psi.row_norms() == 0)),
@@ -156,7 +159,9 @@ def _draw_axis(axes: Axes, camera: Camera) -> None:
     axes.set_xlim(-0.08 * lens_mm, 1.1 * lens_mm)
     axes.set_ylim(-1.3 * half_mm, 1.4 * half_mm)
     _label(axes, "optical axis, mm (sensor drawn larger)")
-    axes.set_title("camera, shot 0, one pixel's rays to the views", fontsize=10)
+    kind = "camera" if shows_parallax(camera.view_axes) else "equivalent camera"
+    seen = f"{picture_name(camera.view_axes)}s"
+    axes.set_title(f"{kind}, shot 0, one pixel's rays to the {seen}", fontsize=10)
 
 
 def _label(axes: Axes, x: str) -> None:
@@ -172,8 +177,8 @@ def _write_figures(axes: Axes, camera: Camera, psi: ImagingMatrix) -> None:
     exposure_ms = 1e3 * float(camera.exposures_s().sum())
     lines = [
         ("sensor", f"{_sensor_name(camera)}, {camera.sensor.sample_pitch_um:g} um per sample"),
-        ("views", f"{camera.views[0]} x {camera.views[1]}, {lens.aperture_cell_mm:g} mm apart, "
-         f"{width}"),
+        ("views", f"{grid_name(camera.view_axes, camera.views)}, "
+         f"{lens.aperture_cell_mm:g} mm apart, {width}"),
         ("shots", f"{len(camera.shots)}, {exposure_ms:.3g} ms in all"),
         ("sampling rate", f"{Fraction(*psi.shape)} measurements per value"),
         ("light", f"{psi.light_efficiency():.1%}"),
@@ -191,7 +196,8 @@ def _write_figures(axes: Axes, camera: Camera, psi: ImagingMatrix) -> None:
 
 def _draw_masks(band: SubFigure, camera: Camera, plates: dict[str, Plate]) -> None:
     """Draw the masks of shot 0 as the beam meets them."""
-    _band_title(band, "masks of shot 0, around the optical axis; dots: one pixel's rays to views")
+    seen = f"{picture_name(camera.view_axes)}s"
+    _band_title(band, f"masks of shot 0, around the optical axis; dots: one pixel's rays to {seen}")
     names = camera.shot_masks(0)
     panels = band.subplots(1, max(len(names), 5), squeeze=False)[0]
     for axes, name in zip(panels, names, strict=False):
@@ -244,16 +250,17 @@ def _draw_weights(band: SubFigure, camera: Camera, psi: ImagingMatrix) -> None:
     """Draw the colour filters, and shot 0's weights: two views, and all of them together."""
     _band_title(band, "weights of shot 0: the share of light that passes, in each pixel's colours")
     passed = _transmittance(camera, psi)
-    middle_v, middle_u = camera.views[0] // 2, camera.views[1] // 2
+    middle, corner = (camera.views[0] // 2, camera.views[1] // 2), (0, 0)
+    name, place = picture_name(camera.view_axes), (camera.view_axes, camera.views)
     whiteboard = passed.mean(axis=(0, 1))
     peak = float(whiteboard.max())
     tile = cfa_tile(camera.sensor.cfa)
     filters = np.tile(tile, (8 // len(tile) + 1, 8 // len(tile[0]) + 1, 1))[:8, :8]
     panels = [
         (f"colour filters: {_sensor_name(camera)}", "pixel", filters),
-        (f"centre view ({middle_v}, {middle_u})", "sample", _crop(passed[middle_v, middle_u])),
-        ("corner view (0, 0)", "sample", _crop(passed[0, 0])),
-        (f"all views (a whiteboard); full scale {peak:.2f}", "sample", _crop(whiteboard) / peak),
+        (f"centre {name}: {place_name(*place, middle)}", "sample", _crop(passed[middle])),
+        (f"first {name}: {place_name(*place, corner)}", "sample", _crop(passed[corner])),
+        (f"all {name}s (a whiteboard); full scale {peak:.2f}", "sample", _crop(whiteboard) / peak),
     ]
     for axes, (title, unit, picture) in zip(band.subplots(1, 4), panels, strict=True):
         axes.imshow(np.clip(picture, 0, 1), interpolation="nearest")
@@ -273,4 +280,6 @@ def _transmittance(camera: Camera, psi: ImagingMatrix) -> NDArray[np.float32]:
     response = sensor_response(camera, psi.size)[0]
     scale = camera.views[0] * camera.views[1] * camera.sensor.binning**2
     weights = psi.weights[0].swapaxes(-1, -2) * scale
-    return weights * response.sum(axis=-1, keepdims=True) * (response > 0)
+    passed = weights * response.sum(axis=-1, keepdims=True) * (response > 0)
+    psi.even_unseen_colours(passed)
+    return passed

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from emmc_rig.files.results import stated_words
-from emmc_rig.model.view_axes import picture_name, shows_parallax
+from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
 from emmc_rig.version import __version__
 
 KINDS = {
@@ -79,7 +79,7 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
     if lost_db > 0:
         why.append(
             f"{'' if why else agree + ', '}but the truth, which frames do not show, is missed by "
-            f"{lost_db:.1f} dB more than by the copied centre view"
+            f"{lost_db:.1f} dB more than by the copied {middle_name(axes_of(metrics))}"
         )
     if stated := stated_words(metrics):
         why = [*(why or [agree]), f"stated PSNR {stated}"]
@@ -93,6 +93,14 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
     )
 
 
+def estimated(metrics: Mapping[str, object]) -> list[str]:
+    """Return a sentence with what of raw frames was estimated; none where all was given."""
+    found = metrics.get("estimated_from_frames")
+    if not isinstance(found, list) or not found:
+        return []
+    return [f"Estimated from the frames, as nobody gave it: {'; '.join(map(str, found))}."]
+
+
 def _below_copied_db(metrics: Mapping[str, object]) -> float:
     """Return by how much a result with a truth falls short of the copied view; 0: it does not."""
     found, copied = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")
@@ -104,10 +112,10 @@ def _below_copied_db(metrics: Mapping[str, object]) -> float:
 def _uses(metrics: Mapping[str, object], source: str, viewer: bool) -> list[str]:
     """Return what a light field can be used for."""
     look = "drag the picture to turn it, click to focus, turn the wheel to open the aperture"
-    match metrics.get("view_axes"):
-        case [str(rows), str(columns)] if not shows_parallax((rows, columns)):
-            named = picture_name((rows, columns))
-            look = f"drag the picture from {named} to {named}, turn the wheel for a mean of several"
+    axes = axes_of(metrics)
+    if not shows_parallax(axes):
+        named = picture_name(axes)
+        look = f"drag the picture from {named} to {named}, turn the wheel for a mean of several"
     if not source:
         return [look]
     named = shlex.quote(source)

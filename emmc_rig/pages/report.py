@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.files.formats import Export
 from emmc_rig.model.files import write_text
+from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
 from emmc_rig.pages.display import (
     PART_PIXELS,
     DisplayCurve,
@@ -69,7 +70,11 @@ def render(content: ReportContent) -> str:
     """Return the page as text."""
     rows, columns, height, width, _ = content.estimate.shape
     disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
-    export = Export(content.title, "", content.estimate, content.truth, disparity, sigma, misfit)
+    axes = axes_of(content.metrics)
+    export = Export(
+        content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
+        view_axes=axes,
+    )  # fmt: skip
     return fragment(
         "report.html",
         title=content.title,
@@ -84,6 +89,8 @@ def render(content: ReportContent) -> str:
         whiteboards=[
             (label, _frames(frame[None])["pictures"][0]) for label, frame in content.whiteboards
         ],
+        parallax=shows_parallax(axes),
+        picture=picture_name(axes),
         views={"rows": rows, "columns": columns, "height": height, "width": width},
         error=None if content.truth is None else _error(content.estimate, content.truth),
         timings=_timings(content.stage_s),
@@ -130,13 +137,14 @@ class Figure(NamedTuple):
 
 
 FIGURES = {
-    "psnr_db": Figure("PSNR", ".2f", "dB", "peak 1, over all views, pixels and colours"),
+    "psnr_db": Figure("PSNR", ".2f", "dB", "peak 1, over all {picture}s, pixels and colours"),
     "stated_db": Figure("Stated PSNR", ".2f", "dB", "by the method, without the truth"),
     "stated_interval_db": Figure("Interval of the stated PSNR", ".1f", "",
         "dB, from and to; it holds the true one in 9 of 10 captures"),
-    "ssim": Figure("SSIM", ".4f", "", "structural similarity, averaged over views; 1 is identical"),
-    "replicate_psnr_db": Figure("PSNR of the copied centre view", ".2f", "dB",
-        "the true centre view copied to all views: below it, no parallax has been recovered"),
+    "ssim": Figure("SSIM", ".4f", "",
+        "structural similarity, averaged over {picture}s; 1 is identical"),
+    "replicate_psnr_db": Figure("PSNR of the copied {middle}", ".2f", "dB",
+        "the true {middle} copied to all {picture}s: below it, {lost}"),
     "psi_relative_error": Figure("Relative error of Psi", ".2e", "",
         "|measured - exact| / |exact|, Euclidean norms"),
     "exact_psi_psnr_db": Figure("PSNR with the exact Psi", ".2f", "dB",
@@ -155,11 +163,13 @@ FIGURES = {
     "advice": Figure("Advice", meaning="what the solver suggests"),
     "seed": Figure("Seed", meaning="same seed, same result"),
     "steps": Figure("Steps", meaning="of the solver"),
-    "size": Figure("Size", meaning="height and width of a view, pixels"),
+    "size": Figure("Size", meaning="height and width of a {picture}, pixels"),
     "scene_provenance": Figure("Origin of the scene"),
-    "finer": Figure("Finer scene", meaning="views and pixels of the simulated scene for each here"),
+    "finer": Figure("Finer scene",
+        meaning="{picture}s and pixels of the simulated scene for each here"),
 }  # fmt: skip
-"""By the name in metrics.json; a figure without a row here is listed under its own name."""
+"""By the name in metrics.json; a figure without a row here is listed under its own name. In braces:
+what pictures are called, the one in the middle, what it is to fall short of it."""
 SHOWN_ELSEWHERE = {"verdict", "versions", "seconds", "warnings", "command"}
 
 
@@ -191,16 +201,22 @@ def _cards(content: ReportContent) -> list[Card]:
     metrics, stage_s = content.metrics, content.stage_s
     no_truth = "no true light field to compare with" if content.truth is None else ""
     psnr, replicate = _number(metrics.get("psnr_db")), _number(metrics.get("replicate_psnr_db"))
-    versus = Card("Over centre view", "not measured", no_truth)
+    axes = axes_of(metrics)
+    middle, picture = middle_name(axes), picture_name(axes)
+    versus = Card(f"Over {middle}", "not measured", no_truth)
     if psnr is not None and replicate is not None:
-        note = f"copying the true centre view gives {replicate:.2f} dB"
+        note = f"copying the true {middle} gives {replicate:.2f} dB"
         tone = "good" if psnr > replicate else "bad"
-        versus = Card("Over centre view", f"{psnr - replicate:+.2f} dB", note, tone)
+        versus = Card(f"Over {middle}", f"{psnr - replicate:+.2f} dB", note, tone)
     psi_error = _number(metrics.get("psi_relative_error"))
     known_psi = "not measured" if psi_error is None else f"{100 * psi_error:.2f} %"
     status = str(metrics.get("status") or "not measured")
     cards = [
-        Card("PSNR", _named(metrics, "psnr_db"), no_truth or "peak 1, all views, pixels, colours"),
+        Card(
+            "PSNR",
+            _named(metrics, "psnr_db"),
+            no_truth or f"peak 1, all {picture}s, pixels, colours",
+        ),
         versus,
         Card("SSIM", _named(metrics, "ssim"), "1 is identical"),
         Card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
@@ -251,7 +267,9 @@ def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, ob
 
 def _figures(metrics: Mapping[str, object]) -> list[dict[str, str]]:
     """Return the rows of the table of metrics."""
-    rows = []
+    rows, axes = [], axes_of(metrics)
+    lost = "no parallax has been recovered" if shows_parallax(axes) else "they are not told apart"
+    words = {"picture": picture_name(axes), "middle": middle_name(axes), "lost": lost}
     for key, value in _flat(metrics):
         name = key.removeprefix("parameters.")
         unknown = Figure(
@@ -259,9 +277,10 @@ def _figures(metrics: Mapping[str, object]) -> list[dict[str, str]]:
         )
         figure = FIGURES.get(key, unknown)
         written = _written(value, figure.format, figure.unit)
-        rows.append(
-            {"key": key, "label": figure.label, "value": written, "meaning": figure.meaning}
-        )
+        label, meaning = figure.label, figure.meaning
+        if key in FIGURES:
+            label, meaning = label.format(**words), meaning.format(**words)
+        rows.append({"key": key, "label": label, "value": written, "meaning": meaning})
     return rows
 
 

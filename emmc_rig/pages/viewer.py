@@ -37,7 +37,7 @@ from emmc_rig.pages.display import (
     three_colours,
     tiled,
 )
-from emmc_rig.pages.page import fragment, light_field_head
+from emmc_rig.pages.page import estimated, fragment, light_field_head
 
 Array = NDArray[np.floating]
 BYTES_PER_PIXEL = 0.36
@@ -74,7 +74,7 @@ def render_viewer(content: Export, lossless: bool = False) -> str:
     return fragment(
         "viewer_page.html",
         title=content.title,
-        about=[content.caption] if content.caption else [],
+        about=[*([content.caption] if content.caption else []), *estimated(content.metrics)],
         caveats=(), sections=(), lead="",
         summary=light_field_head(content.metrics, content.source, viewer=True),
         styles=("viewer.css",), scripts=("viewer.js",),

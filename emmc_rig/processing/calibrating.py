@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, overload
 
@@ -31,6 +32,8 @@ from emmc_rig.session.session import Session
 
 POSES_TAKE = "a list of dicts, one for each whiteboard, such as {'mask_um': (0, 0), 'shot': 0}"
 DARKS_TAKE = "an array (repeat, y, x), or such arrays by their exposure"
+LEAST_MOVED = 0.1
+"""Of a cell: masks are moved by several; of mm taken for um, a thousandth of that is left."""
 View = Annotated[int, Field(ge=0)]
 
 
@@ -84,6 +87,12 @@ def calibrate(
 ) -> SessionCalibration | tuple[ImagingMatrix, SessionCalibration]:
     """Return Psi as whiteboards measure it: `calibrate(session)`, or arrays with their poses.
 
+    Arrays are calibrated by the routes of a session, and judged by whiteboards held out. Of what a
+    session can hold besides, arrays have nothing: boards turned in their plane or with the lamp
+    moved, which tell uneven light from the lens; pinholes of several views at once; whiteboards
+    after the scene, besides what `taken_s` shows of drift. What was not watched for that, the
+    report says. Lamps of three colours are poses with their `lamp`.
+
     `calibrate(session, route)` returns a calibration, whose `psi` it is. `calibrate(whiteboards,
     poses, camera, darks=darks)` returns Psi and that calibration, whose `frames(dn)` are what the
     same bench reads of a scene. In both `save(folder)` writes psi.h5 with a report.
@@ -100,7 +109,8 @@ def calibrate(
         watcher: is shown the progress of a session's.
 
     Raises:
-        AppError: whiteboards without poses, of another size, or fewer than are needed.
+        AppError: whiteboards without poses, of another size, or fewer than are needed; masks that
+            moved by so little that millimetres were given.
         CalibrationError: whiteboards that are unfit: no lamp, another mask, saturated, unsteady.
         ArgumentError: an argument of another type.
     """
@@ -116,17 +126,24 @@ def _of_arrays(
     whiteboards: Any, poses: Any, camera: Camera, darks: Any
 ) -> tuple[ImagingMatrix, SessionCalibration]:
     started = time.perf_counter()
+    required(whiteboards, (list, tuple, np.ndarray), "whiteboards", "a list of arrays, DN")
     required(poses, (list, tuple), "poses", POSES_TAKE)
     if len(whiteboards) != len(poses):
         raise AppError(f"{len(whiteboards)} whiteboards, and {len(poses)} poses: give one for each")
     stood = [validated(Pose, one, f"poses[{place}]", AppError) for place, one in enumerate(poses)]
     if darks is None:
         raise refusal(darks, "darks", DARKS_TAKE)
+    _refuse_millimetres(stood, camera)
     exposed = darks if isinstance(darks, Mapping) else {stood[0].exposure_s: darks}
+    for exposure_s in exposed:
+        required(exposure_s, Real, "an exposure of darks", "a number, as poses give it")
     dark = tuple(
         _mean(frames, float(exposure_s), camera, f"darks at {exposure_s:g}", lit=False)
         for exposure_s, frames in exposed.items()
     )
+    sizes = {one.mean_dn.shape for one in dark}
+    if len(sizes) != 1:
+        raise AppError(f"darks: of {len(sizes)} sizes, {', '.join(map(str, sorted(sizes)))} pixels")
     references: dict[tuple[int, str], MeanFrame] = {}
     sorted_in: dict[str, list[BoardFrame]] = {"open": [], "pinhole": [], "held out": []}
     for place, (frames, pose) in enumerate(zip(whiteboards, stood, strict=True)):
@@ -183,6 +200,17 @@ def _mean(
     repeats = array.reshape(-1, *array.shape[-2:])
     white_dn = camera.sensor.noise.white_level_dn
     return average(repeats, exposure_s, white_dn, name, taken_s, lit)
+
+
+def _refuse_millimetres(poses: Sequence[Pose], camera: Camera) -> None:
+    """Raise AppError where the mask moved, but by less than calibration can use."""
+    moved_um = max((abs(at) for pose in poses for at in pose.mask_um or ()), default=0.0)
+    cell_um = min((mask.cell_um for mask in camera.masks.values()), default=0.0)
+    if 0 < moved_um < LEAST_MOVED * cell_um:
+        raise AppError(
+            f"poses: the mask moves by {moved_um:g} um at most, its cells are {cell_um:g} um: "
+            "mask_um takes um; were these mm?"
+        )
 
 
 def _refuse_beyond(pose: Pose, camera: Camera, name: str) -> None:

@@ -9,6 +9,7 @@ no part of a frame smooth, so that this is the most that noise can be.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
@@ -38,6 +39,20 @@ whose squared autocorrelations sum to 70 / 36 along each axis."""
 LEAST_ELECTRONS = 1.0
 """Of read noise: few sensors have less, and a line through brighter parts hardly tells."""
 LEVELS, FEWEST_BLOCKS, ROUNDS = 8, 16, 4
+MOST_LOOKED_AT = 2**20
+"""Pixels among whose values codes are looked for."""
+FEW_CODES = 32
+"""Of 8 bits; fewer different ones may be a drawing."""
+REPEATED, NARROWED = 8, 3.0
+"""How often each value has to be there at least, so that none between two was only missed; and how
+many times closer values lie, from which on they are codes: those of gamma 2.2 an eighth of the
+range from black and from white 12, evenly spaced ones 1."""
+STEADY, BETWEEN, QUANTISED, TEXTURED = 0.85, 20.0, 0.25, 4.0
+"""Variance of darker parts over that of the brightest, from which on noise does not grow; how many
+deviations the two are apart at least; the variance, DN^2, that may be rounding alone; and the ratio
+above which what differs is texture. Noise of a linear sensor that grows by 15 % over 20 deviations
+has a read noise above 100 electrons, which none has; of codes of gamma 2.2 it falls by a fifth of
+what light grows."""
 CLIPPED = 4
 """Times as many pixels as at each of as many levels below read the level where they saturate."""
 
@@ -61,7 +76,8 @@ def frames(
     read_noise: float | None = None,
     *,
     white: ArrayLike | None = None,
-    gamma: float = 1.0,
+    gamma: float | None = None,
+    exposure_s: ArrayLike | None = None,
 ) -> MeasuredFrames:
     """Return the readings of raw frames, with the deviation of each and which are usable.
 
@@ -70,7 +86,7 @@ def frames(
     that it can be, as the structure of mask and scene is in it.
 
     Args:
-        dn: (shot, y, x), or (y, x) of one shot, raw values of the sensor, all of one exposure.
+        dn: (shot, y, x), or (y, x) of one shot, raw values of the sensor.
         dark: the lamp off or the lens covered, at the same exposure: (y, x), (repeat, y, x), or the
             black level, a number. DN.
         white_level: the value at which the sensor saturates. DN.
@@ -78,11 +94,15 @@ def frames(
         read_noise: standard deviation in the dark, in electrons.
         white: a white board through the open aperture without masks, (y, x) or (repeat, y, x), or
             one number; it reads 1. Default: the white level does. DN.
-        gamma: of codes that are light ** (1 / gamma), such as those of pictures: about 2.2.
+        gamma: of codes that are light ** (1 / gamma), such as those of pictures: about 2.2. None:
+            1, and `estimates` says where the values look like such codes.
+        exposure_s: of every shot, seconds, where they differ: readings are those at the shortest
+            one, of which `white` is to be. Default: all alike.
 
     Raises:
         AppError: values that are not finite, of another size, or above the white level; darks that
-            are brighter than the frames; frames too small to estimate their noise.
+            are brighter than the frames; frames too small to estimate their noise; exposures that
+            are no times, or not one a shot.
         ArgumentError: an argument of another type.
 
     >>> import emmc_rig as emmc
@@ -105,6 +125,7 @@ def frames(
     if read_noise is not None and not (isinstance(read_noise, Real) and 0 <= read_noise < np.inf):
         raise refusal(read_noise, "read_noise", "electrons, 0 or more")
     taken = _finite(taken.reshape(-1, *taken.shape[-2:]), "dn")
+    longer = _longer(exposure_s, len(taken))
     estimates: list[str] = []
     whole, top = not np.mod(taken, 1).any(), float(taken.max())
     saturates = white_level
@@ -116,6 +137,11 @@ def frames(
     usable = taken < (np.inf if saturates is None else saturates)
     if not usable.any():
         raise AppError(f"dn: every pixel reads the white level, {saturates:g} DN, or more")
+
+    if gamma is None:
+        gamma = 1.0
+        if looks := _looks_coded(taken, usable, np.asarray(dn).dtype == np.uint8):
+            estimates.append(f"gamma 1 (assumed, though {looks}: of a picture's, give gamma=2.2)")
 
     def linear(values: Array) -> Array:
         return (
@@ -152,9 +178,22 @@ def frames(
     safe = np.where(span > 0, span, 1)
     readings = np.where(lit, signal / safe, 0)
     deviation = np.sqrt(variance + np.square(readings) * span_variance) / safe
+    readings, deviation = (values / longer for values in (readings, deviation))
     return MeasuredFrames(
         readings.astype(np.float32), deviation.astype(np.float32), usable & lit, tuple(estimates)
     )
+
+
+def _longer(exposure_s: ArrayLike | None, shots: int) -> Array:
+    """Return how many times the shortest exposure each is, (shot, 1, 1)."""
+    if exposure_s is None:
+        return np.ones((1, 1, 1))
+    times_s = numbers_of(exposure_s, "exposure_s", "seconds, one number a shot")
+    if times_s.shape != (shots,):
+        raise AppError(f"exposure_s: {times_s.size} exposures of {shots} shots: give one a shot")
+    if not (np.isfinite(times_s) & (times_s > 0)).all():
+        raise AppError("exposure_s: an exposure is a number of seconds above 0")
+    return (times_s / times_s.min())[:, None, None]
 
 
 def _finite(values: NDArray, name: str) -> Array:
@@ -225,22 +264,14 @@ def _noise_line(
 
     slope, floor: where known. Raises AppError where frames are too small to tell.
     """
-    rough, levels = [], []
-    for frame, good in zip(signal, usable, strict=True):
-        apart = convolve2d(convolve2d(frame, SECOND[None], "valid"), SECOND[:, None], "valid")
-        for y, x in np.ndindex(*(side // BLOCK_PX for side in apart.shape)):
-            rows, columns = (slice(i * BLOCK_PX, (i + 1) * BLOCK_PX) for i in (y, x))
-            beside = slice(rows.start, rows.stop + 4), slice(columns.start, columns.stop + 4)
-            if good[beside].all():
-                rough.append(np.mean(np.square(apart[rows, columns])))
-                levels.append(max(frame[beside].mean(), 0.0))
-    if len(rough) < FEWEST_BLOCKS:
+    blocks = _blocks(signal, usable)
+    if len(blocks) < FEWEST_BLOCKS:
         raise AppError(
-            f"dn: too few pixels that are not saturated to estimate their noise ({len(rough)} "
+            f"dn: too few pixels that are not saturated to estimate their noise ({len(blocks)} "
             f"blocks of {BLOCK_PX}^2): give gain and read_noise"
         )
-    mean_squares, level = np.array(rough), np.array(levels)
-    groups = np.array_split(np.argsort(level), min(LEVELS, 2 * len(rough) // FEWEST_BLOCKS))
+    level, mean_squares = blocks.T
+    groups = _by_level(level)
     x = np.array([level[group].mean() for group in groups])
     columns = [one for one, known in ((x, slope), (np.ones_like(x), floor)) if known is None]
     line, expected = (slope or 0.0, floor or 0.0), np.ones_like(level)
@@ -258,3 +289,56 @@ def _noise_line(
         )
         expected = np.maximum(line[0] * level + line[1], 1e-12 + 1e-6 * y.max())
     return line
+
+
+def _looks_coded(dn: Array, usable: NDArray[np.bool_], eight_bits: bool) -> str:
+    """Return what of values (shot, y, x) looks like a picture's codes, in words; "" for nothing."""
+    flat = dn[0].ravel()
+    values, counts = np.unique(flat[:: 1 + flat.size // MOST_LOOKED_AT], return_counts=True)
+    whole, top = not np.mod(values, 1).any(), float(values[-1])
+    steps = [256, 257] if whole else [1 / 255]
+    on_steps = any(np.abs(values / one - np.round(values / one)).max() < 1e-3 for one in steps)
+    if eight_bits or (on_steps and len(values) > FEW_CODES and top <= 255 * steps[-1]):
+        return "these are codes of 8 bits"
+    # Linear values of a sensor, turned into codes, lie ever closer towards white.
+    ends = np.linspace(values[0], top, LEVELS + 1)
+    apart = [
+        np.diff(inside).min()
+        for inside, count in (
+            (values[chosen], counts[chosen].sum())
+            for chosen in ((values >= a) & (values <= b) for a, b in itertools.pairwise(ends))
+        )
+        if len(inside) >= FEWEST_BLOCKS and count >= REPEATED * len(inside)
+    ]
+    falling = all(later <= before + whole for before, later in itertools.pairwise(apart))
+    if len(apart) > 1 and falling and apart[0] > NARROWED * apart[-1]:
+        return f"its values lie {apart[0] / apart[-1]:.0f} times closer towards white"
+    level, mean_squares = _blocks(dn, usable).T
+    if len(level) < LEVELS * FEWEST_BLOCKS // 2:
+        return ""
+    groups = _by_level(level)
+    low = np.array([np.quantile(mean_squares[one], SMOOTHEST) for one in groups])
+    between = level[groups[-1]].mean() - level[groups[0]].mean()
+    if low.min() <= whole * QUANTISED or between < BETWEEN * np.sqrt(low[-1]):
+        return ""
+    low /= low[-1]
+    return "its noise does not grow with light" if STEADY < low.min() < low.max() < TEXTURED else ""
+
+
+def _by_level(level: Array) -> list[NDArray[np.intp]]:
+    """Return which blocks are alike bright, groups from dark to bright."""
+    return np.array_split(np.argsort(level), min(LEVELS, 2 * len(level) // FEWEST_BLOCKS))
+
+
+def _blocks(signal: Array, usable: NDArray[np.bool_]) -> Array:
+    """Return mean and mean square of the second difference of every block, (block, 2)."""
+    found = []
+    for frame, good in zip(signal, usable, strict=True):
+        apart = convolve2d(convolve2d(frame, SECOND[None], "valid"), SECOND[:, None], "valid")
+        for y, x in np.ndindex(*(side // BLOCK_PX for side in apart.shape)):
+            rows, columns = (slice(i * BLOCK_PX, (i + 1) * BLOCK_PX) for i in (y, x))
+            beside = slice(rows.start, rows.stop + 4), slice(columns.start, columns.stop + 4)
+            if good[beside].all():
+                square = np.mean(np.square(apart[rows, columns]))
+                found.append((max(frame[beside].mean(), 0.0), square))
+    return np.array(found).reshape(-1, 2)

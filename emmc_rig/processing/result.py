@@ -25,7 +25,7 @@ from emmc_rig.model.lightfield import (
     ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_axes import ATTRIBUTE, picture_name, stored_as
+from emmc_rig.model.view_axes import ATTRIBUTE, grid_name, stored_as
 from emmc_rig.pages.viewer import render_viewer
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.kept import missed_readings
@@ -46,6 +46,12 @@ def compared(light_field: Any, truth: NDArray) -> dict[str, float]:
     }
 
 
+def estimates_of(frames: Frames) -> dict[str, list[str]]:
+    """Return what of raw frames was estimated, in words, as metrics.json has it."""
+    found = getattr(frames, "estimates", ())
+    return {"estimated_from_frames": list(found)} if found else {}
+
+
 def figures(solved: Reconstruction, verdict: Verdict, frames: Frames) -> dict[str, Any]:
     """Return what metrics.json has of a reconstruction, its verdict and its frames."""
     return {
@@ -59,6 +65,7 @@ def figures(solved: Reconstruction, verdict: Verdict, frames: Frames) -> dict[st
         "parameters": solved.parameters,
         "noise_sigma": frames.noise_sigma,
         "usable_share": float(frames.usable.mean()),
+        **estimates_of(frames),
         "command": command_line(),
         "versions": versions(),
     }
@@ -204,7 +211,7 @@ class Result:
 
     def __repr__(self) -> str:
         (v, u, rows, columns, _), level = self.light_field.shape, self.verdict.level
-        pictures = f"{v}x{u} {picture_name(self.psi.view_axes)}s"
+        pictures = grid_name(self.psi.view_axes, (v, u))
         return (
             f"Result({self.method}, {pictures} of {rows}x{columns}, {self.status} in "
             f"{self.seconds:.1f} s, verdict: {level})"

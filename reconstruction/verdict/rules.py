@@ -379,10 +379,12 @@ def _does_harm(e: Evidence, cause: str) -> bool:
 
 def _causes(e: Evidence) -> dict[str, tuple[float, float, float]]:
     """Return value, deviation and gain of each cause that is known, by name."""
+    # Outer bands or times that are darker are the light's own.
+    own = () if shows_parallax(e.view_axes) else ("vignetting",)
     return {
         name: (value, deviation, gain)
         for name, (value, deviation, gain) in e.changes.items()
-        if value is not None and deviation is not None and gain is not None
+        if name not in own and value is not None and deviation is not None and gain is not None
     }
 
 

@@ -91,9 +91,7 @@ def reconstruct_judged(
         )
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
     verdict = verdict_from(gathered(psi, read, typical, result, seen, found))
-    if psi.colour is not None and (psi.colour == psi.colour.flat[0]).all():
-        # Nothing was seen of the others: light without colours, or a picture in one.
-        result.light_field[...] = result.light_field[..., psi.colour.flat[0], None]
+    psi.even_unseen_colours(result.light_field)
     return result, verdict
 
 

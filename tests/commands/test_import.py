@@ -16,6 +16,7 @@ from programs import one_line, program
 
 from drivers.dng import encode_dng
 from emmc_rig.files.cameras import shipped_camera_files
+from emmc_rig.importing.session import _Import as importing
 from emmc_rig.processing.reconstructing import open_frames, reconstruct
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.frame_means import decoded
@@ -30,6 +31,8 @@ PLAN = {
     "whiteboards": {
         "repeats": 1,
         "references": 2,
+        "lamp_checks": 2,
+        "turned": 2,
         "open": [{"held_out": True}, {"mask_um": [0, 0]}, {"mask_um": [24, 0]}],
     },
     "darks": {"repeats": 2, "of_shots": 2},
@@ -47,7 +50,13 @@ def exported(session, folder, write):
     rows = []
     for frame, (raw, exposure_s) in zip(frames, decoded(session, frames), strict=True):
         bench, um = frame.bench, frame.bench.offsets_um
-        row = {"file": write(folder / frame.id, raw.mosaic), "kind": frame.kind}
+        kind, turned = frame.kind, {}
+        if kind == "turned":
+            kind = "open" if bench.masks_in else "reference"
+            turned = {"turn_deg": bench.board_turn_deg}
+        elif kind == "check" and not bench.masks_in:
+            kind = "reference-check"
+        row = {"file": write(folder / frame.id, raw.mosaic), "kind": kind, **turned}
         row |= {"exposure_s": repr(exposure_s), "lamp": bench.lamp}
         if frame.kind != "dark" or frame.is_dark_of_shots:
             row["shot"] = bench.shot
@@ -88,15 +97,16 @@ def captured(tmp_path_factory):
     return folder
 
 
-def test_an_imported_session_is_complete_and_says_that_it_was_imported(captured):
-    session = Session(captured / "imported")
+def test_an_imported_session_is_complete_and_says_that_it_was_imported(tmp_path, run):
+    table = table_of(tmp_path, world(tmp_path))
+    session, _ = imported(run, tmp_path, table, "--camera", CAMERA)
     assert session.is_complete
     assert verify(session).is_complete
     (entry,) = of_kind(session.journal.entries, ImportedEntry)
-    assert len(entry.files) == len(session.stored)
+    assert len(entry.files) == len(session.stored) == 4
     first = session.frames[0].id
     frame = decode_frame(session.read(first), session.stored[first])
-    file = captured / "files/dark-0-r0.npy"
+    file = tmp_path / "d0.npy"
     assert session.stored[first].metadata["imported"] == str(file)
     assert frame.original == file.read_bytes()
     assert entry.files[str(file)] == hashlib.sha256(file.read_bytes()).hexdigest()
@@ -157,7 +167,7 @@ def hdf5(path, mosaic):
 
 
 @pytest.mark.parametrize(
-    "form", [pytest.param(one, marks=[] if one in ("npy", "dng") else pytest.mark.slow)
+    "form", [pytest.param(one, marks=[] if one == "npy" else pytest.mark.slow)
              for one in FORMATS]
 )  # fmt: skip
 def test_shots_of_every_format_read_as_those_of_the_captured_session(shots_only, tmp_path, form):
@@ -257,6 +267,56 @@ def all_rows(**cells):
     return lambda folder, rows: [row.update(cells) for row in rows]
 
 
+LIT_BENCH = {"electrons_per_s": 5_000_000.0}
+TABLE = "file,kind,shot,exposure_s\n" + "".join(
+    f"{name},{kind},{shot},0.02\n" for name, kind, shot in zip(NAMES, KINDS, "01  ", strict=True)
+)
+
+
+def each(rows):
+    return list(enumerate(rows))
+
+
+def third_shot(folder, rows):
+    np.save(folder / "s2.npy", LIT[2])
+    rows.append({"file": "s2.npy", "kind": "shot", "shot": 2, "exposure_s": 0.02})
+
+
+def described(folder, change):
+    """Write the camera with changes to its description as `mine.yaml`."""
+    camera = yaml.safe_load(shipped_camera_files()[CAMERA].read_text())
+    change(camera)
+    (folder / "mine.yaml").write_text(yaml.safe_dump(camera))
+
+
+def camera_of(also=lambda folder, rows: None, **noise):
+    """Return what describes the camera with its noise, after another change."""
+
+    def change(folder, rows):
+        also(folder, rows)
+        described(folder, lambda camera: camera.setdefault("sensor", {}).update(noise=noise))
+
+    return change
+
+
+def mask_of(cells):
+    """Return what gives the camera a picture of so many cells a side; None: one that is missing."""
+
+    def change(folder, rows):
+        if cells is not None:
+            codes = np.random.default_rng(0).integers(0, 2, (cells, cells)).astype(np.uint8)
+            cv2.imwrite(str(folder / "m.png"), 255 * codes)
+        pattern = {"kind": "picture", "path": "m.png"}
+        described(folder, lambda camera: camera["masks"]["mask"].update(pattern=pattern))
+
+    return change
+
+
+def table_bytes(content):
+    """Return what writes a table of its own instead of the rows."""
+    return lambda folder, rows: (folder / "own.csv").write_bytes(content)
+
+
 MISTAKES = {
     "a file that is missing": (changed(1, file="s9.npy"), "s9.npy: no such file"),
     "a file named twice": (changed(1, file="s0.npy"), "s0.npy is there twice, also in"),
@@ -328,7 +388,7 @@ MISTAKES = {
     "shots without and with a number": (changed(1, shot=""), "other shots have a number"),
     "a dark of no shot": (changed(2, shot=7), "there is no shot 7, only 0 to 1"),
     "no shots": (lambda folder, rows: rows.__delitem__(slice(0, 2)), "no file is a shot"),
-    "no rows": (lambda folder, rows: rows.clear(), "no row below the names"),
+    "no rows": (table_bytes(b"file,kind\n"), "no row below the names"),
     "a shot as a dark": (changed(1, kind="dark", shot=""), "a dark that is"),
     "an ISO as a gain": (changed(0, gain=800), "gain: input should be less than or equal to 100"),
     "a gain below 1": (changed(0, gain=0.5), "gain: input should be greater than or equal to 1"),
@@ -351,24 +411,117 @@ MISTAKES = {
         changed(2, kind="reference", exposure_s=""), "its exposure is not known"
     ),
     "an array that is not there": (changed(0, file="s0.npz@a"), "s0.npz: no such file"),
+    "more shots than the camera has": (third_shot, "and the camera has 2 shot(s): write mask_x_um"),
+    "nm for um of the mask": (changed(1, mask_x_um=24_000), "mask at 24000, 0 um: nm for um?"),
+    "mm for um of a whiteboard's mask": (
+        changed(2, kind="open", mask_x_um=0.024), "mm for um? write um"
+    ),
+    "a shot that is turned": (changed(0, turn_deg=90), "turn_deg with kind shot"),
+    "a turned board without its reference": (
+        changed(2, kind="open", turn_deg=90), "turned by 90 degrees has kind open alone"
+    ),
+    "a pinhole before a shot": (changed(0, aperture_x_um=0), "a pinhole's place with kind shot"),
+    "a mask in a reference": (
+        changed(2, kind="reference", mask_x_um=24), "kind reference, which is without masks"
+    ),
+    "minutes for s": (camera_of(all_rows(exposure_s=0.02 / 60), **LIT_BENCH), "minutes for s in"),
+    "us for s": (all_rows(exposure_s=20_000), "less than or equal to 3600"),
+    "levels swapped": (
+        camera_of(black_level_dn=4095, white_level_dn=64), "must be below white_level_dn"
+    ),
+    "codes moved up to 16 bits": (
+        camera_of(white_level_dn=4095), "above sensor.noise.white_level_dn 4095"
+    ),
+    "a shot all white": (written(0, np.full_like(LIT[0], 65_535)), "100% of its pixels are at"),
+    "a cap on the lens": (written(0, DARK[0] + 1), "its brightest readings are 0.0% of white"),
+    "frames of one row": (
+        lambda folder, rows: [np.save(folder / row["file"], LIT[i, :1]) for i, row in each(rows)],
+        "1x32 pixels (y x), fewer than a frame has",
+    ),
+    "seconds beside dates": (
+        lambda folder, rows: [
+            rows[0].update(time=12), rows[1].update(time="2026-11-25T14:30:00")
+        ],
+        "line 3: time is over a year after that of",
+    ),
+    "a month that is none": (changed(0, time="2026-13-25T14:30:00"), "month must be in 1..12"),
+    "a time without a date": (changed(0, time="14:30:00"), "time: input should be a number"),
+    "letters of another case": (changed(1, file="S1.npy"), "no such file; did you mean 's1.npy'?"),
+    "a name that is nearly right": (changed(1, file="s1.tif"), "did you mean 's1.npy'?"),
+    "a plural as a kind": (changed(0, kind="shots"), "kind: input should be 'shot', 'dark'"),
+    "a flat": (changed(2, kind="flat"), "kind: input should be 'shot', 'dark', 'reference'"),
+    "a mask of fewer cells than the beam": (
+        mask_of(12), "it has 12 cells of 36 um, the beam needs 18"
+    ),
+    "a mask picture that is missing": (mask_of(None), "m.png: no such file, or not a picture"),
+    "a workbook": (table_bytes(b"PK\x03\x04\x14\x00"), "save it as CSV UTF-8"),
+    "UTF-16": (table_bytes(TABLE.encode("utf-16")), "not text in UTF-8 (byte 0); save it as CSV"),
+    "Latin letters": (table_bytes(TABLE.replace("s0", "\xe4").encode("latin-1")), "not text in"),
+    "a zero byte": (table_bytes(TABLE.replace("s0", "s\0").encode()), "it holds a zero byte"),
+    "no names of columns": (
+        table_bytes(TABLE.partition("\n")[2].encode()), "line 1: names no column"
+    ),
+    "a quote that stays open": (
+        table_bytes(TABLE.replace("s1", '"s1').encode()), "not a table in CSV"
+    ),
+    "a cell too many": (
+        table_bytes(TABLE.replace("0.02\n", "0.02,7\n").encode()), "5 cells under 4 columns"
+    ),
+    "a cell too few": (table_bytes(TABLE.replace(",0.02", "").encode()), "3 cells under 4 columns"),
+    "capital letters": (table_bytes(TABLE.replace("exp", "Exp").encode()), "mean 'exposure_s'?"),
+    "a column twice": (table_bytes(TABLE.replace("exposure_s", "file").encode()), "is there twice"),
+    "an empty table": (table_bytes(b""), "empty; its first line names the columns"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
+IN_CHILDREN = ("no MAT", "ms for s of an OME-TIFF", "a folder")
+"""Mistakes in files that a process of its own reads, which takes a second to begin."""
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [pytest.param(one, marks=pytest.mark.slow if one in IN_CHILDREN else []) for one in MISTAKES],
+)
 def test_a_mistake_is_named_in_one_line_and_nothing_is_written(mistake, tmp_path, run):
     change, words = MISTAKES[mistake]
     rows = world(tmp_path)
     change(tmp_path, rows)
-    table = table_of(tmp_path, rows)
+    own, mine = tmp_path / "own.csv", tmp_path / "mine.yaml"
+    table = own if own.exists() else table_of(tmp_path, rows)
+    camera = mine if mine.exists() else CAMERA
     before = sorted(tmp_path.rglob("*"))
-    code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
+    code, _, err = run("import", table, "--camera", camera, "--out", tmp_path / "out")
     assert code == 1
     assert words in one_line(err)
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_the_same_table_without_a_mistake_is_imported(tmp_path, run):
-    table = table_of(tmp_path, world(tmp_path))
+def in_a_folder(folder, rows):
+    (folder / "from Köln").mkdir()
+    for row in rows:
+        (folder / row["file"]).rename(folder / "from Köln" / row["file"])
+        row["file"] = f"from Köln\\{row['file']}"
+
+
+WAYS = {
+    "as it is": lambda folder, rows: None,
+    "with a byte-order mark": table_bytes(TABLE.encode("utf-8-sig")),
+    "with semicolons and decimal commas": table_bytes(
+        TABLE.replace(",", ";").replace("0.02", "0,02").encode()
+    ),
+    "with tabs and lines of Windows": table_bytes(
+        TABLE.replace(",", "\t").replace("\n", "\r\n").encode()
+    ),
+    "with backslashes, spaces and umlauts": in_a_folder,
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_same_table_without_a_mistake_is_imported(way, tmp_path, run):
+    rows = world(tmp_path)
+    WAYS[way](tmp_path, rows)
+    own = tmp_path / "own.csv"
+    table = own if own.exists() else table_of(tmp_path, rows)
     code, out, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
     assert code == 0, err
     assert "4 frames of 4 files imported and verified" in out
@@ -386,6 +539,7 @@ def mosaics(session, kind):
     return np.stack([raw.mosaic for raw, _ in decoded(session, frames)])
 
 
+@pytest.mark.slow
 def test_pages_of_an_ome_tiff_are_shots_with_its_exposures_and_times(tmp_path, run):
     plane = {"ExposureTime": [20.0, 40.0], "ExposureTimeUnit": ["ms"] * 2, "DeltaT": [0.5, 2.0]}
     tifffile.imwrite(tmp_path / "s.ome.tif", LIT[:2], metadata={"axes": "TYX", "Plane": plane})
@@ -399,6 +553,7 @@ def test_pages_of_an_ome_tiff_are_shots_with_its_exposures_and_times(tmp_path, r
     assert [(one.exposure_s, one.host_time_s) for one in shots] == [(0.02, 0.5), (0.04, 2.0)]
 
 
+@pytest.mark.slow
 def test_a_zarr_array_is_read(tmp_path, run):
     zarr = pytest.importorskip("zarr")
     zarr.create_group(tmp_path / "s.zarr").create_array("data", data=LIT[:2])
@@ -458,15 +613,93 @@ def test_frames_cannot_be_added_to_an_imported_session(tmp_path, run):
     assert "an imported session takes no further frames" in one_line(err)
 
 
-def test_a_disk_that_fails_leaves_nothing(tmp_path, run, monkeypatch):
+def failing(fault):
+    def fail(*arguments, **more):
+        raise fault
+
+    return fail
+
+
+@pytest.mark.parametrize("where", ["session", "spool"])
+def test_a_disk_that_is_full_leaves_nothing(where, tmp_path, run, monkeypatch):
     table = table_of(tmp_path, world(tmp_path))
     before = sorted(tmp_path.rglob("*"))
-
-    def full(*arguments):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Session, "store", full)
+    fault = failing(OSError(28, "No space left on device"))
+    if where == "session":
+        monkeypatch.setattr(Session, "store", fault)
+    else:
+        monkeypatch.setattr("emmc_rig.importing.session._reader", fault)
     code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
     assert code == 1
-    assert "nothing was imported" in one_line(err)
+    assert "No space left on device; nothing was imported" in one_line(err)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_ctrl_c_leaves_nothing(tmp_path, run, monkeypatch):
+    table = table_of(tmp_path, world(tmp_path))
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(Session, "store", failing(KeyboardInterrupt()))
+    code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
+    assert code == 130
+    assert "nothing was written" in one_line(err)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("then", "words"), [(b"", "s1.npy: changed"), (None, "s1.npy: No such")])
+def test_a_file_that_goes_while_it_is_imported_is_named(then, words, tmp_path, run, monkeypatch):
+    table = table_of(tmp_path, world(tmp_path))
+    file, write = tmp_path / "s1.npy", importing.write
+
+    def later(*arguments):
+        file.unlink() if then is None else file.write_bytes(then)
+        return write(*arguments)
+
+    monkeypatch.setattr(importing, "write", later)
+    code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
+    assert code == 1
+    assert words in one_line(err)
+    assert not (tmp_path / "out").exists()
+
+
+OUTS = {
+    "s0.npy": "a file, where a folder is meant",
+    "s0.npy/out": "cannot be made",
+    ".": "holds something already",
+    "/proc/out": "/proc/out",
+}
+
+
+@pytest.mark.parametrize("out", OUTS)
+def test_a_place_that_cannot_be_written_is_named(out, tmp_path, run):
+    table = table_of(tmp_path, world(tmp_path))
+    before = sorted(tmp_path.rglob("*"))
+    code, _, err = run("import", table, "--camera", CAMERA, "--out", out)
+    assert code == 1
+    assert OUTS[out] in one_line(err)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--shots", "x*.npy"), "x*.npy: no file is called so (shot)"),
+        (("--shots", "*.npy", "--darks", "d*.npy"), "is there twice"),
+        (("--shots", "s*.npy", "--planes"), "the camera's sensor.cfa is rggb"),
+        (("table.xlsx",), "table.xlsx: no such file"),
+        ((".",), "cannot be read (Is a directory)"),
+    ],
+)
+def test_a_mistake_in_the_command_is_named(arguments, words, tmp_path, run):
+    world(tmp_path)
+    code, _, err = run("import", *arguments, "--camera", CAMERA, "--out", "out")
+    assert code == 1
+    assert words in one_line(err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_white_level_that_nobody_states_is_said(tmp_path, run):
+    rows = world(tmp_path)
+    for row in rows:
+        np.save(tmp_path / row["file"], np.load(tmp_path / row["file"]) >> 4)
+    _, said = imported(run, tmp_path, table_of(tmp_path, rows), "--camera", CAMERA)
+    assert "white_level_dn is taken as 65535, as nothing states it" in said

@@ -127,6 +127,18 @@ MISTAKES = {
     "another size": ({"darks": DARK[:, :-2]}, r"whiteboards\[0\]: \(44, 60\) pixels, the darks"),
     "a hole": ({"whiteboards": [BOARD, BOARD * np.nan]}, r"whiteboards\[1\]: holds values that"),
     "a flat list": ({"whiteboards": [1, 2]}, r"whiteboards\[0\]: got 1; it takes DN"),
+    "no list": ({"whiteboards": None}, "whiteboards: got None; it takes a list of arrays"),
+    "poses in mm": (
+        {"poses": [{"reference": True}, {"mask_um": (0.27, 0.162)}]},
+        r"moves by 0.27 um at most, its cells are [\d.]+ um: .* were these mm\?",
+    ),
+    "a place that is no number": (
+        {"poses": [{"reference": True}, {"mask_um": (0, np.nan)}]},
+        r"poses\[1\]: mask_um.1: ",
+    ),
+    "darks of two sizes": ({"darks": {1.0: DARK, 2.0: DARK[:, 1:]}}, "darks: of 2 sizes"),
+    "darks by a name": ({"darks": {"1 s": DARK}}, "an exposure of darks: got '1 s'"),
+    "a hole in the darks": ({"darks": DARK * np.inf}, "darks at 1: holds values that are not"),
     "a shot of none": (
         {"poses": [{"reference": True}, {"shot": 2}]},
         "shot 2, the camera has shots 0 to 0",

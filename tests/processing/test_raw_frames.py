@@ -1,9 +1,16 @@
 """Raw values to readings: against the values that made them, given and estimated."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import emmc_rig as emmc
+from emmc_rig.model.camera import shipped_cameras
+from simulators.scenes import SCENES
+
+RAW = Path(os.environ.get("EMMC_PEER_FILES", "")) / "raw"
 
 BLACK, GAIN, READ, WHITE = 64, 0.8, 2.5, 4095
 SIZE = (128, 192)
@@ -124,6 +131,119 @@ def test_codes_of_a_picture_become_light():
     np.testing.assert_allclose(frames.readings[0], light, atol=0.012)
 
 
+def test_shots_of_other_exposures_read_alike_and_as_surely_as_their_light_says(exposed):
+    _, signal = exposed
+    rng = np.random.default_rng(9)
+    times_s = np.array([0.01, 0.04])
+    electrons = np.stack([signal[0] / GAIN / 8 * t / 0.01 for t in times_s])
+    given = {"dark": BLACK, "white_level": WHITE, "gain": GAIN, "read_noise": READ}
+    frames = emmc.frames(sensor(electrons, rng), exposure_s=times_s, **given)
+    truth = np.stack([GAIN * electrons[0] / (WHITE - BLACK)] * 2)
+    assert (frames.readings - truth).mean() == pytest.approx(0, abs=1e-4)
+    for shot in range(2):
+        one = frames.usable[shot] & (truth[shot] > 0.002)
+        scaled = (frames.readings[shot] - truth[shot])[one] / frames.deviation[shot][one]
+        assert scaled.std() == pytest.approx(1, abs=0.03)
+    assert frames.deviation[1].mean() < 0.6 * frames.deviation[0].mean()
+
+
+def test_what_was_estimated_stands_in_a_result_s_metrics_and_on_its_page(tmp_path):
+    light = np.linspace(0.1, 0.9, 96 * 96).reshape(1, 96, 96) * np.ones((2, 1, 1))
+    dn = sensor(4000 * light, np.random.default_rng(10))
+    psi = emmc.Psi.from_weights(np.ones((2, 1, 2, 96, 96)) / 2)
+    frames = emmc.frames(dn, white_level=WHITE)
+    result = emmc.reconstruct(psi, frames, "tv")
+    assert result.metrics()["estimated_from_frames"] == list(frames.estimates)
+    page = result.viewer().split("<script")[0]
+    assert "Estimated from the frames, as nobody gave it: black level" in page
+    given = emmc.frames(dn, dark=BLACK, white_level=WHITE, gain=GAIN, read_noise=READ)
+    told = emmc.reconstruct(psi, given, "tv")
+    assert "estimated_from_frames" not in told.metrics()
+    assert "Estimated from" not in told.viewer().split("<script")[0]
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    """12-bit raw values of a smooth scene, one shot, of shot noise, black level 64."""
+    y, x = np.indices((256, 384)) / 384
+    electrons = 20000 * (0.02 + 0.95 * (0.5 + 0.5 * np.sin(9 * x + 3 * y * y) * np.cos(7 * y)))
+    rng = np.random.default_rng(11)
+    return np.round(64 + 0.2 * (rng.poisson(electrons) + rng.normal(0, READ, electrons.shape)))
+
+
+def gammas(frames):
+    """Return what is said of the gamma."""
+    return [words for words in frames.estimates if words.startswith("gamma")]
+
+
+CODED = {
+    "16 bits of a 12-bit sensor": (lambda dn: np.round(65535 * (dn / 4095) ** (1 / 2.2)), "closer"),
+    "floats of a 12-bit sensor": (lambda dn: (dn / 4095) ** (1 / 2.2), "closer towards white"),
+    "floats without levels": (
+        lambda dn: np.random.default_rng(0).normal(
+            (np.maximum(dn - 64, 0) / 4095) ** (1 / 2.2), 1e-5
+        ),
+        "noise does not grow with light",
+    ),
+    "8 bits": (lambda dn: np.uint8(np.round(255 * (dn / 4095) ** (1 / 2.2))), "codes of 8 bits"),
+    "8 bits in 16": (lambda dn: 257 * np.round(255 * dn / 4095), "codes of 8 bits"),
+    "8 bits as floats": (lambda dn: np.round(255 * dn / 4095) / 255, "codes of 8 bits"),
+}
+
+
+@pytest.mark.parametrize("kind", CODED)
+def test_values_that_look_like_a_picture_s_codes_are_said_to(kind, smooth):
+    coded, words = CODED[kind]
+    said = gammas(emmc.frames(coded(smooth)))
+    assert len(said) == 1
+    assert words in said[0]
+    assert "give gamma=2.2" in said[0]
+    for given in (1, 2.2):
+        assert gammas(emmc.frames(coded(smooth), gamma=given)) == []
+
+
+@pytest.mark.parametrize(
+    "linear",
+    [
+        lambda dn: dn,
+        lambda dn: 16 * dn,
+        lambda dn: np.round(dn * 65535 / 4095),
+        lambda dn: (dn - 64) / 4031,
+        lambda dn: np.random.default_rng(1).normal(dn, 20),
+        lambda dn: dn + np.random.default_rng(2).normal(0, 40, dn.shape[1]),
+    ],
+)
+def test_linear_values_are_not_taken_for_codes(linear, smooth):
+    assert gammas(emmc.frames(linear(smooth))) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_no_camera_s_frames_of_a_built_in_scene_look_like_codes(name):
+    for camera in shipped_cameras().values():
+        scene = emmc.scene(name, size=(96, 128), views=camera.views)
+        taken = camera.expose(scene, seed=1)
+        for values in (taken.frames_dn, taken.readings, taken.noise_free):
+            assert gammas(emmc.frames(values, gain=1, read_noise=1)) == [], camera.title
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not RAW.is_dir(), reason="EMMC_PEER_FILES names no folder with raw/")
+def test_no_maker_s_raw_values_look_like_codes():
+    rawpy = pytest.importorskip("rawpy")
+    looked = 0  # most of these files are cut off behind their tags
+    for path in sorted(RAW.iterdir()):
+        try:
+            with rawpy.imread(str(path)) as opened:
+                values = np.array(opened.raw_image_visible)
+        except rawpy.LibRawError:
+            continue
+        if values.ndim == 2 and values.any():
+            looked += 1
+            assert gammas(emmc.frames(values, gain=1, read_noise=1)) == [], path.name
+    assert looked
+
+
 FLAT = np.full((1, 64, 64), 900.0)
 MISTAKES = {
     "text": (lambda: emmc.frames("shot.tif"), "dn: got 'shot.tif'; it takes raw values"),
@@ -155,6 +275,11 @@ MISTAKES = {
         ),
         "white: most of it reads the white level, 1023 DN",
     ),
+    "an exposure too few": (
+        lambda: emmc.frames(FLAT, exposure_s=[0.1, 0.2]),
+        "exposure_s: 2 exposures of 1 shots",
+    ),
+    "no exposure": (lambda: emmc.frames(FLAT, exposure_s=[np.nan]), "seconds above 0"),
     "gain of nothing": (lambda: emmc.frames(FLAT, gain=0), "gain: got 0; it takes a number above"),
     "noise below nothing": (lambda: emmc.frames(FLAT, read_noise=-1), "read_noise: got -1"),
 }

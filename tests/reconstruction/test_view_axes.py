@@ -8,21 +8,26 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+import yaml
 from programs import program
 
 import emmc_rig as emmc
 from emmc_rig.files.exports import MAPS, open_export
 from emmc_rig.files.formats import FORMATS
 from emmc_rig.files.psi import FRAMES, PSI, open_psi, save_shards
-from emmc_rig.model.errors import SensingError, ViewOrderWarning
+from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
+from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES
+from emmc_rig.pages.page import light_field_head
+from emmc_rig.pages.report import ReportContent, render
 from emmc_rig.pages.result_figure import draw_results
 from emmc_rig.pages.viewer import render_viewer, viewer_data
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.processing.reconstructing import reconstruct_folder
 from reconstruction.methods import MethodSettings
+from reconstruction.preview import Preview
 
 SIZE = (24, 32)
 BANDS, TIMES = ("angle", "band"), ("time", "angle")
@@ -57,6 +62,28 @@ def light_of(views, axes, size=SIZE):
 def frames_of(psi, light):
     rng = np.random.default_rng(5)
     return (psi @ light + rng.normal(0, NOISE, psi.frames_shape)).astype(np.float32)
+
+
+def cassi_file(folder, cells, bands=24, step=2):
+    """Write the YAML of a mask whose shadow moves by `step` pixels from band to band."""
+    lens_mm, mask_mm, pitch_um = 50, 0.5, 24
+    cell_um = (1 - mask_mm / lens_mm) * pitch_um  # one sample wide on the sensor
+    pattern = {"kind": "parameters", "cells": cells.tolist()}
+    camera = {
+        "title": "CASSI",
+        "views": [1, bands],
+        "view_axes": ["angle", "band"],
+        "lens": {
+            "distance_mm": lens_mm,
+            "aperture_cell_mm": step * cell_um * lens_mm / mask_mm / 1e3,
+            "aperture_fill": 0,
+        },
+        "sensor": {"sample_pitch_um": pitch_um},
+        "masks": {"code": {"distance_mm": mask_mm, "cell_um": cell_um, "pattern": pattern}},
+    }
+    path = folder / "cassi.yaml"
+    path.write_text(yaml.safe_dump(camera))
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +135,91 @@ def test_other_names_of_view_axes_are_refused_in_one_line(tmp_path):
         file.attrs["view_axes"] = "angle,time"
     with pytest.raises(SensingError, match="checksum"):
         ImagingMatrix.load(path)
+
+
+def test_a_cassi_described_by_a_file_has_the_matrix_of_its_shifted_masks(tmp_path):
+    (rows, columns), count, step = SIZE, 24, 2
+    cells = np.random.default_rng(6).integers(0, 2, (rows + 16, columns + step * (count - 1) + 16))
+    camera = emmc.camera(cassi_file(tmp_path, cells))
+    psi = camera.psi(SIZE)
+    shifted = [cells[8:, 8 + step * band :][:rows, :columns] for band in range(count)]
+    expected = emmc.Psi.from_weights(np.stack(shifted)[None, None] / count, view_axes=BANDS)
+    np.testing.assert_allclose(psi.weights, expected.weights, atol=1e-7)
+    np.testing.assert_array_equal(psi.colour, expected.colour)
+    assert psi.view_axes == psi_layout(camera, SIZE).view_axes == psi.layout.view_axes == BANDS
+    assert psi.layout.psi(psi.weights).checksum() == psi.checksum()
+    assert camera_of(psi) == camera
+    assert "1x24 bands" in repr(camera)
+    assert emmc.camera(camera.model_dump()) == camera
+
+
+def test_bands_that_are_darker_at_the_ends_are_no_vignetting(tmp_path):
+    cells = np.random.default_rng(7).integers(0, 2, (110, 170))
+    camera = emmc.camera(cassi_file(tmp_path, cells, bands=12))
+    picture = light_of((1, 1), ANGLES, (64, 96))[0, 0]
+    lit = 1 - 0.8 * np.abs(np.arange(12) - 6) / 6
+    light = (picture * lit[:, None, None, None]).astype(np.float32)[None]
+    psi = camera.psi((64, 96))
+    verdict = emmc.reconstruct(psi, camera.expose(light, psi=psi), "adaptive-fast").verdict
+    for wrong in ("outermost rays", "aperture", "colour"):
+        assert wrong not in verdict.words
+
+
+def test_a_sensor_without_filters_sees_bands_as_light_without_colours(tmp_path):
+    path = cassi_file(tmp_path, np.ones((90, 90), int), bands=3)
+    assert emmc.camera(path).psi((8, 8)).colour is not None
+    filtered = yaml.safe_load(path.read_text())
+    for more in ({"shots": [{"filter": "green"}]}, {"view_axes": ["angle", "time"]}):
+        described = {**filtered, **more}
+        seen = sensor_response(emmc.camera(described), (8, 8))
+        assert seen[..., 1].all()
+
+
+def test_a_camera_at_angles_is_described_and_hashed_as_by_earlier_versions():
+    camera = emmc.camera("rgbw-mono-3shots")
+    assert camera.view_axes == ANGLES
+    assert "view_axes" not in camera.model_dump()
+    assert "view_axes" not in camera.psi((8, 8)).camera_json
+    assert Camera.model_validate_json(camera.model_dump_json()) == camera
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("view_axes", ["angle", "colour"], "view_axes.1: .*'angle', 'band' or 'time'"),
+        ("view_axes", ["band"], "view_axes"),
+        ("view_axis", ["angle", "band"], "'view_axes'"),
+    ],
+)
+def test_a_camera_with_other_view_axes_is_refused_in_one_line(key, value, said):
+    with pytest.raises(CameraError, match=said) as fault:
+        emmc.camera({"title": "mine", key: value})
+    assert "\n" not in str(fault.value)
+
+
+def test_a_camera_of_bands_is_listed_as_such(tmp_path):
+    path = cassi_file(tmp_path, np.ones((90, 90), int), bands=3)
+    code, output, _ = program("cameras", str(path), "--out", str(tmp_path / "out"))
+    assert code == 0
+    assert "1x3 bands" in output
+
+
+def test_a_report_of_bands_speaks_of_no_view():
+    light = light_of((1, 6), BANDS)
+    metrics = {
+        "view_axes": list(BANDS), "psnr_db": 20.0, "replicate_psnr_db": 25.0, "size": [24, 32],
+        "verdict": {"level": "trust", "reasons": []},
+    }  # fmt: skip
+    content = ReportContent(
+        "t", "s", "c", "", "", light, light[0, :1, ..., 0], "mono", metrics, truth=light
+    )
+    page = render(content)
+    words = page.split("<script")[0]
+    for wrong in ("viewpoint, also", "parallax", "centre view", "over views"):
+        assert wrong not in words
+    assert "copied middle band" in words
+    assert "Over middle band" in words
+    assert "missed by 5.0 dB more than by the copied middle band" in str(light_field_head(metrics))
 
 
 def test_a_result_of_bands_calls_them_so_in_every_file(bands, tmp_path):
@@ -185,6 +297,16 @@ def test_what_a_method_calls_disparity_is_a_shift_between_times():
     assert "disparit" not in result.verdict.words
 
 
+def test_the_preview_of_a_camera_without_colours_is_grey():
+    psi = psi_of((1, 6), BANDS, size=(32, 48))
+    frames = frames_of(psi, light_of((1, 6), BANDS, (32, 48)))
+    preview = Preview(psi, 4, frames, NOISE)
+    preview.follow(frames, 5)
+    light = preview.light_field
+    assert light.std() > 0.01
+    assert (light == light[..., :1]).all()
+
+
 @pytest.mark.parametrize("views", [(1, 2), (2, 1), (1, 24)])
 def test_a_row_of_views_is_a_light_field(views):
     light = light_of(views, ANGLES)
@@ -221,6 +343,28 @@ def test_every_grid_of_views_is_reconstructed_and_kept(
     seen = psi.weights.any(axis=(0, 3, 4, 5))
     off = (result.light_field - light)[seen][..., 0]
     assert np.sqrt(np.mean(np.square(off))) < 0.9 * light[seen][..., 0].std()
+
+
+@pytest.mark.slow
+def test_a_demo_of_bands_is_grey_and_speaks_of_bands(tmp_path):
+    cells = np.random.default_rng(8).integers(0, 2, (70, 90))
+    path = cassi_file(tmp_path, cells, bands=3)
+    code, output, _ = program(
+        "demo", "--camera", str(path), "--scene", "near-planar", "--size", "24x32",
+        "--method", "tv", "--out", str(tmp_path / "out"),
+    )  # fmt: skip
+    assert code == 0
+    assert "against the copied middle band" in output
+    words = (tmp_path / "out/report.html").read_text().split("<script")[0]
+    assert "parallax" not in words
+    assert "Over middle band" in words
+    opened = open_export(str(tmp_path / "out"))
+    assert opened.view_axes == BANDS
+    light = opened.light_field
+    assert light.std() > 0.01
+    assert (light == light[..., :1]).all()
+    with h5py.File(tmp_path / "out/maps.h5") as maps:
+        assert maps.attrs["view_axes"] == "angle,band"
 
 
 @pytest.mark.slow
