@@ -15,6 +15,7 @@ from typing import Any
 
 from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.amend import amendment
+from emmc_rig.acquisition.between import load_hook
 from emmc_rig.acquisition.by_hand import with_hands
 from emmc_rig.acquisition.checks import refuse_impossible
 from emmc_rig.acquisition.control import Control, interruptible
@@ -272,6 +273,9 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
         refuse_unless_shots_can_be_spared(plan, request.camera)
     with ExitStack() as open_things:
         session = begun_session(request)
+        hook = None
+        if plan.between is not None:
+            hook = load_hook(plan.between, request.plan_path.absolute().parent, Path.cwd())
         rig = open_things.enter_context(opened_rig(request.rig, request.camera, front.ask))
         planned = planned_frames(request, rig)
         rig = with_hands(rig, planned)
@@ -319,6 +323,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                     watcher,
                     front.control,
                     choose,
+                    hook,
                 )
                 return session, sequencer.run()
 

@@ -59,9 +59,11 @@ class Devices:
         self._rig, self._plan = rig, plan
         self.camera = rig.camera
         self.sent = Sent()
+        self.homings = 0
 
     def home(self) -> None:
         """Home the stage, and bring the axes that no plan moves to their places."""
+        self.homings += 1
         if self._rig.stage.axes:
             self._rig.stage.home()
         if self._rig.stands_um:
@@ -80,6 +82,18 @@ class Devices:
             self._rig.stage.reconnect()
         if what.home:
             self.home()
+
+    def look_again(self) -> None:
+        """Take nothing for known, after somebody else had the devices, but axes that still stand.
+
+        Where they do not, or cannot be read, they are moved again, homed if need be.
+        """
+        before_um, self.sent = self.sent.offsets_um, Sent()
+        with suppress(DriverError):
+            for axis, um in before_um.items():
+                off_um = self._rig.stage.position_um(axis) - self._rig.zero_um[axis] - um
+                if abs(off_um) <= self._plan.checks.stage_um:
+                    self.sent.offsets_um[axis] = um
 
     def attend(self, planned: PlannedFrame) -> None:
         """Let lamp, board and masks be as a frame needs them; nobody is asked for a dark."""

@@ -212,6 +212,12 @@ class Plan(Settings):
     darks: Darks | None = Darks()
     metering: Metering = Metering()
     order: Literal["least-travel", "as-planned"] = "least-travel"
+    between: str | None = Field(
+        default=None,
+        min_length=1,
+        description="module:function, called before every frame and after the last, see "
+        "`emmc_rig.acquisition.between`",
+    )
     settle_s: float = Field(
         default=0.0, ge=0, le=3600, description="after a move, beyond the stage's own"
     )
@@ -343,6 +349,7 @@ darks:
 
 order: least-travel         # or as-planned
 settle_s: 0                 # after a move, beyond the stage's own
+# between: lab:hook         # a function in lab.py, called before every frame (docs: Hooks)
 
 retries:
   per_frame: 4

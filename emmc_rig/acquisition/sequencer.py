@@ -12,8 +12,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
+from emmc_rig.acquisition.between import Between, HookError, plain
 from emmc_rig.acquisition.by_hand import HandPlaces, WrongPlaceError
 from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
@@ -33,9 +35,10 @@ from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.acquisition.writer import Writer
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.bench.registration import Shift, registered
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, StopCapture
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import decode_frame, frame_entry, frame_file
 from emmc_rig.session.journal import (
@@ -44,6 +47,7 @@ from emmc_rig.session.journal import (
     Entry,
     FrameEntry,
     HaltEntry,
+    HookEntry,
     ResumedEntry,
     RetryEntry,
     RunEntry,
@@ -65,8 +69,8 @@ Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 class Sequencer:
     """A run over a session; `run` once.
 
-    choose: by default all that is missing. timer: seconds that never run backwards, for the
-    timeline; wall: the time of day, for people.
+    choose: by default all that is missing. between: the plan's hook. timer: seconds that never run
+    backwards, for the timeline; wall: the time of day, for people.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class Sequencer:
         watcher: CaptureWatcher | None = None,
         control: Control | None = None,
         choose: Choose | None = None,
+        between: Between | None = None,
         timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
     ) -> None:
@@ -84,6 +89,8 @@ class Sequencer:
         self._watcher = watcher or CaptureWatcher()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
+        self._between = between
+        self._prepared: tuple[str, int] | None = None
         self._timer, self._wall = timer, wall
         self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
@@ -109,17 +116,31 @@ class Sequencer:
         self._began_s = self._timer()
         with self._writer, self._bench_left_safe():
             self._open_session()
-            frames = self._choose(self._now_s) or self._next()
-            if frames:
-                self._retrying("home", self._devices.home)
-                self._compare_with_last_good()
-            while frames and self._take_all(frames):
-                self._verify_stored({frame.id for frame in frames})
-                frames = self._next()
+            try:
+                self._take_missing()
+            except StopCapture as end:
+                assert self._between is not None
+                reason = f"{self._between.name} ended the capture: {one_line(end)}"
+                self._note(HaltEntry(kind="stopped", reason=reason, wall=self._wall()))
+                self._watcher.tell(reason)
             left = self._close_session()
         return RunEnd(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )
+
+    def _take_missing(self) -> None:
+        """Take frames until none is to be taken, and let the hook know when all are."""
+        frames = self._choose(self._now_s) or self._next()
+        ends_by_hook = self._between is not None and not self._session.is_complete
+        if frames or (ends_by_hook and not self._session.missing()):
+            self._retrying("home", self._devices.home)
+        if frames:
+            self._compare_with_last_good()
+        while frames and self._take_all(frames):
+            self._verify_stored({frame.id for frame in frames})
+            frames = self._next()
+        if ends_by_hook and not self._session.missing():
+            self._prepare(None)
 
     # Set up.
 
@@ -133,6 +154,7 @@ class Sequencer:
                 versions=versions(),
                 command=command_line(),
                 resumed=bool(session.stored),
+                between={} if self._between is None else self._between.facts(),
                 **self._devices.facts(),
             )
         )
@@ -163,6 +185,7 @@ class Sequencer:
         def compare() -> None:
             nonlocal shift
             devices.attend(planned)
+            self._prepare(planned)
             if devices.move(planned) and self._plan.settle_s:
                 devices.settle()
             shift = registered(devices.snap(planned, entry.exposure_s)[0], then)
@@ -294,6 +317,7 @@ class Sequencer:
             span = Spans(self._now_s, self._watcher)
             self._take_once(planned, span, attempts)
 
+        self._prepared = None
         began_s, before_um = self._now_s(), dict(self._devices.sent.offsets_um)
         self._retrying(planned.id, attempt)
         self._taken += 1
@@ -311,6 +335,9 @@ class Sequencer:
         devices = self._devices
         with span("attend", planned):
             devices.attend(planned)
+        if self._between is not None:
+            with span("between", planned):
+                self._prepare(planned)
         frame, found = devices.move_and_expose(planned, self._exposure_s(planned), span)
         with span("read back", planned):
             read_um, unsure_um = devices.read_back_um(planned), {}
@@ -329,6 +356,47 @@ class Sequencer:
                 planned, frame, found, (read_um, unsure_um), dict(span.seconds), attempts
             )
         self._handed, self._before = handing.seconds, frame.mosaic
+
+    def _prepare(self, planned: PlannedFrame | None) -> None:
+        """Call the plan's hook, once a frame, and again where the stage was homed since.
+
+        planned: None after the last one. Raises `HookError`; `StopCapture` before a frame.
+        """
+        hook, devices = self._between, self._devices
+        now = ("" if planned is None else planned.id), devices.homings
+        if hook is None or self._prepared == now:
+            return
+        self._writer.flush()
+        began_s, noted, fault = self._now_s(), dict[str, Any](), "stopped"
+        rig = replace(self._rig, camera=devices.camera)
+        self._control.between_frames = True
+        try:
+            hook.call(rig, planned, lambda **facts: noted.update(plain(facts)))
+            fault = ""
+        except StopCapture as end:
+            fault = f"ended the capture: {one_line(end)}"
+            if planned is not None:
+                raise
+        except (Exception, SystemExit) as error:
+            fault = hook.shown(error)
+            raise HookError(hook, now[0], error) from error
+        finally:
+            self._control.between_frames = False
+            self._note(
+                HookEntry(
+                    id=now[0],
+                    name=hook.name,
+                    notes=noted,
+                    fault=fault,
+                    at_s=began_s,
+                    seconds=round(self._now_s() - began_s, 6),
+                    wall=self._wall(),
+                )
+            )
+        devices.look_again()
+        if planned is not None:
+            devices.attend(planned)
+        self._prepared = now
 
     def _exposure_s(self, planned: PlannedFrame) -> float:
         """Return the exposure to ask the camera for."""

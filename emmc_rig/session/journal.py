@@ -72,7 +72,7 @@ class AmendedEntry(Entry):
 
 
 class RunEntry(Entry):
-    """A capture was started, on these devices."""
+    """A capture was started, on these devices; between: the plan's hook, its file and SHA-256."""
 
     kind: Literal["run"] = "run"
     wall: str = ""
@@ -82,6 +82,7 @@ class RunEntry(Entry):
     camera: dict[str, Any]
     camera_settings: dict[str, Any] = {}
     stage: dict[str, Any] = {}
+    between: dict[str, str] = {}
 
     def __str__(self) -> str:
         return f"{self.wall}: {self.command}"
@@ -268,6 +269,26 @@ class ComparedEntry(Entry):
             f"{self.id} taken again: shifted by ({self.x_px:+.3f}, {self.y_px:+.3f}) px, "
             f"likeness {self.likeness:.3f}"
         )
+
+
+class HookEntry(Entry):
+    """The plan's hook was called before frame `id`, "" after the last, and noted this.
+
+    fault: what ended the capture there, "" where nothing did.
+    """
+
+    kind: Literal["hook"] = "hook"
+    id: str = ""
+    name: str = ""
+    notes: dict[str, Any] = {}
+    fault: str = ""
+    at_s: float = 0.0
+    seconds: float = 0.0
+    wall: str = ""
+
+    def __str__(self) -> str:
+        when = f"before {self.id}" if self.id else "after the last frame"
+        return f"{self.wall}: {self.name}, {when}: {self.fault}" if self.fault else ""
 
 
 class CompleteEntry(Entry):
