@@ -34,6 +34,7 @@ from drivers.transport import SerialTransport, Transport
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
 from emmc_rig.bench.camera_config import CameraChoice, parse_camera, settings_of
+from emmc_rig.bench.environment import Source
 from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.bench.stage_config import (
     AptAxisConfig,
@@ -126,7 +127,8 @@ class Rig:
     square window, to put its edges between views; None: not known. stands_um: where axes that no
     plan moves stand in a capture, as the focus. recorded_s: of a recording that is replayed, the
     exposure of each frame by its name. hands: axes that the stage has not, which the attendant
-    moves; left: such that stay where they are, as every frame wants them at one place.
+    moves; left: such that stay where they are, as every frame wants them at one place. sources:
+    what is read beside every frame.
     """
 
     stage: Stage
@@ -142,6 +144,7 @@ class Rig:
     recorded_s: Mapping[str, float] = field(default_factory=dict)
     hands: frozenset[str] = frozenset()
     left: frozenset[str] = frozenset()
+    sources: tuple[Source, ...] = ()
 
 
 RigType = TypeVar("RigType", bound=Rig)

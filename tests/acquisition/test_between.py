@@ -100,7 +100,7 @@ def test_a_hook_that_raises_loses_nothing_and_the_capture_goes_on(when):
     name = [*[frame.id for frame in session.frames], None][when]
     ended = f"before frame {name}" if name else "after the last frame"
     line = (
-        f"between: lab:hook raised RuntimeError: the meter is off \\(test_between.py, line \\d+\\)"
+        "between: lab:hook raised RuntimeError: the meter is off \\(test_between.py, line \\d+\\)"
     )
     assert fault.match(f"^{line}, {ended}$")
     assert rig.attendant.lamp == "off"

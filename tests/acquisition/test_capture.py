@@ -25,7 +25,7 @@ from emmc_rig.acquisition.command import (
     estimated,
     new_session,
     planned_frames,
-    refuse_other_camera,
+    refuse_other_devices,
     refuse_small_disk,
 )
 from emmc_rig.acquisition.control import Control, interruptible
@@ -215,8 +215,8 @@ def test_another_camera_is_refused_on_resuming():
     session, _, rig, _ = stopped_after(9)
     other = still_rig()
     with pytest.raises(AppError, match="begun with camera EMMC simulated camera S1"):
-        refuse_other_camera(session, other)
-    refuse_other_camera(session, rig)
+        refuse_other_devices(session, other)
+    refuse_other_devices(session, rig)
 
 
 def test_pausing_holds_the_next_frame_until_it_goes_on():
