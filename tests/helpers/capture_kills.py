@@ -1,7 +1,7 @@
 """A server that runs captures in processes of their own and lets them kill themselves.
 
 Started as a program, it reads a line `KIND NUMBER FOLDER` for each capture, forks, and answers with
-how the child ended. The child sends itself SIGKILL at the NUMBER-th event of that KIND: "step", a
+how the child ended. A folder whose name ends with "hooked" is captured with a hook in the plan. The child sends itself SIGKILL at the NUMBER-th event of that KIND: "step", a
 step of the sequence begins; "line", a line of the storage, journal or session code is about to
 run, in whichever thread. With NUMBER 0 it lives, and answers how many events there were.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 from capture_rigs import begun, plan_and_camera, still_rig
 
 from emmc_rig.acquisition import writer
+from emmc_rig.acquisition.between import Between
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
@@ -29,6 +30,15 @@ whiteboards: {views: [[2, 2]], repeats: 1, references: 2, exposure_s: 0.02}
 darks: null
 settle_s: 0.1
 """
+HOOKED = "hooked"
+
+
+def hook(rig, frame, note):
+    """Move the mask away, and note something."""
+    rig.stage.move_by_um({"mask_x": 50.0})
+    note(power_w=0.5, frame=None if frame is None else frame.id)
+
+
 WATCHED = frozenset(module.__file__ for module in (storage, journal, lock, session, writer))
 
 
@@ -83,7 +93,8 @@ def capture_into(folder, watcher=None):
             opened, plan = Session(folder / "s"), plan_and_camera(PLAN)[0]
         except AppError:
             opened, plan = begun(folder, storage.SYSTEM_DISK, rig, PLAN)
-        Sequencer(opened, plan, rig, watcher).run()
+        between = Between("capture_kills:hook", hook) if folder.name.endswith(HOOKED) else None
+        Sequencer(opened, plan, rig, watcher, between=between).run()
     return opened
 
 
