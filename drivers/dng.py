@@ -39,6 +39,8 @@ IDENTITY_MATRIX = tuple(
     n for row in np.eye(3, dtype=int).tolist() for value in row for n in (value, 1)
 )
 EXIF_POINTER_TAG, EXIF_VERSION = 34665, b"0232"
+STAND_IN_TAG = EXIF_POINTER_TAG + 1
+"""tifffile writes no pointer to EXIF, but a tag of the next number, in the same place."""
 LARGEST_ISO = 65535
 SIMULATED = CameraIdentity("EMMC", "EMMC simulated camera")
 
@@ -87,7 +89,7 @@ def encode_dng(
         (50708, ASCII, 0, identity.model, True),
         (50717, LONG, 1, int(white_level_dn), True),
     ]
-    if exposure_s is not None:
+    if exposure_s is not None and facts is None:
         exposure = Fraction(exposure_s).limit_denominator(1_000_000)
         tags.append((33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True))
     if facts is not None:
@@ -97,7 +99,7 @@ def encode_dng(
             (50735, ASCII, 0, identity.serial, True),
         ]
         tags = [tag for tag in tags if tag[3] != ""]
-        tags.append((EXIF_POINTER_TAG, LONG, 1, 0, True))
+        tags.append((STAND_IN_TAG, LONG, 1, 0, True))
     if private is not None:
         kept = PRIVATE_DATA_OWNER + private
         tags.append((PRIVATE_DATA_TAG, UNDEFINED, len(kept), kept, True))
@@ -166,7 +168,7 @@ def _exif(facts: Facts, serial: str, exposure_s: float | None) -> dict[int, tupl
 
 
 def _append_exif(file: io.BytesIO, exif: Mapping[int, tuple[int, bytes]]) -> None:
-    """Append an EXIF directory to a little-endian TIFF that has a pointer to one."""
+    """Append an EXIF directory to a little-endian TIFF, and let its stand-in tag point there."""
     start = file.seek(0, io.SEEK_END)
     start += file.write(b"\0" * (start % 2))
     entries, data = b"", b""
@@ -181,9 +183,9 @@ def _append_exif(file: io.BytesIO, exif: Mapping[int, tuple[int, bytes]]) -> Non
     file.write(struct.pack("<H", len(exif)) + entries + struct.pack("<I", 0) + data)
     file.seek(0)
     with tifffile.TiffFile(file) as tiff:
-        pointer = tiff.pages.first.tags[EXIF_POINTER_TAG].valueoffset
+        pointer = tiff.pages.first.tags[STAND_IN_TAG].offset
     file.seek(pointer)
-    file.write(struct.pack("<I", start))
+    file.write(struct.pack("<HHII", EXIF_POINTER_TAG, LONG, 1, start))
 
 
 def private_data(dng: bytes) -> bytes:

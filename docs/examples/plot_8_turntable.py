@@ -10,7 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import emmc_rig as emmc
-from emmc_rig.session.journal import HookEntry, of_kind
 
 # %%
 # The hook, beside the plan. It is called before every frame with the rig, the frame that comes, and
@@ -57,8 +56,8 @@ session = emmc.capture(folder / "plan.yaml", rig)
 # What it noted stands in the journal, by frame. A frame whose hook raised is not lost: those before
 # are on the disk, and the same call goes on.
 
-for entry in of_kind(session.journal.entries, HookEntry):
-    print(entry.id or "the end", entry.notes)
+for name, notes in session.notes.items():
+    print(name or "the end", notes)
 
 # %%
 work.cleanup()

@@ -13,7 +13,6 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 
 import emmc_rig as emmc
-from emmc_rig.session.journal import HookEntry, of_kind
 
 # %%
 # A meter has a state, so it is an object; `pyvisa` opens a real one. The stand-in here has the lamp
@@ -62,11 +61,7 @@ session = emmc.capture(folder / "plan.yaml", rig)
 # %%
 # Its readings, beside the brightness of the frames:
 
-power_w = {
-    entry.id: entry.notes["power_w"]
-    for entry in of_kind(session.journal.entries, HookEntry)
-    if entry.notes
-}
+power_w = {name: notes["power_w"] for name, notes in session.notes.items() if notes}
 levels = [session.stored[name].level for name in power_w]
 figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
 axes.plot([1e3 * one for one in power_w.values()], label="power, mW")

@@ -218,12 +218,14 @@ def refuse_other_devices(session: Session, rig: Rig, meant: bool = False) -> Non
     if last is None or not session.stored:
         return
     then, now = last.camera, rig.camera.identity
-    if (then["serial"] != now.serial and not meant) or then["shape"] != list(rig.camera.shape):
+    way = "connect that one, name another --out, or say that it is meant by --other-devices"
+    same_shape = then["shape"] == list(rig.camera.shape)
+    if not same_shape or (then["serial"] != now.serial and not meant):
         raise AppError(
             f"session {session.folder.name} was begun with camera {then['model']} "
             f"{then['serial']} of {then['shape'][0]}x{then['shape'][1]} pixels, this is "
-            f"{now.model} {now.serial} of {rig.camera.shape[0]}x{rig.camera.shape[1]}: connect "
-            "that one, or name another --out"
+            f"{now.model} {now.serial} of {rig.camera.shape[0]}x{rig.camera.shape[1]}: "
+            f"{way if same_shape else 'connect that one, or name another --out'}"
         )
     for axis in () if meant else rig.stage.axes:
         earlier = last.stage.get(axis, {}).get("identity", {})
@@ -231,8 +233,7 @@ def refuse_other_devices(session: Session, rig: Rig, meant: bool = False) -> Non
         if earlier.get("serial") and own.serial and earlier["serial"] != own.serial:
             raise AppError(
                 f"session {session.folder.name} was begun with {axis} on {earlier['model']} "
-                f"{earlier['serial']}, now it is on {own.model} {own.serial}: connect that one, "
-                "name another --out, or say that it is meant by --other-devices"
+                f"{earlier['serial']}, now it is on {own.model} {own.serial}: {way}"
             )
 
 

@@ -42,7 +42,7 @@ Positive = Annotated[float, Field(gt=0)]
 class SourceConfig(Settings):
     """A source: the first number of a file, of a command's output, or of a serial port's line."""
 
-    name: str = Field(min_length=1)
+    name: str = Field(min_length=1, pattern="^[^/]*$")
     file: str | None = None
     command: str | None = Field(default=None, description="run without a shell")
     serial: str | None = Field(default=None, description="a port, as the stage's")

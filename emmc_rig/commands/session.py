@@ -134,6 +134,8 @@ def export(
 
     opened = Session(session)
     if dng:
+        if compress:
+            raise typer.BadParameter("--compress is of the HDF5 file: leave it out with --dng")
         with shown_progress() as progress:
             progress.begin("export", len(opened.stored))
             export_dng(opened, out, progress.step)

@@ -5,7 +5,8 @@
         /instrument/mask        NXpositioner: x, y; commanded beside; /aperture likewise
         /instrument/source      NXsource: the lamp of every frame
         /sample                 NXsample: scene or whiteboard
-        /data                   NXdata: the frames, with id, kind and shot of each
+        /data                   NXdata: the frames, with id, kind, shot, time, notes (JSON) of each
+        /environment            NXcollection: temperatures, sources of the rig's file; NaN: not read
         /process                NXprocess: versions; the plan and the camera as NXnote
 
 Or as a folder of DNG files, whose EXIF says of each frame what the session knows.
@@ -15,6 +16,7 @@ Frames pass one at a time: memory stays flat. Source: NeXus definitions 2024.02,
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -59,12 +61,16 @@ def export_hdf5(
         )
     frames = session.needed
     lines = [session.stored[frame.id] for frame in frames]
+    runs = of_kind(session.journal.entries, RunEntry)
     with new_file(path) as part, h5py.File(part, "w") as file:
         file.attrs.update(default="entry", creator="emmc-rig")
         for name, (nx_class, values) in _groups(session, frames, lines).items():
             _fill(file.create_group(name), nx_class, values)
         file["entry"].attrs["default"] = "data"
         file["entry/program_name"].attrs["version"] = session.header["versions"]["emmc-rig"]
+        units = {name: unit for run in runs for name, unit in run.environment.items()}
+        for name, values in file.get("entry/environment", {}).items():
+            values.attrs["units"] = units.get(name, "C")
         _write_frames(
             session,
             file.require_group("entry/instrument/detector"),
@@ -135,6 +141,9 @@ def _groups(
     """Return class and datasets of every group, those above others first."""
     camera = {} if session.first_run is None else session.first_run.camera
     version = session.header["versions"]["emmc-rig"]
+    noted = session.notes
+    beside = [line.temperatures_c | line.environment for line in lines]
+    read = {name: [one.get(name, np.nan) for one in beside] for one in beside for name in one}
     detector = {
         "count_time": [line.exposure_s for line in lines],
         "gain": [line.gain for line in lines],
@@ -153,6 +162,8 @@ def _groups(
         "plan": [line.plan for line in lines],
         "view": [frame.view or (-1, -1) for frame in frames],
         "sha256": [line.sha256 for line in lines],
+        "time": [line.wall for line in lines],
+        "notes": [json.dumps(noted.get(frame.id, {})) for frame in frames],
     }
     notes = {
         "plan": ("application/yaml", session.plan_yaml),
@@ -178,6 +189,7 @@ def _groups(
         "entry/instrument/source": ("NXsource", {"name": lamps}),
         "entry/sample": ("NXsample", {"name": targets}),
         "entry/data": ("NXdata", data),
+        **({"entry/environment": ("NXcollection", read)} if read else {}),
         "entry/process": ("NXprocess", {"program": "emmc-rig capture", "version": version}),
         **{
             f"entry/process/{name}": ("NXnote", {"type": kind, "data": text})

@@ -60,6 +60,7 @@ from emmc_rig.session.journal import (
     DiscardedEntry,
     Entry,
     FrameEntry,
+    HookEntry,
     Journal,
     RunEntry,
     UntilEntry,
@@ -280,6 +281,11 @@ class Session:
     def stored(self) -> dict[str, FrameEntry]:
         """The journal line of every frame that counts, by its id, kept up to date."""
         return count_stored(self.journal.entries)
+
+    @property
+    def notes(self) -> dict[str, dict[str, Any]]:
+        """What the plan's hook noted before each frame, by its id; by "" after the last one."""
+        return {entry.id: entry.notes for entry in of_kind(self.journal.entries, HookEntry)}
 
     @property
     def runs(self) -> int:

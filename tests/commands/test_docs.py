@@ -20,7 +20,6 @@ from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
 from emmc_rig.processing import session_calibration as calibrate_session
 from emmc_rig.session import measured_psi
-from emmc_rig.session.journal import HookEntry, of_kind
 
 ROOT = Path(__file__).parents[2]
 REASONS = ("hardware", "real files", "minutes")
@@ -121,7 +120,7 @@ def test_every_camera_of_the_page_is_drawn_as_the_script_draws_it(tmp_path):
 def test_the_worked_hooks_run_and_note_what_they_are_for(name):
     names = runpy.run_path(str(ROOT / "docs" / "examples" / f"{name}.py"))
     session = names["session"]
-    notes = {one.id: one.notes for one in of_kind(session.journal.entries, HookEntry)}
+    notes = session.notes
     pyplot.close("all")
     if name == "plot_8_turntable":
         degrees = {frame.bench.shot: notes[frame.id]["degrees"] for frame in session.frames}

@@ -104,7 +104,7 @@ def test_what_is_not_known_is_not_stated(tmp_path):
 
 def test_frames_are_not_written_where_something_else_lies(session, tmp_path):
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(AppError, match=r"note\.txt"):
+    with pytest.raises(AppError, match="holds something else"):
         export_dng(session, tmp_path)
     assert [one.name for one in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(AppError, match="session"):
