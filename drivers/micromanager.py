@@ -11,7 +11,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
@@ -249,6 +249,16 @@ class MicroManagerCamera:
                 name: core.getProperty(self.label, name)
                 for name in core.getDevicePropertyNames(self.label)
             }
+
+    def temperatures_c(self) -> dict[str, float]:
+        """Return the properties of the camera that are called temperatures and are numbers."""
+        core, found = self._loaded.core, {}
+        with calling("read the temperatures"):
+            for name in core.getDevicePropertyNames(self.label):
+                if "temperature" in name.lower():
+                    with suppress(ValueError):
+                        found[name] = float(core.getProperty(self.label, name))
+        return found
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Choose the exposure of the frames that follow.

@@ -14,7 +14,7 @@ import emmc_rig as emmc
 # %%
 # The hook, beside the plan. It is called before every frame with the rig, the frame that comes, and
 # `note`, which writes into the session's journal; and once more at the end, with no frame. The table
-# is a Grbl controller whose millimetre is a degree; a simulated one here, else `grbl:/dev/ttyUSB1`.
+# is a Grbl controller, ten degrees to the millimetre; simulated here, else `grbl:/dev/ttyUSB1`.
 
 HOOK = """
 from emmc_rig.bench.hardware import open_stage
@@ -28,8 +28,8 @@ def turn(rig, frame, note):
         table.close()
     elif frame.bench.target == "scene":
         side = frame.bench.shot // 2                 # two shots of every side
-        reached_um = table.move_to_um({"x": -100_000 + 30_000 * side})["x"]
-        note(side=side, degrees=round(100 + reached_um / 1000, 2))
+        reached_um = table.move_to_um({"x": -20_000 + 3_000 * side})["x"]
+        note(side=side, degrees=round(200 + reached_um / 100, 1))
 """
 
 PLAN = """
