@@ -169,7 +169,7 @@ class _Port:
 
     def __init__(self, config: SourceConfig) -> None:
         self._config = config
-        self._port: serial.SerialBase | None = None
+        self._port: serial.Serial | None = None
 
     def ask(self) -> str:
         """Return the line that the question brings."""

@@ -69,8 +69,9 @@ def export_hdf5(
         file["entry"].attrs["default"] = "data"
         file["entry/program_name"].attrs["version"] = session.header["versions"]["emmc-rig"]
         units = {name: unit for run in runs for name, unit in run.environment.items()}
-        for name, values in file.get("entry/environment", {}).items():
-            values.attrs["units"] = units.get(name, "C")
+        if isinstance(beside := file.get("entry/environment"), h5py.Group):
+            for name, values in beside.items():
+                values.attrs["units"] = units.get(name, "C")
         _write_frames(
             session,
             file.require_group("entry/instrument/detector"),

@@ -227,14 +227,14 @@ def test_a_resume_refuses_another_stage_unless_it_is_meant():
 
     def of_serial(serial):
         """Return the rig with another controller for mask_y."""
-        stage, asked = rig.stage, rig.stage.identity
+        stage: Any = rig.stage
 
         class Exchanged:
             def __getattr__(self, name):
                 return getattr(stage, name)
 
             def identity(self, axis):
-                own = asked(axis)
+                own = stage.identity(axis)
                 return replace(own, serial=serial) if axis == "mask_y" else own
 
         return replace(rig, stage=Exchanged())

@@ -138,6 +138,22 @@ def test_an_export_that_is_killed_leaves_no_part_after_the_next_one(captured, ru
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(
+    captured, run, tmp_path, monkeypatch
+):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+    monkeypatch.setattr("simulators.zaber.FIRST_SERIAL_NUMBER", 900)
+    journal = (copy / "journal.jsonl").read_bytes()
+    code, _, err = run("capture", copy)
+    assert code == 1
+    assert "was begun with mask_x on" in one_line(err)
+    assert "901: connect that one, name another --out, or say" in one_line(err)
+    assert (copy / "journal.jsonl").read_bytes() == journal
+    assert run("capture", copy, "--other-devices")[0] == 0
+    assert run("capture", copy)[0] == 0
+
+
 def test_frames_are_exported_as_dng_files_by_the_command(captured, run, tmp_path):
     session, out = captured / "plan-session", tmp_path / "dng"
     for _ in range(2):  # what an earlier export wrote is replaced

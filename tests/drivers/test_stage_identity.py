@@ -2,7 +2,9 @@
 
 import pytest
 
+from drivers.apt import identify
 from drivers.combined import CombinedStage
+from drivers.errors import UnknownAxisError
 from drivers.stage import StageIdentity
 from emmc_rig.bench.hardware import open_simulated
 from simulators.clock import ManualClock
@@ -19,7 +21,7 @@ def test_a_controller_says_its_model_and_firmware_at_rest_and_after_a_move(proto
         assert before.firmware
         stage.home()
         assert stage.identity(axis) == before
-        with pytest.raises(ValueError, match="no axis"):
+        with pytest.raises(UnknownAxisError):
             stage.identity("elsewhere")
 
 
@@ -33,12 +35,10 @@ def test_axes_of_two_zaber_devices_have_their_own_serial_numbers():
 
 
 def test_a_thorlabs_controller_says_its_serial_number_as_probing_it_does():
-    from drivers.apt import identify
-
     stage, firmware = open_simulated("apt")
     with stage:
         own = stage.identity(stage.axes[0])
-        told = identify(firmware.transport(), firmware.clock)
+    told = identify(firmware.transport(), ManualClock())
     assert (own.maker, own.model) == ("Thorlabs", told.model)
     assert own.serial == str(told.serial_number)
 
