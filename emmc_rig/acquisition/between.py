@@ -107,7 +107,7 @@ def load_hook(name: str, *folders: Path) -> Between:
         raise AppError(f"between: {name} cannot be loaded: {text}") from fault
     try:
         inspect.signature(hook).bind(None, None, None)
-    except TypeError as fault:
+    except (TypeError, ValueError) as fault:
         raise AppError(f"between: {name} is no function of (rig, frame, note): {fault}") from fault
     if inspect.iscoroutinefunction(hook) or inspect.isgeneratorfunction(hook):
         raise AppError(f"between: {name} is a generator or coroutine: write a plain function")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -230,7 +231,6 @@ class Plan(Settings):
     order: Literal["least-travel", "as-planned"] = "least-travel"
     between: str | None = Field(
         default=None,
-        min_length=1,
         description="module:function, called before every frame and after the last, see "
         "`emmc_rig.acquisition.between`",
     )
@@ -242,6 +242,13 @@ class Plan(Settings):
     )
     retries: Retries = Retries()
     checks: Checks = Checks()
+
+    @field_validator("between")
+    @classmethod
+    def _a_name(cls, between: str | None) -> str | None:
+        if between is not None and not re.fullmatch(r"[\w.]+:[\w.]+|[\w-]+", between):
+            raise ValueError(f"write module:function, as lab:hook, not {between!r}")
+        return between
 
     @field_validator("focus", mode="before")
     @classmethod
