@@ -5,6 +5,7 @@ What was sent last is remembered, so that nothing is sent twice; after a fault n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -194,7 +195,11 @@ class Devices:
             for name, device in (("camera", self.camera), ("stage", stage)):
                 with suppress(DriverError):
                     told = getattr(device, "temperatures_c", dict)()
-                    self._warmth_c |= {f"{name} {key}": celsius for key, celsius in told.items()}
+                    self._warmth_c |= {
+                        f"{name} {key}": celsius
+                        for key, celsius in told.items()
+                        if math.isfinite(celsius)
+                    }
         return {"stands_um": stands_um, "temperatures_c": dict(self._warmth_c)}
 
     def snap(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:

@@ -74,12 +74,13 @@ class Source:
 
     def __init__(self, config: SourceConfig) -> None:
         self.config = config
-        self._answer = _Answer(-math.inf)
+        self._answer, self._begun_s = _Answer(-math.inf), math.inf
         self._answered, self._ended = threading.Event(), threading.Event()
         # A daemon: a file that never opens must not keep the program.
         self._thread = threading.Thread(target=self._ask, name=f"source {config.name}", daemon=True)
 
     def __enter__(self) -> Self:
+        self._begun_s = time.monotonic()
         self._thread.start()
         return self
 
@@ -88,9 +89,12 @@ class Source:
         self._thread.join(CLOSING_S)
 
     def read(self) -> tuple[float, str]:
-        """Return the last value, and "" or why there is none; waits for none but the first."""
+        """Return the last value, and "" or why there is none; waits for none but the first.
+
+        For that one until its limit after the begin, however often it is read.
+        """
         config = self.config
-        self._answered.wait(config.limit_s)
+        self._answered.wait(max(0.0, self._begun_s + config.limit_s - time.monotonic()))
         answer = self._answer
         if time.monotonic() - answer.at_s > config.every_s + 2 * config.limit_s:
             return math.nan, f"gave no answer within {config.limit_s:g} s"
@@ -100,7 +104,7 @@ class Source:
         with _asking(self.config) as ask:
             while not self._ended.is_set():
                 try:
-                    value = _number(ask()) * self.config.scale
+                    value = _number(ask(), self.config.scale)
                     self._answer = _Answer(time.monotonic(), value)
                 except Exception as fault:
                     self._answer = _Answer(time.monotonic(), fault=one_line(fault))
@@ -115,12 +119,12 @@ def read_all(sources: Iterable[Source]) -> tuple[dict[str, float], dict[str, str
     return values, {name: fault for name, (_, fault) in read.items() if fault}
 
 
-def _number(text: str) -> float:
-    """Return the first number in a text, none that is part of a word."""
+def _number(text: str, scale: float) -> float:
+    """Return the first number in a text, none that is part of a word, scaled."""
     found = NUMBER.search(text)
-    if found is None:
+    if found is None or not math.isfinite(value := float(found[0]) * scale):
         raise ValueError(f"no number in {one_line(text)[:60]!r}")
-    return float(found[0])
+    return value
 
 
 @contextmanager
