@@ -1,10 +1,19 @@
 """A plan that focuses: the axis goes to where the scene is sharpest, and what is refused."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from capture_rigs import begun, plan_and_camera
+from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
-from emmc_rig.session.journal import FocusEntry, HaltEntry, of_kind
+from drivers.errors import DriverError
+from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.files.scenes import fine_scene
+from emmc_rig.session.journal import FocusEntry, HaltEntry, RetryEntry, of_kind
 
 FOCUS_UM = 9000.0
 PLAN = """
@@ -74,3 +83,39 @@ def test_where_no_peak_is_seen_the_axis_is_left_where_it_stood_and_the_capture_g
     assert any("not focused" in text for text in told)
     assert not of_kind(session.journal.entries, HaltEntry)
     assert np.isclose(found.from_um, 2000, atol=1)
+
+
+class Faltering:
+    """A camera whose n-th frame, from 1, is lost."""
+
+    def __init__(self, camera, lost):
+        self._camera, self._left = camera, lost
+
+    def __getattr__(self, name):
+        return getattr(self._camera, name)
+
+    def snap(self):
+        self._left -= 1
+        if self._left == 0:
+            raise DriverError("the cable was touched")
+        return self._camera.snap()
+
+
+def test_a_fault_while_focusing_is_met_by_focusing_again_from_where_it_began():
+    text = PLAN.replace("darks: {repeats: 2}", "darks: null") + "focus: before-shots\n"
+    size = (48, 64)
+    camera = plan_and_camera(text)[1]
+    fine = fine_scene("deep-occlusions", 2, 2, size=size, views=camera.views)
+    rig, _ = simulated_rig(
+        camera, fine.samples, size, 0, focus_um=FOCUS_UM, stands_um={"focus": 8800.0}
+    )
+    rig = replace(rig, camera=Faltering(rig.camera, 4))
+    session, plan = begun(Path("/disk"), SimulatedDisk(), rig, text)
+    assert Sequencer(session, plan, rig).run().complete
+    (retry,) = of_kind(session.journal.entries, RetryEntry)
+    assert "the cable was touched" in retry.fault
+    (found,) = focused(session)
+    assert found.from_um == pytest.approx(8800, abs=1)
+    assert found.place_um == pytest.approx(FOCUS_UM, abs=50)
+    for frame in session.frames:
+        assert session.stored[frame.id].stands_um["focus"] == pytest.approx(found.place_um, abs=1)
