@@ -142,6 +142,7 @@ def test_a_mask_that_a_hook_moved_is_moved_back_before_the_next_frame():
 
     session, outcome = run(hook, rig)
     assert outcome.complete
+    assert outcome.retries == 0
     for frame in session.frames:
         entry = session.stored[frame.id]
         for axis, um in frame.bench.offsets_um.items():

@@ -9,7 +9,7 @@ from capture_rigs import begun, plan_and_camera
 from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
-from drivers.errors import DriverError
+from drivers.errors import DriverError, NotHomedError
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
@@ -88,8 +88,8 @@ def test_where_no_peak_is_seen_the_axis_is_left_where_it_stood_and_the_capture_g
 class Faltering:
     """A camera whose n-th frame, from 1, is lost."""
 
-    def __init__(self, camera, lost):
-        self._camera, self._left = camera, lost
+    def __init__(self, camera, lost, fault):
+        self._camera, self._left, self._fault = camera, lost, fault
 
     def __getattr__(self, name):
         return getattr(self._camera, name)
@@ -97,11 +97,19 @@ class Faltering:
     def snap(self):
         self._left -= 1
         if self._left == 0:
-            raise DriverError("the cable was touched")
+            raise self._fault
         return self._camera.snap()
 
 
-def test_a_fault_while_focusing_is_met_by_focusing_again_from_where_it_began():
+@pytest.mark.parametrize(
+    ("lost", "fault", "at"),
+    [
+        (4, DriverError("the cable was touched"), "while it focuses"),
+        # 32 are of focusing; what makes the stage home must not undo it.
+        (34, NotHomedError("mask_x"), "of a later frame"),
+    ],
+)
+def test_a_fault_is_met_by_focusing_from_where_it_began_or_by_going_back_there(lost, fault, at):
     text = PLAN.replace("darks: {repeats: 2}", "darks: null") + "focus: before-shots\n"
     size = (48, 64)
     camera = plan_and_camera(text)[1]
@@ -109,11 +117,12 @@ def test_a_fault_while_focusing_is_met_by_focusing_again_from_where_it_began():
     rig, _ = simulated_rig(
         camera, fine.samples, size, 0, focus_um=FOCUS_UM, stands_um={"focus": 8800.0}
     )
-    rig = replace(rig, camera=Faltering(rig.camera, 4))
+    rig = replace(rig, camera=Faltering(rig.camera, lost, fault))
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig, text)
     assert Sequencer(session, plan, rig).run().complete
     (retry,) = of_kind(session.journal.entries, RetryEntry)
-    assert "the cable was touched" in retry.fault
+    assert retry.fault == str(fault)
+    assert (retry.id == "shot-0-e0-r1") == (at == "of a later frame")
     (found,) = focused(session)
     assert found.from_um == pytest.approx(8800, abs=1)
     assert found.place_um == pytest.approx(FOCUS_UM, abs=50)

@@ -3,6 +3,7 @@
 import json
 import os
 import time
+from pathlib import Path
 
 import pytest
 
@@ -42,6 +43,15 @@ def test_a_source_that_fails_says_why_and_nothing_is_raised(config, fault):
     began_s = time.monotonic()
     assert fault in read(**config)[1]
     assert time.monotonic() - began_s < 3
+
+
+def test_a_command_that_takes_too_long_ends_with_what_it_started(tmp_path):
+    pid = tmp_path / "pid"
+    read(command=f"sh -c 'sleep 60 & echo $! > {pid}; wait'", limit_s=1)
+    stat = Path("/proc", pid.read_text().strip(), "stat")
+    until_s = time.monotonic() + 5
+    while stat.exists() and stat.read_text().split()[2] != "Z":
+        assert time.monotonic() < until_s
 
 
 def test_a_file_that_never_opens_is_given_up_in_its_time(tmp_path):
