@@ -19,7 +19,14 @@ from drivers.errors import (
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
+from drivers.stage import (
+    DEFAULT_SETTINGS,
+    HostStage,
+    Reading,
+    StageIdentity,
+    StageSettings,
+    check_tolerance,
+)
 from drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
@@ -93,6 +100,13 @@ class AptStage(HostStage):
         self._channels = {axis: _Channel(axis, one, links) for axis, one in axes.items()}
         self._homing_since_s: dict[str, float] = {}
         self._start_up()
+
+    def identity(self, axis: str) -> StageIdentity:
+        """As `HostStage.identity`."""
+        self._require_axis(axis)
+        reply = self._channels[axis].query(Id.HW_REQ_INFO, Id.HW_GET_INFO, with_channel=False)
+        info = codec.decode_info(reply)
+        return StageIdentity("Thorlabs", info.model, str(info.serial_number), info.firmware)
 
     def _configure(self) -> None:
         self._homing_since_s.clear()

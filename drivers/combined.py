@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from typing import Self
 
 from drivers.errors import UnknownAxisError
-from drivers.stage import Stage, check_within_limits
+from drivers.stage import Stage, StageIdentity, check_within_limits
 
 
 class CombinedStage:
@@ -33,6 +33,18 @@ class CombinedStage:
         """Find the reference of the given axes (all by default), and wait until they stand."""
         for stage, own in self._by_stage(self.axes if axes is None else axes):
             stage.home(own)
+
+    def identity(self, axis: str) -> StageIdentity:
+        """Return who made the controller of an axis, where its stage says."""
+        return getattr(self._stage(axis), "identity", lambda axis: StageIdentity())(axis)
+
+    def temperatures_c(self) -> dict[str, float]:
+        """Return the temperatures that the stages tell."""
+        return {
+            f"stage {number} {name}": celsius
+            for number, stage in enumerate(self._stages, 1)
+            for name, celsius in getattr(stage, "temperatures_c", dict)().items()
+        }
 
     def is_homed(self, axis: str) -> bool:
         """Return whether the axis knows where it is."""

@@ -4,7 +4,10 @@ Source: Adobe Digital Negative specification 1.4 (tags 50706 to 50829) and TIFF/
 """
 
 import io
+import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
 from fractions import Fraction
 
 import numpy as np
@@ -35,7 +38,26 @@ D65 = 21
 IDENTITY_MATRIX = tuple(
     n for row in np.eye(3, dtype=int).tolist() for value in row for n in (value, 1)
 )
+EXIF_POINTER_TAG, EXIF_VERSION = 34665, b"0232"
+STAND_IN_TAG = EXIF_POINTER_TAG + 1
+"""tifffile writes no pointer to EXIF, but a tag of the next number, in the same place."""
+LARGEST_ISO = 65535
 SIMULATED = CameraIdentity("EMMC", "EMMC simulated camera")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a DNG says of its frame besides; None or "" where that is not known.
+
+    captured: with its time zone, where that is known. document: a name; unique_id: 32 hexadecimal
+    digits that no other picture has.
+    """
+
+    iso: int | None = None
+    captured: datetime | None = None
+    document: str = ""
+    unique_id: str = ""
+    software: str = ""
 
 
 def encode_dng(
@@ -46,14 +68,15 @@ def encode_dng(
     exposure_s: float | None,
     identity: CameraIdentity = SIMULATED,
     private: bytes | None = None,
+    facts: Facts | None = None,
 ) -> bytes:
     """Return a DNG with the uint16 `(y, x)` mosaic in it, uncompressed.
 
     `cfa` is a Bayer phase, "mono", or the name of any other tile: that one is marked rggb for
     LibRaw's sake and carries its name beside it. `black_level_dn` is a whole number, or `(2, 2)`
     of them in mosaic order; a monochrome DNG has but one. `exposure_s`: None where it is not known.
-    `private`: other bytes to be kept in it, which `private_data` returns.
-    Raises `ValueError`.
+    `private`: other bytes to be kept in it, which `private_data` returns. `facts`: go into its EXIF
+    directory, with exposure and the camera's serial number. Raises `ValueError`.
     """
     black = np.broadcast_to(np.asarray(black_level_dn), (2, 2))
     _check(mosaic, cfa, black, exposure_s)
@@ -66,9 +89,17 @@ def encode_dng(
         (50708, ASCII, 0, identity.model, True),
         (50717, LONG, 1, int(white_level_dn), True),
     ]
-    if exposure_s is not None:
+    if exposure_s is not None and facts is None:
         exposure = Fraction(exposure_s).limit_denominator(1_000_000)
         tags.append((33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True))
+    if facts is not None:
+        tags += [
+            (269, ASCII, 0, facts.document, True),
+            (305, ASCII, 0, facts.software, True),
+            (50735, ASCII, 0, identity.serial, True),
+        ]
+        tags = [tag for tag in tags if tag[3] != ""]
+        tags.append((STAND_IN_TAG, LONG, 1, 0, True))
     if private is not None:
         kept = PRIVATE_DATA_OWNER + private
         tags.append((PRIVATE_DATA_TAG, UNDEFINED, len(kept), kept, True))
@@ -96,6 +127,7 @@ def encode_dng(
         planarconfig=1,
         description=None if named else CFA_TILE_PREFIX + cfa,
         metadata=None,
+        byteorder="<",
         software=False,
         extratags=tags,
     )
@@ -105,7 +137,55 @@ def encode_dng(
         file.seek(0)
         with tifffile.TiffFile(file) as tiff:
             tiff.pages.first.tags[PHOTOMETRIC_TAG].overwrite(PHOTOMETRIC_LINEAR_RAW)
+    if facts is not None:
+        exif = _exif(facts, identity.serial, exposure_s)
+        _append_exif(file, exif)
     return file.getvalue()
+
+
+def _exif(facts: Facts, serial: str, exposure_s: float | None) -> dict[int, tuple[int, bytes]]:
+    """Return type and little-endian value by tag; source: EXIF 2.32, section 4.6.5."""
+
+    def text(value: str) -> tuple[int, bytes]:
+        return ASCII, value.encode("ascii", "replace") + b"\0"
+
+    found = {36864: (UNDEFINED, EXIF_VERSION)}
+    if exposure_s is not None:
+        exposure = Fraction(exposure_s).limit_denominator(1_000_000)
+        found[33434] = RATIONAL, struct.pack("<II", exposure.numerator, exposure.denominator)
+    if facts.iso is not None:
+        found[34855] = SHORT, struct.pack("<H", min(facts.iso, LARGEST_ISO))
+    if (at := facts.captured) is not None:
+        found[36867] = text(at.strftime("%Y:%m:%d %H:%M:%S"))
+        found[37521] = text(f"{at.microsecond // 1000:03d}")
+        if at.tzinfo is not None:
+            found[36881] = text(at.isoformat()[-6:])
+    if facts.unique_id:
+        found[42016] = text(facts.unique_id)
+    if serial:
+        found[42033] = text(serial)
+    return found
+
+
+def _append_exif(file: io.BytesIO, exif: Mapping[int, tuple[int, bytes]]) -> None:
+    """Append an EXIF directory to a little-endian TIFF, and let its stand-in tag point there."""
+    start = file.seek(0, io.SEEK_END)
+    start += file.write(b"\0" * (start % 2))
+    entries, data = b"", b""
+    beyond = start + 2 + 12 * len(exif) + 4
+    for tag, (kind, value) in sorted(exif.items()):
+        size = {SHORT: 2, RATIONAL: 8}.get(kind, 1)
+        held = value.ljust(4, b"\0")
+        if len(value) > 4:
+            held = struct.pack("<I", beyond + len(data))
+            data += value + b"\0" * (len(value) % 2)
+        entries += struct.pack("<HHI", tag, kind, len(value) // size) + held
+    file.write(struct.pack("<H", len(exif)) + entries + struct.pack("<I", 0) + data)
+    file.seek(0)
+    with tifffile.TiffFile(file) as tiff:
+        pointer = tiff.pages.first.tags[STAND_IN_TAG].offset
+    file.seek(pointer)
+    file.write(struct.pack("<HHII", EXIF_POINTER_TAG, LONG, 1, start))
 
 
 def private_data(dng: bytes) -> bytes:

@@ -16,7 +16,14 @@ from drivers.errors import (
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
+from drivers.stage import (
+    DEFAULT_SETTINGS,
+    HostStage,
+    Reading,
+    StageIdentity,
+    StageSettings,
+    check_tolerance,
+)
 from drivers.transport import Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
@@ -94,6 +101,12 @@ class GrblStage(HostStage):
         self._require_axis(axis)
         return self._positive(codec.STEPS_PER_MM, axis)
 
+    def identity(self, axis: str) -> StageIdentity:
+        """As `HostStage.identity`; the serial is what somebody wrote into it by `$I=`."""
+        self._require_axis(axis)
+        firmware, _, written = self._build.get("VER", "").partition(":")
+        return StageIdentity("", "Grbl", written, firmware)
+
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """As `HostStage.stop`; all axes stop together, and a program that runs is held."""
         self._choose(axes)
@@ -105,7 +118,8 @@ class GrblStage(HostStage):
     def _configure(self) -> None:
         self._controller = _Controller(self._transport, self._clock, self._mark_all_unknown)
         self._controller.wait_for_boot(self._boot_s)
-        self._options = self._controller.command("$I").get("OPT", "").split(",")[0]
+        self._build = self._controller.command("$I")
+        self._options = self._build.get("OPT", "").split(",")[0]
         self._controller.command("$$")
         self._mark_all_unknown("it was not homed since it was connected")
         self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}

@@ -11,7 +11,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,7 +30,7 @@ from drivers.errors import (
     SpeedFixedError,
 )
 from drivers.raw import RawFrame
-from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings
+from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageIdentity, StageSettings
 
 if TYPE_CHECKING:
     from pymmcore_plus import CMMCorePlus
@@ -250,6 +250,16 @@ class MicroManagerCamera:
                 for name in core.getDevicePropertyNames(self.label)
             }
 
+    def temperatures_c(self) -> dict[str, float]:
+        """Return the properties of the camera that are called temperatures and are numbers."""
+        core, found = self._loaded.core, {}
+        with calling("read the temperatures"):
+            for name in core.getDevicePropertyNames(self.label):
+                if "temperature" in name.lower():
+                    with suppress(ValueError):
+                        found[name] = float(core.getProperty(self.label, name))
+        return found
+
     def set_exposure_s(self, exposure_s: float) -> None:
         """Choose the exposure of the frames that follow.
 
@@ -453,6 +463,14 @@ class MicroManagerStage(HostStage):
             self._closed = True
             super().close()
 
+    def identity(self, axis: str) -> StageIdentity:
+        """As `HostStage.identity`: adapter and device, and a property that is a serial number."""
+        (label, _), core = self._place(axis), self._loaded.core
+        with calling("describe the stage"):
+            names = [n for n in core.getDevicePropertyNames(label) if "serialnumber" in _plain(n)]
+            serial = core.getProperty(label, names[0]) if names else ""
+            return StageIdentity(core.getDeviceLibrary(label), core.getDeviceName(label), serial)
+
     def speed_um_s(self, axis: str) -> float:
         """Return the speed of a move: the device's where a property holds it."""
         label, _ = self._place(axis)
@@ -559,6 +577,11 @@ class MicroManagerStage(HostStage):
             if place.endswith(ending):
                 return place.removesuffix(ending), coordinate
         return place, None
+
+
+def _plain(name: str) -> str:
+    """Return a property's name without case, spaces and marks."""
+    return "".join(filter(str.isalnum, name)).lower()
 
 
 def stage_axes(loaded: LoadedCore) -> tuple[str, ...]:

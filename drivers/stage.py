@@ -106,6 +106,16 @@ class Stage(Protocol):
 
 
 @dataclass(frozen=True)
+class StageIdentity:
+    """Who made the controller of an axis; "" where it does not say."""
+
+    maker: str = ""
+    model: str = ""
+    serial: str = ""
+    firmware: str = ""
+
+
+@dataclass(frozen=True)
 class StageSettings:
     """How carefully a stage moves.
 
@@ -295,6 +305,15 @@ class HostStage(ABC):
         for axis in self._axes:
             self._stop_axis(axis)
         self._start_up()
+
+    def identity(self, axis: str) -> StageIdentity:
+        """Return who made the controller of an axis, as far as it says; it is asked now."""
+        self._require_axis(axis)
+        return StageIdentity()
+
+    def temperatures_c(self) -> dict[str, float]:
+        """Return the temperatures that the controllers tell, by what they are of."""
+        return {}
 
     def is_homed(self, axis: str) -> bool:
         """Return whether the axis knows where it is."""

@@ -53,6 +53,7 @@ GAIN_NAMES = ("Gain", "GainAbs")
 DECIBEL = ("", "db")
 BLACK_LEVEL_NAMES = ("BlackLevel", "BlackLevelAbs", "BlackLevelRaw")
 
+TEMPERATURE = "DeviceTemperature"
 RAW_SETTINGS = (
     ("ExposureAuto", "Off"),
     ("ExposureMode", "Timed"),
@@ -265,6 +266,11 @@ class U3vCamera:
                 f"{self.cfa}"
             )
         return replace(frame, exposure_s=self.exposure_s, gain=self.gain, host_time_s=host_time_s)
+
+    def temperatures_c(self) -> dict[str, float]:
+        """Return the camera's temperature, by the selector it has now; {} where it has none."""
+        has = self.features.has(TEMPERATURE)
+        return {TEMPERATURE: self.features.number(TEMPERATURE)} if has else {}
 
     def _choose_format(self) -> PixelFormat:
         features = self.features

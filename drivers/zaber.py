@@ -21,7 +21,14 @@ from drivers.errors import (
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings, check_tolerance
+from drivers.stage import (
+    DEFAULT_SETTINGS,
+    HostStage,
+    Reading,
+    StageIdentity,
+    StageSettings,
+    check_tolerance,
+)
 from drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
@@ -100,6 +107,25 @@ class ZaberStage(HostStage):
         for axis in (*self._stated_um, *self._stated_resolution):
             self._require_axis(axis)
         self._start_up()
+
+    def identity(self, axis: str) -> StageIdentity:
+        """As `HostStage.identity`; the model by name where its ids are known."""
+        self._require_axis(axis)
+        device, _ = self._addresses[axis]
+        settings = ("deviceid", "system.serial", "version")
+        device_id, serial, firmware = (self._chain.text(device, name) for name in settings)
+        known = codec.find_model(int(device_id or 0), self._optional(axis, "peripheralid"))
+        model = f"device id {device_id}" if known is None else known.name
+        return StageIdentity("Zaber", model, serial, firmware)
+
+    def temperatures_c(self) -> dict[str, float]:
+        """As `HostStage.temperatures_c`: of every controller on the chain that has a sensor."""
+        found = {}
+        for device in dict.fromkeys(device for device, _ in self._addresses.values()):
+            text = self._chain.text(device, "system.temperature")
+            if _NUMBER.fullmatch(text):
+                found[f"device {device}"] = float(text)
+        return found
 
     def _configure(self) -> None:
         self._chain.checksummed = frozenset()
@@ -296,6 +322,13 @@ class _Chain:
         """Exchange a command that may be repeated without harm, a few times if need be."""
         return repeated(lambda: self.ask(device, number, data, name), f"{data!r} to {name}")
 
+    def text(self, device: int, setting: str) -> str:
+        """Return a setting of a device, "" where it has none of that name."""
+        try:
+            return self.query(device, 0, f"get {setting}", f"device {device}").data
+        except CommandRefusedError:
+            return ""
+
     def ask(self, device: int, number: int, data: str, name: str) -> codec.Reply:
         """Exchange a command once; an error carries the command and the axis."""
         try:
@@ -357,22 +390,16 @@ def find_devices(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> list[Zabe
         listed = ", ".join(map(str, addresses))
         raise GarbledReplyError(b"", f"devices share an address ({listed}), renumber them")
 
-    def setting(address: int, name: str) -> str:
-        try:
-            return chain.query(address, 0, f"get {name}", f"device {address}").data
-        except CommandRefusedError:
-            return ""
-
     found = []
     for address in addresses:
-        count = setting(address, "system.axiscount")
+        count = chain.text(address, "system.axiscount")
         found.append(
             ZaberDevice(
                 address=address,
                 axis_count=int(count) if count.isdecimal() else 1,
-                device_id=setting(address, "device.id"),
-                serial_number=setting(address, "system.serial"),
-                firmware=setting(address, "version"),
+                device_id=chain.text(address, "device.id"),
+                serial_number=chain.text(address, "system.serial"),
+                firmware=chain.text(address, "version"),
             )
         )
     return found

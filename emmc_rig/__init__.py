@@ -12,7 +12,8 @@
 Functions: `camera`, `scene`, `frames`, `reconstruct`, `rig`, `capture`, `calibrate`,
 `open_frames`.
 What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. Faults that the user can
-mend are of the classes in `ERRORS`, each one line that says what to do.
+mend are of the classes in `ERRORS`, each one line that says what to do. A hook that a plan calls
+between frames raises `StopCapture` to end the capture.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from emmc_rig.version import __version__
 if TYPE_CHECKING:
     from emmc_rig.acquisition.command import capture
     from emmc_rig.bench.rig_config import rig
-    from emmc_rig.errors import ERRORS
+    from emmc_rig.errors import ERRORS, StopCapture
     from emmc_rig.files.cameras import find_camera as camera
     from emmc_rig.files.scenes import Scene
     from emmc_rig.files.scenes import open_scene as scene
@@ -54,6 +55,7 @@ _HOME = {
     "Result": "emmc_rig.processing.result:Result",
     "Scene": "emmc_rig.files.scenes:Scene",
     "Session": "emmc_rig.session.session:Session",
+    "StopCapture": "emmc_rig.errors:StopCapture",
 }
 """Where each public name is defined; it is imported when it is first used."""
 
@@ -65,6 +67,7 @@ __all__ = [
     "Result",
     "Scene",
     "Session",
+    "StopCapture",
     "__version__",
     "calibrate",
     "camera",

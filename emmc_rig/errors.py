@@ -20,5 +20,9 @@ class StoppedError(AppError):
     """Somebody stopped the program; the message says what is kept and how to go on."""
 
 
+class StopCapture(Exception):  # noqa: N818
+    """Raised by a hook of a plan to end the capture, with the reason; what was taken is kept."""
+
+
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
 """The roots of each package's errors: `except emmc_rig.ERRORS` catches what the user can mend."""

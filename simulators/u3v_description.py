@@ -21,6 +21,7 @@ SIZE = 0x70
 
 EXPOSURE_TICK_US = 0.5
 GAIN_STEP_DB = 0.1
+TEMPERATURE_C = 38.5
 AUTO_EXPOSURE_BIT, AUTO_GAIN_BIT = 0, 1
 
 Limits = tuple[int, int]
@@ -85,6 +86,8 @@ def describe(
         '<SwissKnife Name="BlackLevelKnife"><pVariable Name="RAW">BlackLevelReg</pVariable>'
         "<Formula>RAW / 16</Formula></SwissKnife>",
         _register("BlackLevelReg", BLACK_LEVEL, "RO"),
+        '<Float Name="DeviceTemperature"><pValue>Warmth</pValue><Unit>C</Unit></Float>'
+        f'<SwissKnife Name="Warmth"><Formula>{TEMPERATURE_C}</Formula></SwissKnife>',
         _float("AcquisitionFrameRate", FRAME_RATE, (0.001, 1000), "Hz"),
         '<Integer Name="TLParamsLocked"><Visibility>Invisible</Visibility>'
         "<pValue>TLParamsLockedReg</pValue><Min>0</Min><Max>1</Max></Integer>",
@@ -101,7 +104,7 @@ def describe(
         "AcquisitionStart AcquisitionStop TriggerSelector TriggerMode TriggerSource "
         "ExposureAuto ExposureTime GainAuto Gain BlackLevel "
         "AcquisitionFrameRate TLParamsLocked SensorName DeviceVendorName DeviceModelName "
-        "DeviceSerialNumber"
+        "DeviceSerialNumber DeviceTemperature"
     )
     listed = "".join(f"<pFeature>{name}</pFeature>" for name in features.split())
     xml = (

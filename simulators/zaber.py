@@ -32,6 +32,7 @@ TOP_SPEED_PER_RESOLUTION = 16_384
 FINEST_RESOLUTION = 256
 MOVE_NUMBERS = {"abs": (1, 2), "rel": (1, 2), "vel": (1, 1), "min": (0, 1), "max": (0, 1)}
 """How many numbers each kind of `move` takes; the last one is a speed."""
+TEMPERATURE_C = "31.4"
 OLD_NAMES = {"deviceid": "device.id", "peripheralid": "peripheral.id"}
 """What firmware 6 called them; firmware 7 answers to both."""
 
@@ -194,6 +195,7 @@ class _Device:
             "device.id": str(model),
             "device.hw.modified": str(int(modified)),
             "version": FIRMWARE,
+            "system.temperature": TEMPERATURE_C,
         }
 
 

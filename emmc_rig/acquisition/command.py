@@ -9,15 +9,17 @@ import errno
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.amend import amendment
+from emmc_rig.acquisition.between import load_hook
 from emmc_rig.acquisition.by_hand import with_hands
 from emmc_rig.acquisition.checks import refuse_impossible
 from emmc_rig.acquisition.control import Control, interruptible
+from emmc_rig.acquisition.devices import identity_of
 from emmc_rig.acquisition.estimate import Estimate, known_exposures, pace_of
 from emmc_rig.acquisition.events import EventWatcher, OnEvent
 from emmc_rig.acquisition.expand import expand
@@ -29,7 +31,7 @@ from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
-from emmc_rig.bench.hardware import Rig
+from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.rig_config import Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
 from emmc_rig.errors import AppError, StoppedError
@@ -65,6 +67,7 @@ class CaptureRequest:
     """What to capture and where to; rig: see `emmc_rig.bench.rig_config`, None on resuming alike.
 
     until_db: the PSNR at which no further shot is taken; None: what the session has, if any.
+    other_devices: the session may go on with a camera and stages of other serial numbers.
     """
 
     plan_path: Path
@@ -74,6 +77,7 @@ class CaptureRequest:
     out: Path
     rig: Mapping[str, Any]
     until_db: float | None = None
+    other_devices: bool = False
 
 
 @dataclass(frozen=True)
@@ -204,18 +208,33 @@ def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -
         )
 
 
-def refuse_other_camera(session: Session, rig: Rig) -> None:
-    """Raise AppError when the session was begun with another camera body or frame size."""
-    if session.first_run is None or not session.stored:
+def refuse_other_devices(session: Session, rig: Rig, meant: bool = False) -> None:
+    """Raise AppError when the last run of a session had another camera, frame size, or stage.
+
+    meant: other serial numbers are, not another frame size. A stage that does not say its serial
+    number is not compared.
+    """
+    last = session.last_run
+    if last is None or not session.stored:
         return
-    then, now = session.first_run.camera, rig.camera.identity
-    if then["serial"] != now.serial or then["shape"] != list(rig.camera.shape):
+    then, now = last.camera, rig.camera.identity
+    way = "connect that one, name another --out, or say that it is meant by --other-devices"
+    same_shape = then["shape"] == list(rig.camera.shape)
+    if not same_shape or (then["serial"] != now.serial and not meant):
         raise AppError(
             f"session {session.folder.name} was begun with camera {then['model']} "
             f"{then['serial']} of {then['shape'][0]}x{then['shape'][1]} pixels, this is "
-            f"{now.model} {now.serial} of {rig.camera.shape[0]}x{rig.camera.shape[1]}: connect "
-            "that one, or name another --out"
+            f"{now.model} {now.serial} of {rig.camera.shape[0]}x{rig.camera.shape[1]}: "
+            f"{way if same_shape else 'connect that one, or name another --out'}"
         )
+    for axis in () if meant else rig.stage.axes:
+        earlier = last.stage.get(axis, {}).get("identity", {})
+        own = identity_of(rig.stage, axis)
+        if earlier.get("serial") and own.serial and earlier["serial"] != own.serial:
+            raise AppError(
+                f"session {session.folder.name} was begun with {axis} on {earlier['model']} "
+                f"{earlier['serial']}, now it is on {own.model} {own.serial}: {way}"
+            )
 
 
 @contextmanager
@@ -272,6 +291,9 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
         refuse_unless_shots_can_be_spared(plan, request.camera)
     with ExitStack() as open_things:
         session = begun_session(request)
+        hook = None
+        if plan.between is not None:
+            hook = load_hook(plan.between, request.plan_path.absolute().parent, Path.cwd())
         rig = open_things.enter_context(opened_rig(request.rig, request.camera, front.ask))
         planned = planned_frames(request, rig)
         rig = with_hands(rig, planned)
@@ -293,9 +315,15 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
             rig, recording = replaying(rig, planned)
             if words := missing_words(folder, frames, recording):
                 watcher.tell(words)
+        elif plan.focus is not None and FOCUS not in rig.stage.axes:
+            known = ", ".join(rig.stage.axes) or "none"
+            raise AppError(
+                f"focus: the rig has no axis named {FOCUS}, only {known}: name it so in the file "
+                "of the stage, or leave focus out of the plan"
+            )
         refuse_impossible(rig, frames)
         if session is not None:
-            refuse_other_camera(session, rig)
+            refuse_other_devices(session, rig, request.other_devices)
         expected = estimated(frames, plan, rig, session)
         refuse_small_disk(request.out, expected)
         if not front.agreed(expected):
@@ -319,6 +347,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                     watcher,
                     front.control,
                     choose,
+                    hook,
                 )
                 return session, sequencer.run()
 
@@ -346,6 +375,7 @@ def capture_session(
     out: Path | None,
     until_db: float | None,
     front: FrontEnd,
+    other_devices: bool = False,
 ) -> tuple[Session, RunEnd] | None:
     """Capture what is missing of a plan or session, and write the session's report.
 
@@ -358,6 +388,7 @@ def capture_session(
     go_on = f"go on with: emmc-rig capture {folder}"
     with held(folder):
         request = asked_for(plan, folder, rig, until_db)
+        request = replace(request, other_devices=other_devices)
         try:
             captured = run_capture(request, front)
         except KeyboardInterrupt as stop:
@@ -386,6 +417,7 @@ def capture(
     *,
     out: str | Path | None = None,
     until_db: float | None = None,
+    other_devices: bool = False,
     watcher: CaptureWatcher | None = None,
     on_event: OnEvent | None = None,
     ask: Ask = ask_at_prompt,
@@ -397,6 +429,7 @@ def capture(
         rig: what `emmc_rig.rig` returns, or what it takes; a session has its own.
         out: folder of the session (default: PLAN-session beside the plan).
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
+        other_devices: a session may go on with a camera or stage of another serial number.
         watcher: gets what is captured.
         on_event: is called with each `emmc_rig.acquisition.events.Event`, as `frame.written` or
             `shot.done`; one that raises is not called again.
@@ -419,7 +452,7 @@ def capture(
     if on_event is not None:
         watching = EventWatcher(on_event, watching)
     front = FrontEnd(watching, ask)
-    captured = capture_session(plan, description, folder, until_db, front)
+    captured = capture_session(plan, description, folder, until_db, front, other_devices)
     assert captured is not None  # nobody is asked whether to agree
     return captured[0]
 

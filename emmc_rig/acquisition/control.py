@@ -27,10 +27,12 @@ class Control:
     signal interrupts.
 
     stays: at the end the capture waits until it is stopped, so that frames may be taken again.
+    between_frames: a hook is running, so that nothing is lost by stopping at once.
     """
 
     def __init__(self, stays: bool = False) -> None:
         self.paused = False
+        self.between_frames = False
         self.stopping = False
         self.stays = stays
         self._again: list[str] = []
@@ -70,14 +72,15 @@ class Control:
 def interruptible(control: Control, say: Callable[[str], None]) -> Iterator[None]:
     """Let Ctrl-C stop after the present frame, and the second one, SIGTERM or SIGHUP now.
 
-    "Now" raises `KeyboardInterrupt` in the main thread. Elsewhere than there nothing is changed.
+    Within a hook the first one stops now too. "Now" raises `KeyboardInterrupt` in the main thread.
+    Elsewhere than there nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGINT and not control.stopping:
+        if number == signal.SIGINT and not control.stopping and not control.between_frames:
             control.stop()
             say("stopping after this frame; Ctrl-C again stops now")
             return

@@ -5,24 +5,39 @@ What was sent last is remembered, so that nothing is sent twice; after a fault n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from itertools import count
 from typing import Any
 
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
+from drivers.stage import Stage, StageIdentity
 from emmc_rig.acquisition.checks import Figures, FrameRefusedError, figures
+from emmc_rig.acquisition.focus import FocusFound, focused, sharpness
 from emmc_rig.acquisition.metering import METERING_TRIES, better_metering_s
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.retries import Mending
 from emmc_rig.acquisition.watcher import CaptureWatcher
-from emmc_rig.bench.hardware import Rig
+from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
 from emmc_rig.errors import AppError
 from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import wall_time
 
+TEMPERATURES_EVERY_S = 5.0
+"""Devices warm up over minutes; asking one takes some milliseconds of every frame."""
 LARGEST_EXPOSURE_RATIO = 1.5
 """A camera may take the nearest of full stops, which is off by at most half a stop."""
+
+
+def identity_of(stage: Stage, axis: str) -> StageIdentity:
+    """Return who made the controller of an axis, where the stage says; of a plug-in it may not."""
+    try:
+        return getattr(stage, "identity", lambda axis: StageIdentity())(axis)
+    except DriverError:
+        return StageIdentity()
 
 
 @dataclass
@@ -53,19 +68,27 @@ class Spans:
 
 
 class Devices:
-    """Stage, camera and attendant of a rig, as a capture by a plan uses them."""
+    """Stage, camera and attendant of a rig, as a capture by a plan uses them.
 
-    def __init__(self, rig: Rig, plan: Plan) -> None:
-        self._rig, self._plan = rig, plan
+    asked: when the last exposure was, by the time of day (`wall`) and on the rig's clock.
+    """
+
+    def __init__(self, rig: Rig, plan: Plan, wall: Callable[[], str] = wall_time) -> None:
+        self._rig, self._plan, self._wall = rig, plan, wall
+        self.asked = "", 0.0
         self.camera = rig.camera
         self.sent = Sent()
+        self.homings = 0
+        self._warmth_s, self._warmth_c = -TEMPERATURES_EVERY_S, dict[str, float]()
+        self._stands_um = dict(rig.stands_um)
 
     def home(self) -> None:
         """Home the stage, and bring the axes that no plan moves to their places."""
+        self.homings += 1
         if self._rig.stage.axes:
             self._rig.stage.home()
-        if self._rig.stands_um:
-            self._rig.stage.move_to_um(self._rig.stands_um)
+        if self._stands_um:
+            self._rig.stage.move_to_um(self._stands_um)
         self.sent = Sent()
 
     def mend(self, what: Mending) -> None:
@@ -80,6 +103,18 @@ class Devices:
             self._rig.stage.reconnect()
         if what.home:
             self.home()
+
+    def look_again(self) -> None:
+        """Take nothing for known, after somebody else had the devices, but axes that still stand.
+
+        Where they do not, or cannot be read, they are moved again, homed if need be.
+        """
+        before_um, self.sent = self.sent.offsets_um, Sent()
+        with suppress(DriverError):
+            for axis, um in before_um.items():
+                off_um = self._rig.stage.position_um(axis) - self._rig.zero_um[axis] - um
+                if abs(off_um) <= self._plan.checks.stage_um:
+                    self.sent.offsets_um[axis] = um
 
     def attend(self, planned: PlannedFrame) -> None:
         """Let lamp, board and masks be as a frame needs them; nobody is asked for a dark."""
@@ -144,12 +179,57 @@ class Devices:
             read_um[axis] = at_um
         return read_um
 
+    def beside(self) -> dict[str, Any]:
+        """Return what is read beside a frame: see `FrameEntry`; what cannot be read is left out.
+
+        Devices are asked for temperatures every few seconds only.
+        """
+        stage, stands_um = self._rig.stage, {}
+        for axis in stage.axes:
+            if axis not in STAGE_AXES:
+                with suppress(DriverError):
+                    stands_um[axis] = stage.position_um(axis)
+        now_s = self._rig.clock.now_s()
+        if now_s - self._warmth_s >= TEMPERATURES_EVERY_S:
+            self._warmth_s, self._warmth_c = now_s, {}
+            for name, device in (("camera", self.camera), ("stage", stage)):
+                with suppress(DriverError):
+                    told = getattr(device, "temperatures_c", dict)()
+                    self._warmth_c |= {
+                        f"{name} {key}": celsius
+                        for key, celsius in told.items()
+                        if math.isfinite(celsius)
+                    }
+        return {"stands_um": stands_um, "temperatures_c": dict(self._warmth_c)}
+
     def snap(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
         """Expose one frame where everything stands."""
         self._rig.about_to_expose(planned.id)
         self._set_camera(planned, exposure_s)
+        self.asked = self._wall(), self._rig.clock.now_s()
         frame = self.camera.snap()
         return frame, figures(frame)
+
+    def focus(
+        self, planned: PlannedFrame, exposure_s: float, span_um: float, stopped: Callable[[], bool]
+    ) -> FocusFound | None:
+        """Bring the focus axis to where the scene of a frame is sharpest; it stays there.
+
+        Returns None when stopped; raises as `focused` does.
+        """
+        names = (f"{planned.id} focus {number}" for number in count())
+
+        def snapped() -> RawFrame:
+            self._rig.about_to_expose(next(names))
+            self._set_camera(planned, exposure_s)
+            return self.camera.snap()
+
+        found = focused(
+            self._rig.stage, FOCUS, span_um, lambda: sharpness(snapped(), snapped()), stopped
+        )
+        if found is not None:
+            self._stands_um[FOCUS] = found.place_um
+        return found
 
     def make_safe(self) -> None:
         """Switch the lamp off, and close a camera that was opened again; no fault is raised."""
@@ -171,6 +251,7 @@ class Devices:
             "camera_settings": settings,
             "stage": {
                 axis: {
+                    "identity": asdict(identity_of(stage, axis)),
                     "limits_um": list(stage.limits_um(axis)),
                     "speed_um_s": stage.speed_um_s(axis),
                     "zero_um": self._rig.zero_um.get(axis, 0.0),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -201,6 +202,22 @@ class Checks(Settings):
     )
 
 
+class Focusing(Settings):
+    """When the focus axis is brought to where the scene is sharpest: before shots of the scene.
+
+    Before the first one of every run, and again before one whenever `every` frames were taken
+    since.
+    """
+
+    every: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="frames, of any kind; null: once a run"
+    )
+    span_um: Positive = Field(default=400.0, description="to either side of where the axis stands")
+
+
+BEFORE_SHOTS = "before-shots"
+
+
 class Plan(Settings):
     """What to capture; see `new_plan` for a commented one."""
 
@@ -212,11 +229,33 @@ class Plan(Settings):
     darks: Darks | None = Darks()
     metering: Metering = Metering()
     order: Literal["least-travel", "as-planned"] = "least-travel"
+    between: str | None = Field(
+        default=None,
+        description="module:function, called before every frame and after the last, see "
+        "`emmc_rig.acquisition.between`",
+    )
+    focus: Focusing | None = Field(
+        default=None, description=f"`{BEFORE_SHOTS}`, or when: needs an axis named focus"
+    )
     settle_s: float = Field(
         default=0.0, ge=0, le=3600, description="after a move, beyond the stage's own"
     )
     retries: Retries = Retries()
     checks: Checks = Checks()
+
+    @field_validator("between")
+    @classmethod
+    def _a_name(cls, between: str | None) -> str | None:
+        if between is not None and not re.fullmatch(r"[\w.]+:[\w.]+|[\w-]+", between):
+            raise ValueError(f"write module:function, as lab:hook, not {between!r}")
+        return between
+
+    @field_validator("focus", mode="before")
+    @classmethod
+    def _by_name(cls, focus: object) -> object:
+        if isinstance(focus, str) and focus != BEFORE_SHOTS:
+            raise ValueError(f"write {BEFORE_SHOTS}, or {{every: 50}}, not {focus!r}")
+        return {} if focus == BEFORE_SHOTS else focus
 
 
 def load_plan(path: Path) -> Plan:
@@ -343,6 +382,8 @@ darks:
 
 order: least-travel         # or as-planned
 settle_s: 0                 # after a move, beyond the stage's own
+# between: lab:hook         # a function in lab.py, called before every frame (docs: Hooks)
+# focus: before-shots       # the axis `focus` goes to where the scene is sharpest
 
 retries:
   per_frame: 4

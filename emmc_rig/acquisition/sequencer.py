@@ -12,8 +12,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,32 +22,39 @@ from numpy.typing import NDArray
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
+from emmc_rig.acquisition.between import Between, HookError, plain
 from emmc_rig.acquisition.by_hand import HandPlaces, WrongPlaceError
 from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
 from emmc_rig.acquisition.estimate import known_exposures, pace_of
+from emmc_rig.acquisition.focus import FocusFound
 from emmc_rig.acquisition.metering import asked_of_scene, first_meterings, metered_exposure_s
 from emmc_rig.acquisition.plan import Boards, Plan
 from emmc_rig.acquisition.retries import Budget, mending
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.acquisition.writer import Writer
-from emmc_rig.bench.hardware import Rig
+from emmc_rig.bench.environment import read_all
+from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.registration import Shift, registered
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, StopCapture
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import decode_frame, frame_entry, frame_file
 from emmc_rig.session.journal import (
     ComparedEntry,
     CompleteEntry,
     Entry,
+    FocusEntry,
     FrameEntry,
     HaltEntry,
+    HookEntry,
     ResumedEntry,
     RetryEntry,
     RunEntry,
+    SourceEntry,
     metered,
 )
 from emmc_rig.session.planned import PlannedFrame
@@ -65,8 +73,8 @@ Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 class Sequencer:
     """A run over a session; `run` once.
 
-    choose: by default all that is missing. timer: seconds that never run backwards, for the
-    timeline; wall: the time of day, for people.
+    choose: by default all that is missing. between: the plan's hook. timer: seconds that never run
+    backwards, for the timeline; wall: the time of day, for people.
     """
 
     def __init__(
@@ -77,6 +85,7 @@ class Sequencer:
         watcher: CaptureWatcher | None = None,
         control: Control | None = None,
         choose: Choose | None = None,
+        between: Between | None = None,
         timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
     ) -> None:
@@ -84,10 +93,14 @@ class Sequencer:
         self._watcher = watcher or CaptureWatcher()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
+        self._between = between
+        self._prepared: tuple[str, int] | None = None
+        self._silent: dict[str, str] = {}
+        self._focused_at: int | None = None
         self._timer, self._wall = timer, wall
         self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
-        self._devices = Devices(rig, plan)
+        self._devices = Devices(rig, plan, wall)
         self._budget = Budget(plan.retries)
         self._writer = Writer()
         self._places = self._hand_places()
@@ -109,17 +122,31 @@ class Sequencer:
         self._began_s = self._timer()
         with self._writer, self._bench_left_safe():
             self._open_session()
-            frames = self._choose(self._now_s) or self._next()
-            if frames:
-                self._retrying("home", self._devices.home)
-                self._compare_with_last_good()
-            while frames and self._take_all(frames):
-                self._verify_stored({frame.id for frame in frames})
-                frames = self._next()
+            try:
+                self._take_missing()
+            except StopCapture as end:
+                assert self._between is not None
+                reason = f"{self._between.name} ended the capture: {one_line(end)}"
+                self._note(HaltEntry(kind="stopped", reason=reason, wall=self._wall()))
+                self._watcher.tell(reason)
             left = self._close_session()
         return RunEnd(
             not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
         )
+
+    def _take_missing(self) -> None:
+        """Take frames until none is to be taken, and let the hook know when all are."""
+        frames = self._choose(self._now_s) or self._next()
+        ends_by_hook = self._between is not None and not self._session.is_complete
+        if frames or (ends_by_hook and not self._session.missing()):
+            self._retrying("home", self._devices.home)
+        if frames:
+            self._compare_with_last_good()
+        while frames and self._take_all(frames):
+            self._verify_stored({frame.id for frame in frames})
+            frames = self._next()
+        if ends_by_hook and not self._session.missing():
+            self._prepare(None)
 
     # Set up.
 
@@ -133,6 +160,8 @@ class Sequencer:
                 versions=versions(),
                 command=command_line(),
                 resumed=bool(session.stored),
+                environment={one.config.name: one.config.unit for one in self._rig.sources},
+                between={} if self._between is None else self._between.facts(),
                 **self._devices.facts(),
             )
         )
@@ -163,6 +192,7 @@ class Sequencer:
         def compare() -> None:
             nonlocal shift
             devices.attend(planned)
+            self._prepare(planned)
             if devices.move(planned) and self._plan.settle_s:
                 devices.settle()
             shift = registered(devices.snap(planned, entry.exposure_s)[0], then)
@@ -280,7 +310,71 @@ class Sequencer:
                 return True
             if frame.is_exposed_as_shots and self._decide_exposures():
                 return True
+            self._prepared = None
+            if self._focus_is_due(frame) and not self._focus(frame):
+                return False
             self._take(frame)
+        return True
+
+    def _focus_is_due(self, planned: PlannedFrame) -> bool:
+        """Return whether the plan wants the scene focused before a frame; a recording is not."""
+        asked = self._plan.focus
+        if asked is None or planned.kind != "shot" or self._rig.recorded_s:
+            return False
+        taken = None if self._focused_at is None else self._taken - self._focused_at
+        return taken is None or (asked.every is not None and taken >= asked.every)
+
+    def _focus(self, planned: PlannedFrame) -> bool:
+        """Focus on the scene of a frame; returns False when the capture was asked to stop.
+
+        Where no peak is seen the axis is left where it stood, which is told.
+        """
+        assert self._plan.focus is not None
+        devices, span_um = self._devices, self._plan.focus.span_um
+        began_s = self._now_s()
+        found: FocusFound | None = None
+        from_um: float | None = None
+        fault = ""
+
+        def attempt() -> None:
+            nonlocal found, from_um, fault
+            devices.attend(planned)
+            self._prepare(planned)
+            devices.move(planned)
+            if from_um is None:
+                from_um = self._rig.stage.position_um(FOCUS)
+            else:
+                self._rig.stage.move_to_um({FOCUS: from_um})
+            try:
+                found = devices.focus(
+                    planned,
+                    self._exposure_s(planned),
+                    span_um,
+                    lambda: self._control.stopping,
+                )
+            except AppError as unseen:
+                fault = str(unseen)
+
+        self._retrying(planned.id, attempt)
+        if found is None and not fault:
+            return False
+        assert from_um is not None
+        self._focused_at = self._taken
+        place_um, deviation_um = (
+            (None, None) if found is None else (found.place_um, found.deviation_um)
+        )
+        entry = FocusEntry(
+            id=planned.id,
+            from_um=from_um,
+            place_um=place_um,
+            deviation_um=deviation_um,
+            fault=fault,
+            at_s=began_s,
+            seconds=round(self._now_s() - began_s, 6),
+            wall=self._wall(),
+        )
+        self._note(entry)
+        self._watcher.tell(str(entry))
         return True
 
     def _take(self, planned: PlannedFrame) -> None:
@@ -311,9 +405,13 @@ class Sequencer:
         devices = self._devices
         with span("attend", planned):
             devices.attend(planned)
+        if self._between is not None:
+            with span("between", planned):
+                self._prepare(planned)
         frame, found = devices.move_and_expose(planned, self._exposure_s(planned), span)
         with span("read back", planned):
             read_um, unsure_um = devices.read_back_um(planned), {}
+            beside = {**devices.beside(), "environment": self._read_sources()}
         with span("check", planned):
             may_saturate = planned.id in self._may_saturate
             check(planned, frame, found, self._before, self._plan.checks, may_saturate)
@@ -326,9 +424,69 @@ class Sequencer:
         handing = Spans(self._now_s, self._watcher)
         with handing("hand over", planned):
             self._hand_over(
-                planned, frame, found, (read_um, unsure_um), dict(span.seconds), attempts
+                planned,
+                frame,
+                found,
+                dict(span.seconds),
+                read_um=read_um,
+                deviation_um=unsure_um,
+                attempts=attempts,
+                **beside,
             )
         self._handed, self._before = handing.seconds, frame.mosaic
+
+    def _prepare(self, planned: PlannedFrame | None) -> None:
+        """Call the plan's hook, once a frame, and again where the stage was homed since.
+
+        planned: None after the last one. Raises `HookError`; `StopCapture` before a frame.
+        """
+        hook, devices = self._between, self._devices
+        now = ("" if planned is None else planned.id), devices.homings
+        if hook is None or self._prepared == now:
+            return
+        self._writer.flush()
+        began_s, noted, fault = self._now_s(), dict[str, Any](), "stopped"
+        rig = replace(self._rig, camera=devices.camera)
+        self._control.between_frames = True
+        try:
+            hook.call(rig, planned, lambda **facts: noted.update(plain(facts)))
+            fault = ""
+        except StopCapture as end:
+            fault = f"ended the capture: {one_line(end)}"
+            if planned is not None:
+                raise
+        except (Exception, SystemExit) as error:
+            fault = hook.shown(error)
+            raise HookError(hook, now[0], error) from error
+        finally:
+            self._control.between_frames = False
+            self._note(
+                HookEntry(
+                    id=now[0],
+                    name=hook.name,
+                    notes=noted,
+                    fault=fault,
+                    at_s=began_s,
+                    seconds=round(self._now_s() - began_s, 6),
+                    wall=self._wall(),
+                )
+            )
+        devices.look_again()
+        if planned is not None:
+            devices.attend(planned)
+        self._prepared = now
+
+    def _read_sources(self) -> dict[str, float]:
+        """Return what the rig's sources say; one that fails, or does again, is noted once."""
+        values, faults = read_all(self._rig.sources)
+        for name in faults.keys() | self._silent.keys():
+            fault = faults.get(name, "")
+            if fault != self._silent.get(name, ""):
+                entry = SourceEntry(name=name, fault=fault, wall=self._wall())
+                self._note(entry)
+                self._watcher.tell(f"environment, {name}: {fault or 'gives values again'}")
+        self._silent = faults
+        return values
 
     def _exposure_s(self, planned: PlannedFrame) -> float:
         """Return the exposure to ask the camera for."""
@@ -402,15 +560,12 @@ class Sequencer:
         planned: PlannedFrame,
         frame: RawFrame,
         found: Figures,
-        places_um: tuple[dict[str, float], dict[str, float]],
         spans_s: dict[str, tuple[float, float]],
-        attempts: int,
+        **about: Any,
     ) -> None:
-        """Give a frame to the writer's thread, with what its journal line says.
-
-        places_um: where axes read to stand, and the deviation of those that the frame shows.
-        """
+        """Give a frame to the writer's thread, with what its journal line says (`about` it)."""
         camera = self._devices.camera
+        wall, monotonic_s = self._devices.asked
         entry = frame_entry(
             frame,
             # Only asked for where it is needed: a camera may read its next frame for that.
@@ -420,11 +575,10 @@ class Sequencer:
             plan=self._session.amendments,
             lamp=planned.bench.lamp,
             commanded_um=dict(planned.bench.offsets_um),
-            read_um=places_um[0],
-            deviation_um=places_um[1],
             figures=found,
-            attempts=attempts,
-            wall=self._wall(),
+            wall=wall,
+            monotonic_s=monotonic_s,
+            **about,
         )
         if planned.kind == "metering":
             self._metered.setdefault(planned.id, entry)

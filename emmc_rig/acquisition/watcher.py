@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from emmc_rig.session.session import Session
     from reconstruction.result import Reconstruction
 
-STEPS = ("attend", "move", "settle", "expose", "read back", "check", "hand over", "write")
+STEPS = (
+    *("attend", "between", "move", "settle", "expose", "read back", "check"),
+    *("hand over", "write"),
+)
 
 
 @dataclass(frozen=True)

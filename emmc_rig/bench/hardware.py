@@ -35,6 +35,7 @@ from drivers.u3v import open_camera as open_u3v
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
 from emmc_rig.bench.camera_config import CameraChoice, parse_camera, settings_of
+from emmc_rig.bench.environment import Source
 from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.bench.stage_config import (
     AptAxisConfig,
@@ -128,7 +129,8 @@ class Rig:
     square window, to put its edges between views; None: not known. stands_um: where axes that no
     plan moves stand in a capture, as the focus. recorded_s: of a recording that is replayed, the
     exposure of each frame by its name. hands: axes that the stage has not, which the attendant
-    moves; left: such that stay where they are, as every frame wants them at one place.
+    moves; left: such that stay where they are, as every frame wants them at one place. sources:
+    what is read beside every frame.
     """
 
     stage: Stage
@@ -144,6 +146,7 @@ class Rig:
     recorded_s: Mapping[str, float] = field(default_factory=dict)
     hands: frozenset[str] = frozenset()
     left: frozenset[str] = frozenset()
+    sources: tuple[Source, ...] = ()
 
 
 RigType = TypeVar("RigType", bound=Rig)

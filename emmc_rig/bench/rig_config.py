@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 
 from drivers.clock import SYSTEM_CLOCK
 from drivers.stage import Stage
+from emmc_rig.bench.environment import Source, SourceConfig
 from emmc_rig.bench.hands import Ask, AskingAttendant, NoAttendant
 from emmc_rig.bench.hardware import (
     NO_FLAWS,
@@ -38,7 +39,9 @@ SIMULATED = "simulated"
 IMPORTED = "imported"
 """What a session has for a rig whose frames are files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
-LATER = ("focus_um", "stands_um", "mask", "axes", "second_stage", "hands_um", "usb_camera")
+LATER = (
+    "focus_um", "stands_um", "mask", "environment", "axes", "second_stage", "hands_um", "usb_camera",
+)  # fmt: skip
 StageSpec = str | dict[str, Any]
 NO_SETTINGS = ("kind", "trigger")
 """What a description has, or had in version 0.2, beside the settings of a rig."""
@@ -57,11 +60,21 @@ class AnyRig(Settings):
     """What a rig's file may say of every rig.
 
     stands_um: by axis, where those stand that no plan moves, as `focus`. mask: how it was found to
-    sit, which sessions keep.
+    sit, which sessions keep. environment: what is read beside every frame.
     """
 
     stands_um: dict[str, float] = Field(default_factory=dict)
     mask: Mounting | None = None
+    environment: tuple[SourceConfig, ...] = ()
+
+    @field_validator("environment")
+    @classmethod
+    def _names_once(cls, sources: tuple[SourceConfig, ...]) -> tuple[SourceConfig, ...]:
+        names = [one.name for one in sources]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two sources are named {name}: give one another name")
+        return sources
 
     @field_validator("stands_um")
     @classmethod
@@ -242,6 +255,16 @@ def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iter
     ask: tells a person what to do and returns when it is done. Raises AppError or what opening a
     device raises.
     """
+    with ExitStack() as opened:
+        rig = opened.enter_context(_opened_devices(description, camera, ask))
+        read = [SourceConfig.model_validate(one) for one in description.get("environment", ())]
+        sources = tuple(opened.enter_context(Source(one)) for one in read)
+        yield replace(rig, sources=sources)
+
+
+@contextmanager
+def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iterator[Rig]:
+    """Yield the rig, see `opened_rig`, without what is read beside it."""
     if description["kind"] == IMPORTED:
         raise AppError("an imported session takes no further frames: import them with the others")
     settings = {key: value for key, value in description.items() if key not in NO_SETTINGS}

@@ -67,6 +67,10 @@ def capture(
         bool,
         typer.Option("--steer", help="and let the page pause and take frames again; it ends there"),
     ] = False,
+    other_devices: Annotated[
+        bool,
+        typer.Option("--other-devices", help="go on with a camera or stage of another serial"),
+    ] = False,
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
     ] = None,
@@ -94,7 +98,7 @@ def capture(
     if dry_run and (page or steer):
         refuse(context, given_names(context) & {"page", "steer"}, "with --dry-run")
     shown = None if not (page or steer) else "steers" if steer else "shows"
-    _run(plan, chosen, until_db, dry_run, out, shown)
+    _run(plan, chosen, until_db, dry_run, out, shown, other_devices)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -113,6 +117,7 @@ def _run(
     dry_run: bool,
     out: Path | None,
     page: Literal["shows", "steers"] | None,
+    other_devices: bool,
 ) -> None:
     from emmc_rig.acquisition.command import FrontEnd, asked_folder, capture_session
     from emmc_rig.acquisition.control import Control
@@ -161,7 +166,7 @@ def _run(
         if json_wanted.get():
             emit("stage", stage="open the rig", steps=None)
         front = FrontEnd(watcher, ask, agreed, control)
-        captured = capture_session(plan, rig, out, until_db, front)
+        captured = capture_session(plan, rig, out, until_db, front, other_devices)
     if captured is None:
         return
     session, outcome = captured

@@ -116,17 +116,32 @@ def verify(session: Folder) -> None:
 @app.command()
 def export(
     session: Folder,
-    out: Annotated[Path, typer.Option("--out", help="the file to write, FILE.h5")],
+    out: Annotated[
+        Path, typer.Option("--out", help="the file to write, FILE.h5; with --dng, a folder")
+    ],
     compress: Annotated[
         bool, typer.Option("--compress", help="gzip: smaller, and slower by far")
     ] = False,
+    dng: Annotated[
+        bool,
+        typer.Option("--dng", help="a DNG a frame, with exposure, ISO, time, serial, session"),
+    ] = False,
 ) -> None:
-    """Write a complete session as one HDF5 file with NeXus names."""
+    """Write a complete session as one HDF5 file with NeXus names, or frames as DNG files."""
     from emmc_rig.files.results import shown_bytes
-    from emmc_rig.session.export import export_hdf5
+    from emmc_rig.session.export import export_dng, export_hdf5
     from emmc_rig.session.session import Session
 
     opened = Session(session)
+    if dng:
+        if compress:
+            raise typer.BadParameter("--compress is of the HDF5 file: leave it out with --dng")
+        with shown_progress() as progress:
+            progress.begin("export", len(opened.stored))
+            export_dng(opened, out, progress.step)
+        tell(f"wrote {len(opened.stored)} DNG files into {out}")
+        give_result(out, frames=len(opened.stored))
+        return
     with shown_progress() as progress:
         progress.begin("export", len(opened.needed))
         export_hdf5(opened, out, compress, progress.step)

@@ -22,12 +22,12 @@ from drivers.camera import Camera
 from drivers.errors import DriverError, ExposureStoppedError
 from drivers.raw import RawFrame
 from drivers.stage import Stage
+from emmc_rig.acquisition.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.live.alignment import MaskGauge, is_dark
 from emmc_rig.live.driving import Driving
-from emmc_rig.live.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.save import Files, Found
 from emmc_rig.live.steps import (

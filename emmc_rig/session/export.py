@@ -5,29 +5,39 @@
         /instrument/mask        NXpositioner: x, y; commanded beside; /aperture likewise
         /instrument/source      NXsource: the lamp of every frame
         /sample                 NXsample: scene or whiteboard
-        /data                   NXdata: the frames, with id, kind and shot of each
+        /data                   NXdata: the frames, with id, kind, shot, time, notes (JSON) of each
+        /environment            NXcollection: temperatures, sources of the rig's file; NaN: not read
         /process                NXprocess: versions; the plan and the camera as NXnote
+
+Or as a folder of DNG files, whose EXIF says of each frame what the session knows.
 
 Frames pass one at a time: memory stays flat. Source: NeXus definitions 2024.02, base classes.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from drivers.camera import CameraIdentity
+from drivers.dng import Facts
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import new_file
+from emmc_rig.files.folders import new_file, result_folder
+from emmc_rig.session.frame_file import dng_of
 from emmc_rig.session.frame_means import decoded
-from emmc_rig.session.journal import FrameEntry
+from emmc_rig.session.journal import FrameEntry, ImportedEntry, RunEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import CAMERA, RIG, Session
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
+BASE_ISO = 100
+"""At gain 1, where a camera does not say: what most sensors are nearest to."""
 UNITS = {"count_time": "s", "black_level": "DN", "saturation_value": "DN", "data": "DN"}
 """Of numbers; places are in um."""
 
@@ -51,12 +61,17 @@ def export_hdf5(
         )
     frames = session.needed
     lines = [session.stored[frame.id] for frame in frames]
+    runs = of_kind(session.journal.entries, RunEntry)
     with new_file(path) as part, h5py.File(part, "w") as file:
         file.attrs.update(default="entry", creator="emmc-rig")
         for name, (nx_class, values) in _groups(session, frames, lines).items():
             _fill(file.create_group(name), nx_class, values)
         file["entry"].attrs["default"] = "data"
         file["entry/program_name"].attrs["version"] = session.header["versions"]["emmc-rig"]
+        units = {name: unit for run in runs for name, unit in run.environment.items()}
+        if isinstance(beside := file.get("entry/environment"), h5py.Group):
+            for name, values in beside.items():
+                values.attrs["units"] = units.get(name, "C")
         _write_frames(
             session,
             file.require_group("entry/instrument/detector"),
@@ -68,12 +83,68 @@ def export_hdf5(
         file["entry/data/data"] = h5py.SoftLink("/entry/instrument/detector/data")
 
 
+def export_dng(
+    session: Session, folder: Path, on_frame: Callable[[str], None] = lambda frame_id: None
+) -> None:
+    """Write every stored frame as a DNG with its facts into a folder, named as in the session.
+
+    Its mosaic as the camera gave it, levels in whole DN. Exposure, ISO (100 at gain 1 where the
+    camera says none), the time of exposure to the millisecond, maker, model, serial number, and as
+    ImageUniqueID the session's id followed by 16 digits of the frame's own. Every frame's digest is
+    checked on the way. Raises AppError where a frame is not good, or nothing can be written.
+    """
+    frames = [frame for frame in session.frames if frame.id in session.stored]
+    if not frames:
+        raise AppError(f"{session.folder}: no frame was captured yet; resume it")
+    runs = of_kind(session.journal.entries, RunEntry)
+    imported = bool(of_kind(session.journal.entries, ImportedEntry))
+    with result_folder(folder, "session export --dng") as new:
+        for planned, (frame, _) in zip(frames, decoded(session, frames), strict=True):
+            line = session.stored[planned.id]
+            run = runs[max(0, line.run - 1)] if runs else None
+            named = {} if run is None else run.camera
+            keys = ("maker", "model", "serial")
+            maker, model, serial = (named.get(key) or line.metadata.get(key, "") for key in keys)
+            facts = Facts(
+                _iso(line, imported),
+                _captured(line, imported),
+                f"session {session.id}, frame {planned.id}",
+                f"{session.id}{line.sha256[:16]}",
+                f"emmc-rig {session.header['versions']['emmc-rig']}",
+            )
+            identity = CameraIdentity(maker, model, serial)
+            data = dng_of(frame, identity, facts=facts)
+            (new / line.file).with_suffix(".dng").write_bytes(data)
+            on_frame(planned.id)
+
+
+def _iso(line: FrameEntry, imported: bool) -> int | None:
+    """Return what the camera says; else, of a frame captured here, what its gain amounts to."""
+    told = str(line.metadata.get("iso", ""))
+    if told.isdecimal() and int(told):
+        return int(told)
+    return None if imported else round(BASE_ISO * line.gain)
+
+
+def _captured(line: FrameEntry, imported: bool) -> datetime | None:
+    """Return when a frame was exposed; of an imported one by the camera's clock, if it says."""
+    try:
+        if imported:
+            return datetime.strptime(line.metadata.get("captured", ""), "%Y:%m:%d %H:%M:%S")
+        return datetime.fromisoformat(line.wall)
+    except ValueError:
+        return None
+
+
 def _groups(
     session: Session, frames: Sequence[PlannedFrame], lines: Sequence[FrameEntry]
 ) -> dict[str, tuple[str, Mapping[str, Any]]]:
     """Return class and datasets of every group, those above others first."""
     camera = {} if session.first_run is None else session.first_run.camera
     version = session.header["versions"]["emmc-rig"]
+    noted = session.notes
+    beside = [line.temperatures_c | line.environment for line in lines]
+    read = {name: [one.get(name, np.nan) for one in beside] for one in beside for name in one}
     detector = {
         "count_time": [line.exposure_s for line in lines],
         "gain": [line.gain for line in lines],
@@ -92,6 +163,8 @@ def _groups(
         "plan": [line.plan for line in lines],
         "view": [frame.view or (-1, -1) for frame in frames],
         "sha256": [line.sha256 for line in lines],
+        "time": [line.wall for line in lines],
+        "notes": [json.dumps(noted.get(frame.id, {})) for frame in frames],
     }
     notes = {
         "plan": ("application/yaml", session.plan_yaml),
@@ -117,6 +190,7 @@ def _groups(
         "entry/instrument/source": ("NXsource", {"name": lamps}),
         "entry/sample": ("NXsample", {"name": targets}),
         "entry/data": ("NXdata", data),
+        **({"entry/environment": ("NXcollection", read)} if read else {}),
         "entry/process": ("NXprocess", {"program": "emmc-rig capture", "version": version}),
         **{
             f"entry/process/{name}": ("NXnote", {"type": kind, "data": text})

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.camera import CameraIdentity
 from drivers.cameras import CAMERAS
-from drivers.dng import MONO, encode_dng, private_data
+from drivers.dng import MONO, Facts, encode_dng, private_data
 from drivers.errors import DriverError, RawFrameError
 from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
 from emmc_rig.errors import AppError
@@ -70,7 +70,8 @@ def frame_file(frame: RawFrame) -> FrameFile:
     own = FrameFile(_suffix_of(frame), frame.original, frame.sha256)
     if _decodes_to(own, frame):
         return own
-    data = _dng_of(frame)
+    identity = CameraIdentity(frame.metadata.get("maker", ""), frame.metadata.get("model", ""))
+    data = dng_of(frame, identity, frame.original)
     made = FrameFile(".dng", data, hashlib.sha256(data).hexdigest(), frame.sha256)
     if not _decodes_to(made, frame):
         raise AppError(f"{UNSTORABLE} (a DNG of it decodes to something else)")
@@ -127,9 +128,17 @@ def _decodes_to(file: FrameFile, frame: RawFrame) -> bool:
     )
 
 
-def _dng_of(frame: RawFrame) -> bytes:
+def dng_of(
+    frame: RawFrame,
+    identity: CameraIdentity,
+    private: bytes | None = None,
+    facts: Facts | None = None,
+) -> bytes:
+    """Return a DNG of a frame's mosaic, see `encode_dng`: its levels in whole DN.
+
+    Raises AppError for a frame that no DNG can hold.
+    """
     black_dn = np.maximum(np.round(frame.black_level_dn), 0)
-    identity = CameraIdentity(frame.metadata.get("maker", ""), frame.metadata.get("model", ""))
     try:
         return encode_dng(
             frame.mosaic,
@@ -138,7 +147,8 @@ def _dng_of(frame: RawFrame) -> bytes:
             frame.white_level_dn,
             frame.exposure_s,
             identity,
-            frame.original,
+            private,
+            facts,
         )
     except (ValueError, OverflowError) as fault:
         raise AppError(f"{UNSTORABLE} ({fault})") from fault

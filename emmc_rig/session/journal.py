@@ -72,7 +72,11 @@ class AmendedEntry(Entry):
 
 
 class RunEntry(Entry):
-    """A capture was started, on these devices."""
+    """A capture was started, on these devices.
+
+    environment: units, by the names of what is read beside frames. between: the plan's hook, its
+    file and SHA-256.
+    """
 
     kind: Literal["run"] = "run"
     wall: str = ""
@@ -82,6 +86,8 @@ class RunEntry(Entry):
     camera: dict[str, Any]
     camera_settings: dict[str, Any] = {}
     stage: dict[str, Any] = {}
+    environment: dict[str, str] = {}
+    between: dict[str, str] = {}
 
     def __str__(self) -> str:
         return f"{self.wall}: {self.command}"
@@ -107,8 +113,11 @@ class FrameEntry(Entry):
 
     run: counted from 1. plan: number of the amendment that it was taken by. camera_sha256: of the
     camera's own bytes, where `file` is a DNG of the mosaic that holds them. read_um: where the axes
-    read to stand; of one that a hand moved, where the frame shows it, to `deviation_um`. spans_s:
-    by step, its begin and end in seconds of the run.
+    read to stand; of one that a hand moved, where the frame shows it, to `deviation_um`. wall,
+    monotonic_s: when its exposure was asked for, by the time of day and on the clock of the rig.
+    stands_um: where axes of the stage read to stand that no plan moves. temperatures_c: of stage
+    and camera, environment: of other sources, whose units the run's line has. spans_s: by step, its
+    begin and end in seconds of the run.
     """
 
     kind: Literal["frame"] = "frame"
@@ -136,6 +145,10 @@ class FrameEntry(Entry):
     triggered: bool = False
     attempts: int = 1
     wall: str = ""
+    monotonic_s: float | None = None
+    stands_um: dict[str, float] = {}
+    temperatures_c: dict[str, float] = {}
+    environment: dict[str, float] = {}
     spans_s: dict[str, tuple[float, float]] = {}
 
     @property
@@ -268,6 +281,62 @@ class ComparedEntry(Entry):
             f"{self.id} taken again: shifted by ({self.x_px:+.3f}, {self.y_px:+.3f}) px, "
             f"likeness {self.likeness:.3f}"
         )
+
+
+class HookEntry(Entry):
+    """The plan's hook was called before frame `id`, "" after the last, and noted this.
+
+    fault: what ended the capture there, "" where nothing did.
+    """
+
+    kind: Literal["hook"] = "hook"
+    id: str = ""
+    name: str = ""
+    notes: dict[str, Any] = {}
+    fault: str = ""
+    at_s: float = 0.0
+    seconds: float = 0.0
+    wall: str = ""
+
+    def __str__(self) -> str:
+        when = f"before {self.id}" if self.id else "after the last frame"
+        return f"{self.wall}: {self.name}, {when}: {self.fault}" if self.fault else ""
+
+
+class FocusEntry(Entry):
+    """The focus axis was brought to where the scene is sharpest, before frame `id`.
+
+    place_um: where it is, to deviation_um; None where no peak was seen, see `fault`: then the axis
+    stands where it did, from_um.
+    """
+
+    kind: Literal["focus"] = "focus"
+    id: str
+    from_um: float
+    place_um: float | None = None
+    deviation_um: float | None = None
+    fault: str = ""
+    at_s: float = 0.0
+    seconds: float = 0.0
+    wall: str = ""
+
+    def __str__(self) -> str:
+        if self.place_um is None:
+            return f"before {self.id}: not focused, {self.fault}"
+        found = f"{self.place_um:.1f} um, to {self.deviation_um:.1f} um"
+        return f"before {self.id}: sharpest at {found}; it stood at {self.from_um:.1f} um"
+
+
+class SourceEntry(Entry):
+    """A source of the rig's environment failed, or gives values again (fault "")."""
+
+    kind: Literal["source"] = "source"
+    name: str
+    fault: str = ""
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.wall}: {self.name}: {self.fault or 'gives values again'}"
 
 
 class CompleteEntry(Entry):

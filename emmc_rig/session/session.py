@@ -60,6 +60,7 @@ from emmc_rig.session.journal import (
     DiscardedEntry,
     Entry,
     FrameEntry,
+    HookEntry,
     Journal,
     RunEntry,
     UntilEntry,
@@ -196,6 +197,11 @@ class Session:
             raise AppError(f"{self.folder}: made by a later emmc-rig; update this one")
         return first
 
+    @cached_property
+    def id(self) -> str:
+        """16 hexadecimal digits that tell this session from others; raises AppError."""
+        return hashlib.sha256(encode_line(self.created)).hexdigest()[:16]
+
     @property
     def amendments(self) -> int:
         """How often the plan was amended: the number of the plan that holds, from 0."""
@@ -277,6 +283,11 @@ class Session:
         return count_stored(self.journal.entries)
 
     @property
+    def notes(self) -> dict[str, dict[str, Any]]:
+        """What the plan's hook noted before each frame, by its id; by "" after the last one."""
+        return {entry.id: entry.notes for entry in of_kind(self.journal.entries, HookEntry)}
+
+    @property
     def runs(self) -> int:
         """How often a capture was started on it."""
         return len(of_kind(self.journal.entries, RunEntry))
@@ -285,6 +296,11 @@ class Session:
     def first_run(self) -> RunEntry | None:
         """The first run, which says what camera took the frames; None before any."""
         return next(iter(of_kind(self.journal.entries, RunEntry)), None)
+
+    @property
+    def last_run(self) -> RunEntry | None:
+        """The last run; None before any."""
+        return next(reversed(of_kind(self.journal.entries, RunEntry)), None)
 
     @property
     def target_db(self) -> float | None:
@@ -433,8 +449,8 @@ def amended_name(name: str, number: int) -> str:
 
 
 def wall_time() -> str:
-    """Return the time of day for people; nothing is computed from it."""
-    return datetime.now(UTC).astimezone().isoformat(timespec="seconds")
+    """Return the time of day to the millisecond; nothing is computed from it."""
+    return datetime.now(UTC).astimezone().isoformat(timespec="milliseconds")
 
 
 def _digests(files: Mapping[str, bytes]) -> dict[str, str]:

@@ -25,7 +25,7 @@ from emmc_rig.acquisition.command import (
     estimated,
     new_session,
     planned_frames,
-    refuse_other_camera,
+    refuse_other_devices,
     refuse_small_disk,
 )
 from emmc_rig.acquisition.control import Control, interruptible
@@ -215,8 +215,64 @@ def test_another_camera_is_refused_on_resuming():
     session, _, rig, _ = stopped_after(9)
     other = still_rig()
     with pytest.raises(AppError, match="begun with camera EMMC simulated camera S1"):
-        refuse_other_camera(session, other)
-    refuse_other_camera(session, rig)
+        refuse_other_devices(session, other)
+    refuse_other_devices(session, rig)
+
+
+def test_a_resume_refuses_another_stage_unless_it_is_meant():
+    rig, _ = bench_rig(ONE_SHOT)
+    session, plan = started(rig, ONE_SHOT)
+    Sequencer(session, plan, rig).run()
+    refuse_other_devices(session, rig)
+
+    def of_serial(serial):
+        """Return the rig with another controller for mask_y."""
+        stage: Any = rig.stage
+
+        class Exchanged:
+            def __getattr__(self, name):
+                return getattr(stage, name)
+
+            def identity(self, axis):
+                own = stage.identity(axis)
+                return replace(own, serial=serial) if axis == "mask_y" else own
+
+        return replace(rig, stage=Exchanged())
+
+    with pytest.raises(AppError, match=r"begun with mask_y on .*, now it is on .* 999") as refused:
+        refuse_other_devices(session, of_serial("999"))
+    assert "--other-devices" in str(refused.value)
+    # Meant, it goes on, and later runs are compared with that one.
+    refuse_other_devices(session, of_serial("999"), meant=True)
+    again = Session(session.folder, session.disk)
+    again.discard(next(iter(again.stored)), "wanted once more")
+    assert Sequencer(again, plan, of_serial("999")).run().complete
+    refuse_other_devices(again, of_serial("999"))
+    with pytest.raises(AppError, match="999"):
+        refuse_other_devices(again, rig)
+    # A controller that does not say its serial number is not compared.
+    refuse_other_devices(again, of_serial(""))
+
+
+def test_another_camera_is_taken_where_it_is_meant_and_has_the_same_frames():
+    rig = still_rig()
+    session, plan = started(rig)
+    Sequencer(session, plan, rig).run()
+    wire = rig.camera
+    other = replace(rig, camera=SimpleCamera(wire, "8", wire.shape))
+    with pytest.raises(AppError, match="--other-devices"):
+        refuse_other_devices(session, other)
+    refuse_other_devices(session, other, meant=True)
+    larger = replace(rig, camera=SimpleCamera(wire, "7", (48, 64)))
+    with pytest.raises(AppError, match="48x64: connect that one, or name another --out"):
+        refuse_other_devices(session, larger, meant=True)
+
+
+class SimpleCamera:
+    """A camera of another serial number and frame size."""
+
+    def __init__(self, camera, serial, shape):
+        self.identity, self.shape = replace(camera.identity, serial=serial), shape
 
 
 def test_pausing_holds_the_next_frame_until_it_goes_on():

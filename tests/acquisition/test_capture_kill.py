@@ -6,9 +6,10 @@ import signal
 
 import numpy as np
 import pytest
-from capture_kills import capture_into
+from capture_kills import HOOKED, capture_into
 from programs import line_server
 
+from emmc_rig.session.journal import HookEntry, of_kind
 from emmc_rig.session.session import FRAMES, LOCK, Session
 from emmc_rig.session.verify import verify
 
@@ -55,9 +56,9 @@ def assert_made_whole(folder, expected):
     assert len(opened.stored) == len(expected)
 
 
-def check(killed, memory_folder, kind, numbers, expected):
+def check(killed, memory_folder, kind, numbers, expected, ending=""):
     for number in numbers:
-        folder = memory_folder / f"{kind}-{number}"
+        folder = memory_folder / f"{kind}-{number}{ending}"
         code, _ = killed(kind, number, folder)
         assert code == -signal.SIGKILL, number
         assert_made_whole(folder, expected)
@@ -82,6 +83,33 @@ def test_a_capture_killed_at_random_lines_of_the_storing_code_is_made_whole(
     rng = np.random.default_rng(chunk)
     chosen = rng.choice(np.arange(1, lines - 20), RANDOM_LINES // CHUNKS, replace=False)
     check(killed, memory_folder, "line", chosen.tolist(), undisturbed)
+
+
+@pytest.mark.slow
+def test_a_capture_with_a_hook_and_by_hand_killed_at_any_step_is_made_whole_with_the_same_bytes(
+    killed, memory_folder, undisturbed
+):
+    code, steps = killed("step", 0, memory_folder / f"all-steps-{HOOKED}")
+    assert code == 0
+    assert steps >= 10 * len(undisturbed)  # the hook is a step too
+    check(killed, memory_folder, "step", range(1, steps + 1), undisturbed, HOOKED)
+
+
+@pytest.mark.slow
+def test_a_capture_with_a_hook_and_by_hand_killed_at_random_lines_notes_every_frame(
+    killed, memory_folder, undisturbed
+):
+    code, lines = killed("line", 0, memory_folder / f"all-lines-{HOOKED}")
+    assert code == 0
+    rng = np.random.default_rng(11)
+    for number in rng.choice(np.arange(1, lines - 20), 50, replace=False).tolist():
+        folder = memory_folder / f"line-{number}-{HOOKED}"
+        assert killed("line", number, folder)[0] == -signal.SIGKILL, number
+        assert_made_whole(folder, undisturbed)
+        session = Session(folder / "s")
+        noted = [entry.id for entry in of_kind(session.journal.entries, HookEntry)]
+        assert set(noted) == {*session.stored, ""}
+        shutil.rmtree(folder)
 
 
 @pytest.mark.slow

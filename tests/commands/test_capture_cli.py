@@ -138,6 +138,34 @@ def test_an_export_that_is_killed_leaves_no_part_after_the_next_one(captured, ru
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(
+    captured, run, tmp_path, monkeypatch
+):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+    monkeypatch.setattr("simulators.zaber.FIRST_SERIAL_NUMBER", 900)
+    journal = (copy / "journal.jsonl").read_bytes()
+    code, _, err = run("capture", copy)
+    assert code == 1
+    assert "was begun with mask_x on" in one_line(err)
+    assert "901: connect that one, name another --out, or say" in one_line(err)
+    assert (copy / "journal.jsonl").read_bytes() == journal
+    assert run("capture", copy, "--other-devices")[0] == 0
+    assert run("capture", copy)[0] == 0
+
+
+def test_frames_are_exported_as_dng_files_by_the_command(captured, run, tmp_path):
+    session, out = captured / "plan-session", tmp_path / "dng"
+    for _ in range(2):  # what an earlier export wrote is replaced
+        code, told, err = run("session", "export", session, "--dng", "--out", out)
+        assert code == 0, err
+        assert "wrote 62 DNG files" in told
+    assert len(list(out.glob("*.dng"))) == 62
+    code, _, err = run("session", "export", session, "--dng", "--compress", "--out", tmp_path / "x")
+    assert code == 2
+    assert not (tmp_path / "x").exists()
+
+
 def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured, run):
     os.chdir(captured)
     code, _, err = run("session", "export", "plan-session", "--out", "x.h5", "--compress")
@@ -158,6 +186,12 @@ def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured,
         assert places[ids.index("shot-1-e0-r0")] == pytest.approx(270, abs=0.5)
         times_s = entry["instrument/detector/count_time"][:]
         assert times_s[ids.index("shot-0-e1-r0")] == pytest.approx(0.08)
+        warmth_c = entry["environment/stage device 1"]
+        assert warmth_c.attrs["units"] == "C"
+        assert set(warmth_c[:]) == {31.4}
+        assert set(entry["data/notes"].asstr()[:]) == {"{}"}
+        stored = Session(Path("plan-session")).stored
+        assert entry["data/time"].asstr()[:].tolist() == [stored[name].wall for name in ids]
         exposed = frames[ids.index("shot-0-e1-r0")]
     session = Session(captured / "plan-session")
     raw = decode_raw(session.read("shot-0-e1-r0"))

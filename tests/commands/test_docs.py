@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from matplotlib import pyplot
 from placed import files_of, listed
 from programs import program
 
@@ -117,6 +118,21 @@ def test_every_camera_and_bench_is_drawn_as_the_script_draws_it(tmp_path):
     for name in script["PICTURES"]:
         assert f"pictures/bench-{name}.svg" in (ROOT / "docs" / "day-one.md").read_text()
         assert (pictures / f"bench-{name}.svg").read_text() == script["drawn"](name)
+
+
+@pytest.mark.parametrize("name", ["plot_8_turntable", "plot_9_power_meter"])
+def test_the_worked_hooks_run_and_note_what_they_are_for(name):
+    names = runpy.run_path(str(ROOT / "docs" / "examples" / f"{name}.py"))
+    session = names["session"]
+    notes = session.notes
+    pyplot.close("all")
+    if name == "plot_8_turntable":
+        degrees = {frame.bench.shot: notes[frame.id]["degrees"] for frame in session.frames}
+        assert degrees == {0: 0.0, 1: 0.0, 2: 30.0, 3: 30.0}
+    else:
+        power_w = [one["power_w"] for one in notes.values() if one]
+        assert len(power_w) == 12
+        assert power_w == sorted(power_w, reverse=True)
 
 
 @pytest.fixture

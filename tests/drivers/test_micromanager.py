@@ -117,6 +117,18 @@ def test_binning_depth_and_properties_are_set_by_name():
         assert camera.details()["Gain"] == "3"
 
 
+def test_a_stage_says_which_adapter_moves_an_axis():
+    with demo_stage() as stage:
+        identity = stage.identity("mask_x")
+        assert (identity.maker, identity.model) == ("DemoCamera", "DXYStage")
+
+
+def test_a_camera_tells_its_temperatures_by_the_names_of_its_properties():
+    with closing(demo_camera(properties={"CCDTemperature": -20})) as camera:
+        assert camera.temperatures_c()["CCDTemperature"] == -20
+        assert set(camera.temperatures_c()) <= set(camera.details())
+
+
 @pytest.mark.parametrize(
     ("corner", "cfa"), [((0, 0), "rggb"), ((1, 0), "grbg"), ((0, 1), "gbrg"), ((5, 3), "bggr")]
 )

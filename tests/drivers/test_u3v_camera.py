@@ -120,6 +120,10 @@ def test_a_camera_is_listed_and_says_who_made_it(bench):
         bench.open(serial="U2")
 
 
+def test_a_camera_tells_its_temperature(bench):
+    assert bench.open().temperatures_c() == {"DeviceTemperature": 38.5}
+
+
 def test_a_camera_is_opened_by_its_name_on_the_command_line(bench):
     camera = open_camera("u3v:U1", bench.clock, bench.bus)
     np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)

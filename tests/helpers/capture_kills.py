@@ -3,24 +3,28 @@
 Started as a program, it reads a line `KIND NUMBER FOLDER` for each capture, forks, and answers with
 how the child ended. The child sends itself SIGKILL at the NUMBER-th event of that KIND: "step", a
 step of the sequence begins; "line", a line of the storage, journal or session code is about to
-run, in whichever thread. With NUMBER 0 it lives, and answers how many events there were.
+run, in whichever thread. With NUMBER 0 it lives, and answers how many events there were. A folder
+whose name ends with "hooked" is captured with a hook in the plan, hands moving the pinhole.
 """
 
 import os
 import signal
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 from capture_rigs import begun, plan_and_camera, still_rig
 
 from emmc_rig.acquisition import writer
+from emmc_rig.acquisition.between import Between
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.session import journal, lock, session, storage
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
+from simulators.still import StillStage
 
 PLAN = """
 camera: rgbw-bayer-1shot
@@ -28,7 +32,17 @@ shots: [{exposure_s: 0.01}]
 whiteboards: {views: [[2, 2]], repeats: 1, references: 2, exposure_s: 0.02}
 darks: null
 settle_s: 0.1
+checks: {places_by_hand: false}
 """
+HOOKED = "hooked"
+
+
+def hook(rig, frame, note):
+    """Move the mask away, and note something."""
+    rig.stage.move_by_um({"mask_x": 50.0})
+    note(power_w=0.5, frame=None if frame is None else frame.id)
+
+
 WATCHED = frozenset(module.__file__ for module in (storage, journal, lock, session, writer))
 
 
@@ -77,13 +91,17 @@ class Lines(Countdown):
 
 def capture_into(folder, watcher=None):
     """Begin a session in a folder, or go on with the one there, as a new program would."""
-    rig = still_rig()
+    rig, between = still_rig(), None
+    if folder.name.endswith(HOOKED):
+        between = Between("capture_kills:hook", hook)
+        stage = StillStage(("mask_x", "mask_y"), rig.clock)
+        rig = replace(rig, stage=stage, hands=frozenset(("aperture_x", "aperture_y")))
     with held(folder / "s"):
         try:
             opened, plan = Session(folder / "s"), plan_and_camera(PLAN)[0]
         except AppError:
             opened, plan = begun(folder, storage.SYSTEM_DISK, rig, PLAN)
-        Sequencer(opened, plan, rig, watcher).run()
+        Sequencer(opened, plan, rig, watcher, between=between).run()
     return opened
 
 

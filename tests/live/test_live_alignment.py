@@ -7,10 +7,10 @@ import pytest
 from calibration.errors import CalibrationError
 from calibration.repeats import Repeats, repeats_of
 from drivers.raw import RawFrame
+from emmc_rig.acquisition import focus
+from emmc_rig.acquisition.focus import REMEMBERED_S, FocusMeter, sharpness
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.live import focus
 from emmc_rig.live.alignment import MaskGauge, grid_direction
-from emmc_rig.live.focus import REMEMBERED_S, FocusMeter, sharpness
 from emmc_rig.model.camera import Camera, shipped_cameras
 from simulators.bench import Bench, MountingErrors
 
