@@ -27,12 +27,14 @@ class Control:
     signal interrupts.
 
     stays: at the end the capture waits until it is stopped, so that frames may be taken again.
+    answered: what somebody was asked to do at the bench is done.
     """
 
     def __init__(self, stays: bool = False) -> None:
         self.paused = False
         self.stopping = False
         self.stays = stays
+        self.answered = False
         self._again: list[str] = []
 
     def take_again(self, ids: Iterable[str]) -> None:
@@ -60,6 +62,16 @@ class Control:
     def stop(self) -> None:
         """End after the present frame, paused or not."""
         self.stopping = True
+
+    def until_answered(self, pressed: Callable[[], str] = lambda: "") -> None:
+        """Wait until what somebody was asked for is done; Enter says so too, among keys pressed.
+
+        Raises KeyboardInterrupt where the capture is to stop: then nobody does it any more.
+        """
+        while not self.answered and pressed() not in ("\n", "\r"):
+            if self.stopping:
+                raise KeyboardInterrupt
+            self.wait()
 
     def wait(self) -> None:
         """Let a moment pass in which nothing is to be done."""
