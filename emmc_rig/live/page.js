@@ -96,7 +96,7 @@ function drawNext(hinted) {
   writeWithCode("next-text", step ? `Step ${number + 1} of ${steps.length}, ${step.name}: ${step.text}`
     : `All steps are done.${state.next ? ` Next: \`${state.next}\`` : ""}`);
   $("next-do").hidden = nextStep < 0;
-  write("next-do", nextStep < 0 ? "" : label(steps[nextStep]));
+  write("next-do", nextStep < 0 ? "" : nextStep === number ? label(step) : `or go on: ${steps[nextStep].name}`);
   $("next-do").disabled = state.read_only;
 }
 
@@ -106,9 +106,10 @@ function drawWhy() {
   const { figures, hint, trouble } = state, gone = lostSince ? "no connection" : trouble.camera;
   const level = figures ? Math.max(...Object.values(figures.brightest)) : 0;
   const what = !figures ? "" : figures.dark ? "Black" : level < DIM && !view.bright ? "Almost black" : "";
+  const reason = hint?.text || "Looking for the reason.";
   write("why", gone ? `${state.frame ? "Not live, this is the last frame" : "No picture"}: ${gone}. It is tried again every second.`
     : !state.frame ? (state.exposing ? "The first exposure is under way." : "Waiting for the first frame.")
-    : !what ? "" : state.busy ? `${what} while the stage is ${state.busy}.` : `${what}. ${hint?.text || "Looking for the reason."}`);
+    : !what ? "" : state.busy ? `${what} while the stage is ${state.busy}.` : figures.dark && hint ? reason : `${what}. ${reason}`);
 }
 
 // Steps are made once and then written to: a button that has the focus keeps it.
@@ -118,13 +119,13 @@ function drawSteps() {
   if (parent.children.length !== state.steps.length)
     fill(parent, state.steps.map((step, i) => {
       const row = document.createElement("li");
-      row.append(cell("b", step.name), cell("span", ""), button("", () => doStep(i)));
+      row.append(cell("b", step.name), cell("em", step.need), cell("span", ""), button("", () => doStep(i)));
       return row;
     }));
   state.steps.forEach((step, i) => {
-    const [, words, press] = parent.children[i].children;
-    const said = step.done || !step.need ? step.text : `${step.need} ${step.text}`;
-    if (words.textContent !== said) words.textContent = said;
+    const [, need, words, press] = parent.children[i].children;
+    need.hidden = step.done;
+    if (words.textContent !== step.text) words.textContent = step.text;
     if (press.textContent !== label(step)) press.textContent = label(step);
     press.hidden = !label(step);
     press.disabled = state.read_only || (state.busy !== "" && step.action !== "autoexpose");
@@ -218,7 +219,7 @@ function drawTargets() {
   if (key === drawnTargets) return;
   drawnTargets = key;
   fill($("targets"), state.targets.map((target) =>
-    button("look at the " + target, () => act("look", { target }), "", state.read_only)));
+    button(target, () => act("look", { target }), "look at the " + target, state.read_only)));
 }
 
 // Rows are made once and then written to: a button that has the focus keeps it.

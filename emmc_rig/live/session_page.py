@@ -107,7 +107,7 @@ class SessionPage(EventWatcher):
             "resume": lambda: self._wish("", control.resume),
             "stop": lambda: self._wish("stopping after this frame", control.stop),
             "retake": self._retake,
-            "done": self._done,
+            "done": self._answer,
         }
 
     def start(self) -> None:
@@ -265,7 +265,7 @@ class SessionPage(EventWatcher):
         ask()
         self._publish(wish=words, held=self._control.paused)
 
-    def _done(self, number: int) -> None:
+    def _answer(self, number: int) -> None:
         """Go on; not where another wish than the one with that number stands by now."""
         with self._changed:
             asked = self._state["asked"]

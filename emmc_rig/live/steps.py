@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from emmc_rig.bench.hands import APERTURE, MASK
@@ -27,13 +28,13 @@ NO_FOCUS = (
 
 
 NEEDS = {
-    "centre the mask": "The mask's middle before the sensor's, the aperture open.",
-    "exposure": "Brightest readings of 70 to 90 % of white, none saturated.",
-    "align": "The mask along the sensor's rows, to 0.1 degrees.",
-    "focus": "The scene sharp, where it will be captured.",
-    "save": "What was found, in the plan and the rig's file.",
+    "centre the mask": "and open the aperture",
+    "exposure": "to 70 to 90 % of white, none saturated",
+    "align": "the mask with the sensor's rows, to 0.1\u00b0",
+    "focus": "on the scene, where it will be captured",
+    "save": "what was found in the plan and the rig",
 }
-"""Of every step, what it needs to be done."""
+"""Of every step, in the words that follow its name, what it needs to be done."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def steps(
 
 
 def _save(saving: Saving) -> dict[str, Any]:
-    takes, text = saving.takes, f"wrote {', '.join(saving.written)}"
+    takes, text = saving.takes, f"wrote {', '.join(Path(one).name for one in saving.written)}"
     if not saving.written:
         text = f"{', '.join(takes)} can be written into your files"
     if not takes:
