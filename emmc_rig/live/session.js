@@ -58,6 +58,7 @@ function drawEnd() {
 }
 
 // The wish is the largest thing on the page, and its button stays in its place between two wishes.
+const DIM = 0.05; // of white, below which a picture looks black
 const UNREAD_MS = 400; // so long a button or foot switch pressed twice answers no wish that nobody read
 let wish = 0, wishedAt = 0, plate = null;
 function drawAsk() {
@@ -74,10 +75,12 @@ function drawAsk() {
   write("ask-text", words[0].toUpperCase() + words.slice(1));
   $("ask").classList.toggle("due", Boolean(asked));
   drawPlate(asked?.hole);
-  $("done").hidden = state.read_only;
+  $("done").hidden = state.read_only || (!asked && state.paused !== null);
   $("done").disabled = !asked || performance.now() - wishedAt < UNREAD_MS;
-  write("ask-note", [state.read_only ? "Press Enter at the computer when it is done."
-    : "Space bar or Enter, or a foot switch that sends one of them: done.", $("left").textContent].filter(Boolean).join(" "));
+  const left = $("left").textContent;
+  const how = !asked ? "" : state.read_only ? "Press Enter at the computer when it is done."
+    : "Done is also the space bar or Enter, or a foot switch that sends one of them.";
+  write("ask-note", `${left && `A${left.slice(1)}. `}${how}`);
 }
 
 let drawnPlate = "";
@@ -183,9 +186,11 @@ function choose_frame(id) {
 }
 
 function drawNewest() {
-  const one = state.frames.at(-1);
-  write("newest", !one || !state.frame ? "" : one.kind === "dark" ? `${one.id}: black, for the lamp is off while darks are taken`
-    : `${one.id}: its brightest readings reach ${Math.round(100 * one.level)}\u00a0% of white`);
+  const one = state.frame ? state.frames.at(-1) : null;
+  write("none-yet", state.asked ? "no frame yet: it is taken when that is done" : "waiting for the first frame");
+  write("newest", one ? `${one.id}: its brightest readings reach ${Math.round(100 * one.level)}\u00a0% of white` : "");
+  write("why", !one || one.level > DIM ? "" : one.kind === "dark" ? "Black, as it should be: the lamp is off while darks are taken."
+    : `Almost black: ${one.kind === "whiteboard" ? "little light comes through one pinhole" : "little light comes at this exposure"}.`);
 }
 
 let loading = false, wanted = false;

@@ -159,10 +159,12 @@ class SessionPage(EventWatcher):
     def _asked_hole(self, what: str) -> dict[str, Any]:
         """Return the hole (v, u) that is asked for, the plate's, and what was wrong before."""
         view, views = self._attended and self._attended.view, self._views
-        if view is None or hole_name(view, views) not in what:
-            about_plate = self._wrong_hole() is not None
-            return {"hole": None, "views": None, "refusal": "" if about_plate else self._refusal}
         wrong = self._wrong_hole()
+        if view is None or hole_name(view, views) not in what:
+            refusal = self._refusal
+            if wrong:
+                refusal = f"The pinhole was on {hole_name(wrong, views)}: check all once more."
+            return {"hole": None, "views": None, "refusal": refusal}
         refusal = f"That was {hole_name(wrong, views)}." if wrong else self._refusal
         return {"hole": list(view), "views": list(views), "refusal": refusal}
 

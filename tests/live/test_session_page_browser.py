@@ -4,6 +4,7 @@ import threading
 
 import pytest
 import yaml
+from asked_person import manned
 from browsers import MARKS, complaints, open_browser
 
 import emmc_rig as emmc
@@ -16,6 +17,7 @@ from emmc_rig.session.session import Session
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
@@ -88,3 +90,114 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
         wait(lambda: "Complete: every frame verified" in one("#end").text)
         assert not one("#finish").is_displayed()
         assert complaints(driver) == []
+
+
+PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+
+
+def wait_for(driver, holds):
+    ignored = [StaleElementReferenceException]
+    WebDriverWait(driver, PATIENCE_S, ignored_exceptions=ignored).until(lambda _: holds())
+
+
+@pytest.mark.slow
+def test_a_person_with_a_phone_sees_the_hole_and_answers_with_finger_or_foot(tmp_path, monkeypatch):
+    plan, rig = manned(tmp_path, monkeypatch, {(1, 1): (1, 2)})
+    control = Control(stays=True)
+    page = SessionPage(tmp_path / "plan-session", control, computes=False)
+
+    def ask(what):
+        page.asked(what)
+        control.until_answered()
+        page.asked("")
+
+    front = FrontEnd(page, ask, control=control)
+    run = threading.Thread(target=lambda: capture_session(plan, rig, None, None, front))
+    with (
+        served(application(page, "secret")) as port,
+        open_browser(tmp_path / "profile") as driver,
+    ):
+        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+        driver.get(f"http://127.0.0.1:{port}/secret/")
+        page.start()
+        run.start()
+
+        def one(css):
+            return driver.find_element(By.CSS_SELECTOR, css)
+
+        answered, holes = 0, []
+        while True:
+            wait_for(driver, lambda: one("#done").is_enabled() or page.state()["done"] == 8)
+            asked = page.state()["asked"]
+            if asked is None or asked["number"] == answered:
+                if page.state()["paused"] and not page.state()["asked"]:
+                    break  # all frames are taken
+                continue
+            wait_for(driver, lambda: one("#ask-text").text.lower() == asked["text"].lower())
+            wait_for(driver, lambda: one("#done").is_enabled())
+            top, bottom, height = driver.execute_script(
+                "const box = document.getElementById('done').getBoundingClientRect();"
+                "return [box.top, box.bottom, innerHeight]"
+            )
+            assert 0 < top < bottom < height
+            if asked["hole"]:
+                wanted = one("#plate text.wanted").text
+                holes.append((wanted, one("#plate").get_attribute("aria-label")))
+                assert one("#ask-refusal").text == asked["refusal"]
+            answered = asked["number"]
+            if answered % 3:
+                one("body").send_keys(Keys.SPACE if answered % 3 == 1 else Keys.ENTER)
+            else:
+                one("#done").click()
+            wait_for(driver, lambda: (page.state()["asked"] or {}).get("number") != answered)
+        plate = "plate of 5 by 5 holes: "
+        assert holes == [
+            ("1", plate + "1 is wanted"),
+            ("7", plate + "7 is wanted, 1 was the last"),
+            ("7", plate + "7 is wanted, 8 was the last"),
+        ]
+        assert not one("#done").is_displayed()
+        one("#finish").click()
+        run.join(PATIENCE_S)
+        page.close()
+        wait_for(driver, lambda: "Complete: every frame verified" in one("#end").text)
+        assert complaints(driver) == []
+
+
+def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
+    page = SessionPage(tmp_path / "session", Control(), computes=False)
+    kinds = {"dark": 20, "reference": 4, "whiteboard": 110, "open": 13, "shot": 3}
+    names = [(kind, n) for kind, count in kinds.items() for n in range(count)]
+    page._frames = {
+        f"{kind}-{n}": {
+            "id": f"{kind}-{n}", "kind": kind, "shot": 0, "exposure_s": 0.1, "level": 0.7,
+            "saturated": 0.2 if (kind, n) == ("open", 3) else 0.0, "number": 0, "stored": True,
+        }
+        for kind, n in names
+    }  # fmt: skip
+    page._small = dict.fromkeys(page._frames, b"")
+    page._publish_frames(planned=len(names))
+    with (
+        served(application(page, "secret")) as port,
+        open_browser(tmp_path / "profile") as driver,
+    ):
+        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+        driver.get(f"http://127.0.0.1:{port}/secret/")
+        tiles = "return document.querySelectorAll('.tile').length"
+        wait_for(driver, lambda: driver.execute_script(tiles) == 150)
+        groups = driver.find_elements(By.CSS_SELECTOR, "#frames details")
+        assert [one.get_attribute("open") is not None for one in groups] == [True] + 4 * [False]
+        assert groups[0].text.startswith("Shots of the scene")
+        assert "13, 70\u00a0% of white, 1 saturated" in groups[1].text
+        tall = "return document.documentElement.scrollHeight"
+        assert driver.execute_script(tall) <= 2000
+        groups[2].find_element(By.TAG_NAME, "summary").click()
+        assert driver.execute_script(tall) <= 3000
+        more = groups[2].find_element(By.XPATH, "./button")
+        assert more.text == "all 110"
+        shown = (
+            "return [...document.querySelectorAll('.tile')].filter((x) => x.offsetParent).length"
+        )
+        assert driver.execute_script(shown) == 3 + 24
+        more.click()
+        assert driver.execute_script(shown) == 3 + 110
