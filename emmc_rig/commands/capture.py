@@ -207,7 +207,14 @@ def _page(
 
     other: called too.
     """
-    from emmc_rig.live.server import address, application, names_of, new_token, served
+    from emmc_rig.live.server import (
+        LOCAL_HOSTS,
+        address,
+        application,
+        names_of,
+        new_token,
+        served,
+    )
     from emmc_rig.live.session_page import SessionPage
 
     page, token = SessionPage(folder, control, other, until_db is None), new_token()
@@ -215,6 +222,9 @@ def _page(
     made = application(page, token, does == "shows", names_of(host), to_act)
     with served(made, host) as port:
         say("page", address(host, port, token), "cyan")
+        if names_of(host) != LOCAL_HOSTS:
+            acts = "look" if does == "shows" else "look and steer"
+            say("careful", f"others in the network who know this address can {acts}")
         page.start()
         why = ""
         try:
