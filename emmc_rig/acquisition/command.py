@@ -360,7 +360,7 @@ def capture_session(
         request = asked_for(plan, folder, rig, until_db)
         try:
             captured = run_capture(request, front)
-        except KeyboardInterrupt as stop:
+        except (KeyboardInterrupt, StoppedError) as stop:
             begun = is_session(folder)
             kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
             raise StoppedError(f"stopped at once; {kept}") from stop

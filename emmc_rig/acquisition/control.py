@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
+from emmc_rig.errors import StoppedError
+
 PAUSE_POLL_S = 0.05
 ENDING = ("SIGTERM", "SIGHUP")
 """A request to end, and a terminal that closed."""
@@ -66,11 +68,11 @@ class Control:
     def until_answered(self, pressed: Callable[[], str] = lambda: "") -> None:
         """Wait until what somebody was asked for is done; Enter says so too, among keys pressed.
 
-        Raises KeyboardInterrupt where the capture is to stop: then nobody does it any more.
+        Raises StoppedError where the capture is to stop: then nobody does it any more.
         """
         while not self.answered and pressed() not in ("\n", "\r"):
             if self.stopping:
-                raise KeyboardInterrupt
+                raise StoppedError("stopped")
             self.wait()
 
     def wait(self) -> None:

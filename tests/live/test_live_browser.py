@@ -4,7 +4,7 @@ import re
 
 import pytest
 from browsers import MARKS, complaints
-from test_live import PatientCamera
+from test_live import FakeCamera, PatientCamera
 
 from drivers.errors import DriverError
 from emmc_rig.acquisition.control import Control
@@ -358,15 +358,8 @@ def test_a_black_picture_says_why_and_the_next_step_stands_below_it(page, rig):
 
 
 def test_no_camera_and_no_stage_are_explained_where_the_picture_would_be(browser):
-    class Gone(PatientCamera):
-        fault: DriverError | None = DriverError("no camera answers", "switch it on")
-
-        def snap(self):
-            if self.fault:
-                raise self.fault
-            return super().snap()
-
-    camera = Gone()
+    camera, gone = FakeCamera(), DriverError("no camera answers", "switch it on")
+    camera.fault = gone
     watch = Watch(camera)
     watch.start()
     try:
@@ -380,7 +373,7 @@ def test_no_camera_and_no_stage_are_explained_where_the_picture_would_be(browser
             assert "by hand" in first
             camera.fault = None
             wait(browser, lambda: frame_number(browser) > 0)
-            camera.fault = DriverError("no camera answers", "switch it on")
+            camera.fault = gone
             wait(browser, lambda: text(browser, "why").startswith("Not live, this is the last"))
             assert complaints(browser) == []
     finally:

@@ -196,7 +196,7 @@ def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
         groups = driver.find_elements(By.CSS_SELECTOR, "#frames details")
         assert [one.get_attribute("open") is not None for one in groups] == [True] + 4 * [False]
         assert groups[0].text.startswith("Shots of the scene")
-        assert "13, 70\u00a0% of white, 1 saturated" in groups[1].text
+        assert "13, 70 % of white, 1 saturated" in groups[1].text
         tall = "return document.documentElement.scrollHeight"
         assert driver.execute_script(tall) <= 2000
         groups[2].find_element(By.TAG_NAME, "summary").click()
