@@ -329,7 +329,7 @@ def test_picture_levels_exposure_focus_mask_and_stop_are_in_view_without_scrolli
     page.execute_cdp_cmd("Emulation.setEmulatedMedia", seen)
     try:
         page.execute_script("scrollTo(0, 0)")
-        click(page, "#centre")
+        page.execute_script("act('centre')")
         wait(page, lambda: page.execute_script("return state.figures && !state.busy"))
         wait(page, lambda: page.execute_script("return !picture.hidden"))
         assert page.execute_script(SHOWN) == []

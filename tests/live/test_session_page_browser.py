@@ -204,7 +204,7 @@ def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
         more = groups[2].find_element(By.XPATH, "./button")
         assert more.text == "all 110"
         shown = (
-            "return [...document.querySelectorAll('.tile')].filter((x) => x.offsetParent).length"
+            "return [...document.querySelectorAll('.tile')].filter((x) => x.checkVisibility()).length"
         )
         assert driver.execute_script(shown) == 3 + 24
         more.click()
