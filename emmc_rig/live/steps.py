@@ -29,7 +29,7 @@ NO_FOCUS = (
 
 NEEDS = {
     "centre the mask": "and open the aperture",
-    "exposure": "to 70 to 90 % of white, none saturated",
+    "exposure": "at 70 to 90 % of white, none saturated",
     "align": "the mask with the sensor's rows, to 0.1\u00b0",
     "focus": "on the scene, where it will be captured",
     "save": "what was found in the plan and the rig",
