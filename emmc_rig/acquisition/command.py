@@ -391,7 +391,7 @@ def capture_session(
         request = replace(request, other_devices=other_devices)
         try:
             captured = run_capture(request, front)
-        except KeyboardInterrupt as stop:
+        except (KeyboardInterrupt, StoppedError) as stop:
             begun = is_session(folder)
             kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
             raise StoppedError(f"stopped at once; {kept}") from stop

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
+from emmc_rig.errors import StoppedError
+
 PAUSE_POLL_S = 0.05
 ENDING = ("SIGTERM", "SIGHUP")
 """A request to end, and a terminal that closed."""
@@ -28,6 +30,7 @@ class Control:
 
     stays: at the end the capture waits until it is stopped, so that frames may be taken again.
     between_frames: a hook is running, so that nothing is lost by stopping at once.
+    answered: what somebody was asked to do at the bench is done.
     """
 
     def __init__(self, stays: bool = False) -> None:
@@ -35,6 +38,7 @@ class Control:
         self.between_frames = False
         self.stopping = False
         self.stays = stays
+        self.answered = False
         self._again: list[str] = []
 
     def take_again(self, ids: Iterable[str]) -> None:
@@ -62,6 +66,16 @@ class Control:
     def stop(self) -> None:
         """End after the present frame, paused or not."""
         self.stopping = True
+
+    def until_answered(self, pressed: Callable[[], str] = lambda: "") -> None:
+        """Wait until what somebody was asked for is done; Enter says so too, among keys pressed.
+
+        Raises StoppedError where the capture is to stop: then nobody does it any more.
+        """
+        while not self.answered and pressed() not in ("\n", "\r"):
+            if self.stopping:
+                raise StoppedError("stopped")
+            self.wait()
 
     def wait(self) -> None:
         """Let a moment pass in which nothing is to be done."""

@@ -40,7 +40,8 @@ IMPORTED = "imported"
 """What a session has for a rig whose frames are files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
 LATER = (
-    "focus_um", "stands_um", "mask", "environment", "axes", "second_stage", "hands_um", "usb_camera",
+    "focus_um", "stands_um", "mask", "environment", "axes", "second_stage", "hands_um",
+    "usb_camera",
 )  # fmt: skip
 StageSpec = str | dict[str, Any]
 NO_SETTINGS = ("kind", "trigger")

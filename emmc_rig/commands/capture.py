@@ -71,6 +71,9 @@ def capture(
         bool,
         typer.Option("--other-devices", help="go on with a camera or stage of another serial"),
     ] = False,
+    host: Annotated[
+        str, typer.Option("--host", help="address to serve the page at, for a phone at the bench")
+    ] = "127.0.0.1",
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
     ] = None,
@@ -97,8 +100,10 @@ def capture(
         refuse(context, given_names(context) & set(SIMULATED_ONLY), where)
     if dry_run and (page or steer):
         refuse(context, given_names(context) & {"page", "steer"}, "with --dry-run")
+    if not (page or steer):
+        refuse(context, given_names(context) & {"host"}, "without --page or --steer")
     shown = None if not (page or steer) else "steers" if steer else "shows"
-    _run(plan, chosen, until_db, dry_run, out, shown, other_devices)
+    _run(plan, chosen, until_db, dry_run, out, shown, host, other_devices)
 
 
 def _write_plan(name: str, path: Path) -> None:
@@ -117,10 +122,11 @@ def _run(
     dry_run: bool,
     out: Path | None,
     page: Literal["shows", "steers"] | None,
+    host: str,
     other_devices: bool,
 ) -> None:
     from emmc_rig.acquisition.command import FrontEnd, asked_folder, capture_session
-    from emmc_rig.acquisition.control import Control
+    from emmc_rig.acquisition.control import Control, pressed_keys
     from emmc_rig.acquisition.estimate import Estimate
     from emmc_rig.acquisition.events import EventWatcher
     from emmc_rig.commands.capture_display import CaptureDisplay
@@ -134,13 +140,21 @@ def _run(
     watcher: CaptureWatcher = EventWatcher(_print_line) if json_wanted.get() else display
 
     def ask(what: str) -> None:
-        if not sys.stdin.isatty():
+        terminal = sys.stdin.isatty()
+        if not terminal and page != "steers":
             raise AppError(
-                f"somebody has to {what}: run this on a terminal, or automate the lamp and masks"
+                f"somebody has to {what}: answer on a page (--steer), "
+                "run this on a terminal, or automate the lamp and masks"
             )
         watcher.asked(what)
+        wish = f"please {what}, then press Enter"
         with display.aside():
-            input(f"please {what}, then press Enter ")
+            if page != "steers":
+                input(f"{wish} ")
+            else:
+                tell(f"{wish}, or on the page" if terminal else f"please {what}")
+                with pressed_keys() as pressed:
+                    control.until_answered(pressed)
         watcher.asked("")
 
     def agreed(expected: Estimate) -> bool:
@@ -161,7 +175,8 @@ def _run(
     with ExitStack() as open_things:
         if page is not None:
             folder = asked_folder(plan, out)
-            watcher = open_things.enter_context(_page(folder, control, watcher, page, until_db))
+            made = _page(folder, control, watcher, page, until_db, host)
+            watcher = open_things.enter_context(made)
         open_things.enter_context(display.shown())
         if json_wanted.get():
             emit("stage", stage="open the rig", steps=None)
@@ -191,18 +206,30 @@ def _page(
     other: CaptureWatcher,
     does: Literal["shows", "steers"],
     until_db: float | None,
+    host: str,
 ) -> Iterator[CaptureWatcher]:
     """Serve the page of a capture, and say where, until the block ends; yield what it watches by.
 
     other: called too.
     """
-    from emmc_rig.live.server import application, new_token, served
+    from emmc_rig.live.server import (
+        LOCAL_HOSTS,
+        address,
+        application,
+        names_of,
+        new_token,
+        served,
+    )
     from emmc_rig.live.session_page import SessionPage
 
     page, token = SessionPage(folder, control, other, until_db is None), new_token()
     to_act = "start `emmc-rig capture` with --steer"
-    with served(application(page, token, does == "shows", to_act=to_act)) as port:
-        say("page", f"http://127.0.0.1:{port}/{token}/", "cyan")
+    made = application(page, token, does == "shows", names_of(host), to_act)
+    with served(made, host) as port:
+        say("page", address(host, port, token), "cyan")
+        if names_of(host) != LOCAL_HOSTS:
+            acts = "look" if does == "shows" else "look and steer"
+            say("careful", f"others in the network who know this address can {acts}")
         page.start()
         why = ""
         try:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from emmc_rig.session.measured_psi import Scale
 
 DESIGN = "design"
-EVERYWHERE = ("0.0.0.0", "::")
 
 
 def live(
@@ -66,8 +65,10 @@ def live(
     from emmc_rig.live.server import (
         LOCAL_HOSTS,
         Server,
+        address,
         application,
         listening_socket,
+        names_of,
         new_token,
     )
     from emmc_rig.live.setup_page import SetupPage
@@ -89,19 +90,16 @@ def live(
                 _watch(rig, camera, stage, design, scene, size, psi, method, plan)
             )
         token = new_token()
-        number = listening.getsockname()[1]
-        shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
-        address = f"http://{shown}:{number}/{token}/"
-        tell(address)
-        hosts = LOCAL_HOSTS
-        if host not in ("127.0.0.1", "::1", "localhost"):
-            hosts = ("*",) if host in EVERYWHERE else (*LOCAL_HOSTS, shown)
+        found = address(host, listening.getsockname()[1], token)
+        tell(found)
+        hosts = names_of(host)
+        if hosts != LOCAL_HOSTS:
             does = "look" if read_only else "look and move the stage"
             say("careful", f"others in the network who know this address can {does}")
         if browser:
             import webbrowser
 
-            webbrowser.open(address)
+            webbrowser.open(found)
         watch.start()
         try:
             words = ("emmc-rig", "capture", str(plan), "--rig", rig or "")
@@ -148,14 +146,16 @@ def _watch(
             look, targets = None, ()
             if isinstance(opened, SimulatedRig):
                 opened.attendant.set_lamp("white")
+                open_um = {"aperture_x": opened.window_um, "aperture_y": 0.0}
+                by_hand = {a: um for a, um in open_um.items() if a not in opened.stage.axes}
+                opened.attendant.move(by_hand)
                 look, targets = opened.attendant.place, ("scene", "whiteboard")
             centre_um = dict(opened.zero_um)
             if "aperture_x" in centre_um:
                 centre_um["aperture_x"] += opened.window_um
             field = _light_field(psi, scale, method, described, opened.camera.shape)
-            watch = Watch(
-                opened.camera, opened.stage, look, targets, centre_um, described, field, files
-            )
+            moved = opened.stage if opened.stage.axes else None
+            watch = Watch(opened.camera, moved, look, targets, centre_um, described, field, files)
         else:
             try:
                 device = stack.enter_context(closing(open_camera(camera or "ptp:")))

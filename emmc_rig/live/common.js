@@ -71,7 +71,11 @@ function follow(draw) {
     showField();
     if (state.ended) source.close();
   };
-  source.onerror = () => { lostSince ||= new Date().toLocaleTimeString(); drawTrouble(); };
+  source.onerror = () => {
+    lostSince ||= new Date().toLocaleTimeString();
+    drawTrouble();
+    if (state.version) draw(state);
+  };
 }
 
 function cell(kind, text, style = "") {

@@ -2,6 +2,7 @@
 // The light field: fetched when there is a newer one and somebody looks, turned by viewer.js.
 const field = { number: 0, loading: false };
 let shownKind = document.querySelector("[data-show][aria-pressed=true]").dataset.show;
+$("viewer").hidden = true; // until there is something to see
 function onField() { return shownKind === "views"; }
 
 async function showField() {

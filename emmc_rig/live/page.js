@@ -24,6 +24,7 @@ async function show() {
     $("picture").src = URL.createObjectURL(blob);
     if (before) URL.revokeObjectURL(before);
     $("picture").dataset.frame = state.frame;
+    $("picture").hidden = false;
   } catch (fault) { /* the next state tells why */ }
   loading = false;
   if (wanted) { wanted = false; show(); }
@@ -32,6 +33,7 @@ async function show() {
 function draw() {
   const { figures, settings } = state;
   drawHint();
+  drawWhy();
   const exposing = state.exposing;
   $("exposing").hidden = !exposing;
   if (exposing) write("exposing-text", `exposing, ${Math.ceil(exposing.left_s)} s left of ${Number(exposing.exposure_s.toPrecision(3))}`);
@@ -81,6 +83,33 @@ function drawHint() {
   $("hint-do").hidden = !hint?.action;
   write("hint-do", hint?.label || ACTIONS[hint?.action] || "");
   $("hint-do").disabled = state.read_only || state.busy !== "";
+  drawNext(!$("hint").hidden);
+}
+
+// The first step that is not done; one that hands do has no button, and the next one's may be pressed.
+let nextStep = -1;
+function drawNext(hinted) {
+  const steps = state.steps, number = steps.findIndex((step) => !step.done);
+  $("next").hidden = hinted || state.busy !== "" || !steps.length || !state.frame;
+  nextStep = number < 0 ? -1 : steps.findIndex((step, i) => i >= number && !step.done && label(step));
+  const step = steps[number];
+  writeWithCode("next-text", step ? `Step ${number + 1} of ${steps.length}, ${step.name}: ${step.text}`
+    : `All steps are done.${state.next ? ` Next: \`${state.next}\`` : ""}`);
+  $("next-do").hidden = nextStep < 0;
+  write("next-do", nextStep < 0 ? "" : nextStep === number ? label(step) : `or go on: ${steps[nextStep].name}`);
+  $("next-do").disabled = state.read_only;
+}
+
+// A picture that shows nothing says why, and what to do about it.
+const DIM = 0.05;
+function drawWhy() {
+  const { figures, hint, trouble } = state, gone = lostSince ? "no connection" : trouble.camera;
+  const level = figures ? Math.max(...Object.values(figures.brightest)) : 0;
+  const what = !figures ? "" : figures.dark ? "Black" : level < DIM && !view.bright ? "Almost black" : "";
+  const reason = hint?.text || "Looking for the reason.";
+  write("why", gone ? `${state.frame ? "Not live, this is the last frame" : "No picture"}: ${gone}. It is tried again every second.`
+    : !state.frame ? (state.exposing ? "The first exposure is under way." : "Waiting for the first frame.")
+    : !what ? "" : state.busy ? `${what} while the stage is ${state.busy}.` : figures.dark && hint ? reason : `${what}. ${reason}`);
 }
 
 // Steps are made once and then written to: a button that has the focus keeps it.
@@ -90,19 +119,24 @@ function drawSteps() {
   if (parent.children.length !== state.steps.length)
     fill(parent, state.steps.map((step, i) => {
       const row = document.createElement("li");
-      row.append(cell("b", step.name), cell("span", ""), button("", () => doStep(i)));
+      row.append(cell("b", step.name), cell("em", step.need), cell("span", ""), button("", () => doStep(i)));
       return row;
     }));
   state.steps.forEach((step, i) => {
-    const [, words, press] = parent.children[i].children;
-    const look = step.look && state.targets.includes(step.look);
-    const label = look ? "look at the " + step.look : step.label || LABELS[step.action] || "";
+    const [, need, words, press] = parent.children[i].children;
+    need.hidden = step.done;
     if (words.textContent !== step.text) words.textContent = step.text;
-    if (press.textContent !== label) press.textContent = label;
-    press.hidden = !label;
+    if (press.textContent !== label(step)) press.textContent = label(step);
+    press.hidden = !label(step);
     press.disabled = state.read_only || (state.busy !== "" && step.action !== "autoexpose");
     parent.children[i].classList.toggle("done", step.done);
+    parent.children[i].toggleAttribute("aria-current", i === state.steps.findIndex((one) => !one.done));
   });
+}
+
+function label(step) {
+  const look = step.look && state.targets.includes(step.look);
+  return look ? "look at the " + step.look : step.label || LABELS[step.action] || "";
 }
 
 function doStep(i) {
@@ -115,6 +149,7 @@ function doStep(i) {
 
 function openSave() {
   $("save-form").hidden = false;
+  $("save-form").scrollIntoView({ block: "nearest" });
   fill($("takes"), state.takes.map((name) => {
     const label = document.createElement("label"), box = document.createElement("input");
     Object.assign(box, { type: "checkbox", checked: true, value: name });
@@ -184,14 +219,14 @@ function drawTargets() {
   if (key === drawnTargets) return;
   drawnTargets = key;
   fill($("targets"), state.targets.map((target) =>
-    button("look at the " + target, () => act("look", { target }), "", state.read_only)));
+    button(target, () => act("look", { target }), "look at the " + target, state.read_only)));
 }
 
 // Rows are made once and then written to: a button that has the focus keeps it.
 let drawnAxes = "";
 function drawAxes() {
   const axes = Object.entries(state.axes);
-  $("axes-section").hidden = axes.length === 0;
+  $("axes-section").hidden = $("stop").hidden = axes.length === 0;
   write("busy", state.busy);
   const key = JSON.stringify(Object.keys(state.axes));
   if (key !== drawnAxes) {
@@ -244,7 +279,7 @@ function place(event) {
 }
 
 for (const name of ["marked", "bright"])
-  $(name).addEventListener("change", () => { view[name] = $(name).checked; show(); });
+  $(name).addEventListener("change", () => { view[name] = $(name).checked; drawWhy(); show(); });
 $("closer").addEventListener("click", () => zoom(1));
 $("farther").addEventListener("click", () => zoom(-1));
 $("whole").addEventListener("click", () => zoom(-PARTS.length));
@@ -286,6 +321,7 @@ for (const [id, send] of [
   });
 }
 $("take").addEventListener("click", () => act("reference", { taken: !state.reference }));
+$("next-do").addEventListener("click", () => doStep(nextStep));
 $("hint-do").addEventListener("click", () => act(state.hint.action, state.hint.values));
 for (const name of ["home", "centre", "stop", "autoexpose", "refocus", "cancel"])
   $(name).addEventListener("click", () => act(name));

@@ -37,6 +37,7 @@ from emmc_rig.model.json_text import parse_json
 from emmc_rig.pages.page import ENVIRONMENT, TEMPLATES
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
+EVERYWHERE = ("0.0.0.0", "::")
 PATIENCE_S = 10.0
 LARGEST = 1e12
 """No position, exposure or number of pixels comes near it."""
@@ -108,6 +109,19 @@ class Page(Protocol):
 def new_token() -> str:
     """Return a secret for an address."""
     return secrets.token_urlsafe(18)
+
+
+def address(host: str, port: int, token: str) -> str:
+    """Return what to open for a page that is served there."""
+    shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
+    return f"http://{shown}:{port}/{token}/"
+
+
+def names_of(host: str) -> tuple[str, ...]:
+    """Return under which names a page served there may be asked for, see `application`."""
+    if host in ("127.0.0.1", "::1", "localhost"):
+        return LOCAL_HOSTS
+    return ("*",) if host in EVERYWHERE else (*LOCAL_HOSTS, f"[{host}]" if ":" in host else host)
 
 
 def application(
@@ -281,9 +295,9 @@ class Server(uvicorn.Server):
 
 
 @contextmanager
-def served(app: Starlette) -> Iterator[int]:
-    """Serve on this computer in a thread of its own until the block ends; yield the port."""
-    with listening_socket() as listening:
+def served(app: Starlette, host: str = "127.0.0.1") -> Iterator[int]:
+    """Serve in a thread of its own until the block ends; yield the port. Raises AppError."""
+    with listening_socket(host) as listening:
         server = Server(app)
         thread = Thread(target=server.run, kwargs={"sockets": [listening]}, name="live server")
         thread.start()

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calibration.errors import CalibrationError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import Figures
@@ -14,13 +16,14 @@ from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.events import Event, EventWatcher
 from emmc_rig.acquisition.until import METHOD, light_field_so_far
 from emmc_rig.acquisition.watcher import CaptureWatcher
+from emmc_rig.bench.hands import hole_name
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import stated_words
 from emmc_rig.live.light_field import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
-from emmc_rig.pages.session_sheet import small_jpeg, stored_jpeg
+from emmc_rig.pages.session_sheet import HEADINGS, small_jpeg, stored_jpeg
 from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
@@ -43,7 +46,7 @@ class SessionPage(EventWatcher):
     """
 
     files: tuple[str, ...] = ("session.html", "session.js", *COMMON_FILES)
-    urgent: frozenset[str] = frozenset({"pause", "stop"})
+    urgent: frozenset[str] = frozenset({"pause", "stop", "done"})
 
     def __init__(
         self,
@@ -61,6 +64,9 @@ class SessionPage(EventWatcher):
         self._shots: set[int] = set()
         self._scale: Scale | None = None
         self._wanted, self._retaken = False, 0
+        self._attended: PlannedFrame | None = None
+        self._views: tuple[int, int] = (1, 1)
+        self._refusal, self._wishes = "", 0
         self._pictures: Pictures | None = None
         self._ending = threading.Event()
         self._thread = threading.Thread(
@@ -73,6 +79,10 @@ class SessionPage(EventWatcher):
             "paused": None,
             "held": False,
             "wish": "",
+            "asked": None,
+            "last_hole": None,
+            "by_hand": False,
+            "headings": HEADINGS,
             "done": 0,
             "planned": 0,
             "left": None,
@@ -97,6 +107,7 @@ class SessionPage(EventWatcher):
             "resume": lambda: self._wish("", control.resume),
             "stop": lambda: self._wish("stopping after this frame", control.stop),
             "retake": self._retake,
+            "done": self._answer,
         }
 
     def start(self) -> None:
@@ -127,8 +138,42 @@ class SessionPage(EventWatcher):
     def step(self, name: str, frame: PlannedFrame) -> None:
         """Show what is under way."""
         super().step(name, frame)
+        if name == "attend" and frame is not self._attended:
+            self._attended, self._refusal = frame, ""
         if name != "write":
             self._publish(step=f"{frame.id}: {name}")
+
+    def asked(self, what: str) -> None:
+        """Show what somebody has to do, where on the plate, and why once more; "": it is done."""
+        before, asked = self._state["asked"], None
+        more: dict[str, Any] = {}
+        if what:
+            self._wishes += 1
+            self._control.answered = False
+            asked = {"number": self._wishes, "text": what, **self._asked_hole(what)}
+        elif before and before["hole"]:
+            more["last_hole"] = before["hole"]
+        self._publish(asked=asked, by_hand=True, **more)
+        super().asked(what)
+
+    def _asked_hole(self, what: str) -> dict[str, Any]:
+        """Return the hole (v, u) that is asked for, the plate's, and what was wrong before."""
+        view, views = self._attended and self._attended.view, self._views
+        wrong = self._wrong_hole()
+        if view is None or hole_name(view, views) not in what:
+            refusal = self._refusal
+            if wrong:
+                refusal = f"The pinhole was on {hole_name(wrong, views)}: check all once more."
+            return {"hole": None, "views": None, "refusal": refusal}
+        refusal = f"That was {hole_name(wrong, views)}." if wrong else self._refusal
+        return {"hole": list(view), "views": list(views), "refusal": refusal}
+
+    def _wrong_hole(self) -> tuple[int, int] | None:
+        """Return the hole through which the last frame that was refused shows the shadow."""
+        every = np.ndindex(self._views)
+        return next(
+            (v for v in every if f"through {hole_name(v, self._views)}" in self._refusal), None
+        )
 
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
         """Keep what is shown of a frame."""
@@ -176,11 +221,18 @@ class SessionPage(EventWatcher):
             self._publish(**{event.name: facts})
         elif event.name == "message":
             lines = [*self._state["messages"], facts["text"]]
-            self._publish(messages=lines[-SHOWN_MESSAGES:])
+            more: dict[str, Any] = {}
+            if self._attended and facts["text"].startswith(f"{self._attended.id}, try "):
+                self._refusal = facts["text"].partition(": ")[2]
+                if wrong := self._wrong_hole():
+                    more["last_hole"] = list(wrong)
+            self._publish(messages=lines[-SHOWN_MESSAGES:], **more)
 
     def _begin(self, facts: dict[str, Any]) -> None:
         """Show what is there already."""
         session = Session(self._folder)
+        rows, columns = session.camera["views"]
+        self._views = rows, columns
         for frame in session.frames:
             entry = session.stored.get(frame.id)
             if entry is not None and frame.id not in self._frames:
@@ -214,6 +266,13 @@ class SessionPage(EventWatcher):
     def _wish(self, words: str, ask: Callable[[], None]) -> None:
         ask()
         self._publish(wish=words, held=self._control.paused)
+
+    def _answer(self, number: int) -> None:
+        """Go on; not where another wish than the one with that number stands by now."""
+        with self._changed:
+            asked = self._state["asked"]
+            if asked is not None and asked["number"] == number:
+                self._control.answered = True
 
     def _retake(self, ids: list[str]) -> None:
         for name in ids:

@@ -24,7 +24,7 @@ class SetupPage:
     urgent: frozenset[str] = frozenset({"stop", "cancel"})
 
     def __init__(self, watch: Watch, following: str = "") -> None:
-        self._watch = watch
+        self._watch, self._following = watch, following
         self.pictures: Mapping[str, Pictured] = {
             "picture.jpg": self._picture,
             **field_pictures(lambda: watch.light_field and watch.light_field.pictures()),
@@ -53,8 +53,8 @@ class SetupPage:
         return self._watch.version
 
     def state(self) -> dict[str, Any]:
-        """Return what the Watch knows."""
-        return self._watch.state()
+        """Return what the Watch knows, and the command to go on with."""
+        return {**self._watch.state(), "next": self._following}
 
     def touch(self) -> None:
         """Let frames be taken."""

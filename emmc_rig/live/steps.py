@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from emmc_rig.bench.hands import APERTURE, MASK
+from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.live.save import Found
 
 WANTED_LEVELS = (0.7, 0.9)
@@ -23,34 +27,56 @@ NO_FOCUS = (
 )
 
 
+NEEDS = {
+    "centre the mask": "and open the aperture",
+    "exposure": "at 70 to 90 % of white, none saturated",
+    "align": "the mask with the sensor's rows, to 0.1\u00b0",
+    "focus": "on the scene, where it will be captured",
+    "save": "what was found in the plan and the rig",
+}
+"""Of every step, in the words that follow its name, what it needs to be done."""
+
+
+@dataclass(frozen=True)
+class Saving:
+    """What can be saved, and the files that were written."""
+
+    takes: Sequence[str] = ()
+    written: Sequence[str] = ()
+
+
 def steps(
     figures: Mapping[str, Any] | None,
     mask: Mapping[str, Any] | None,
     off_um: Mapping[str, float | None],
-    has_focus: bool,
+    axes: Sequence[str],
     found: Found,
-    takes: Sequence[str],
+    saving: Saving,
     hint: Mapping[str, Any] | None,
 ) -> list[dict[str, Any]]:
-    """Return for every step its name, whether it is done, what to say, and the action that does it.
+    """Return by step its name, what it needs, whether it is done, what was found, and its action.
 
     figures, mask: of the page's state. off_um: by axis, how far it stands from where it centres the
-    mask or opens the aperture; None: not homed. takes: what can be saved. hint: what to do next.
+    mask or opens the aperture; None: not homed. axes: of the stage. hint: what to do next.
     """
-    return [
-        _centre(off_um),
+    made = [
+        _centre(off_um, axes, figures),
         _exposure(figures, hint),
         _align(mask, found),
-        _focus(has_focus, found),
-        {
-            "name": "save",
-            "done": False,
-            "text": f"{', '.join(takes)} can be written into your files"
-            if takes
-            else "to write it into your files start with --plan plan.yaml, --rig rig.yaml",
-            "action": "preview" if takes else "",
-        },
+        _focus(FOCUS in axes, found),
+        _save(saving),
     ]
+    return [{"need": NEEDS[step["name"]], **step} for step in made]
+
+
+def _save(saving: Saving) -> dict[str, Any]:
+    takes, text = saving.takes, f"wrote {', '.join(Path(one).name for one in saving.written)}"
+    if not saving.written:
+        text = f"{', '.join(takes)} can be written into your files"
+    if not takes:
+        text = "to write it into your files start with --plan plan.yaml, --rig rig.yaml"
+    action = "preview" if takes else ""
+    return {"name": "save", "done": bool(saving.written), "text": text, "action": action}
 
 
 def _exposure(figures: Mapping[str, Any] | None, hint: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -89,7 +115,18 @@ def exposure_hint(level: float, exposure_s: float, longest_s: float) -> dict[str
     return {"text": f"{text}.", "action": "autoexpose", "values": values, "label": label}
 
 
-def _centre(off_um: Mapping[str, float | None]) -> dict[str, Any]:
+def _centre(
+    off_um: Mapping[str, float | None],
+    axes: Sequence[str],
+    figures: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    by_hand = [
+        name for name, own in (("mask", MASK), ("aperture", APERTURE)) if not {*own} & {*axes}
+    ]
+    if len(by_hand) == 2:
+        lit = figures is not None and not figures["dark"]
+        text = "light comes through" if lit else "put the mask in and open the aperture by hand"
+        return {"name": "centre the mask", "done": lit, "text": text, "action": ""}
     if not off_um:
         text = "it is not known where the mask is centred: name zero_um in the rig's file"
         return {"name": "centre the mask", "done": False, "text": text, "action": ""}
@@ -102,6 +139,8 @@ def _centre(off_um: Mapping[str, float | None]) -> dict[str, Any]:
             if unknown
             else f"away from it: {', '.join(away)}"
         )
+    if by_hand:
+        text += f"; no axis moves the {by_hand[0]}: a hand does"
     action = "centre" if away else ""
     return {"name": "centre the mask", "done": not away, "text": text, "action": action}
 

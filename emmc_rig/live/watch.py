@@ -37,6 +37,7 @@ from emmc_rig.live.steps import (
     NO_FOCUS,
     WANTED_LEVEL,
     WANTED_LEVELS,
+    Saving,
     exposure_hint,
     steps,
 )
@@ -104,11 +105,13 @@ class Watch:
         files: Files | None = None,
     ) -> None:
         self._camera, self._look, self.targets = camera, look, targets
-        self._centre_um = dict(centre_um or {})
+        axes = () if stage is None else stage.axes
+        self._centre_um = {a: um for a, um in (centre_um or {}).items() if a in axes}
         self._design = design
         self.light_field = light_field
         self._files = files or Files()
         self._found = Found()
+        self._written: list[str] = []
         self._news = threading.Condition()
         self._shown: Shown | None = None
         self._reference: RawFrame | None = None
@@ -359,7 +362,9 @@ class Watch:
 
     def save(self) -> dict[str, list[str]]:
         """Write what was previewed; raises AppError."""
-        return {"written": self._files.save()}
+        self._written = self._files.save()
+        self._publish()
+        return {"written": self._written}
 
     def stop(self) -> None:
         """Stop all axes now, in the middle of a move too."""
@@ -449,7 +454,8 @@ class Watch:
             for axis, at in places.items()
             if axis in self._centre_um
         }
-        return steps(figures, mask, off_um, FOCUS in places, self._found, self._files.takes, hint)
+        saving = Saving(self._files.takes, self._written)
+        return steps(figures, mask, off_um, tuple(places), self._found, saving, hint)
 
     def _read_settings(self) -> dict[str, Any]:
         camera = self._camera

@@ -21,6 +21,7 @@ from test_live_alignment import BLACK, WHITE, frame_of
 
 from drivers.camera import CameraIdentity
 from drivers.errors import (
+    DriverError,
     ExposureStoppedError,
     PositionMismatchError,
     RawFrameError,
@@ -112,7 +113,7 @@ class FakeCamera:
     def __init__(self):
         self.exposure_s, self.gain, self.taken = 0.01, 1.0, 0
         self.light = 1.0
-        self.fault: RawFrameError | None = None
+        self.fault: DriverError | None = None
 
     def set_exposure_s(self, exposure_s):
         if not 0.001 <= exposure_s <= 1:

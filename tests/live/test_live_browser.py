@@ -4,8 +4,9 @@ import re
 
 import pytest
 from browsers import MARKS, complaints
-from test_live import PatientCamera
+from test_live import FakeCamera, PatientCamera
 
+from drivers.errors import DriverError
 from emmc_rig.acquisition.control import Control
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.cameras import find_camera
@@ -303,6 +304,77 @@ def test_a_long_exposure_is_counted_down_where_the_picture_is_and_cancelled(brow
             click(browser, "#cancel")
             wait(browser, lambda: frame_number(browser) > before + 1)
             wait(browser, lambda: not browser.find_element(By.ID, "exposing").is_displayed())
+            assert complaints(browser) == []
+    finally:
+        watch.close()
+
+
+SHOWN = """
+const box = (id) => document.getElementById(id).getBoundingClientRect();
+const stop = box("stop"), below = stop.top > innerHeight / 2 ? stop.top : innerHeight;
+return ["picture", "histogram", "levels", "exposure", "gain", "focus", "rotation", "offset", "stop"]
+  .filter((id) => !box(id).height || box(id).top < 0 || box(id).left < 0 ||
+    box(id).right > innerWidth || box(id).bottom > (id === "stop" ? innerHeight : below));
+"""
+
+
+@pytest.mark.parametrize("size", [(1600, 900), (390, 844)])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_picture_levels_exposure_focus_mask_and_stop_are_in_view_without_scrolling(
+    page, size, scheme
+):
+    at = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 500}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", at)
+    seen = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    page.execute_cdp_cmd("Emulation.setEmulatedMedia", seen)
+    try:
+        page.execute_script("scrollTo(0, 0)")
+        page.execute_script("act('centre')")
+        wait(page, lambda: page.execute_script("return state.figures && !state.busy"))
+        wait(page, lambda: page.execute_script("return !picture.hidden"))
+        assert page.execute_script(SHOWN) == []
+        back = page.execute_script("return getComputedStyle(document.body).backgroundColor")
+        assert (int(back.split("(")[1].split(",")[0]) < 128) == (scheme == "dark")
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+def test_a_black_picture_says_why_and_the_next_step_stands_below_it(page, rig):
+    click(page, "#centre")
+    wait(page, lambda: text(page, "busy") == "")
+    click(page, "#targets button:nth-child(1)")
+    click(page, "#autoexpose")
+    wait(page, lambda: text(page, "why") == "")
+    wait(page, lambda: text(page, "next").startswith("Step "))
+    rig.attendant.set_lamp("off")
+    try:
+        wait(page, lambda: text(page, "why") == text(page, "hint-text") != "")
+        assert "light the lamp" in text(page, "why")
+        assert not page.find_element(By.ID, "next").is_displayed()
+    finally:
+        rig.attendant.set_lamp("white")
+    wait(page, lambda: text(page, "why") == "")
+
+
+def test_no_camera_and_no_stage_are_explained_where_the_picture_would_be(browser):
+    camera, gone = FakeCamera(), DriverError("no camera answers", "switch it on")
+    camera.fault = gone
+    watch = Watch(camera)
+    watch.start()
+    try:
+        with served(application(SetupPage(watch), TOKEN)) as port:
+            browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
+            said = "No picture: no camera answers: switch it on. It is tried again every second."
+            wait(browser, lambda: text(browser, "why") == said)
+            assert not browser.find_element(By.ID, "picture").is_displayed()
+            assert not browser.find_element(By.ID, "stop").is_displayed()
+            first = browser.find_element(By.CSS_SELECTOR, "#steps li").text
+            assert "by hand" in first
+            camera.fault = None
+            wait(browser, lambda: frame_number(browser) > 0)
+            camera.fault = gone
+            wait(browser, lambda: text(browser, "why").startswith("Not live, this is the last"))
             assert complaints(browser) == []
     finally:
         watch.close()

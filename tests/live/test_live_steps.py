@@ -8,7 +8,7 @@ import yaml
 from test_live import until, watching
 
 from emmc_rig.acquisition.focus import FocusFound, peak
-from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
@@ -103,7 +103,10 @@ def test_the_mask_is_centred_by_what_was_measured_and_written(tmp_path):
         shown = watch.preview(["centre", "mask"])["diff"]
         assert "-zero_um" in shown
         assert path.read_text().startswith("# the bench in room 12\n")
+        assert not watch.state()["steps"][-1]["done"]
         assert watch.save() == {"written": [str(path)]}
+        last = watch.state()["steps"][-1]
+        assert (last["done"], last["text"]) == (True, "wrote rig.yaml")
     written = yaml.safe_load(path.read_text())
     for axis, off_um in (("mask_x", 30.0), ("mask_y", -20.0)):
         assert written["zero_um"][axis] == pytest.approx(rig.zero_um[axis] - off_um, abs=3)
@@ -172,3 +175,29 @@ def test_a_replaced_file_keeps_its_line_ends_its_permissions_and_its_link(tmp_pa
     assert link.is_symlink()
     assert real.read_bytes() == b"a: 2\r\n"
     assert real.stat().st_mode & 0o777 == 0o600
+
+
+def test_without_a_stage_the_mask_is_put_in_by_hand_and_light_shows_that_it_is():
+    camera, rig, centre_um = lit_rig()
+    rig.stage.home()
+    rig.stage.move_to_um(centre_um)
+    rig.attendant.set_lamp("off")
+    with watching(rig.camera, None, rig.attendant.place, (), centre_um, camera) as watch:
+        dark = until(watch, lambda state: state["figures"] and state["hint"])
+        assert (dark["steps"][0]["done"], "by hand" in dark["steps"][0]["text"]) == (False, True)
+        assert dark["hint"]["action"] == ""
+        rig.attendant.set_lamp("white")
+        until(watch, lambda state: state["steps"][0]["done"])
+
+
+def test_a_stage_that_moves_the_mask_alone_centres_it_and_the_aperture_is_named_as_a_hands():
+    camera, size = find_camera("rgbw-bayer-1shot"), (48, 64)
+    fine = fine_scene("near-planar", 2, 2, size=size, views=camera.views)
+    rig, _ = simulated_rig(camera, fine.samples, size, 0, fitted=Fitted(("mask_x", "mask_y")))
+    centre_um = {"mask_x": 12_700.0, "mask_y": 12_700.0, "aperture_x": 0.0}
+    with watching(rig.camera, rig.stage, None, (), centre_um, camera) as watch:
+        watch.centre()
+        ended = until(watch, lambda state: state["steps"][0]["done"] and not state["busy"])
+        assert ended["trouble"]["stage"] == ""
+        assert "no axis moves the aperture: a hand does" in ended["steps"][0]["text"]
+        assert rig.stage.position_um("mask_x") == pytest.approx(12_700.0, abs=0.5)

@@ -2,19 +2,24 @@
 
 import http.client
 import json
+import re
+import subprocess
+import sys
 import threading
 import time
+import urllib.request
 
 import cv2
 import numpy as np
 import pytest
 import yaml
+from asked_person import manned
 
 import emmc_rig as emmc
 from emmc_rig.acquisition.command import FrontEnd, capture_session
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.sequencer import ALL_TAKEN
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
@@ -184,3 +189,114 @@ def test_the_first_state_is_not_pushed_again_and_again(tmp_path):
     states = [line for line in (first, *pushed) if line.startswith(b"data: ")]
     link.close()
     assert len(states) <= 3
+
+
+class Answering(SessionPage):
+    """A page on which somebody answers each wish, but for a last one at which the capture stops."""
+
+    def __init__(self, folder, stop_at=None):
+        self.control = Control()
+        super().__init__(folder, self.control, computes=False)
+        self.stop_at = stop_at
+        self.asks = []
+
+    def ask(self, what):
+        self.asked(what)
+        asked = self.state()["asked"]
+        self.asks.append((asked, self.state()["last_hole"]))
+        assert not self.control.answered
+        self.actions["done"](asked["number"] - 1)
+        assert not self.control.answered  # a press for the wish before it
+        if len(self.asks) == self.stop_at:
+            self.actions["stop"]()
+        else:
+            self.actions["done"](asked["number"])
+        self.control.until_answered()
+        self.asked("")
+        assert self.state()["asked"] is None
+
+
+@pytest.mark.slow
+def test_the_page_asks_for_a_hole_of_the_plate_and_says_which_one_it_was_instead(
+    tmp_path, monkeypatch
+):
+    plan, rig = manned(tmp_path, monkeypatch, {(1, 1): (1, 2)})
+    page = Answering(tmp_path / "plan-session")
+    capture_session(plan, rig, None, None, FrontEnd(page, page.ask, control=page.control))
+    assert page.state()["by_hand"]
+    holes = [(one["hole"], last, one["refusal"]) for one, last in page.asks if one["hole"]]
+    assert holes == [
+        ([0, 0], None, ""),
+        ([1, 1], [0, 0], ""),
+        ([1, 1], [1, 2], "That was hole 8 of 25 (row 2, column 3)."),
+    ]
+    assert {tuple(one["views"]) for one, _ in page.asks if one["hole"]} == {(5, 5)}
+    others = [one for one, _ in page.asks if not one["hole"]]
+    assert "switch the white lamp on" in {one["text"] for one in others}
+    again = [one["refusal"] for one in others if one["refusal"]]
+    assert set(again) == {"The pinhole was on hole 8 of 25 (row 2, column 3): check all once more."}
+    numbers = [one["number"] for one, _ in page.asks]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_a_capture_that_somebody_finishes_instead_of_doing_what_is_asked_ends_at_once(
+    tmp_path, monkeypatch
+):
+    plan, rig = manned(tmp_path, monkeypatch)
+    page = Answering(tmp_path / "plan-session", stop_at=1)
+    with pytest.raises(StoppedError, match="stopped at once"):
+        capture_session(plan, rig, None, None, FrontEnd(page, page.ask, control=page.control))
+    assert {one["text"] for one, _ in page.asks} == {"switch the lamp off"}
+    assert not (tmp_path / "plan-session").exists()
+
+
+def test_enter_at_the_terminal_answers_too():
+    keys = iter(["", "x", "\n"])
+    control = Control()
+    control.until_answered(lambda: next(keys))
+    assert next(keys, None) is None
+    assert not control.answered
+
+
+PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
+
+
+@pytest.mark.slow
+def test_a_page_that_steers_answers_for_a_capture_without_a_terminal(tmp_path):
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
+    axes = dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 12_700.0)
+    rig = {"stage": "simulated", "camera": "simulated", "zero_um": axes, "window_um": 1000.0}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    command = [*PROGRAM, "capture", "plan.yaml", "--rig", "rig.yaml", "--steer"]
+    running = subprocess.Popen(
+        [*command, "--host", "localhost"], cwd=tmp_path, stdin=subprocess.DEVNULL,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    with running:
+        assert running.stderr is not None
+        address = next(found.group() for line in running.stderr
+                       if (found := re.search(r"http://localhost:\d+/\S+/", line)))  # fmt: skip
+
+        def asked(than=0):
+            for _ in range(600):
+                with urllib.request.urlopen(f"{address}state") as answer:
+                    now = json.load(answer)["asked"]
+                if now and now["number"] > than:
+                    return now
+                time.sleep(0.1)
+            raise AssertionError("nothing is asked")
+
+        def act(name, **values):
+            headers = {"Content-Type": "application/json"}
+            body = json.dumps(values).encode()
+            request = urllib.request.Request(f"{address}do/{name}", body, headers)
+            urllib.request.urlopen(request).close()
+
+        first = asked()
+        assert first["text"] == "switch the lamp off"
+        act("done", number=first["number"])
+        asked(than=first["number"])
+        act("stop")
+        line = running.stderr.read()
+    assert running.returncode == 130
+    assert "stopped at once" in line

@@ -1,9 +1,11 @@
 """The page of a running capture in a browser: it follows, steers, and looks right at every size."""
 
 import threading
+from queue import Queue
 
 import pytest
 import yaml
+from asked_person import manned
 from browsers import MARKS, complaints, open_browser
 
 import emmc_rig as emmc
@@ -16,6 +18,7 @@ from emmc_rig.session.session import Session
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
@@ -88,3 +91,120 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
         wait(lambda: "Complete: every frame verified" in one("#end").text)
         assert not one("#finish").is_displayed()
         assert complaints(driver) == []
+
+
+PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+
+
+def wait_for(driver, holds):
+    ignored = [StaleElementReferenceException]
+    WebDriverWait(driver, PATIENCE_S, ignored_exceptions=ignored).until(lambda _: holds())
+
+
+class Asking(SessionPage):
+    """A page whose wishes wait in a queue; None where all frames are taken."""
+
+    def __init__(self, folder):
+        self.control, self.wishes = Control(stays=True), Queue()
+        super().__init__(folder, self.control, computes=False)
+
+    def ask(self, what):
+        self.asked(what)
+        self.wishes.put(self.state()["asked"])
+        self.control.until_answered()
+        self.asked("")
+
+    def paused(self, reason):
+        super().paused(reason)
+        self.wishes.put(None)
+
+
+@pytest.mark.slow
+def test_a_person_with_a_phone_sees_the_hole_and_answers_with_finger_or_foot(tmp_path, monkeypatch):
+    plan, rig = manned(tmp_path, monkeypatch, {(1, 1): (1, 2)})
+    page = Asking(tmp_path / "plan-session")
+    front = FrontEnd(page, page.ask, control=page.control)
+    run = threading.Thread(target=lambda: capture_session(plan, rig, None, None, front))
+    with (
+        served(application(page, "secret")) as port,
+        open_browser(tmp_path / "profile") as driver,
+    ):
+        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+        driver.get(f"http://127.0.0.1:{port}/secret/")
+        page.start()
+        run.start()
+
+        def one(css):
+            return driver.find_element(By.CSS_SELECTOR, css)
+
+        def answer(asked):
+            wait_for(driver, lambda: one("#ask-text").text.lower() == asked["text"].lower())
+            wait_for(driver, lambda: one("#done").is_enabled())
+            top, bottom, height = driver.execute_script(
+                "const box = document.getElementById('done').getBoundingClientRect();"
+                "return [box.top, box.bottom, innerHeight]"
+            )
+            assert 0 < top < bottom < height
+            assert one("#ask-refusal").text == asked["refusal"]
+            if asked["hole"]:
+                holes.append(
+                    (one("#plate text.wanted").text, one("#plate").get_attribute("aria-label"))
+                )
+            if asked["number"] % 3 == 0:
+                one("#done").click()
+            else:
+                one("body").send_keys(Keys.SPACE if asked["number"] % 3 == 1 else Keys.ENTER)
+
+        holes = []
+        while asked := page.wishes.get(timeout=PATIENCE_S):
+            answer(asked)
+        plate = "plate of 5 by 5 holes: "
+        assert holes == [
+            ("1", plate + "1 is wanted"),
+            ("7", plate + "7 is wanted, 1 was the last"),
+            ("7", plate + "7 is wanted, 8 was the last"),
+        ]
+        wait_for(driver, lambda: not one("#done").is_displayed())
+        one("#finish").click()
+        run.join(PATIENCE_S)
+        page.close()
+        wait_for(driver, lambda: "Complete: every frame verified" in one("#end").text)
+        assert complaints(driver) == []
+
+
+def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
+    page = SessionPage(tmp_path / "session", Control(), computes=False)
+    kinds = {"dark": 20, "reference": 4, "whiteboard": 110, "open": 13, "shot": 3}
+    names = [(kind, n) for kind, count in kinds.items() for n in range(count)]
+    page._frames = {
+        f"{kind}-{n}": {
+            "id": f"{kind}-{n}", "kind": kind, "shot": 0, "exposure_s": 0.1, "level": 0.7,
+            "saturated": 0.2 if (kind, n) == ("open", 3) else 0.0, "number": 0, "stored": True,
+        }
+        for kind, n in names
+    }  # fmt: skip
+    page._small = dict.fromkeys(page._frames, b"")
+    page._publish_frames(planned=len(names))
+    with (
+        served(application(page, "secret")) as port,
+        open_browser(tmp_path / "profile") as driver,
+    ):
+        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+        driver.get(f"http://127.0.0.1:{port}/secret/")
+        tiles = "return document.querySelectorAll('.tile').length"
+        wait_for(driver, lambda: driver.execute_script(tiles) == 150)
+        groups = driver.find_elements(By.CSS_SELECTOR, "#frames details")
+        assert [one.get_attribute("open") is not None for one in groups] == [True] + 4 * [False]
+        assert groups[0].text.startswith("Shots of the scene")
+        assert "13, 70 % of white, 1 saturated" in groups[1].text
+        tall = "return document.documentElement.scrollHeight"
+        assert driver.execute_script(tall) <= 2000
+        groups[2].find_element(By.TAG_NAME, "summary").click()
+        assert driver.execute_script(tall) <= 3000
+        more = groups[2].find_element(By.XPATH, "./button")
+        assert more.text == "all 110"
+        tiles = "[...document.querySelectorAll('.tile')]"
+        shown = f"return {tiles}.filter((x) => x.checkVisibility()).length"
+        assert driver.execute_script(shown) == 3 + 24
+        more.click()
+        assert driver.execute_script(shown) == 3 + 110
