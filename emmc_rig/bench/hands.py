@@ -69,8 +69,9 @@ class AskingAttendant:
             self._want("mask", f"set the mask's micrometer, {places}")
 
     def again(self) -> None:
-        """Ask for everything once more when it is next wanted: it was not as asked."""
-        self._done.clear()
+        """Ask for pinhole and mask once more when they are next wanted: they were not as asked."""
+        for what in ("aperture", "mask"):
+            self._done.pop(what, None)
 
     def _aperture(self, offsets_um: Mapping[str, float]) -> str:
         hole = hole_at(self._camera, offsets_um)

@@ -110,7 +110,7 @@ class Attendant(Protocol):
         ...
 
     def again(self) -> None:
-        """Take nothing for done any more: what was asked for is not what came."""
+        """Take what `move` did for undone: the frame shows something else."""
         ...
 
 

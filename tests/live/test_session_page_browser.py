@@ -203,8 +203,8 @@ def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
         assert driver.execute_script(tall) <= 3000
         more = groups[2].find_element(By.XPATH, "./button")
         assert more.text == "all 110"
-        tiles = "[...document.querySelectorAll('.tile')]"
-        shown = f"return {tiles}.filter((x) => x.checkVisibility()).length"
+        tile = "[...document.querySelectorAll('.tile')]"
+        shown = f"return {tile}.filter((one) => one.checkVisibility()).length"
         assert driver.execute_script(shown) == 3 + 24
         more.click()
         assert driver.execute_script(shown) == 3 + 110
