@@ -14,7 +14,8 @@ import emmc_rig as emmc
 # %%
 # The hook, beside the plan. It is called before every frame with the rig, the frame that comes, and
 # `note`, which writes into the session's journal; and once more at the end, with no frame.
-# The table is a Grbl controller, ten degrees to the millimetre; simulated here, else `grbl:/dev/ttyUSB1`.
+# The table is a Grbl controller, ten degrees to the millimetre; simulated here, else
+# `grbl:/dev/ttyUSB1`.
 
 HOOK = """
 from emmc_rig.bench.hardware import open_stage
