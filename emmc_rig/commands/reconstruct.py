@@ -148,6 +148,8 @@ def _say_result(metrics: dict, out: Path) -> None:
     from emmc_rig.files.results import stated_words
     from emmc_rig.model.view_axes import axes_of, middle_name
 
+    if "assumed" in metrics:
+        say("note", metrics["assumed"])
     for line in metrics["screening"]:
         say("screening", line)
     compared = ""

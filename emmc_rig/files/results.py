@@ -21,6 +21,10 @@ from emmc_rig.files.shards import ENDING, save_arrays
 from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
+PSI_ASSUMED = (
+    "Psi is the camera as described, which no whiteboard measured: what it is off by is in no "
+    "deviation, and masks that stand elsewhere are doubted only where the frames show it"
+)
 _SECONDS = {"us": 1e-6, "ms": 1e-3, "": 1, "s": 1, "min": 60, "m": 60, "h": 3600}
 VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")
 

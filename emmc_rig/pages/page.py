@@ -94,11 +94,13 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
 
 
 def estimated(metrics: Mapping[str, object]) -> list[str]:
-    """Return a sentence with what of raw frames was estimated; none where all was given."""
-    found = metrics.get("estimated_from_frames")
-    if not isinstance(found, list) or not found:
-        return []
-    return [f"Estimated from the frames, as nobody gave it: {'; '.join(map(str, found))}."]
+    """Return sentences with what was assumed or estimated; none where all was measured or given."""
+    assumed, found = metrics.get("assumed"), metrics.get("estimated_from_frames")
+    sentences = [f"{assumed}."] if assumed else []
+    if isinstance(found, list) and found:
+        words = "; ".join(map(str, found))
+        sentences.append(f"Estimated from the frames, as nobody gave it: {words}.")
+    return sentences
 
 
 def _below_copied_db(metrics: Mapping[str, object]) -> float:

@@ -20,7 +20,7 @@ from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import LIGHT_FIELD, MAPS
 from emmc_rig.files.folders import KEPT, is_session, kept_folder, result_folder
 from emmc_rig.files.psi import PSI, open_psi, psi_beside, read_frames
-from emmc_rig.files.results import write_metrics
+from emmc_rig.files.results import PSI_ASSUMED, write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
 from emmc_rig.model.arguments import NAMES, numbers_of, path_of, refusal, required
@@ -41,6 +41,7 @@ from emmc_rig.processing.memory import (
 from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.measured_psi import psi_is_assumed
 from emmc_rig.session.readings import session_readings
 from emmc_rig.session.session import RECONSTRUCTION, Session
 from reconstruction.dictionary import Dictionary
@@ -246,11 +247,14 @@ def reconstruct_folder(
     """
     find_method(method)
     settings = settings or MethodSettings()
+    assumed = psi_path is None and is_session(folder) and psi_is_assumed(Session(folder))
     frames, psi_path = stored_frames(folder, out, psi_path)
     frames = _without(frames, without_shots)
     saved = open_psi(psi_path)
     in_memory = is_one_block(saved.size, settings) and not as_zarr
     further: dict[str, Any] = {"chosen": chosen}
+    if assumed:
+        further["assumed"] = PSI_ASSUMED
     if in_memory and pool is None:
         result = _solved(saved.load(), frames, method, dictionary_spec, settings, on_step)
     else:

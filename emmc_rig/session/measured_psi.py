@@ -141,7 +141,7 @@ def session_scale(session: Session) -> Scale:
     Raises AppError or CalibrationError.
     """
     darks, dark = session_darks(session), mean_dark(session)
-    if any(frame.kind in ("whiteboard", "open") for frame in session.frames):
+    if not psi_is_assumed(session):
         known = session_calibration(session)
         good = np.ones(dark.mean_dn.shape, dtype=bool) if known.good is None else known.good
         return Scale(known.psi, known.white_dn_per_s, darks, known.gain, good)
@@ -152,6 +152,11 @@ def session_scale(session: Session) -> Scale:
     white = per_second * pixel_light(camera, psi.size)
     gain = SensorGain(noise.gain_dn_per_electron, dark.variance_dn2)
     return Scale(psi, white, darks, gain, np.ones(dark.mean_dn.shape, dtype=bool))
+
+
+def psi_is_assumed(session: Session) -> bool:
+    """Return whether no whiteboard measures Psi, so that it is the camera as described."""
+    return not any(frame.kind in ("whiteboard", "open") for frame in session.frames)
 
 
 def designed_psi(session: Session, frame: MeanFrame) -> ImagingMatrix:

@@ -71,9 +71,13 @@ def filmed(folder, sensor, change=lambda dn: dn, cells=CELLS):
     return field
 
 
-def verdict(session):
+def metrics_of(session):
     metrics = session / "reconstruction/metrics.json"
-    return parse_json(metrics.read_bytes(), "metrics", ValueError)["verdict"]
+    return parse_json(metrics.read_bytes(), "metrics", ValueError)
+
+
+def verdict(session):
+    return metrics_of(session)["verdict"]
 
 
 def test_a_photograph_of_the_mask_and_four_files_become_the_light_field(tmp_path, run):
@@ -88,6 +92,7 @@ def test_a_photograph_of_the_mask_and_four_files_become_the_light_field(tmp_path
     assert 10 * np.log10(1 / np.mean((field - truth) ** 2)) > 34
     found = verdict(tmp_path / "bench")
     assert found["level"] == "trust", found["reasons"]
+    assert "which no whiteboard measured" in metrics_of(tmp_path / "bench")["assumed"]
 
 
 def gamma(bits):
