@@ -73,6 +73,10 @@ FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
 BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
 MOVES_UM = np.geomspace(0.002, 10.0, 12)
 """Widths of the whiteboards' own that are tried."""
+LOOSE_UM = 0.5
+"""Width of where a hand puts a pinhole, as a move of the mask: 0.2 mm of 50 mm at 0.12 mm."""
+OF_LOOSE = 0.05
+"""Of the width of what they would be taken for."""
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
 rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
@@ -236,15 +240,24 @@ class _Prior:
         return 0.5 * float(np.sum(self.precision * (at.vector() - self.centre) ** 2))
 
 
-def _prior(placement: Array, centre: Array, widths: tuple[float, float], fast2: Array) -> _Prior:
+def _prior(
+    placement: Array, centre: Array, widths: tuple[float, float], own2: NDArray[np.float64]
+) -> _Prior:
     """Return the prior of a placement (precisions, centre) and of the whiteboards' own.
 
-    fast2: (board,), variance of brightness that repeats show, beside the width of all.
+    own2: (board, OWN), variances beside the widths of all, see `_own2`.
     """
-    own2 = np.tile(np.square([widths[0], widths[1], widths[1]]), (len(fast2), 1))
-    own2[:, 0] += fast2
+    own2 = own2 + np.square([widths[0], widths[1], widths[1]])
     precision = np.concatenate([placement, 1 / own2.ravel()]).astype(np.float64)
     return _Prior(precision, np.concatenate([centre, np.zeros(own2.size)]).astype(np.float64))
+
+
+def _own2(boards: Sequence[Board]) -> NDArray[np.float64]:
+    """Return variances of the whiteboards' own brightness, as repeats show it, and places."""
+    own2 = np.zeros((len(boards), OWN))
+    own2[:, 0] = unsteadiness2(boards) / np.array([one.repeats for one in boards])
+    own2[[one.loose for one in boards], 1:] = LOOSE_UM**2
+    return own2
 
 
 def _scaled_residuals(
@@ -450,17 +463,17 @@ def _posterior(
 
 
 def _widths(
-    normal: _Normal, at: _State, placement: Array, centre: Array, fast2: Array
+    normal: _Normal, at: _State, placement: Array, centre: Array, own2: NDArray[np.float64]
 ) -> tuple[float, float]:
     """Return the widths of brightness and place that make the readings likeliest, at a fit.
 
-    placement, centre: precisions of its prior, and where it is drawn to. fast2: see `_prior`.
+    placement, centre: precisions of its prior, and where it is drawn to. own2: see `_prior`.
     """
     away = at.vector() - np.concatenate([centre, np.zeros(at.own.size)])
     pull = normal.gradient + normal.matrix @ away
 
     def evidence(widths: tuple[float, float]) -> float:
-        precision = _prior(placement, centre, widths, fast2).precision
+        precision = _prior(placement, centre, widths, own2).precision
         factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
         seen = np.linalg.solve(factor, pull)
         own = precision[len(placement) :]
@@ -502,24 +515,27 @@ def fit_placement(
         placement = start
     centre = soft.vector()
     deviations = tolerances.deviations(camera.views)
+    if any(one.loose for one in boards):
+        # Pinholes a little off their holes look like glass before the mask.
+        deviations[SCALARS.index("glass_um")] *= OF_LOOSE
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     of_placement = 1 / deviations**2
     widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
-    fast2 = unsteadiness2(boards) / np.array([one.repeats for one in boards])
+    own2 = _own2(boards)
     at = _State(placement, np.zeros((len(boards), OWN)))
     rng = np.random.default_rng(settings.seed)
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
         samples = _samples(boards, half_px, limit, rng)
-        prior = _prior(of_placement, centre, widths, fast2)
+        prior = _prior(of_placement, centre, widths, own2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     assert normal is not None
     for _ in range(WIDTH_ROUNDS):
-        widths = _widths(normal, at, of_placement, centre, fast2)
-        prior = _prior(of_placement, centre, widths, fast2)
+        widths = _widths(normal, at, of_placement, centre, own2)
+        prior = _prior(of_placement, centre, widths, own2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
     size = len(of_placement)

@@ -193,6 +193,7 @@ def calibrate(
             good = good & ~dusty
             seen, judges = ([one.without(dusty) for one in some] for some in (seen, judges))
             fit = fit_placement(seen, camera, mask, start=fit.placement)
+        findings += _hands_finding(fit, seen, mask)
         parametric = with_misfit(Parametric(fit, mask), seen)
         if {"mixed", "combined"} & set(routes) and layout.binning == 1:
             on_stage("defects of the mask")
@@ -214,7 +215,7 @@ def calibrate(
         on_stage("Psi, free")
         free = replace(measure_psi(pinholes, design, empty, on_plane), good=good)
         if (best := mixed or parametric) is not None:
-            findings += _put_right(free, best, seen, layout)
+            _put_right(free, best, seen, layout)
         calibrations["free"] = free
         still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
         if not still:
@@ -502,12 +503,11 @@ def _cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> f
 
 def _put_right(
     known: Calibration, one: Parametric, seen: Sequence[Board], layout: PsiLayout
-) -> list[str]:
-    """Take out of a measured Psi that hands put the pinhole a little off, and say how far.
+) -> None:
+    """Take out of a measured Psi that hands put the pinhole a little off.
 
     Each view changes by what the fitted mask says that the way to its hole changes.
     """
-    farthest_um = 0.0
     weights, deviation = known.psi.weights, known.deviation
     for check, board in zip(one.fit.boards, seen, strict=True):
         if not (board.loose and board.views_open.sum() == 1):
@@ -530,11 +530,18 @@ def _put_right(
             )
             variance += np.square(_cut_off(check.moved_um, board, one.mask) * right)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
-        ratio = one.mask.distance_um / one.mask.lens_um
-        farthest_um = max(farthest_um, float(np.hypot(off_x, off_y)) / ratio)
-    if not farthest_um:
+
+
+def _hands_finding(fit: Fit, seen: Sequence[Board], mask: ShadowMask) -> list[str]:
+    """Return how far hands put pinholes off their holes; nothing where no hand did."""
+    loose = [
+        float(np.hypot(*check.moved_um)) * mask.lens_um / mask.distance_um
+        for check, board in zip(fit.boards, seen, strict=True)
+        if board.loose
+    ]
+    if not loose:
         return []
-    return [f"hands put pinholes up to {farthest_um:.0f} um off their holes: taken out of Psi"]
+    return [f"hands put pinholes up to {max(loose):.0f} um off their holes: taken out of Psi"]
 
 
 def _count_moves(known: Calibration, one: Parametric, layout: PsiLayout, stages: Stages) -> None:

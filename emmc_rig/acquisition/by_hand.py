@@ -38,12 +38,23 @@ FEW_PIXELS = 1500
 """To choose among places by."""
 LEAST_EXPLAINED = 0.2
 """Of a frame's pattern, by the shadow: less is no sight of it."""
+MISSED_ALIKE = 2.0
+"""By how much more than its pixels say a fit of the shadow is off: what it misses of neighbours is
+alike."""
 FARTHEST_MASK_UM = 30.0
 """That a hand may put the mask off its place before it is asked again."""
 
 
 class WrongPlaceError(FrameRefusedError):
-    """A hand put mask or pinhole elsewhere."""
+    """A hand put mask or pinhole, the axes named, elsewhere."""
+
+    axes: tuple[str, ...] = APERTURE
+
+
+class WrongMaskPlaceError(WrongPlaceError):
+    """It was the mask."""
+
+    axes = MASK
 
 
 @dataclass(frozen=True)
@@ -92,7 +103,9 @@ class HandPlaces:
     def __init__(self, camera: Camera, shape: tuple[int, int], hands: frozenset[str]) -> None:
         self._camera, self._hands = camera, hands
         self._stands_um: NDArray[np.float64] | None = None
+        self._first_um: NDArray[np.float64] | None = None
         self._unsure_um = 0.0
+        self._set_to_um: dict[str, float] = {}
         k = camera.sensor.binning
         # Cut by a whole number of tiles on either side, the middle stays the middle.
         self._cut = [max(0, (side - LONGEST_PX + 3) // 4 * 2) for side in shape]
@@ -119,15 +132,24 @@ class HandPlaces:
         """Learn from a whiteboard, the first that is given, how the mask stands."""
         if self._stands_um is not None or not self.shows(planned):
             return
-        found = self._found(planned, frame, planned.view, _around(np.zeros(2)), FITTED)
+        fitted = FITTED if self._first_um is None else FITTED[:2]
+        start_um = np.zeros(2) if self._first_um is None else self._first_um
+        found = self._found(planned, frame, planned.view, _around(start_um), fitted)
         if found is not None:
             self._stands_um, self._unsure_um = found
+            self._first_um = found[0] if self._first_um is None else self._first_um
+
+    def set_anew(self) -> None:
+        """Take for unknown where the mask stands, if a hand moves it: it was set again."""
+        if self._hands & {*MASK}:
+            self._stands_um = None
 
     def found(self, planned: PlannedFrame, frame: RawFrame) -> Place | None:
         """Return where hands put what they moved; None where that cannot be told.
 
         Raises `WrongPlaceError` for the wrong hole, or a mask far from its place.
         """
+        self._follow(planned)
         if not self.shows(planned):
             return None
         self.stand(planned, frame)
@@ -136,8 +158,16 @@ class HandPlaces:
         if planned.view is not None and self._hands & {*APERTURE}:
             return self._hole(planned, frame, planned.view, self._stands_um)
         if planned.view is None and self._hands & {*MASK}:
-            return self._mask_place(planned, frame, self._stands_um)
+            return self._mask_place(planned, self._stands_um)
         return None
+
+    def _follow(self, planned: PlannedFrame) -> None:
+        """Forget where the mask stands once a hand has set it anew."""
+        offsets = planned.bench.offsets_um
+        set_to = {axis: offsets[axis] for axis in MASK if axis in offsets and axis in self._hands}
+        if set_to and self._set_to_um not in ({}, set_to):
+            self.set_anew()
+        self._set_to_um = set_to or self._set_to_um
 
     def _hole(
         self, planned: PlannedFrame, frame: RawFrame, asked: tuple[int, int],
@@ -167,24 +197,21 @@ class HandPlaces:
         deviation_um = float(np.hypot(deviation_um, self._unsure_um)) / self._ratio
         return self._place(dict(zip(APERTURE, (x_um, y_um), strict=True)), deviation_um)
 
-    def _mask_place(
-        self, planned: PlannedFrame, frame: RawFrame, stands_um: NDArray[np.float64]
-    ) -> Place | None:
-        found = self._found(planned, frame, None, _around(stands_um))
-        if found is None:
-            return None
-        seems_um, deviation_um = found
-        off_um = seems_um - stands_um
+    def _mask_place(self, planned: PlannedFrame, stands_um: NDArray[np.float64]) -> Place:
+        """Return where a hand set the mask, beyond where it stood in the first whiteboard."""
+        assert self._first_um is not None
+        off_um = stands_um - self._first_um
         if np.abs(off_um).max() > FARTHEST_MASK_UM:
             x, y = off_um / 1e3
-            raise WrongPlaceError(
+            self.set_anew()
+            raise WrongMaskPlaceError(
                 planned.id,
                 f"shows the mask {x:+.3f} mm in x and {y:+.3f} mm in y off its place",
                 "set it again, and look which way its micrometer counts",
             )
         wanted = planned.bench.offsets_um
         places = {axis: wanted[axis] + float(off) for axis, off in zip(MASK, off_um, strict=True)}
-        return self._place(places, float(np.hypot(deviation_um, self._unsure_um)))
+        return self._place(places, self._unsure_um)
 
     def _place(self, places_um: dict[str, float], deviation_um: float) -> Place:
         """Return what hands moved of it."""
@@ -275,4 +302,4 @@ def _step(
     covariance = np.linalg.pinv((columns / size).T @ (columns / size)) * left.var()
     first = bright.shape[1]
     deviations = (np.sqrt(covariance.diagonal()) / size)[first : first + 2]
-    return np.asarray(fit[first:], np.float64), float(deviations.max())
+    return np.asarray(fit[first:], np.float64), MISSED_ALIKE * float(deviations.max())

@@ -227,6 +227,7 @@ class Sequencer:
         for name, entry in session.stored.items() if hands else ():
             if name in by_id and places.shows(by_id[name]):
                 places.stand(by_id[name], decode_frame(session.read(name), entry))
+                places.set_anew()
                 break
         return places
 
@@ -550,7 +551,7 @@ class Sequencer:
                 self._budget.spend(name, error, faults)
                 self._watcher.tell(f"{name}, try {faults}: {error}")
                 if isinstance(error, WrongPlaceError):
-                    self._rig.attendant.again()
+                    self._rig.attendant.again(error.axes)
                 todo = partial(self._devices.mend, mending(error, faults))
 
     # Store.

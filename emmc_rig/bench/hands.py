@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 
@@ -68,10 +68,11 @@ class AskingAttendant:
             )
             self._want("mask", f"set the mask's micrometer, {places}")
 
-    def again(self) -> None:
-        """Ask for pinhole and mask once more when they are next wanted: they were not as asked."""
-        for what in ("aperture", "mask"):
-            self._done.pop(what, None)
+    def again(self, axes: Collection[str]) -> None:
+        """Ask for the pinhole, or the mask, once more when it is next wanted."""
+        for what, own in (("aperture", APERTURE), ("mask", MASK)):
+            if {*own} & {*axes}:
+                self._done.pop(what, None)
 
     def _aperture(self, offsets_um: Mapping[str, float]) -> str:
         hole = hole_at(self._camera, offsets_um)
@@ -104,7 +105,7 @@ class NoAttendant:
     def move(self, offsets_um: Mapping[str, float]) -> None:
         """Leave mask and aperture where they are."""
 
-    def again(self) -> None:
+    def again(self, axes: Collection[str]) -> None:
         """Nothing was asked."""
 
 

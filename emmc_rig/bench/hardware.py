@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
@@ -76,10 +76,12 @@ STAGE_AXES = {
 FOCUS, FOCUS_ADDRESS = "focus", (3, 1)
 """The axis that moves the lens along the optical axis, where a stage has one."""
 MASK_TRAVEL_UM = 25_400.0
-POSITION_TOLERANCE_UM = 0.5
+POSITION_TOLERANCE_UM, GRBL_TOLERANCE_UM = 0.5, 2.0
 SIMULATED = "simulated"
 NO_STAGE = "none"
 PROBE_TIMEOUT_S = 0.2
+MICROMETER = 0.1
+"""By how much surer a hand puts a mask on its micrometer than a pinhole on its hole."""
 NO_FLAWS = Flaws()
 """But for a mask that sits a few um off, as every one does."""
 SIMULATED_SCALES = {
@@ -109,8 +111,8 @@ class Attendant(Protocol):
         """Bring axes that the stage has not to their places, from where each is centred."""
         ...
 
-    def again(self) -> None:
-        """Take what `move` did for undone: the frame shows something else."""
+    def again(self, axes: Collection[str]) -> None:
+        """Take what `move` did with these axes for undone: the frame shows something else."""
         ...
 
 
@@ -186,6 +188,7 @@ class SimulatedAttendant:
     def __init__(self, bench: Bench, at_um: dict[str, float], hands_um: float, seed: int) -> None:
         self._bench, self._at_um, self._hands_um = bench, at_um, hands_um
         self._rng = np.random.default_rng(seed)
+        self._wanted_um: dict[str, float] = {}
 
     def set_lamp(self, colour: str) -> None:
         """Switch the bench's lamp."""
@@ -204,12 +207,19 @@ class SimulatedAttendant:
         """Put mask or pinhole there, as well as a hand does; an open aperture is just open."""
         opened = offsets_um.get("aperture_x") == self._bench.window_um
         for axis, um in offsets_um.items():
+            if self._wanted_um.get(axis) == um:
+                continue
+            self._wanted_um[axis] = um
             exact = opened and axis.startswith("aperture")
-            off_um = 0.0 if exact else self._rng.uniform(-self._hands_um, self._hands_um)
-            self._at_um[axis] = um + off_um
+            off_um = self._rng.uniform(-self._hands_um, self._hands_um)
+            if axis.startswith("mask"):
+                off_um *= MICROMETER
+            self._at_um[axis] = um + (0.0 if exact else off_um)
 
-    def again(self) -> None:
-        """Nothing is remembered."""
+    def again(self, axes: Collection[str]) -> None:
+        """Move these once more when they are next wanted."""
+        for axis in axes:
+            self._wanted_um.pop(axis, None)
 
 
 def simulated_rig(
@@ -292,6 +302,7 @@ def simulated_rig(
         scale_um = AxisSpec().microstep_um
         stages.append(ZaberStage(chain.transport(), axes, scale_um, clock, care))
     if letters:
+        care = replace(care, tolerance_um=GRBL_TOLERANCE_UM)
         stages.append(GrblStage(second.transport(), letters, clock, care))
     stage = stages[0] if len(stages) == 1 else CombinedStage(stages)
     noise = camera.sensor.noise

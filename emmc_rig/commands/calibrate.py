@@ -60,7 +60,7 @@ def calibrate(
         typer.Option(
             "--leave-out",
             help="with --plan: what the rig cannot take, some of lamp, response, colours, turned, "
-            "aperture; commas between",
+            "aperture, mask; commas between",
         ),
     ] = None,
     sensor: Annotated[

@@ -62,9 +62,10 @@ WATCHES = {
     "colours": "references under red, green and blue lamps",
     "turned": "the white board turned by 90, 180 and 270 degrees",
     "aperture": "whiteboards of single views, or of parts of the aperture",
+    "mask": "whiteboards with the mask moved",
 }
-"""Whiteboards that may be left out of a plan; all but the last show errors of other parts than the
-mask."""
+"""Whiteboards that may be left out of a plan; all but the last two show errors of other parts than
+the mask."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,11 @@ class PlanSettings:
         for name in sorted(self.leave_out):
             if name not in WATCHES:
                 raise AppError(f"--leave-out {name}: use some of {', '.join(WATCHES)}")
+
+    @property
+    def moves_masks(self) -> bool:
+        """Whether whiteboards are planned with the mask elsewhere, too."""
+        return bool(self.camera.moving_masks) and "mask" not in self.leave_out
 
 
 def plan_light(camera: Camera, mask: ShadowMask) -> Light:
@@ -114,7 +120,7 @@ def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
         for kind, count in planned.counts.items()
         if kind.pinhole is None
     ]
-    judged_um = ((0.0, 0.0), VERIFY_UM) if settings.camera.moving_masks else ((0.0, 0.0),)
+    judged_um = ((0.0, 0.0), VERIFY_UM) if settings.moves_masks else ((0.0, 0.0),)
     judging = [OpenBoard(mask_um=place_um, held_out=True) for place_um in judged_um]
     coloured = camera_colours(settings.camera) and "colours" not in settings.leave_out
     return Plan(
@@ -160,7 +166,7 @@ def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> Pla
     frames that the settings allow (default: MOST_FRAMES before every view).
     """
     camera, most_frames, target = settings.camera, settings.most_frames, settings.target
-    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    stages = STAGE_KINDS_UM if settings.moves_masks else STAGE_KINDS_UM[:1]
     opened = {Kind(None, stage): 2 for stage in stages}
     views = [Kind((v, u)) for v, u in np.ndindex(camera.views)]
     least = PlannedFrames(opened | dict.fromkeys(views, 1), 0.0)
@@ -190,9 +196,9 @@ def few_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedF
     frames that the settings allow (default: MOST_FRAMES whiteboards).
     """
     camera, target = settings.camera, settings.target
-    stages = STAGE_KINDS_UM if camera.moving_masks else STAGE_KINDS_UM[:1]
+    stages = STAGE_KINDS_UM if settings.moves_masks else STAGE_KINDS_UM[:1]
     whole = "aperture" in settings.leave_out
-    if whole and camera.moving_masks:
+    if whole and settings.moves_masks:
         stages = STAGE_KINDS_UM + MORE_STAGES_UM
     kinds = [Kind(None, stage) for stage in stages]
     kinds += [] if whole else [Kind(None, window=window) for window in parts(camera.views)]

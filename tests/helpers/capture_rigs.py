@@ -74,7 +74,7 @@ class QuietAttendant:
     def move(self, offsets_um):
         self.asked.append(("move", dict(offsets_um)))
 
-    def again(self):
+    def again(self, axes):
         self.asked.append(("again",))
 
     @property
