@@ -64,6 +64,22 @@ GUARDS = (
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
     ": the stage has no such axis, only ",  # a rig is opened before a session is made
     " is moved by plans: give its zero_um instead",  # likewise
+    # A hook, a focus, sources and axes that are wrong are refused before a session is made.
+    " is a generator or coroutine: write a plain function",
+    "put it beside the plan",
+    ": write module:function, or the name of an entry point of ",
+    " cannot be loaded: ",
+    " is no function of (rig, frame, note): ",
+    "write module:function, as lab:hook, not ",
+    ", or {every: 50}, not ",
+    "focus: the rig has no axis named ",
+    "two sources are named ",
+    " is no axis of the bench: use ",
+    # Walked in test_between.py, test_capture.py and test_focus.py.
+    "note() takes numbers, texts, lists and mappings",
+    ", now it is on ",
+    "no edge above the noise: light the scene",
+    "no sharpest place ",
     "nobody who moves others: write by_hand: true",  # refused before a session is made
     "shows the shadow through ",  # walked in test_by_hand.py
     "shows the mask ",
@@ -596,7 +612,7 @@ def another_rig(bench):
     bench.finish = ("capture", "plan.yaml")
 
 
-@walk(": connect that one, or name another --out")
+@walk("connect that one, or name another --out")
 def another_camera(bench):
     bench.begun()
     camera = bench.rig.camera

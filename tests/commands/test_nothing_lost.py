@@ -51,8 +51,8 @@ WRITERS = {
     "tables": ("--fast",),
 }  # fmt: skip
 READERS = {
-    "devices camera", "devices conform", "devices home", "devices info", "devices jog",
-    "devices list", "devices probe", "devices udev-rule", "live", "session list",
+    "devices camera", "devices check", "devices conform", "devices home", "devices info",
+    "devices jog", "devices list", "devices probe", "devices udev-rule", "live", "session list",
     "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
