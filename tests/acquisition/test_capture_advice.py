@@ -612,7 +612,7 @@ def another_rig(bench):
     bench.finish = ("capture", "plan.yaml")
 
 
-@walk("connect that one, or name another --out")
+@walk("connect that one, ")
 def another_camera(bench):
     bench.begun()
     camera = bench.rig.camera
