@@ -161,10 +161,7 @@ class SessionPage(EventWatcher):
         view, views = self._attended and self._attended.view, self._views
         wrong = self._wrong_hole()
         if view is None or hole_name(view, views) not in what:
-            refusal = self._refusal
-            if wrong:
-                refusal = f"The pinhole was on {hole_name(wrong, views)}: check all once more."
-            return {"hole": None, "views": None, "refusal": refusal}
+            return {"hole": None, "views": None, "refusal": "" if wrong else self._refusal}
         refusal = f"That was {hole_name(wrong, views)}." if wrong else self._refusal
         return {"hole": list(view), "views": list(views), "refusal": refusal}
 
