@@ -61,10 +61,10 @@ def scene(size, views=(5, 5), disparity=0.6):
 def filmed(folder, sensor, change=lambda dn: dn, cells=CELLS):
     """Write what the page's example has in its folder; return the scene, (v, u, y, x, colour)."""
     (folder / "mine.yaml").write_text(BLOCKS["yaml"])
-    (folder / "table.csv").write_text(BLOCKS["csv"])
+    (folder / "table.csv").write_text(BLOCKS["text"])
     tifffile.imwrite(folder / "photo.tif", photograph(CELLS))
     bench, field = Bench(cells, (56, 56), optics=OPTICS, sensor=sensor), scene((56, 56))
-    for row in csv.DictReader(BLOCKS["csv"].splitlines()):
+    for row in csv.DictReader(BLOCKS["text"].splitlines()):
         lit = row["kind"] == "shot"
         dn = bench.take(float(row["exposure_s"]), lit=lit, scene=field if lit else None)
         tifffile.imwrite(folder / row["file"], change(dn))
