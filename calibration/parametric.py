@@ -77,19 +77,27 @@ def coefficient_planes(
     stages: per shot.
     """
     shots, views_v, views_u, _, stored_colours, _ = layout.shape
+    samples_shadow = of_samples(shadow)
     for place in np.ndindex(shots, views_v, views_u, stored_colours):
-        yield place, coefficient_plane(shadow, layout, place, stages[place[0]])
+        yield place, coefficient_plane(samples_shadow, layout, place, stages[place[0]])
+
+
+def of_samples(shadow: Shadow) -> Shadow:
+    """Return the shadow on samples of the light field, whatever the pixels."""
+    return Shadow(replace(shadow.mask, binning=1), shadow.placement)
 
 
 def coefficient_plane(
-    shadow: Shadow,
+    samples_shadow: Shadow,
     layout: PsiLayout,
     place: tuple[int, int, int, int],
     stage_um: tuple[float, float],
 ) -> NDArray[np.float32]:
-    """Return the coefficients (y, x) of one place, (shot, v, u, stored colour), of Psi."""
+    """Return the coefficients (y, x) of one place, (shot, v, u, stored colour), of Psi.
+
+    samples_shadow: see `of_samples`.
+    """
     shot, v, u, stored = place
-    samples_shadow = Shadow(replace(shadow.mask, binning=1), shadow.placement)
     scale = layout.shape[4] * layout.binning**2
     plane = np.empty(layout.size, dtype=np.float32)
     chosen = views_open((layout.shape[1], layout.shape[2]), (v, u))
@@ -121,8 +129,7 @@ def psi_deviation(
     """
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0)))[:, values > 0]
-    mask = replace(shadow.mask, binning=1)
-    samples_shadow = Shadow(mask, shadow.placement)
+    samples_shadow = of_samples(shadow)
     deviation = np.empty(layout.shape, dtype=np.float32)
     shots, views_v, views_u, _, stored_colours, _ = layout.shape
     scale = stored_colours * layout.binning**2

@@ -52,6 +52,7 @@ from calibration.parametric import (
     Stages,
     coefficient_plane,
     coefficient_planes,
+    of_samples,
     psi_deviation,
     shot_stages,
 )
@@ -483,14 +484,12 @@ def _make_less_sure(known: Calibration, missed: float) -> None:
 
 
 def _cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
-    """Return the share of a pinhole's light that the aperture's edge keeps from it; 0 elsewhere.
+    """Return the share of a single pinhole's light that the aperture's edge keeps from it.
 
     moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
     pinhole pushed outward by d the middle of what is left is d / 2 further. That is no more than a
     guess, as the fit takes it for another distance too: it counts in the deviation.
     """
-    if not (board.loose and board.views_open.sum() == 1):
-        return 0.0
     ratio = mask.distance_um / mask.lens_um
     left = 1.0
     view = np.argwhere(board.views_open)[0].tolist()
@@ -509,17 +508,19 @@ def _put_right(
     Each view changes by what the fitted mask says that the way to its hole changes.
     """
     weights, deviation = known.psi.weights, known.deviation
+    shadow = of_samples(one.shadow)
     for check, board in zip(one.fit.boards, seen, strict=True):
         if not (board.loose and board.views_open.sum() == 1):
             continue
         (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
         off_x, off_y = check.moved_um
         unsure_um = check.moved_deviation_um
+        lost = _cut_off(check.moved_um, board, one.mask)
         for stored in range(layout.shape[4]):
             place = board.shot, v, u, stored
 
             def at(x: float, y: float, place: tuple = place) -> NDArray[np.float32]:
-                return coefficient_plane(one.shadow, layout, place, (x, y))
+                return coefficient_plane(shadow, layout, place, (x, y))
 
             right = at(x_um, y_um)
             index = board.shot, v, u, slice(None), stored
@@ -528,7 +529,7 @@ def _put_right(
                 np.square(at(x_um + by_x, y_um + by_y) - right)
                 for by_x, by_y in ((unsure_um, 0.0), (0.0, unsure_um))
             )
-            variance += np.square(_cut_off(check.moved_um, board, one.mask) * right)
+            variance += np.square(lost * right)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
 
 

@@ -18,7 +18,7 @@ from calibration.boards import channels_of
 from calibration.errors import CalibrationError
 from calibration.openings import views_open
 from calibration.placement import SCALARS, designed_placement
-from calibration.shadow import Shadow, shadow_mask
+from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import FrameRefusedError
 from emmc_rig.bench.hands import APERTURE, MASK, NoAttendant, hole_name
@@ -106,21 +106,22 @@ class HandPlaces:
         self._first_um: NDArray[np.float64] | None = None
         self._unsure_um = 0.0
         self._set_to_um: dict[str, float] = {}
+        self._mask: ShadowMask | None = None
+        if not hands:
+            return
         k = camera.sensor.binning
         # Cut by a whole number of tiles on either side, the middle stays the middle.
         self._cut = [max(0, (side - LONGEST_PX + 3) // 4 * 2) for side in shape]
         kept = [side - 2 * cut for side, cut in zip(shape, self._cut, strict=True)]
         size = (kept[0] * k, kept[1] * k)
         try:
-            self._mask = shadow_mask(camera, size) if hands else None
+            self._mask = shadow_mask(camera, size)
         except CalibrationError:
-            self._mask = None
             return
         self._pixels = np.indices(kept).reshape(2, -1).T.astype(np.int64)
         self._layout = psi_layout(camera, size)
-        if self._mask is not None:
-            self._shadow = Shadow(self._mask, designed_placement(camera))
-            self._ratio = self._mask.distance_um / self._mask.lens_um
+        self._shadow = Shadow(self._mask, designed_placement(camera))
+        self._ratio = self._mask.distance_um / self._mask.lens_um
 
     def shows(self, planned: PlannedFrame) -> bool:
         """Return whether a frame shows the mask's shadow."""

@@ -19,7 +19,6 @@ from emmc_rig.bench.hardware import Rig
 from emmc_rig.session.journal import FrameEntry, MeteredEntry
 from emmc_rig.session.planned import PlannedFrame
 
-USUAL_SPEED_UM_S = 2000.0
 DOWNLOAD_BYTES_PER_S = 40e6
 FILE_OVERHEAD_BYTES = 4096
 JOURNAL_BYTES_PER_FRAME = 1500
