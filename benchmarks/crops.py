@@ -1,0 +1,82 @@
+"""No change made a method worse on average: PSNR and time of 25 crops against docs/results/crops.csv.
+
+Crops of real scenes lie at random, so that none is tuned on; `--group A` and `--group B` name the
+scenes of EMMC_LIGHTFIELDS. Exits with 1 where the mean of a method falls by more than 0.03 dB;
+`--store` makes the figures of today those that count. One crop changes by 0.5 dB by where patches
+lie: means count.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+
+import lab
+import numpy as np
+import pandas as pd
+
+from emmc_rig.study.trial import Capture, trial_of
+
+MOST_FALL_DB, CROPS = 0.03, 25
+METHODS = ("adaptive", "adaptive-fast")
+STORED = lab.RESULTS / "crops.csv"
+KEYS = ["scene", "camera", "size", "crop", "shots", "method"]
+
+
+def measure(
+    scene: str, camera: str, size: tuple[int, int], crop: int, shots: int | None, method: str
+) -> dict:
+    """Return PSNR and processor seconds of a method on a crop of a scene."""
+    capture = Capture(scene, camera, None, seed=crop, shots=shots)
+    whole = capture.scene_seen()
+    seen = whole.light_field
+    chance = np.random.default_rng(crop)
+    top, left = (
+        int(chance.integers(0, max(length - side, 0) + 1))
+        for length, side in zip(seen.shape[2:4], size, strict=True)
+    )
+    part = np.ascontiguousarray(seen[:, :, top : top + size[0], left : left + size[1]])
+    given = trial_of(capture, scene=replace(whole, light_field=part, disparity_px=None))
+    started = time.process_time()
+    result = given.solved(method)
+    return {
+        "psnr_db": round(given.psnr_db(result.light_field), 3),
+        "cpu_s": round(time.process_time() - started, 2),
+    }
+
+
+def main() -> None:
+    """Measure the crops, and compare with those stored."""
+    parser = lab.arguments(__doc__, size="128x128")
+    parser.add_argument("--method", action="append", help=f"may repeat; default: {METHODS}")
+    parser.add_argument("--shots", type=int, help="of the camera (default: its own)")
+    parser.add_argument("--crops", type=int, default=CROPS)
+    parser.add_argument("--store", action="store_true", help="keep the figures as those to reach")
+    args = lab.parsed(parser)
+    points = [
+        {
+            "scene": args.scenes[crop % len(args.scenes)], "camera": args.camera,
+            "size": args.size, "crop": crop, "shots": args.shots, "method": method,
+        }
+        for method in (args.method or METHODS)
+        for crop in range(1 if args.smallest else args.crops)
+    ]  # fmt: skip
+    rows = lab.measured(points, measure, "crops-now", args)
+    keyed = rows.astype(dict.fromkeys(KEYS, str))
+    stored = pd.read_csv(STORED).astype(dict.fromkeys(KEYS, str)) if STORED.is_file() else keyed
+    both = keyed.merge(stored, on=KEYS, how="left", suffixes=("", "_stored"))
+    both["change_db"] = both.psnr_db - both.psnr_db_stored
+    both["times"] = both.cpu_s / both.cpu_s_stored
+    lab.finished(both, both.set_index("scene").change_db.plot.barh(), "crops-now", args)
+    means = both.groupby("method")[["psnr_db", "change_db", "cpu_s", "times"]].mean()
+    print(means.to_string(float_format="%.3f"))
+    if args.store:
+        kept = pd.concat([stored, keyed]).drop_duplicates(KEYS, keep="last")
+        kept.sort_values(KEYS).to_csv(STORED, index=False)
+    elif (means.change_db < -MOST_FALL_DB).any():
+        sys.exit(f"fell: {', '.join(means.index[means.change_db < -MOST_FALL_DB])}")
+
+
+if __name__ == "__main__":
+    main()
