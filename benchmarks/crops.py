@@ -1,9 +1,9 @@
-"""No change made a method worse on average: PSNR and time of 25 crops against docs/results/crops.csv.
+"""No change made a method worse on average: PSNR and time of 25 crops, against those stored.
 
-Crops of real scenes lie at random, so that none is tuned on; `--group A` and `--group B` name the
-scenes of EMMC_LIGHTFIELDS. Exits with 1 where the mean of a method falls by more than 0.03 dB;
-`--store` makes the figures of today those that count. One crop changes by 0.5 dB by where patches
-lie: means count.
+They are kept in docs/results/crops.csv. Crops lie at random, so that none is tuned on; `--group A`
+and `--group B` name the scenes of EMMC_LIGHTFIELDS. Exits with 1 where the mean of a method falls
+by more than 0.03 dB; `--store` makes the figures of today those that count. One crop changes by
+0.5 dB by where patches lie: means count.
 """
 
 from __future__ import annotations
