@@ -25,14 +25,14 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence_kernels import Hypotheses, evidence
+from reconstruction.adaptive.evidence_kernels import SIZE, Hypotheses, evidence
 from reconstruction.adaptive.register_tiles import LANES, SIDE
 from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 PROBES = 4
 """Of the disparities, at which the kinds of texture are compared. 2x -0.03, 0.5x -0.23 dB."""
-GROUPS = 8
+GROUPS = 16
 """Of LANES patches, that a thread works on at a time."""
 
 
@@ -43,7 +43,8 @@ class TexturePrior:
     finer_px: lengths of further textures that evidence compares, as likely as the first. kinds: (a,
     b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared brightness,
     and that of a chrominance over that of luminance. The first is next to flat. kept: how many of
-    them are compared at a patch's other probes after the first.
+    them are compared at a patch's other probes after the first, and half as many of further
+    lengths (default all).
     """
 
     length_px: float = 3.0
@@ -58,7 +59,7 @@ class TexturePrior:
         (4e-1, 0.2),
         (4e-1, 0.03),
     )
-    kept: int = 7
+    kept: int | None = None
     freedom: float = 3.0
 
     def covariance(self, square_px: Array) -> Array:
@@ -169,6 +170,13 @@ def _sets(
     return pairs[order[firsts[offsets, None] + within]], offsets, apart
 
 
+def _spots(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return where pairs (..., 2), row and column, lie among tiles of the lower triangle."""
+    tile, within = np.divmod(pairs, SIDE)
+    number = tile[..., 0] * (tile[..., 0] + 1) // 2 + tile[..., 1]
+    return number * SIZE + (within[..., 0] * SIDE + within[..., 1]) * LANES
+
+
 def _textures(
     possible: NDArray[np.bool_], lengths: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -187,6 +195,18 @@ def _textures(
     order = np.argsort(np.abs(np.arange(PROBES) - PROBES // 2), kind="stable") + 1
     probes = np.rint(order * (counts[:, None] - 1) / (PROBES + 1)).astype(np.int64)
     return textures, lengths * counts, probes
+
+
+def _trials(lengths: int, kinds: int, kept: int | None) -> NDArray[np.int64]:
+    """Return (trial, 3): length, probe and rank of the kinds that are tried one after the other."""
+    if kept is None:
+        numbers = np.full((lengths, PROBES), kinds)
+    else:
+        numbers = np.full((lengths, PROBES), min(-(-kept // 2), kinds))
+        numbers[0] = min(kept, kinds)
+        numbers[0, 0] = kinds if kept else 0
+    tried = [(*at, rank) for at, number in np.ndenumerate(numbers) for rank in range(number)]
+    return np.array(tried, dtype=np.int64).reshape(-1, 3)
 
 
 def patch_evidence(
@@ -231,10 +251,8 @@ def patch_evidence(
 
     textures, counts, probes = _textures(asked[:, used], len(lengths))
     out = np.full((len(padded), len(lengths) * len(evaluated)), -np.inf, dtype=np.float32)
-    if kinds is None:
-        chosen = np.zeros((len(padded), len(lengths)), dtype=np.int64)
-    else:
-        chosen, probes = kinds[padded], probes[:, :0]
+    known = np.zeros((count, len(lengths)), dtype=np.int64) if kinds is None else kinds
+    chosen = known[padded]
     amplitudes, chromas = np.array(prior.kinds, dtype=np.float32).T.copy()
     given = Hypotheses(
         psi.weights,
@@ -246,11 +264,12 @@ def patch_evidence(
         psi.binning,
         waves,
         pairs,
+        _spots(pairs),
         offsets,
         tables.reshape(len(pixels_apart), -1, len(waves)),
         amplitudes,
         chromas,
-        min(prior.kept, len(amplitudes)),
+        _trials(len(lengths), len(prior.kinds), prior.kept if kinds is None else 0),
         np.float32(prior.freedom),
     )
     scales = np.square(brightness).astype(np.float32)[padded]

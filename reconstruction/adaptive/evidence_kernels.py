@@ -16,11 +16,17 @@ from emmc_rig.model.compiling import njit
 from reconstruction.adaptive.register_tiles import (
     LANES,
     SIDE,
+    combined,
     divided,
     factored,
     less_products,
     load_tile,
+    meet,
+    meet_too,
+    multiplied,
+    plus_diagonal,
     plus_outer,
+    scatter_tile,
     store_tile,
     substitute,
     take_applied,
@@ -42,11 +48,13 @@ class Hypotheses(NamedTuple):
     readings less those of the mean. places: (reading, 3), shot, and row and column of the pixel
     from a patch's corner. binning: k. waves: (wave, ray), of which the rays' spectra are made, in
     multiples of SIDE. pairs: (set, SIDE, 2), the pairs of readings, first >= second, SIDE of them
-    with pixels equally far apart a set. offsets: (set,), how far, an index of tables. tables:
+    with pixels equally far apart a set; spots: (set, SIDE), where a pair lies in tiles. offsets:
+    (set,), how far apart, an index of tables. tables:
     (offset, texture, wave), the texture's correlation; a texture is a length and a disparity: all
     disparities of the first length, ... amplitudes, chromas: (kind,), variance of luminance, times
-    a patch's scale, and of a chrominance over that of luminance. kept: of the kinds, how many are
-    compared further after a patch's first probe. freedom: of the Student t.
+    a patch's scale, and of a chrominance over that of luminance. trials: (trial, 3), of which
+    length, at which probe, and of which rank of the kinds by what was tried before, is tried one
+    after the other. freedom: of the Student t.
     """
 
     weights: Any
@@ -58,11 +66,12 @@ class Hypotheses(NamedTuple):
     binning: Any
     waves: Any
     pairs: Any
+    spots: Any
     offsets: Any
     tables: Any
     amplitudes: Any
     chromas: Any
-    kept: Any
+    trials: Any
     freedom: Any
 
 
@@ -112,17 +121,6 @@ def _gather(given, corners, rays, known, seen, measured):
 
 
 @njit(forceinline=True, fastmath=True)
-def _copy(source, start, target, at):
-    """Copy the vector at source[start] to target[at], both flat.
-
-    A loop: copying a part of an array compiles for seconds, for its message of shapes.
-    """
-    values, into = source[start : start + LANES], target[at : at + LANES]
-    for lane in range(LANES):
-        into[lane] = values[lane]
-
-
-@njit(forceinline=True, fastmath=True)
 def _product(table, rows, first, vectors, at, apart, terms):
     """Return a tile, SIDE rows of a table (flat, their starts in `rows`) times SIDE of vectors.
 
@@ -135,129 +133,92 @@ def _product(table, rows, first, vectors, at, apart, terms):
 
 
 @njit(forceinline=True, fastmath=True)
-def _analyse(waves, rays, starts, row, spectra):
+def _analyse(waves, rays, starts, columns, spectra):
     """Set spectra (part, reading, wave * lane) to waves (wave, ray) times rays, see `_gather`.
 
-    starts: (wave,), of the rows of waves. row: a tile, flat, to work in.
+    starts: (wave,), of the rows of waves. columns: of SIDE readings in the spectra.
     """
     inputs, table = waves.shape[1], waves.reshape(-1)
     width = inputs * LANES
     for part in range(rays.shape[0]):
-        given = rays[part].reshape(-1)
+        given, out = rays[part].reshape(-1), spectra[part].reshape(-1)
         for i in range(0, rays.shape[1], SIDE):
             for wave in range(0, waves.shape[0], SIDE):
                 tile = _product(table, starts, wave, given, i * width, width, inputs)
-                store_tile(tile, row, 0)
-                for r in range(SIDE):
-                    for c in range(SIDE):
-                        _copy(row, (r * SIDE + c) * LANES, spectra[part, i + c], (wave + r) * LANES)
+                at = i * spectra.shape[2] + wave * LANES
+                scatter_tile(tile, out, at, LANES, columns, 0)
 
 
 @njit(forceinline=True, fastmath=True)
-def _meet(here, there, meetings):
-    """Add to meetings (wave, lane) the spectrum of how two pixels' rays are correlated.
-
-    here, there: their own spectra (wave, lane), cosine and sine by turns. All flat.
-    """
-    for k in range(0, meetings.size, 2 * LANES):
-        a, b, total = here[k : k + 2 * LANES], there[k : k + 2 * LANES], meetings[k : k + 2 * LANES]
-        for lane in range(LANES):
-            even, odd = a[lane], a[LANES + lane]
-            total[lane] += even * b[lane] + odd * b[LANES + lane]
-            total[LANES + lane] += odd * b[lane] - even * b[LANES + lane]
-
-
-@njit(forceinline=True, fastmath=True)
-def _tile_at(i, j):
-    """Return where the entry of row i and column j <= i lies among tiles, lane 0."""
-    block = i // SIDE
-    tile = block * (block + 1) // 2 + j // SIDE
-    return tile * SIZE + (i % SIDE * SIDE + j % SIDE) * LANES
-
-
-@njit(forceinline=True, fastmath=True)
-def _correlate(given, spectra, starts, meetings, row, sums):
+def _correlate(given, spectra, starts, meetings, sums):
     """Set sums (hypothesis, part, tile), flat tiles, to the correlations of all pairs of readings.
 
-    spectra: (part, reading, wave * lane). starts: (hypothesis,), of its row of an offset's table.
-    meetings: (pair, wave * lane), row: a tile, both flat, to work in.
+    spectra: (part, reading, wave * lane), waves being cosines and sines by turns. starts:
+    (hypothesis,), of its row of an offset's table. meetings: (pair, wave * lane), flat, to work in.
+    The two chrominances are correlated alike: they are one part of the sums.
     """
-    pairs, offsets, tables = given.pairs, given.offsets, given.tables
+    pairs, spots, tables = given.pairs, given.spots.reshape(-1), given.tables
     terms = tables.shape[2]
-    width = terms * LANES
+    width, apart = terms * LANES, sums.shape[1] * sums.shape[2]
+    flat = sums.reshape(-1)
     for one in range(pairs.shape[0]):
-        table = tables[offsets[one]].reshape(-1)
-        for part in range(spectra.shape[0]):
-            if part < 2:
-                meetings[:] = 0
+        table = tables[given.offsets[one]].reshape(-1)
+        for part in range(sums.shape[1]):
+            own = spectra[part].reshape(-1)
             for pair in range(SIDE):
-                here, there = spectra[part, pairs[one, pair, 0]], spectra[part, pairs[one, pair, 1]]
-                _meet(here, there, meetings[pair * width : (pair + 1) * width])
-            if part == 1:
-                continue
+                here, there = pairs[one, pair, 0] * width, pairs[one, pair, 1] * width
+                for wave in range(0, width, 2 * LANES):
+                    meet(own, here + wave, there + wave, meetings, pair * width + wave)
+                if part == 1:
+                    other = spectra[2].reshape(-1)
+                    for wave in range(0, width, 2 * LANES):
+                        meet_too(other, here + wave, there + wave, meetings, pair * width + wave)
             for h in range(0, starts.size, SIDE):
                 tile = _product(table, starts, h, meetings, 0, width, terms)
-                store_tile(tile, row, 0)
-                for pair in range(SIDE):
-                    at = _tile_at(pairs[one, pair, 0], pairs[one, pair, 1])
-                    for i in range(SIDE):
-                        _copy(row, (i * SIDE + pair) * LANES, sums[h + i, min(part, 1)], at)
+                at = h * apart + part * sums.shape[2]
+                scatter_tile(tile, flat, at, apart, spots, one * SIDE)
 
 
 @njit(forceinline=True, fastmath=True)
-def _fill(sums, known, alike, strength, chroma, tiles, values):
-    """Set tiles to the readings' covariance, and values to the readings.
+def _log_likelihood(
+    sums, alike, mix, known, measured, freedom, tiles, values, product, square, out
+):
+    """Set out (lane,) to the log-likelihoods of readings, known (2, reading, lane).
 
-    sums: (part, tiles). alike: as tiles, by how much more than a third two pixels' colours are the
-    same, of no tile where three colours are stored. strength, chroma: (lane,).
-    """
-    third = np.float32(1.0 / 3.0)
-    grey = sums[0]
-    if sums.shape[0] == 1:
-        for at in range(0, tiles.size, LANES):
-            own, same, out = grey[at : at + LANES], alike[at : at + LANES], tiles[at : at + LANES]
-            for lane in range(LANES):
-                out[lane] = strength[lane] * own[lane] * (third + chroma[lane] * same[lane])
-    else:
-        tint = sums[1]
-        for at in range(0, tiles.size, LANES):
-            own, other, out = grey[at : at + LANES], tint[at : at + LANES], tiles[at : at + LANES]
-            for lane in range(LANES):
-                out[lane] = strength[lane] * (own[lane] + chroma[lane] * other[lane])
-    for i in range(known.shape[1]):
-        at = _tile_at(i, i)
-        for lane in range(LANES):
-            tiles[at + lane] += known[1, i, lane]
-            values[i * LANES + lane] = known[0, i, lane]
-
-
-@njit(forceinline=True, fastmath=True)
-def _log_likelihood(tiles, values, measured, freedom, product, square, out):
-    """Set out (lane,) to the log-likelihoods of values (reading, lane), flat.
-
-    tiles: (tile, row, column, lane), flat, the lower triangle of scale matrices of multivariate t
-    distributions, with `freedom` degrees and measured (lane,) readings, row by row; constants are
-    left out. Tiles and values are destroyed. product, square: (lane,), to work in.
+    They are those of multivariate t distributions with `freedom` degrees and measured (lane,)
+    readings; constants are left out. The scale matrices are the variances that are known plus
+    sums (part, tile), the lower triangle in tiles (row, column, lane), row by row, all flat: sums
+    times mix (2, lane), flat, where only one part is stored that and its product with alike, as
+    tiles. tiles, values: (reading, lane), flat, product, square: (lane,), to work in.
     """
     out[:] = 0
     product[:] = 1
     square[:] = 0
     strip = SIDE * LANES
     blocks = values.size // strip
+    data, variances = known[0].reshape(-1), known[1].reshape(-1)
+    for at in range(values.size):
+        values[at] = data[at]
     for i in range(blocks):
         first = i * (i + 1) // 2
         for j in range(i + 1):
             other = j * (j + 1) // 2
-            tile = load_tile(tiles, (first + j) * SIZE)
+            at = (first + j) * SIZE
+            tile = load_tile(sums[0], at)
+            if sums.shape[0] == 1:
+                tint = multiplied(tile, load_tile(alike, at))
+            else:
+                tint = load_tile(sums[1], at)
+            tile = combined(tile, tint, mix)
             for k in range(j):
                 tile = less_products(tile, tiles, (first + k) * SIZE, (other + k) * SIZE)
             if j < i:
                 tile = divided(tile, tiles, (other + j) * SIZE)
                 take_applied(tile, values, j * strip, i * strip)
             else:
-                tile = factored(tile, np.float32(LEAST))
+                tile = factored(plus_diagonal(tile, variances, i * strip), np.float32(LEAST))
                 substitute(tile, values, i * strip)
-            store_tile(tile, tiles, (first + j) * SIZE)
+            store_tile(tile, tiles, at)
         for row in range(SIDE):
             at = (first + i) * SIZE + row * (SIDE + 1) * LANES
             value = values[(i * SIDE + row) * LANES : (i * SIDE + row + 1) * LANES]
@@ -273,14 +234,16 @@ def _log_likelihood(tiles, values, measured, freedom, product, square, out):
 
 
 @njit(forceinline=True, fastmath=True)
-def _compare_colours(seen, alike):
+def _compare_colours(given, seen, alike):
     """Set alike, flat tiles, to by how much more than a third the colours seen are the same."""
-    for i in range(seen.shape[0]):
-        for j in range(i + 1):
-            at = _tile_at(i, j)
+    third = np.float32(1.0 / 3.0)
+    for one in range(given.pairs.shape[0]):
+        for pair in range(SIDE):
+            i, j = given.pairs[one, pair]
+            at = given.spots[one, pair]
             for lane in range(LANES):
                 same = np.float32(1.0) if seen[i, lane] == seen[j, lane] else np.float32(0.0)
-                alike[at + lane] = same - np.float32(1.0 / 3.0)
+                alike[at + lane] = same - third
 
 
 @njit(forceinline=True, fastmath=True)
@@ -301,9 +264,9 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
 
     given: `Hypotheses`. Every LANES patches are a group. corners: (patch, 2) pixels. scales:
     (patch,), of the amplitudes. textures: (group, texture), those to compare, counts: (group,), how
-    many. probes: (group, probe), at which of a length's textures kinds are compared: all at the
-    first, those kept at the others. out is set at the group's textures only, for the kind that
-    explains the patch best at any of the probes, `chosen`; without probes that is given.
+    many. probes: (group, probe), at which of a length's textures kinds are tried. out is set at the
+    group's textures only, for the kind that explains the patch best at any of the probes,
+    `chosen`; without trials that is given.
     """
     stored, kinds = given.weights.shape[4], given.amplitudes.size
     m = -(-given.places.shape[0] // SIDE) * SIDE
@@ -320,56 +283,68 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
     # What is no pair of readings, within diagonal tiles and beyond the last reading, stays 0.
     sums = np.zeros((most, 1 if stored == 1 else 2, entries), np.float32)
     meetings = np.empty(SIDE * terms * LANES, np.float32)
-    row, tiles = np.empty(SIZE, np.float32), np.empty(entries, np.float32)
-    values = np.empty(m * LANES, np.float32)
+    tiles, values = np.empty(entries, np.float32), np.empty(m * LANES, np.float32)
     measured, square = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     product, likelihood = np.empty(LANES, np.float64), np.empty(LANES, np.float32)
-    strength, chroma = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    mix = np.empty(2 * LANES, np.float32)
+    # One colour seen is a third luminance.
+    grey = np.float32(1.0 / 3.0) if stored == 1 else np.float32(1.0)
     best, ranks = np.empty((kinds, LANES), np.float32), np.empty((kinds, LANES), np.int64)
-    wave_starts = np.arange(terms) * inputs
-    trials = kinds + given.kept * (probes.shape[1] - 1) if probes.shape[1] else 0
-    lengths = chosen.shape[1]
+    most_likely = np.empty(LANES, np.float32)
+    wave_starts, columns = np.arange(terms) * inputs, np.arange(SIDE) * terms * LANES
+    trials, lengths = given.trials.shape[0], chosen.shape[1]
     for group in range(counts.size):
         first = group * LANES
         _gather(given, corners[first : first + LANES], rays, known, seen, measured)
-        _analyse(given.waves, rays, wave_starts, row, spectra)
+        _analyse(given.waves, rays, wave_starts, columns, spectra)
         count = counts[group]
         starts = np.empty(-(-count // SIDE) * SIDE, np.int64)
         for h in range(starts.size):
             starts[h] = textures[group, min(h, count - 1)] * terms
-        _correlate(given, spectra, starts, meetings, row, sums)
+        _correlate(given, spectra, starts, meetings, sums)
         if stored == 1:
-            _compare_colours(seen, alike)
+            _compare_colours(given, seen, alike)
         each = count // lengths
-        # Of each length, first kinds are tried at probes, then all textures with the best kind: one
-        # loop, since what it calls is compiled once for each place where it is called.
-        for one in range(lengths * (trials + each)):
-            length, turn = one // (trials + each), one % (trials + each)
-            later = turn - kinds
-            if turn == 0:
-                best[:] = -np.inf
-                for kind in range(kinds):
-                    ranks[kind, :] = kind
-            if turn >= trials:
-                rank, h = 0, turn - trials
-            elif turn < kinds:
-                rank, h = turn, probes[group, 0]
+        best[:] = -np.inf
+        for kind in range(kinds):
+            ranks[kind, :] = kind
+        # First kinds are tried, then all textures with the best: one loop, since what it calls is
+        # compiled once for each place where it is called.
+        for turn in range(-trials, count):
+            if turn < 0:
+                length, probe, rank = given.trials[turn + trials]
+                h = length * each + probes[group, probe]
+                if rank == 0:
+                    _rank(best, ranks)
+                    if probe == 0:
+                        best[:] = -np.inf
+                        most_likely[:] = -np.inf
             else:
-                rank, h = later % given.kept, probes[group, 1 + later // given.kept]
-            if rank == 0 and 0 < turn <= trials:
-                _rank(best, ranks)
-                for lane in range(LANES):
-                    chosen[first + lane, length] = ranks[0, lane]
-            h += length * each
+                length, rank, h = turn // each, 0, turn
             for lane in range(LANES):
-                kind = ranks[rank, lane] if turn < trials else chosen[first + lane, length]
-                strength[lane] = given.amplitudes[kind] * scales[first + lane]
-                chroma[lane] = given.chromas[kind]
-            _fill(sums[h], known, alike, strength, chroma, tiles, values)
-            _log_likelihood(tiles, values, measured, given.freedom, product, square, likelihood)
+                kind = ranks[rank, lane] if turn < 0 else chosen[first + lane, length]
+                strength = given.amplitudes[kind] * scales[first + lane]
+                mix[lane] = strength * grey
+                mix[LANES + lane] = strength * given.chromas[kind]
+            _log_likelihood(
+                sums[h],
+                alike,
+                mix,
+                known,
+                measured,
+                given.freedom,
+                tiles,
+                values,
+                product,
+                square,
+                likelihood,
+            )
             for lane in range(LANES):
-                if turn < trials:
-                    kind = ranks[rank, lane]
-                    best[kind, lane] = max(best[kind, lane], likelihood[lane])
-                else:
+                if turn >= 0:
                     out[first + lane, textures[group, h]] = likelihood[lane]
+                    continue
+                kind = ranks[rank, lane]
+                best[kind, lane] = max(best[kind, lane], likelihood[lane])
+                if likelihood[lane] > most_likely[lane]:
+                    most_likely[lane] = likelihood[lane]
+                    chosen[first + lane, length] = kind

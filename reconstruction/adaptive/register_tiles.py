@@ -151,6 +151,66 @@ def store_tile(context, tile, flat, at):
 
 
 @intrinsic
+def scatter_tile(context, tile, flat, at, apart, places, first):
+    """Put the vector of each row r and column c at flat[at + r * apart + places[first + c]].
+
+    places: int64.
+    """
+
+    def write(code, tile, flat, at, apart, places, first):
+        rows = code.rows(tile)
+        for column in _EACH:
+            to = code.builder.add(at, code.builder.load(code.place(places, first, column)))
+            for row in _EACH:
+                code.write(flat, to, 0, rows[row][column])
+                to = code.builder.add(to, apart) if row < SIDE - 1 else to
+
+    return _function(types.void, (tile, flat, at, apart, places, first), write)
+
+
+@intrinsic
+def multiplied(context, tile, other):
+    """Return the product of two tiles, entry by entry."""
+
+    def write(code, tile, other):
+        pairs = zip(code.rows(tile), code.rows(other), strict=True)
+        return code.tile([list(map(code.times, *rows)) for rows in pairs])
+
+    return _function(_TILE, (tile, other), write)
+
+
+@intrinsic
+def combined(context, tile, other, flat):
+    """Return a tile times the vector at flat[0], plus another times that at flat[LANES]."""
+
+    def write(code, tile, other, flat):
+        zero = ir.Constant(ir.IntType(64), 0)
+        one, two = code.read(flat, zero, 0), code.read(flat, zero, 1)
+        pairs = zip(code.rows(tile), code.rows(other), strict=True)
+        return code.tile(
+            [
+                [code.plus(code.times(own, one), its, two) for own, its in zip(*rows, strict=True)]
+                for rows in pairs
+            ]
+        )
+
+    return _function(_TILE, (tile, other, flat), write)
+
+
+@intrinsic
+def plus_diagonal(context, tile, flat, at):
+    """Return a tile plus the SIDE vectors at flat[at], on its diagonal."""
+
+    def write(code, tile, flat, at):
+        out = code.rows(tile)
+        for row in _EACH:
+            out[row][row] = code.builder.fadd(out[row][row], code.read(flat, at, row))
+        return code.tile(out)
+
+    return _function(_TILE, (tile, flat, at), write)
+
+
+@intrinsic
 def plus_outer(context, tile, table, rows, first, term, vectors, at, apart):
     """Return a tile plus the outer product of numbers and vectors.
 
@@ -264,3 +324,37 @@ def substitute(context, tile, flat, at):
             code.write(flat, at, row, solved[row])
 
     return _function(types.void, (tile, flat, at), write)
+
+
+def _conjugate_product(code: _Code, flat: Any, here: Any, there: Any) -> list[Any]:
+    """Return real and imaginary part of flat[here] times the conjugate of flat[there]."""
+    (real, imaginary), (other_real, other_imaginary) = (
+        (code.read(flat, at, 0), code.read(flat, at, 1)) for at in (here, there)
+    )
+    return [
+        code.plus(code.times(real, other_real), imaginary, other_imaginary),
+        code.less(code.times(imaginary, other_real), real, other_imaginary),
+    ]
+
+
+@intrinsic
+def meet(context, flat, here, there, out, at):
+    """Put the product of the complex number at flat[here] and the conjugate of that at [there] at
+    out[at]: real and imaginary part follow each other."""
+
+    def write(code, flat, here, there, out, at):
+        for number, vector in enumerate(_conjugate_product(code, flat, here, there)):
+            code.write(out, at, number, vector)
+
+    return _function(types.void, (flat, here, there, out, at), write)
+
+
+@intrinsic
+def meet_too(context, flat, here, there, out, at):
+    """Add such a product, see `meet`, to what is at out[at]."""
+
+    def write(code, flat, here, there, out, at):
+        for number, vector in enumerate(_conjugate_product(code, flat, here, there)):
+            code.write(out, at, number, code.builder.fadd(code.read(out, at, number), vector))
+
+    return _function(types.void, (flat, here, there, out, at), write)

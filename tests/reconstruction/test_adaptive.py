@@ -21,10 +21,13 @@ from reconstruction.adaptive.refine import fitted, slopes
 from reconstruction.adaptive.register_tiles import LANES
 from reconstruction.adaptive.search import (
     Volume,
+    _asked,
     _between,
     _near_best,
     _possible,
+    _settled,
     _side_by_side,
+    _spanned,
     compatibility,
     per_pixel,
     posteriors,
@@ -435,6 +438,38 @@ def test_evidence_between_disparities_is_that_of_a_cubic():
     known = np.array([[1.0, -np.inf, 2.0, 4.0]], np.float32)
     expected = [[1, -np.inf, -np.inf, -np.inf, 2, 3, 4]]
     np.testing.assert_allclose(_between(known, 2), expected, rtol=1e-6)
+
+
+def test_labels_evaluated_have_those_possible_between_them():
+    possible = np.zeros((1, 2, 7), dtype=bool)
+    possible[0, 0, 3] = possible[0, 1, 4] = True
+    np.testing.assert_array_equal(_asked(possible, 1), possible)
+    found = _asked(possible, 2)
+    assert [np.flatnonzero(one).tolist() for one in found[0]] == [[1, 2], [2]]
+    assert np.flatnonzero(_spanned(found[0, 0], 2)).tolist() == [2, 3, 4]
+    assert np.flatnonzero(_spanned(np.array([1, 0, 1, 1], bool), 2)).tolist() == [0, 4, 5, 6]
+
+
+def test_a_second_grid_is_settled_where_patches_around_are_sure_and_agree():
+    labels, kind = np.arange(4) * 0.25, np.zeros((3, 4), int)
+    chances = np.zeros((3, 4, 4), np.float32)
+    chances[..., 0] = 1
+    chances[:, 1:, :2] = 0.02, 0.98  # the next label agrees
+    chances[0, 3] = 0, 0, 0, 1  # another surface
+    chances[2, 0] = 0.6, 0, 0, 0.4  # not sure
+    evidence = np.log(chances + 1e-3)
+    evidence[1, 1, 3] = -np.inf
+    at = np.arange(3) * 6.0, np.arange(4) * 6.0
+    volume = Volume(labels, at, chances, evidence, kind, kind == 0)
+    between = at[0][:2] + 3, np.array([0.0, *(at[1][:3] + 3)])
+    settled, found = _settled(volume, between)
+    expected = [[True, True, True, False], [False, False, True, True]]
+    np.testing.assert_array_equal(settled, expected)
+    mean = evidence[:2, 1:3].mean(axis=(0, 1))
+    np.testing.assert_allclose(found[0, 2], mean, rtol=1e-5)
+    assert found[0, 2, 3] == -np.inf
+    # Beyond the first column it is that of the first.
+    np.testing.assert_allclose(found[0, 0], evidence[:2, 0].mean(axis=0), rtol=1e-5)
 
 
 def test_disparities_beside_the_best_known_are_evaluated():

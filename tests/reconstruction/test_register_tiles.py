@@ -7,11 +7,17 @@ from numba import njit
 from reconstruction.adaptive.register_tiles import (
     LANES,
     SIDE,
+    combined,
     divided,
     factored,
     less_products,
     load_tile,
+    meet,
+    meet_too,
+    multiplied,
+    plus_diagonal,
     plus_outer,
+    scatter_tile,
     store_tile,
     substitute,
     take_applied,
@@ -42,6 +48,44 @@ def _second_row(tiles, values, least):
     tile = factored(tile, least)
     substitute(tile, values, SIDE * LANES)
     store_tile(tile, tiles, 2 * SIZE)
+
+
+@njit
+def _entries(tiles, mix, spots, out):
+    """Combine a tile and its product with another; add to its diagonal; scatter its vectors."""
+    one = load_tile(tiles, 0)
+    tile = combined(one, multiplied(one, load_tile(tiles, SIZE)), mix)
+    scatter_tile(plus_diagonal(tile, mix, 0), out, LANES, SIDE * LANES, spots, 1)
+
+
+@njit
+def _products(flat, out):
+    meet(flat, 0, 2 * LANES, out, LANES)
+    meet_too(flat, 4 * LANES, 0, out, LANES)
+
+
+def test_entries_of_a_tile_are_scaled_and_scattered():
+    rng = np.random.default_rng(2)
+    tiles = rng.normal(size=(2, SIDE, SIDE, LANES)).astype(np.float32)
+    mix = rng.normal(size=(SIDE, LANES)).astype(np.float32)
+    columns = np.array([3, 0, 2, 1])
+    out = np.zeros((1 + SIDE * SIDE, LANES), np.float32)
+    _entries(tiles.reshape(-1), mix.reshape(-1), np.append(0, columns * LANES), out.reshape(-1))
+    expected = tiles[0] * mix[0] + tiles[0] * tiles[1] * mix[1]
+    expected[np.arange(SIDE), np.arange(SIDE)] += mix
+    found = out[1:].reshape(SIDE, SIDE, LANES)[:, columns]
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    assert not out[0].any()
+
+
+def test_products_of_complex_numbers_are_added():
+    rng = np.random.default_rng(3)
+    parts = rng.normal(size=(3, 2, LANES)).astype(np.float32)
+    out = np.full((3, LANES), np.nan, np.float32)
+    _products(parts.reshape(-1), out.reshape(-1))
+    a, b, c = parts[:, 0] + 1j * parts[:, 1]
+    expected = a * b.conj() + c * a.conj()
+    np.testing.assert_allclose(out[1] + 1j * out[2], expected, rtol=1e-5, atol=1e-5)
 
 
 def test_a_tile_of_sums_is_a_matrix_product():
