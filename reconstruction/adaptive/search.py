@@ -70,8 +70,6 @@ there instead, it made buttercup's crops 0.3 to 0.5 dB worse."""
 SURE, AGREED_PX = 0.9, 0.25
 """Patches of the second grid are not evaluated where those of the first around them believe, with
 this probability, in disparities within AGREED_PX, and agree as closely."""
-STRIP = 4
-"""Rows of patches that are worked on together."""
 
 
 def compatibility(
@@ -388,16 +386,14 @@ def _settled(
     return all_sure & (high - low <= AGREED_PX), evidence
 
 
-def _side_by_side(rows: int, columns: int) -> NDArray[np.int64]:
-    """Return the order of patches (row, column) in which LANES that follow each other are near.
+def _packed(asked: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the patches that ask for any label, asked (patch, label), alike ones side by side.
 
-    Along strips of rows, to and fro: squares of 4 x 4 patches, where they fit.
+    Patches are evaluated LANES at a time, at what any of them asks for.
     """
-    order = []
-    for strip, top in enumerate(range(0, rows, STRIP)):
-        part = np.arange(rows * columns).reshape(rows, columns)[top : top + STRIP]
-        order.append((part[:, ::-1] if strip % 2 else part).T.ravel())
-    return np.concatenate(order)
+    some = np.flatnonzero(asked.any(axis=1))
+    last = asked.shape[1] - asked[some, ::-1].argmax(axis=1)
+    return some[np.lexsort((last, asked[some].argmax(axis=1)))]
 
 
 @cache
@@ -457,8 +453,7 @@ def _on_grid(
     shape = corners.shape[:2]
     evidence = np.full((*shape, len(labels)), -np.inf, dtype=np.float32)
     kind, deciding = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=bool)
-    order = _side_by_side(*shape)
-    order = order[asked.any(axis=-1).ravel()[order]]
+    order = _packed(asked.reshape(-1, asked.shape[2]))
     if not len(order):
         return evidence, kind, deciding
     at = np.unravel_index(order, shape)
@@ -466,9 +461,7 @@ def _on_grid(
     kind[at], deciding[at] = found.kind, _deciding(found.log_likelihood)
     values = _between(found.log_likelihood, every)
     wanted = _near_best(found.log_likelihood, every) & deciding[at][:, None]
-    # Those of one disparity side by side: they want the same.
-    some = np.flatnonzero(wanted.any(axis=1))
-    some = some[np.argsort(found.log_likelihood[some].argmax(axis=1), kind="stable")]
+    some = _packed(wanted)
     if len(some):
         exact = evidence_at(
             data, patches, corners[at][some], labels, prior, wanted[some], found.kinds[some]

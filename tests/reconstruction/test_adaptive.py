@@ -24,9 +24,9 @@ from reconstruction.adaptive.search import (
     _asked,
     _between,
     _near_best,
+    _packed,
     _possible,
     _settled,
-    _side_by_side,
     _spanned,
     compatibility,
     per_pixel,
@@ -395,14 +395,11 @@ def test_corners_of_a_second_grid_lie_between_and_cover_the_same_pixels():
     assert patches.grid((30, 32))[0].tolist() == [0, 6, 12, 18, 22]
 
 
-@pytest.mark.parametrize("shape", [(9, 13), (4, 4), (3, 1)])
-def test_patches_that_follow_each_other_lie_side_by_side(shape):
-    order = _side_by_side(*shape)
-    assert sorted(order) == list(range(shape[0] * shape[1]))
-    rows, columns = np.divmod(order, shape[1])
-    groups = [slice(first, first + LANES) for first in range(0, len(order), LANES)]
-    assert max(np.ptp(columns[group]) for group in groups[:2]) <= 4
-    assert all(np.ptp(rows[group]) < 8 for group in groups)
+def test_patches_that_ask_for_the_same_disparities_follow_each_other():
+    asked = np.zeros((6, 5), dtype=bool)
+    for patch, labels in enumerate(([2, 3], [0, 4], [], [2], [2, 3], [0, 1])):
+        asked[patch, labels] = True
+    assert _packed(asked).tolist() == [5, 1, 3, 0, 4]
 
 
 def test_a_disparity_is_possible_near_where_the_rough_search_believes_it():
