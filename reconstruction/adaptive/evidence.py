@@ -25,12 +25,15 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence_kernels import LANES, TERMS, Hypotheses, evidence
+from reconstruction.adaptive.evidence_kernels import SIZE, Hypotheses, evidence
+from reconstruction.adaptive.register_tiles import LANES, SIDE
 from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 PROBES = 4
 """Of the disparities, at which the kinds of texture are compared. 2x -0.03, 0.5x -0.23 dB."""
+GROUPS = 16
+"""Of LANES patches, that a thread works on at a time."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,9 @@ class TexturePrior:
 
     finer_px: lengths of further textures that evidence compares, as likely as the first. kinds: (a,
     b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared brightness,
-    and that of a chrominance over that of luminance. The first is next to flat.
+    and that of a chrominance over that of luminance. The first is next to flat. kept: how many of
+    them are compared at a patch's other probes after the first, and half as many of further
+    lengths (default all).
     """
 
     length_px: float = 3.0
@@ -54,6 +59,7 @@ class TexturePrior:
         (4e-1, 0.2),
         (4e-1, 0.03),
     )
+    kept: int | None = None
     freedom: float = 3.0
 
     def covariance(self, square_px: Array) -> Array:
@@ -110,7 +116,7 @@ def _spectrum(
     Pairs of rays matter by how far they lie apart only: a correlation, which for the discrete
     Fourier transforms over all separations is a product. Waves (wave, ray): cosine and sine by
     turns, of the mean first; separations (separation, 4), two in samples and two in views; waves
-    back (separation, wave). Rays and waves are padded with zeros to multiples of TERMS.
+    back (separation, wave). Rays and waves are padded with zeros to multiples of SIDE.
     """
     lengths = np.array([binning, binning, *views])
     v, u, y, x = (axis.ravel() for axis in np.indices((*views, binning, binning)))
@@ -118,27 +124,89 @@ def _spectrum(
     apart = np.indices(tuple(2 * lengths - 1)).reshape(4, -1).T - (lengths - 1)
     # The first half of the frequencies is the second's negative: a real function's says no more.
     once = 2 * np.pi * apart[len(apart) // 2 :] / (2 * lengths - 1)
-    short = -len(once) % (TERMS // 2)
+    short = -len(once) % (SIDE // 2)
 
     def analysed(positions: NDArray[np.int64]) -> Array:
         phase = positions @ once.T
         both = np.stack([np.cos(phase), np.sin(phase)], axis=-1).reshape(len(phase), -1)
         return np.pad(both, ((0, 0), (0, 2 * short)))
 
-    waves = np.pad(analysed(rays).T, ((0, 0), (0, -len(rays) % TERMS)))
+    waves = np.pad(analysed(rays).T, ((0, 0), (0, -len(rays) % SIDE)))
     back = 2 * analysed(apart) / len(apart)
     back[:, 0] /= 2
-    return waves.astype(np.float32), apart, back
+    return np.ascontiguousarray(waves, dtype=np.float32), apart, back
 
 
 @dataclass(frozen=True, eq=False)
 class PatchEvidence:
-    """log_likelihood: (patch, disparity), constants (m/2 log 2 pi) left out, of the kind of
-    texture that explains the patch best, the mean over lengths; kind: (patch,), which of the
-    prior's it is."""
+    """log_likelihood: (patch, disparity), constants (m/2 log 2 pi) left out, of the kinds of
+    texture that explain the patch best, the mean over lengths, -inf where not evaluated; kinds:
+    (patch, length), which of the prior's these are; kind: (patch,), that of the likeliest length.
+    """
 
     log_likelihood: NDArray[np.float32]
+    kinds: NDArray[np.int64]
     kind: NDArray[np.int64]
+
+
+def _sets(
+    pixels_apart: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return pairs of readings (set, SIDE, 2), the sets' offsets (set,), and all (offset, 2).
+
+    pixels_apart: (reading, reading, 2). A set's pairs, the first reading not before the second, lie
+    equally far apart; those that have too few repeat their last.
+    """
+    pairs = np.stack(np.tril_indices(len(pixels_apart)), axis=1)
+    apart, which = np.unique(pixels_apart[pairs[:, 0], pairs[:, 1]], axis=0, return_inverse=True)
+    order = np.argsort(which, kind="stable")
+    counts = np.bincount(which)
+    sets = -(-counts // SIDE)
+    offsets = np.repeat(np.arange(len(apart)), sets)
+    number = np.arange(len(offsets)) - np.repeat(np.cumsum(sets) - sets, sets)
+    within = number[:, None] * SIDE + np.arange(SIDE)
+    within = np.minimum(within, counts[offsets, None] - 1)
+    firsts = np.cumsum(counts) - counts
+    return pairs[order[firsts[offsets, None] + within]], offsets, apart
+
+
+def _spots(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return where pairs (..., 2), row and column, lie among tiles of the lower triangle."""
+    tile, within = np.divmod(pairs, SIDE)
+    number = tile[..., 0] * (tile[..., 0] + 1) // 2 + tile[..., 1]
+    return number * SIZE + (within[..., 0] * SIDE + within[..., 1]) * LANES
+
+
+def _textures(
+    possible: NDArray[np.bool_], lengths: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return which textures each group compares, how many, and which of these are its probes.
+
+    possible: (group, disparity). Textures (group, texture) count disparities of the first length,
+    then of the next; what is beyond a group's number repeats its last.
+    """
+    disparities = possible.shape[1]
+    counts = possible.sum(axis=1)
+    ordered = np.argsort(~possible, axis=1, kind="stable")
+    at = np.arange(lengths * counts.max())[None]
+    length, one = np.divmod(np.minimum(at, lengths * counts[:, None] - 1), counts[:, None])
+    textures = length * disparities + np.take_along_axis(ordered, one, axis=1)
+    # The middle one first: most patches' disparities are nearest to it.
+    order = np.argsort(np.abs(np.arange(PROBES) - PROBES // 2), kind="stable") + 1
+    probes = np.rint(order * (counts[:, None] - 1) / (PROBES + 1)).astype(np.int64)
+    return textures, lengths * counts, probes
+
+
+def _trials(lengths: int, kinds: int, kept: int | None) -> NDArray[np.int64]:
+    """Return (trial, 3): length, probe and rank of the kinds that are tried one after the other."""
+    if kept is None:
+        numbers = np.full((lengths, PROBES), kinds)
+    else:
+        numbers = np.full((lengths, PROBES), min(-(-kept // 2), kinds))
+        numbers[0] = min(kept, kinds)
+        numbers[0, 0] = kinds if kept else 0
+    tried = [(*at, rank) for at, number in np.ndenumerate(numbers) for rank in range(number)]
+    return np.array(tried, dtype=np.int64).reshape(-1, 3)
 
 
 def patch_evidence(
@@ -151,36 +219,40 @@ def patch_evidence(
     places: NDArray[np.int64],
     disparities: NDArray[np.floating],
     prior: TexturePrior,
+    possible: NDArray[np.bool_] | None = None,
+    kinds: NDArray[np.int64] | None = None,
 ) -> PatchEvidence:
     """Return how well textures at these disparities explain each patch.
 
     data: readings less those of the smooth picture, variance: theirs, both (shot, pixel_y,
     pixel_x). brightness: (patch,), of the smooth picture; sets the amplitudes' scale. corners:
-    (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`.
+    (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`. possible: (patch, disparity),
+    those to evaluate (default all): LANES patches that follow each other are worked on together,
+    at every disparity that one of them asks for. kinds: (patch, length) of texture, where known.
     """
     count = len(corners)
-    short = -count % LANES
-    filled = np.concatenate([corners, np.repeat(corners[-1:], short, axis=0)])
-    scales = np.square(np.concatenate([brightness, np.repeat(brightness[-1:], short)]))
+    if possible is None:
+        possible = np.ones((count, len(disparities)), dtype=bool)
+    padded = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
+    asked = possible[padded].reshape(-1, LANES, len(disparities)).any(axis=1)
+    used = asked.any(axis=0)
     waves, separations, back = _spectrum(psi.light_field_shape[:2], psi.binning)
-    pixels_apart = places[:, None, 1:] - places[None, :, 1:]
-    kinds, offsets = np.unique(pixels_apart.reshape(-1, 2), axis=0, return_inverse=True)
-    disparities = np.asarray(disparities, dtype=np.float64)
-    apart = (
-        kinds[:, None, None] * psi.binning
-        + separations[None, None, :, :2]
-        - disparities[None, :, None, None] * separations[None, None, :, 2:]
-    )
-    square_px = np.square(apart).sum(axis=-1)
-    lengths = (prior.length_px, *prior.finer_px)
-    textures = [replace(prior, length_px=length) for length in lengths]
-    tables = [texture.covariance(square_px) @ back for texture in textures]
-    tables = np.concatenate(tables, axis=1).astype(np.float32)
-    evaluated = tables.shape[1]
-    tables = np.pad(tables, ((0, 0), (0, -evaluated % TERMS), (0, 0)))
-    probed = np.unique(np.linspace(0, len(disparities) - 1, PROBES + 2).round()[1:-1])
-    out = np.empty((len(filled), evaluated), dtype=np.float32)
-    chosen = np.zeros((len(filled), len(lengths)), dtype=np.int64)
+    pairs, offsets, pixels_apart = _sets(places[:, None, 1:] - places[None, :, 1:])
+    lengths = [replace(prior, length_px=length) for length in (prior.length_px, *prior.finer_px)]
+    evaluated = np.flatnonzero(used)
+    tables = np.empty((len(pixels_apart), len(lengths), len(evaluated), len(waves)), np.float32)
+
+    def tabulate(one: int) -> None:
+        apart = pixels_apart[:, None] * psi.binning + separations[:, :2]
+        apart = apart - float(disparities[evaluated[one]]) * separations[:, 2:]
+        square_px = np.square(apart).sum(axis=-1)
+        for length, texture in enumerate(lengths):
+            tables[:, length, one] = texture.covariance(square_px) @ back
+
+    textures, counts, probes = _textures(asked[:, used], len(lengths))
+    out = np.full((len(padded), len(lengths) * len(evaluated)), -np.inf, dtype=np.float32)
+    known = np.zeros((count, len(lengths)), dtype=np.int64) if kinds is None else kinds
+    chosen = known[padded]
     amplitudes, chromas = np.array(prior.kinds, dtype=np.float32).T.copy()
     given = Hypotheses(
         psi.weights,
@@ -191,21 +263,36 @@ def patch_evidence(
         places,
         psi.binning,
         waves,
-        offsets.reshape(len(places), len(places)).astype(np.int64),
-        tables,
+        pairs,
+        _spots(pairs),
+        offsets,
+        tables.reshape(len(pixels_apart), -1, len(waves)),
         amplitudes,
         chromas,
-        probed.astype(np.int64),
+        _trials(len(lengths), len(prior.kinds), prior.kept if kinds is None else 0),
         np.float32(prior.freedom),
     )
+    scales = np.square(brightness).astype(np.float32)[padded]
 
     def evaluate(first: int) -> None:
-        lanes = slice(first, first + LANES)
-        evidence(given, filled[lanes], scales[lanes].astype(np.float32), out[lanes], chosen[lanes])
+        groups = slice(first, first + GROUPS)
+        lanes = slice(first * LANES, (first + GROUPS) * LANES)
+        evidence(
+            given,
+            corners[padded[lanes]],
+            scales[lanes],
+            textures[groups],
+            counts[groups],
+            probes[groups],
+            out[lanes],
+            chosen[lanes],
+        )
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
-        list(pool.map(evaluate, range(0, len(filled), LANES)))
+        list(pool.map(tabulate, range(len(evaluated))))
+        list(pool.map(evaluate, range(0, len(asked), GROUPS)))
     each = out[:count].reshape(count, len(lengths), -1)
-    mean = np.logaddexp.reduce(each, axis=1) - np.float32(np.log(len(lengths)))
+    mean = np.full((count, len(disparities)), -np.inf, dtype=np.float32)
+    mean[:, used] = np.logaddexp.reduce(each, axis=1) - np.float32(np.log(len(lengths)))
     likeliest = each.max(axis=-1).argmax(axis=1)
-    return PatchEvidence(mean, chosen[np.arange(count), likeliest])
+    return PatchEvidence(mean, chosen[:count], chosen[np.arange(count), likeliest])

@@ -1,10 +1,8 @@
 """Kernels of the patches' evidence: covariances of readings, their factors, log-likelihoods.
 
-LANES patches are worked on side by side: arrays end with (..., lane), and the innermost loops run
-along it. Sums are taken four terms at a time, and of rows and columns in tiles: a value read serves
-several, and tiles lie one after the other, so that no power of two lies between their rows. What is
-worked on together lies a constant apart in flat arrays, else checks for overlap keep the compiler
-from vectors.
+LANES patches are worked on side by side: arrays end with (..., lane), and what takes the time is
+done in tiles of vectors (`register_tiles`). Covariances of all hypotheses of a group of patches are
+kept: for each pair of readings, few sums over the spectrum make them all.
 """
 
 from __future__ import annotations
@@ -15,10 +13,32 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from emmc_rig.model.compiling import njit
+from reconstruction.adaptive.register_tiles import (
+    LANES,
+    SIDE,
+    combined,
+    divided,
+    factored,
+    less_products,
+    load_tile,
+    meet,
+    meet_too,
+    multiplied,
+    plus_diagonal,
+    plus_outer,
+    scatter_tile,
+    store_tile,
+    substitute,
+    take_applied,
+    zero_tile,
+)
 
-LANES = 64
-TERMS = 4
-"""Terms of a sum taken at a time: tables are padded with zeros to a multiple of it."""
+SIZE = SIDE * SIDE * LANES
+"""Numbers of a tile."""
+LEAST = 1e-12
+"""Of a squared pivot: of a covariance that is not positive definite in float32."""
+LOGS = 8
+"""Tiles of pivots between logarithms: 32 of 1e6 each are far from the end of float64."""
 
 
 class Hypotheses(NamedTuple):
@@ -26,12 +46,15 @@ class Hypotheses(NamedTuple):
 
     weights, colour: Psi's. usable, data, variance: (shot, pixel_y, pixel_x), data being the
     readings less those of the mean. places: (reading, 3), shot, and row and column of the pixel
-    from a patch's corner. binning: k. waves: (wave, ray), of which the rays' spectra are made.
-    offsets: (reading, reading), the index of how far two pixels lie apart. tables: (offset,
-    hypothesis, wave), the texture's correlation, padded with zeros to a multiple of TERMS
-    hypotheses. amplitudes, chromas: (kind,), variance of luminance, times a patch's scale, and of a
-    chrominance over that of luminance. probes: indices of the disparities at which every kind is
-    compared. freedom: of the Student t.
+    from a patch's corner. binning: k. waves: (wave, ray), of which the rays' spectra are made, in
+    multiples of SIDE. pairs: (set, SIDE, 2), the pairs of readings, first >= second, SIDE of them
+    with pixels equally far apart a set; spots: (set, SIDE), where a pair lies in tiles. offsets:
+    (set,), how far apart, an index of tables. tables:
+    (offset, texture, wave), the texture's correlation; a texture is a length and a disparity: all
+    disparities of the first length, ... amplitudes, chromas: (kind,), variance of luminance, times
+    a patch's scale, and of a chrominance over that of luminance. trials: (trial, 3), of which
+    length, at which probe, and of which rank of the kinds by what was tried before, is tried one
+    after the other. freedom: of the Student t.
     """
 
     weights: Any
@@ -42,11 +65,13 @@ class Hypotheses(NamedTuple):
     places: Any
     binning: Any
     waves: Any
+    pairs: Any
+    spots: Any
     offsets: Any
     tables: Any
     amplitudes: Any
     chromas: Any
-    probes: Any
+    trials: Any
     freedom: Any
 
 
@@ -56,8 +81,13 @@ def _gather(given, corners, rays, known, seen, measured):
 
     corners: (lane, 2) of pixels. rays: (part, reading, ray, lane), luminance and, where three
     colours are stored, two chrominances. known: (2, reading, lane), data and variance. seen:
-    (reading, lane) colour. measured: (lane,), how many are usable.
+    (reading, lane) colour. measured: (lane,), how many are usable. All are set.
     """
+    rays[:] = 0
+    known[0] = 0
+    known[1] = 1
+    seen[:] = 0
+    measured[:] = 0
     weights, colour, usable, data, variance, places, binning = given[:7]
     _, views_v, views_u, _, stored, _ = weights.shape
     lanes = corners.shape[0]
@@ -66,8 +96,6 @@ def _gather(given, corners, rays, known, seen, measured):
         for lane in range(lanes):
             y, x = corners[lane, 0] + places[i, 1], corners[lane, 1] + places[i, 2]
             if not usable[s, y, x]:
-                known[0, i, lane] = 0
-                known[1, i, lane] = 1
                 continue
             measured[lane] += 1
             known[0, i, lane] = data[s, y, x]
@@ -93,250 +121,230 @@ def _gather(given, corners, rays, known, seen, measured):
 
 
 @njit(forceinline=True, fastmath=True)
-def _meet(here, there, meetings):
-    """Add to meetings (wave, lane) the spectrum of how two pixels' rays are correlated.
+def _product(table, rows, first, vectors, at, apart, terms):
+    """Return a tile, SIDE rows of a table (flat, their starts in `rows`) times SIDE of vectors.
 
-    here, there: their own spectra (wave, lane), cosine and sine by turns. All flat.
+    vectors: (column, term, lane), flat, from `at`; columns lie `apart`.
     """
-    for k in range(0, meetings.size, 2 * LANES):
-        a, b, total = here[k : k + 2 * LANES], there[k : k + 2 * LANES], meetings[k : k + 2 * LANES]
-        for lane in range(LANES):
-            even, odd = a[lane], a[LANES + lane]
-            total[lane] += even * b[lane] + odd * b[LANES + lane]
-            total[LANES + lane] += odd * b[lane] - even * b[LANES + lane]
+    tile = zero_tile()
+    for term in range(terms):
+        tile = plus_outer(tile, table, rows, first, term, vectors, at + term * LANES, apart)
+    return tile
 
 
 @njit(forceinline=True, fastmath=True)
-def _mixed(table, terms, out):
-    """Set out (row, lane) to table (row, term) times terms (term, lane), the latter two flat.
+def _analyse(waves, rays, starts, columns, spectra):
+    """Set spectra (part, reading, wave * lane) to waves (wave, ray) times rays, see `_gather`.
 
-    TERMS rows and terms at a time: a value read serves as many sums.
+    starts: (wave,), of the rows of waves. columns: of SIDE readings in the spectra.
     """
-    width = TERMS * LANES
+    inputs, table = waves.shape[1], waves.reshape(-1)
+    width = inputs * LANES
+    for part in range(rays.shape[0]):
+        given, out = rays[part].reshape(-1), spectra[part].reshape(-1)
+        for i in range(0, rays.shape[1], SIDE):
+            for wave in range(0, waves.shape[0], SIDE):
+                tile = _product(table, starts, wave, given, i * width, width, inputs)
+                at = i * spectra.shape[2] + wave * LANES
+                scatter_tile(tile, out, at, LANES, columns, 0)
+
+
+@njit(forceinline=True, fastmath=True)
+def _correlate(given, spectra, starts, meetings, sums):
+    """Set sums (hypothesis, part, tile), flat tiles, to the correlations of all pairs of readings.
+
+    spectra: (part, reading, wave * lane), waves being cosines and sines by turns. starts:
+    (hypothesis,), of its row of an offset's table. meetings: (pair, wave * lane), flat, to work in.
+    The two chrominances are correlated alike: they are one part of the sums.
+    """
+    pairs, spots, tables = given.pairs, given.spots.reshape(-1), given.tables
+    terms = tables.shape[2]
+    width, apart = terms * LANES, sums.shape[1] * sums.shape[2]
+    flat = sums.reshape(-1)
+    for one in range(pairs.shape[0]):
+        table = tables[given.offsets[one]].reshape(-1)
+        for part in range(sums.shape[1]):
+            own = spectra[part].reshape(-1)
+            for pair in range(SIDE):
+                here, there = pairs[one, pair, 0] * width, pairs[one, pair, 1] * width
+                for wave in range(0, width, 2 * LANES):
+                    meet(own, here + wave, there + wave, meetings, pair * width + wave)
+                if part == 1:
+                    other = spectra[2].reshape(-1)
+                    for wave in range(0, width, 2 * LANES):
+                        meet_too(other, here + wave, there + wave, meetings, pair * width + wave)
+            for h in range(0, starts.size, SIDE):
+                tile = _product(table, starts, h, meetings, 0, width, terms)
+                at = h * apart + part * sums.shape[2]
+                scatter_tile(tile, flat, at, apart, spots, one * SIDE)
+
+
+@njit(forceinline=True, fastmath=True)
+def _log_likelihood(
+    sums, alike, mix, known, measured, freedom, tiles, values, product, square, out
+):
+    """Set out (lane,) to the log-likelihoods of readings, known (2, reading, lane).
+
+    They are those of multivariate t distributions with `freedom` degrees and measured (lane,)
+    readings; constants are left out. The scale matrices are the variances that are known plus
+    sums (part, tile), the lower triangle in tiles (row, column, lane), row by row, all flat: sums
+    times mix (2, lane), flat, where only one part is stored that and its product with alike, as
+    tiles. tiles, values: (reading, lane), flat, product, square: (lane,), to work in.
+    """
     out[:] = 0
-    for h in range(0, table.shape[0], TERMS):
-        total = out[h * LANES : h * LANES + width]
-        first, second, third, fourth = table[h], table[h + 1], table[h + 2], table[h + 3]
-        for k in range(0, table.shape[1], TERMS):
-            part = terms[k * LANES : k * LANES + width]
-            p, q, r, s = first[k], first[k + 1], first[k + 2], first[k + 3]
-            e, f, g, i = second[k], second[k + 1], second[k + 2], second[k + 3]
-            t, u, v, w = third[k], third[k + 1], third[k + 2], third[k + 3]
-            x, y, z, o = fourth[k], fourth[k + 1], fourth[k + 2], fourth[k + 3]
-            for lane in range(LANES):
-                a, b = part[lane], part[LANES + lane]
-                c, d = part[2 * LANES + lane], part[3 * LANES + lane]
-                total[lane] += p * a + q * b + r * c + s * d
-                total[LANES + lane] += e * a + f * b + g * c + i * d
-                total[2 * LANES + lane] += t * a + u * b + v * c + w * d
-                total[3 * LANES + lane] += x * a + y * b + z * c + o * d
-
-
-@njit(forceinline=True, fastmath=True)
-def _less_products(left, right, tile):
-    """Take the product of a tile and another's transpose off a third, all (row, column, lane)."""
-    for lane in range(LANES):
-        for i in range(TERMS):
-            at = i * TERMS * LANES + lane
-            a, b, c, d = left[at], left[at + LANES], left[at + 2 * LANES], left[at + 3 * LANES]
-            for j in range(TERMS):
-                by = j * TERMS * LANES + lane
-                tile[at + j * LANES] -= (
-                    a * right[by]
-                    + b * right[by + LANES]
-                    + c * right[by + 2 * LANES]
-                    + d * right[by + 3 * LANES]
-                )
-
-
-@njit(forceinline=True, fastmath=True)
-def _solved(diagonal, inverses, tile):
-    """Divide a tile by the transpose of a diagonal one's factor; inverses: of its pivots."""
-    for i in range(TERMS):
-        for j in range(TERMS):
-            at = (i * TERMS + j) * LANES
-            for k in range(j):
-                to, by = (i * TERMS + k) * LANES, (j * TERMS + k) * LANES
-                for lane in range(LANES):
-                    tile[at + lane] -= tile[to + lane] * diagonal[by + lane]
-            for lane in range(LANES):
-                tile[at + lane] *= inverses[j * LANES + lane]
-
-
-@njit(forceinline=True, fastmath=True)
-def _factored(tile, inverses, product):
-    """Put the Cholesky factor of a diagonal tile in its place; set product to that of its pivots.
-
-    inverses: of the factor's diagonal, set.
-    """
     product[:] = 1
-    for j in range(TERMS):
-        for i in range(j, TERMS):
-            at = (i * TERMS + j) * LANES
-            for k in range(j):
-                to, by = (i * TERMS + k) * LANES, (j * TERMS + k) * LANES
-                for lane in range(LANES):
-                    tile[at + lane] -= tile[to + lane] * tile[by + lane]
-            for lane in range(LANES):
-                if i == j:
-                    pivot = max(tile[at + lane], np.float32(1e-12))
-                    product[lane] *= pivot
-                    inverses[j * LANES + lane] = np.float32(1.0) / np.sqrt(pivot)
-                else:
-                    tile[at + lane] *= inverses[j * LANES + lane]
-
-
-@njit(forceinline=True, fastmath=True)
-def _log_likelihood(tiles, data, measured, freedom, inverses, product, square, out):
-    """Set out (lane,) to the log-likelihoods of data (reading, lane), all flat.
-
-    tiles: (tile, row, column, lane), the lower triangle of scale matrices of multivariate t
-    distributions, with `freedom` degrees and measured (lane,) readings, in tiles of TERMS x TERMS,
-    row by row; constants are left out. Tiles and data are destroyed. inverses: as data, product,
-    square: (lane,), to work in.
-    """
-    size, strip = TERMS * TERMS * LANES, TERMS * LANES
-    out[:] = 0
-    for i in range(inverses.size // strip):
+    square[:] = 0
+    strip = SIDE * LANES
+    blocks = values.size // strip
+    data, variances = known[0].reshape(-1), known[1].reshape(-1)
+    for at in range(values.size):
+        values[at] = data[at]
+    for i in range(blocks):
         first = i * (i + 1) // 2
         for j in range(i + 1):
             other = j * (j + 1) // 2
-            tile = tiles[(first + j) * size : (first + j + 1) * size]
-            for k in range(j):
-                left = tiles[(first + k) * size : (first + k + 1) * size]
-                right = tiles[(other + k) * size : (other + k + 1) * size]
-                _less_products(left, right, tile)
-            if j < i:
-                diagonal = tiles[(other + j) * size : (other + j + 1) * size]
-                _solved(diagonal, inverses[j * strip : (j + 1) * strip], tile)
+            at = (first + j) * SIZE
+            tile = load_tile(sums[0], at)
+            if sums.shape[0] == 1:
+                tint = multiplied(tile, load_tile(alike, at))
             else:
-                _factored(tile, inverses[i * strip : (i + 1) * strip], product)
-        for lane in range(LANES):
-            out[lane] -= 0.5 * log(product[lane])
-    square[:] = 0
-    for i in range(inverses.size // LANES):
-        block, row = i // TERMS, i % TERMS
-        own = data[i * LANES : (i + 1) * LANES]
-        for k in range(i):
-            at = block * (block + 1) // 2 + k // TERMS
-            at = ((at * TERMS + row) * TERMS + k % TERMS) * LANES
+                tint = load_tile(sums[1], at)
+            tile = combined(tile, tint, mix)
+            for k in range(j):
+                tile = less_products(tile, tiles, (first + k) * SIZE, (other + k) * SIZE)
+            if j < i:
+                tile = divided(tile, tiles, (other + j) * SIZE)
+                take_applied(tile, values, j * strip, i * strip)
+            else:
+                tile = factored(plus_diagonal(tile, variances, i * strip), np.float32(LEAST))
+                substitute(tile, values, i * strip)
+            store_tile(tile, tiles, at)
+        for row in range(SIDE):
+            at = (first + i) * SIZE + row * (SIDE + 1) * LANES
+            value = values[(i * SIDE + row) * LANES : (i * SIDE + row + 1) * LANES]
             for lane in range(LANES):
-                own[lane] -= tiles[at + lane] * data[k * LANES + lane]
-        for lane in range(LANES):
-            own[lane] *= inverses[i * LANES + lane]
-            square[lane] += own[lane] ** 2
+                product[lane] *= tiles[at + lane]
+                square[lane] += value[lane] ** 2
+        if i % LOGS == LOGS - 1 or i == blocks - 1:
+            for lane in range(LANES):
+                out[lane] += log(product[lane])
+            product[:] = 1
     for lane in range(LANES):
         out[lane] -= 0.5 * (freedom + measured[lane]) * log(1 + square[lane] / freedom)
 
 
 @njit(forceinline=True, fastmath=True)
-def _fill(sums, known, seen, strength, chroma, tiles, data):
-    """Set tiles, see `_log_likelihood`, to the readings' covariance, and data to their values.
-
-    sums: (part, pair, lane). strength, chroma: (lane,). seen: (reading, lane), or no reading where
-    three colours are stored.
-    """
+def _compare_colours(given, seen, alike):
+    """Set alike, flat tiles, to by how much more than a third the colours seen are the same."""
     third = np.float32(1.0 / 3.0)
-    first = 0
-    for i in range(known.shape[1]):
-        block = i // TERMS
-        for j in range(i + 1):
-            at = block * (block + 1) // 2 + j // TERMS
-            at = ((at * TERMS + i % TERMS) * TERMS + j % TERMS) * LANES
-            row = tiles[at : at + LANES]
-            grey = sums[0, first]
-            if sums.shape[0] == 1:
-                a, b = seen[i], seen[j]
-                for lane in range(LANES):
-                    same = np.float32(1.0) if a[lane] == b[lane] else np.float32(0.0)
-                    row[lane] = (
-                        strength[lane] * grey[lane] * (third + chroma[lane] * (same - third))
-                    )
-            else:
-                tint = sums[1, first]
-                for lane in range(LANES):
-                    row[lane] = strength[lane] * (grey[lane] + chroma[lane] * tint[lane])
-            first += 1
-        for lane in range(LANES):
-            row[lane] += known[1, i, lane]
-            data[i * LANES + lane] = known[0, i, lane]
+    for one in range(given.pairs.shape[0]):
+        for pair in range(SIDE):
+            i, j = given.pairs[one, pair]
+            at = given.spots[one, pair]
+            for lane in range(LANES):
+                same = np.float32(1.0) if seen[i, lane] == seen[j, lane] else np.float32(0.0)
+                alike[at + lane] = same - third
+
+
+@njit(forceinline=True, fastmath=True)
+def _rank(best, ranks):
+    """Order ranks (rank, lane), indices of rows of best (kind, lane), the largest first."""
+    for lane in range(LANES):
+        for end in range(1, ranks.shape[0]):
+            at, kind = end, ranks[end, lane]
+            while at > 0 and best[kind, lane] > best[ranks[at - 1, lane], lane]:
+                ranks[at, lane] = ranks[at - 1, lane]
+                at -= 1
+            ranks[at, lane] = kind
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def evidence(given, corners, scales, out, chosen):
-    """Set out (lane, hypothesis) to log-likelihoods, constants left out, and chosen (lane, length).
+def evidence(given, corners, scales, textures, counts, probes, out, chosen):
+    """Set out (patch, texture) to log-likelihoods, constants left out, and chosen (patch, length).
 
-    given: `Hypotheses`. A hypothesis is a length of the texture, and a disparity: all disparities
-    of the first, ... corners: (lane, 2) pixels. scales: (lane,), of the amplitudes. out is that of
-    the best kind of texture, `chosen`.
+    given: `Hypotheses`. Every LANES patches are a group. corners: (patch, 2) pixels. scales:
+    (patch,), of the amplitudes. textures: (group, texture), those to compare, counts: (group,), how
+    many. probes: (group, probe), at which of a length's textures kinds are tried. out is set at the
+    group's textures only, for the kind that explains the patch best at any of the probes,
+    `chosen`; without trials that is given.
     """
-    weights, _, _, _, _, places, _, waves, offsets, tables, amplitudes, chromas = given[:12]
-    probes, freedom = given[12:]
-    stored = weights.shape[4]
-    readings = places.shape[0]
-    m = -(-readings // TERMS) * TERMS
-    lanes = corners.shape[0]
-    hypotheses, rows, spectrum = out.shape[1], tables.shape[1], tables.shape[2]
+    stored, kinds = given.weights.shape[4], given.amplitudes.size
+    m = -(-given.places.shape[0] // SIDE) * SIDE
+    terms, inputs = given.waves.shape
+    blocks = m // SIDE
+    entries = blocks * (blocks + 1) // 2 * SIZE
+    most = -(-counts.max() // SIDE) * SIDE
     parts = 1 if stored == 1 else 3
-    groups = 1 if stored == 1 else 2
-    rays = np.zeros((parts, readings, waves.shape[1], lanes), np.float32)
-    known = np.zeros((2, m, lanes), np.float32)
-    known[1] = 1
-    seen = np.zeros((m, lanes), np.uint8)
-    measured = np.zeros(lanes, np.float32)
-    _gather(given, corners, rays, known, seen, measured)
-    spectra = np.empty((parts, readings, spectrum * lanes), np.float32)
-    for part in range(parts):
-        for i in range(readings):
-            _mixed(waves, rays[part, i].reshape(-1), spectra[part, i])
-    sums = np.zeros((hypotheses, groups, m * (m + 1) // 2, lanes), np.float32)
-    meetings = np.empty(spectrum * lanes, np.float32)
-    row = np.empty((rows, lanes), np.float32)
-    flat_row = row.reshape(-1)
-    first = 0
-    for i in range(readings):
-        for j in range(i + 1):
-            for part in range(parts):
-                if part < 2:
-                    meetings[:] = 0
-                _meet(spectra[part, i], spectra[part, j], meetings)
-                if part != 1:
-                    _mixed(tables[offsets[i, j]], meetings, flat_row)
-                    for h in range(hypotheses):
-                        # A loop: copying an array compiles for seconds, for its message of shapes.
-                        for lane in range(lanes):
-                            sums[h, min(part, 1), first, lane] = row[h, lane]
-            first += 1
-    blocks = m // TERMS
-    tiles = np.zeros(blocks * (blocks + 1) // 2 * TERMS * TERMS * LANES, np.float32)
-    values, inverses = np.empty(m * LANES, np.float32), np.empty(m * LANES, np.float32)
-    product, square = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
-    likelihood = np.empty(lanes, np.float32)
-    best = np.empty(lanes, np.float32)
-    strength, chroma = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
-    lengths = chosen.shape[1]
-    each = hypotheses // lengths
-    for length in range(lengths):
+    rays = np.empty((parts, m, inputs, LANES), np.float32)
+    spectra = np.empty((parts, m, terms * LANES), np.float32)
+    known = np.empty((2, m, LANES), np.float32)
+    seen = np.empty((m, LANES), np.uint8)
+    alike = np.zeros(entries if stored == 1 else 0, np.float32)
+    # What is no pair of readings, within diagonal tiles and beyond the last reading, stays 0.
+    sums = np.zeros((most, 1 if stored == 1 else 2, entries), np.float32)
+    meetings = np.empty(SIDE * terms * LANES, np.float32)
+    tiles, values = np.empty(entries, np.float32), np.empty(m * LANES, np.float32)
+    measured, square = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    product, likelihood = np.empty(LANES, np.float64), np.empty(LANES, np.float32)
+    mix = np.empty(2 * LANES, np.float32)
+    # One colour seen is a third luminance.
+    grey = np.float32(1.0 / 3.0) if stored == 1 else np.float32(1.0)
+    best, ranks = np.empty((kinds, LANES), np.float32), np.empty((kinds, LANES), np.int64)
+    most_likely = np.empty(LANES, np.float32)
+    wave_starts, columns = np.arange(terms) * inputs, np.arange(SIDE) * terms * LANES
+    trials, lengths = given.trials.shape[0], chosen.shape[1]
+    for group in range(counts.size):
+        first = group * LANES
+        _gather(given, corners[first : first + LANES], rays, known, seen, measured)
+        _analyse(given.waves, rays, wave_starts, columns, spectra)
+        count = counts[group]
+        starts = np.empty(-(-count // SIDE) * SIDE, np.int64)
+        for h in range(starts.size):
+            starts[h] = textures[group, min(h, count - 1)] * terms
+        _correlate(given, spectra, starts, meetings, sums)
+        if stored == 1:
+            _compare_colours(given, seen, alike)
+        each = count // lengths
         best[:] = -np.inf
-        for e in range(amplitudes.size):
-            for lane in range(lanes):
-                strength[lane] = amplitudes[e] * scales[lane]
-                chroma[lane] = chromas[e]
-            for h in probes:
-                _fill(sums[length * each + h], known, seen, strength, chroma, tiles, values)
-                _log_likelihood(
-                    tiles, values, measured, freedom, inverses, product, square, likelihood
-                )
-                for lane in range(lanes):
-                    if likelihood[lane] > best[lane]:
-                        best[lane] = likelihood[lane]
-                        chosen[lane, length] = e
-        for lane in range(lanes):
-            kind = chosen[lane, length]
-            strength[lane] = amplitudes[kind] * scales[lane]
-            chroma[lane] = chromas[kind]
-        for h in range(length * each, (length + 1) * each):
-            _fill(sums[h], known, seen, strength, chroma, tiles, values)
-            _log_likelihood(tiles, values, measured, freedom, inverses, product, square, likelihood)
-            for lane in range(lanes):
-                out[lane, h] = likelihood[lane]
+        for kind in range(kinds):
+            ranks[kind, :] = kind
+        # First kinds are tried, then all textures with the best: one loop, since what it calls is
+        # compiled once for each place where it is called.
+        for turn in range(-trials, count):
+            if turn < 0:
+                length, probe, rank = given.trials[turn + trials]
+                h = length * each + probes[group, probe]
+                if rank == 0:
+                    _rank(best, ranks)
+                    if probe == 0:
+                        best[:] = -np.inf
+                        most_likely[:] = -np.inf
+            else:
+                length, rank, h = turn // each, 0, turn
+            for lane in range(LANES):
+                kind = ranks[rank, lane] if turn < 0 else chosen[first + lane, length]
+                strength = given.amplitudes[kind] * scales[first + lane]
+                mix[lane] = strength * grey
+                mix[LANES + lane] = strength * given.chromas[kind]
+            _log_likelihood(
+                sums[h],
+                alike,
+                mix,
+                known,
+                measured,
+                given.freedom,
+                tiles,
+                values,
+                product,
+                square,
+                likelihood,
+            )
+            for lane in range(LANES):
+                if turn >= 0:
+                    out[first + lane, textures[group, h]] = likelihood[lane]
+                    continue
+                kind = ranks[rank, lane]
+                best[kind, lane] = max(best[kind, lane], likelihood[lane])
+                if likelihood[lane] > most_likely[lane]:
+                    most_likely[lane] = likelihood[lane]
+                    chosen[first + lane, length] = kind

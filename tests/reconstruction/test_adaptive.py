@@ -18,8 +18,16 @@ from reconstruction.adaptive.joint import TextureSettings, solve
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import fitted, slopes
+from reconstruction.adaptive.register_tiles import LANES
 from reconstruction.adaptive.search import (
     Volume,
+    _asked,
+    _between,
+    _near_best,
+    _packed,
+    _possible,
+    _settled,
+    _spanned,
     compatibility,
     per_pixel,
     posteriors,
@@ -116,6 +124,66 @@ def test_the_evidence_of_several_lengths_is_the_mean_likelihood_of_each(coded_ps
     assert 0 < shorter.mean() < 1
     assert (long.kind != short.kind).any()
     np.testing.assert_array_equal(both.kind, np.where(shorter, short.kind, long.kind))
+
+
+def evidence_of_patches(psi, prior, **given):
+    """The evidence of 4x4 patches of noise at five disparities, and how many patches they are."""
+    rng = np.random.default_rng(0)
+    data = rng.normal(0, 0.1, psi.frames_shape).astype(np.float32)
+    patches = EvidencePatches(4, 3)
+    corners = np.stack(np.meshgrid(*patches.grid(data.shape[1:]), indexing="ij"), axis=-1)
+    corners = corners.reshape(-1, 2)
+    found = patch_evidence(
+        psi,
+        data,
+        np.full(data.shape, 1e-4),
+        np.ones(data.shape, bool),
+        np.full(len(corners), 0.5),
+        corners,
+        patches.places(psi.shots),
+        np.linspace(-2, 2, 5),
+        prior,
+        **given,
+    )
+    return found, len(corners)
+
+
+def test_disparities_are_evaluated_where_a_patch_or_one_beside_it_asks(coded_psi):
+    psi = coded_psi(size=(20, 22))
+    prior = TexturePrior(4.0, (1.0,))
+    all_of_them, count = evidence_of_patches(psi, prior)
+    assert count > 2 * LANES
+    possible = np.zeros((count, 5), dtype=bool)
+    possible[:LANES, 1] = possible[3, 4] = possible[LANES:, 2] = possible[-1, 0] = True
+    asked = np.zeros((count, 5), dtype=bool)
+    asked[:LANES, [1, 4]] = asked[LANES:, 2] = asked[count // LANES * LANES :, 0] = True
+    found, _ = evidence_of_patches(psi, prior, possible=possible, kinds=all_of_them.kinds)
+    np.testing.assert_array_equal(np.isfinite(found.log_likelihood), asked)
+    np.testing.assert_allclose(
+        found.log_likelihood[asked], all_of_them.log_likelihood[asked], rtol=1e-5
+    )
+    np.testing.assert_array_equal(found.kinds, all_of_them.kinds)
+
+
+def test_a_known_kind_of_texture_is_the_one_that_evidence_assumes(coded_psi):
+    psi, prior = coded_psi(size=(14, 16)), TexturePrior(4.0, (1.0,))
+    _, count = evidence_of_patches(psi, prior)
+    kinds = np.full((count, 2), 4)
+    found, _ = evidence_of_patches(psi, prior, kinds=kinds)
+    alone, _ = evidence_of_patches(psi, replace(prior, kinds=prior.kinds[4:5]))
+    np.testing.assert_allclose(found.log_likelihood, alone.log_likelihood, rtol=1e-6)
+    assert np.all(found.kind == 4)
+
+
+def test_fewer_kinds_compared_never_fit_better_at_what_is_probed(coded_psi):
+    psi, prior = coded_psi(size=(14, 16)), TexturePrior(3.0)
+    every, _ = evidence_of_patches(psi, prior)
+    few, _ = evidence_of_patches(psi, replace(prior, kept=1))
+    differ = (few.kind != every.kind).ravel()
+    assert 0 < differ.mean() < 1
+    best, kept = (found.log_likelihood[:, :4].max(axis=1) for found in (every, few))
+    assert np.all(kept[~differ] == best[~differ])
+    assert best.mean() > kept.mean()
 
 
 def test_psi_of_surfaces_is_psi_of_their_light_field(random_psi, monkeypatch):
@@ -325,6 +393,87 @@ def test_corners_of_a_second_grid_lie_between_and_cover_the_same_pixels():
     assert rows.tolist() == [0, 3, 9, 15, 21, 22]
     assert columns.tolist() == [0, 3, 9, 15, 21, 24]
     assert patches.grid((30, 32))[0].tolist() == [0, 6, 12, 18, 22]
+
+
+def test_patches_that_ask_for_the_same_disparities_follow_each_other():
+    asked = np.zeros((6, 5), dtype=bool)
+    for patch, labels in enumerate(([2, 3], [0, 4], [], [2], [2, 3], [0, 1])):
+        asked[patch, labels] = True
+    assert _packed(asked).tolist() == [5, 1, 3, 0, 4]
+
+
+def test_a_disparity_is_possible_near_where_the_rough_search_believes_it():
+    grid = np.array([4.0, 16.0, 28.0]), np.array([4.0, 16.0, 28.0, 40.0])
+    rough = np.zeros((3, 4, 3), np.float32)
+    rough[..., 0] = 1
+    rough[1, 2] = 0.0, 0.97, 0.03
+    kind = np.zeros((3, 4), int)
+    volume = Volume(np.array([-0.5, 0.0, 1.0]), grid, rough, rough, kind, kind == 0)
+    labels = np.arange(-4, 9) * 0.25
+    corners = np.array([0, 20]), np.array([0, 40])
+    found = _possible(volume, EvidencePatches(8, 6), corners, labels)
+    # Centres 12 px apart: what lies within 18 px of a patch is near. The labels' spacings are 0.5,
+    # 0.75 and 1.
+    near_first = np.abs(labels + 0.5) <= 0.5
+    others = (np.abs(labels) <= 0.75) | (np.abs(labels - 1) <= 1)
+    np.testing.assert_array_equal(found[:, 0], [near_first] * 2)
+    np.testing.assert_array_equal(found[:, 1], [near_first | others] * 2)
+    far = _possible(volume, EvidencePatches(8, 6), (np.array([0]), np.array([60])), labels)
+    np.testing.assert_array_equal(far[0, 0], False)
+
+
+def test_evidence_between_disparities_is_that_of_a_cubic():
+    at = np.arange(13.0)
+    curves = np.stack([0.1 * at**3 - at**2, 5 - at**2]).astype(np.float32)
+    known = curves[:, ::3].copy()
+    known[1, 0] = -np.inf
+    found = _between(known, 3)
+    np.testing.assert_allclose(found[0], curves[0], atol=1e-3)
+    np.testing.assert_allclose(found[1, 3:], curves[1, 3:], atol=1e-3)
+    assert np.all(found[1, :3] == -np.inf)
+    # One known value stands alone, others lie beyond a gap.
+    known = np.array([[1.0, -np.inf, 2.0, 4.0]], np.float32)
+    expected = [[1, -np.inf, -np.inf, -np.inf, 2, 3, 4]]
+    np.testing.assert_allclose(_between(known, 2), expected, rtol=1e-6)
+
+
+def test_labels_evaluated_have_those_possible_between_them():
+    possible = np.zeros((1, 2, 7), dtype=bool)
+    possible[0, 0, 3] = possible[0, 1, 4] = True
+    np.testing.assert_array_equal(_asked(possible, 1), possible)
+    found = _asked(possible, 2)
+    assert [np.flatnonzero(one).tolist() for one in found[0]] == [[1, 2], [2]]
+    assert np.flatnonzero(_spanned(found[0, 0], 2)).tolist() == [2, 3, 4]
+    assert np.flatnonzero(_spanned(np.array([1, 0, 1, 1], bool), 2)).tolist() == [0, 4, 5, 6]
+
+
+def test_a_second_grid_is_settled_where_patches_around_are_sure_and_agree():
+    labels, kind = np.arange(4) * 0.25, np.zeros((3, 4), int)
+    chances = np.zeros((3, 4, 4), np.float32)
+    chances[..., 0] = 1
+    chances[:, 1:, :2] = 0.02, 0.98  # the next label agrees
+    chances[0, 3] = 0, 0, 0, 1  # another surface
+    chances[2, 0] = 0.6, 0, 0, 0.4  # not sure
+    evidence = np.log(chances + 1e-3)
+    evidence[1, 1, 3] = -np.inf
+    at = np.arange(3) * 6.0, np.arange(4) * 6.0
+    volume = Volume(labels, at, chances, evidence, kind, kind == 0)
+    between = at[0][:2] + 3, np.array([0.0, *(at[1][:3] + 3)])
+    settled, found = _settled(volume, between)
+    expected = [[True, True, True, False], [False, False, True, True]]
+    np.testing.assert_array_equal(settled, expected)
+    mean = evidence[:2, 1:3].mean(axis=(0, 1))
+    np.testing.assert_allclose(found[0, 2], mean, rtol=1e-5)
+    assert found[0, 2, 3] == -np.inf
+    # Beyond the first column it is that of the first.
+    np.testing.assert_allclose(found[0, 0], evidence[:2, 0].mean(axis=0), rtol=1e-5)
+
+
+def test_disparities_beside_the_best_known_are_evaluated():
+    evidence = np.array([[0.0, -9.0, -30.0, -29.0, -1.0, -np.inf, -2.0]], np.float32)
+    found = _near_best(evidence, 2)
+    assert np.flatnonzero(found[0]).tolist() == [1, 7]
+    assert not _near_best(evidence, 1).any()
 
 
 def test_beliefs_of_two_grids_are_averaged_where_they_disagree():

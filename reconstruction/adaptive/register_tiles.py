@@ -1,0 +1,360 @@
+"""Tiles of SIDE x SIDE numbers, of LANES problems each, that kernels keep in vector registers.
+
+Small matrices of many problems are worked on side by side: a vector holds one entry of LANES
+matrices. A compiler does not keep a tile's vectors in registers throughout a sum, since what is
+stored might be what is read next; so these functions, which kernels call, are written in its own
+language. Products and factors then are bound by arithmetic, at two products a vector read.
+
+Matrices lie in flat float32 arrays, at an index: (row, column, lane) of a tile. The arguments
+`flat`, `table` and `vectors` are such arrays; nothing checks their bounds.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, register_model
+
+LANES = 16
+"""Problems side by side: a vector register of AVX-512; other processors take several for it."""
+SIDE = 4
+"""Of a tile. Its 16 vectors and 8 of what it is the product of fit the 32 registers."""
+
+_FLOAT = ir.FloatType()
+_VECTOR = ir.VectorType(_FLOAT, LANES)
+_TILE_OF = ir.ArrayType(_VECTOR, SIDE * SIDE)
+_EACH = range(SIDE)
+
+
+class _Tile(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name=f"Tile({SIDE}, {LANES})")
+
+
+_TILE = _Tile()
+
+
+@register_model(_Tile)
+class _TileModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _TILE_OF)
+
+
+class _Code:
+    """Writes the instructions of one function."""
+
+    def __init__(self, builder: Any) -> None:
+        self.builder = builder
+
+    def place(self, flat: Any, at: Any, further: int = 0) -> Any:
+        at = self.builder.add(at, ir.Constant(at.type, further))
+        return self.builder.gep(flat, [at])
+
+    def read(self, flat: Any, at: Any, number: int = 0) -> Any:
+        """Return the vector that lies `number` vectors beyond an index."""
+        where = self.place(flat, at, number * LANES)
+        return self.builder.load(self.builder.bitcast(where, _VECTOR.as_pointer()), align=4)
+
+    def write(self, flat: Any, at: Any, number: int, vector: Any) -> None:
+        where = self.place(flat, at, number * LANES)
+        self.builder.store(vector, self.builder.bitcast(where, _VECTOR.as_pointer()), align=4)
+
+    def spread(self, number: Any) -> Any:
+        """Return a vector of one number."""
+        one = self.builder.insert_element(
+            ir.Constant(_VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0)
+        )
+        mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        return self.builder.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), mask)
+
+    def called(self, name: str, *vectors: Any) -> Any:
+        """Return what an intrinsic of the compiler makes of vectors."""
+        kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(vectors))
+        name = f"llvm.{name}.v{LANES}f32"
+        function = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        return self.builder.call(function, vectors)
+
+    def plus(self, total: Any, one: Any, other: Any) -> Any:
+        return self.called("fmuladd", one, other, total)
+
+    def less(self, total: Any, one: Any, other: Any) -> Any:
+        return self.plus(total, self.builder.fneg(one), other)
+
+    def times(self, one: Any, other: Any) -> Any:
+        return self.builder.fmul(one, other)
+
+    def rows(self, tile: Any) -> list[list[Any]]:
+        """Return the vectors of a tile, row by row."""
+        return [
+            [self.builder.extract_value(tile, row * SIDE + column) for column in _EACH]
+            for row in _EACH
+        ]
+
+    def tile(self, rows: list[list[Any]]) -> Any:
+        out = ir.Constant(_TILE_OF, ir.Undefined)
+        for number, vector in enumerate(vector for row in rows for vector in row):
+            out = self.builder.insert_value(out, vector, number)
+        return out
+
+
+def _function(returned: Any, kinds: Any, write: Any) -> Any:
+    """Return the signature of a function of arrays, indices and tiles, and what generates it.
+
+    write: called with a `_Code` and the arguments; arrays are pointers to their first number.
+    """
+    known = [types.intp if isinstance(kind, types.Integer) else kind for kind in kinds]
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        given = [
+            context.make_array(kind)(context, builder, value).data
+            if isinstance(kind, types.Array)
+            else value
+            for kind, value in zip(signature.args, values, strict=True)
+        ]
+        out = write(_Code(builder), *given)
+        return context.get_dummy_value() if out is None else out
+
+    return returned(*known), generate
+
+
+@intrinsic
+def zero_tile(context):
+    """Return a tile of zeros."""
+    return _function(_TILE, (), lambda code: ir.Constant(_TILE_OF, None))
+
+
+@intrinsic
+def load_tile(context, flat, at):
+    """Return the tile at flat[at]."""
+
+    def write(code, flat, at):
+        return code.tile(
+            [[code.read(flat, at, SIDE * row + column) for column in _EACH] for row in _EACH]
+        )
+
+    return _function(_TILE, (flat, at), write)
+
+
+@intrinsic
+def store_tile(context, tile, flat, at):
+    """Put a tile at flat[at]."""
+
+    def write(code, tile, flat, at):
+        for row, vectors in enumerate(code.rows(tile)):
+            for column, vector in enumerate(vectors):
+                code.write(flat, at, SIDE * row + column, vector)
+
+    return _function(types.void, (tile, flat, at), write)
+
+
+@intrinsic
+def scatter_tile(context, tile, flat, at, apart, places, first):
+    """Put the vector of each row r and column c at flat[at + r * apart + places[first + c]].
+
+    places: int64.
+    """
+
+    def write(code, tile, flat, at, apart, places, first):
+        rows = code.rows(tile)
+        for column in _EACH:
+            to = code.builder.add(at, code.builder.load(code.place(places, first, column)))
+            for row in _EACH:
+                code.write(flat, to, 0, rows[row][column])
+                to = code.builder.add(to, apart) if row < SIDE - 1 else to
+
+    return _function(types.void, (tile, flat, at, apart, places, first), write)
+
+
+@intrinsic
+def multiplied(context, tile, other):
+    """Return the product of two tiles, entry by entry."""
+
+    def write(code, tile, other):
+        pairs = zip(code.rows(tile), code.rows(other), strict=True)
+        return code.tile([list(map(code.times, *rows)) for rows in pairs])
+
+    return _function(_TILE, (tile, other), write)
+
+
+@intrinsic
+def combined(context, tile, other, flat):
+    """Return a tile times the vector at flat[0], plus another times that at flat[LANES]."""
+
+    def write(code, tile, other, flat):
+        zero = ir.Constant(ir.IntType(64), 0)
+        one, two = code.read(flat, zero, 0), code.read(flat, zero, 1)
+        pairs = zip(code.rows(tile), code.rows(other), strict=True)
+        return code.tile(
+            [
+                [code.plus(code.times(own, one), its, two) for own, its in zip(*rows, strict=True)]
+                for rows in pairs
+            ]
+        )
+
+    return _function(_TILE, (tile, other, flat), write)
+
+
+@intrinsic
+def plus_diagonal(context, tile, flat, at):
+    """Return a tile plus the SIDE vectors at flat[at], on its diagonal."""
+
+    def write(code, tile, flat, at):
+        out = code.rows(tile)
+        for row in _EACH:
+            out[row][row] = code.builder.fadd(out[row][row], code.read(flat, at, row))
+        return code.tile(out)
+
+    return _function(_TILE, (tile, flat, at), write)
+
+
+@intrinsic
+def plus_outer(context, tile, table, rows, first, term, vectors, at, apart):
+    """Return a tile plus the outer product of numbers and vectors.
+
+    The number of its row r is table[rows[first + r] + term], rows being int64; the vector of its
+    column c lies at vectors[at + c * apart].
+    """
+
+    def write(code, tile, table, rows, first, term, vectors, at, apart):
+        out = code.rows(tile)
+        read = []
+        for column in _EACH:
+            read.append(code.read(vectors, at))
+            at = code.builder.add(at, apart) if column < SIDE - 1 else at
+        for row in _EACH:
+            start = code.builder.load(code.place(rows, first, row))
+            number = code.builder.load(code.place(table, code.builder.add(start, term)))
+            number = code.spread(number)
+            for column in _EACH:
+                out[row][column] = code.plus(out[row][column], number, read[column])
+        return code.tile(out)
+
+    return _function(_TILE, (tile, table, rows, first, term, vectors, at, apart), write)
+
+
+@intrinsic
+def less_products(context, tile, flat, left, right):
+    """Return a tile less the product of that at flat[left] and the transpose of that at right."""
+
+    def write(code, tile, flat, left, right):
+        out = code.rows(tile)
+        for term in _EACH:
+            others = [code.read(flat, right, SIDE * column + term) for column in _EACH]
+            for row in _EACH:
+                one = code.read(flat, left, SIDE * row + term)
+                for column in _EACH:
+                    out[row][column] = code.less(out[row][column], one, others[column])
+        return code.tile(out)
+
+    return _function(_TILE, (tile, flat, left, right), write)
+
+
+@intrinsic
+def factored(context, tile, least):
+    """Return the Cholesky factor of a tile, the inverses of its pivots on the diagonal.
+
+    Squared pivots are at least `least`. What is above the diagonal is neither read nor set.
+    """
+
+    def write(code, tile, least):
+        out = code.rows(tile)
+        least, one = code.spread(least), ir.Constant(_VECTOR, [1.0] * LANES)
+        for column in _EACH:
+            for row in range(column, SIDE):
+                for term in range(column):
+                    out[row][column] = code.less(
+                        out[row][column], out[row][term], out[column][term]
+                    )
+                if row == column:
+                    square = code.called("maxnum", out[row][column], least)
+                    out[row][column] = code.builder.fdiv(one, code.called("sqrt", square))
+                else:
+                    out[row][column] = code.times(out[row][column], out[column][column])
+        return code.tile(out)
+
+    return _function(_TILE, (tile, least), write)
+
+
+@intrinsic
+def divided(context, tile, flat, factor):
+    """Return a tile divided by the transpose of the factor (`factored`) at flat[factor]."""
+
+    def write(code, tile, flat, factor):
+        out = code.rows(tile)
+        for column in _EACH:
+            by = [code.read(flat, factor, SIDE * column + term) for term in range(column + 1)]
+            for row in _EACH:
+                for term in range(column):
+                    out[row][column] = code.less(out[row][column], out[row][term], by[term])
+                out[row][column] = code.times(out[row][column], by[column])
+        return code.tile(out)
+
+    return _function(_TILE, (tile, flat, factor), write)
+
+
+@intrinsic
+def take_applied(context, tile, flat, source, target):
+    """Take a tile times the SIDE vectors at flat[source] off those at flat[target]."""
+
+    def write(code, tile, flat, source, target):
+        given = [code.read(flat, source, column) for column in _EACH]
+        for row, vectors in enumerate(code.rows(tile)):
+            left = code.read(flat, target, row)
+            for vector, one in zip(vectors, given, strict=True):
+                left = code.less(left, vector, one)
+            code.write(flat, target, row, left)
+
+    return _function(types.void, (tile, flat, source, target), write)
+
+
+@intrinsic
+def substitute(context, tile, flat, at):
+    """Divide the SIDE vectors at flat[at] by a factor (`factored`)."""
+
+    def write(code, tile, flat, at):
+        solved = []
+        for row, vectors in enumerate(code.rows(tile)):
+            left = code.read(flat, at, row)
+            for vector, one in zip(vectors, solved, strict=False):
+                left = code.less(left, vector, one)
+            solved.append(code.times(left, vectors[row]))
+            code.write(flat, at, row, solved[row])
+
+    return _function(types.void, (tile, flat, at), write)
+
+
+def _conjugate_product(code: _Code, flat: Any, here: Any, there: Any) -> list[Any]:
+    """Return real and imaginary part of flat[here] times the conjugate of flat[there]."""
+    (real, imaginary), (other_real, other_imaginary) = (
+        (code.read(flat, at, 0), code.read(flat, at, 1)) for at in (here, there)
+    )
+    return [
+        code.plus(code.times(real, other_real), imaginary, other_imaginary),
+        code.less(code.times(imaginary, other_real), real, other_imaginary),
+    ]
+
+
+@intrinsic
+def meet(context, flat, here, there, out, at):
+    """Put the product of the complex number at flat[here] and the conjugate of that at [there] at
+    out[at]: real and imaginary part follow each other."""
+
+    def write(code, flat, here, there, out, at):
+        for number, vector in enumerate(_conjugate_product(code, flat, here, there)):
+            code.write(out, at, number, vector)
+
+    return _function(types.void, (flat, here, there, out, at), write)
+
+
+@intrinsic
+def meet_too(context, flat, here, there, out, at):
+    """Add such a product, see `meet`, to what is at out[at]."""
+
+    def write(code, flat, here, there, out, at):
+        for number, vector in enumerate(_conjugate_product(code, flat, here, there)):
+            code.write(out, at, number, code.builder.fadd(code.read(out, at, number), vector))
+
+    return _function(types.void, (flat, here, there, out, at), write)
