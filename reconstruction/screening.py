@@ -242,27 +242,55 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
     values (y, x), colours (y, x) uint8, good (y, x) bool: neighbours are the good pixels of the
     same colour up to `radius` rows and columns away, without the pixel itself. With fewer than
     `fewest` of them the range is endless.
+
+    Of a row of pixels the least and the largest neighbours met so far are kept in order, as many as
+    the quantiles need. Each neighbour is sorted in for all pixels of the row at once.
     """
     rows, columns = values.shape
+    keep = int(tail * ((2 * radius + 1) ** 2 - 2) + 0.5) + 1
+    # One by one: what is unpacked from an array of two is, to the compiler, not contiguous.
+    least = np.empty((keep, columns), values.dtype)
+    most = np.empty((keep, columns), values.dtype)
+    small = np.empty(columns, values.dtype)
+    large = np.empty(columns, values.dtype)
+    count = np.empty(columns, np.int32)
+    endless = np.float32(np.inf)
     for y in range(begin, end):
-        sorted_ = np.empty((2 * radius + 1) ** 2, values.dtype)
+        least[:] = endless
+        most[:] = -endless
+        count[:] = 0
+        for j in range(max(0, y - radius), min(rows, y + radius + 1)):
+            for across in range(-radius, radius + 1):
+                if j == y and across == 0:
+                    continue
+                first, last = max(0, -across), columns - max(0, across)
+                found = 0
+                for x in range(first, last):
+                    alike = good[j, x + across] & (colours[j, x + across] == colours[y, x])
+                    value = values[j, x + across]
+                    small[x] = value if alike else endless
+                    large[x] = value if alike else -endless
+                    count[x] += alike
+                    found += alike
+                if found == 0:
+                    continue
+                for place in range(keep):
+                    kept = least[place]
+                    for x in range(first, last):
+                        one, other = kept[x], small[x]
+                        kept[x] = one if one < other else other
+                        small[x] = other if one < other else one
+                    kept = most[place]
+                    for x in range(first, last):
+                        one, other = kept[x], large[x]
+                        kept[x] = other if one < other else one
+                        large[x] = one if one < other else other
         for x in range(columns):
-            count = 0
-            for j in range(max(0, y - radius), min(rows, y + radius + 1)):
-                for i in range(max(0, x - radius), min(columns, x + radius + 1)):
-                    if (j == y and i == x) or not good[j, i] or colours[j, i] != colours[y, x]:
-                        continue
-                    value, place = values[j, i], count
-                    while place > 0 and sorted_[place - 1] > value:
-                        sorted_[place] = sorted_[place - 1]
-                        place -= 1
-                    sorted_[place] = value
-                    count += 1
-            if count < fewest:
+            if count[x] < fewest:
                 low[y, x], high[y, x] = -np.inf, np.inf
             else:
-                step = int(tail * (count - 1) + 0.5)
-                low[y, x], high[y, x] = sorted_[step], sorted_[count - 1 - step]
+                step = int(tail * (count[x] - 1) + 0.5)
+                low[y, x], high[y, x] = least[step, x], most[step, x]
 
 
 def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:

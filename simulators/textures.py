@@ -7,7 +7,6 @@ in HTML.
 
 import cv2
 import numpy as np
-import scipy.fft
 
 
 def grid(side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -33,6 +32,8 @@ def noise(
     f = np.hypot(fp, fq).astype(np.float32)
     amplitude = np.where(f >= lowest, np.maximum(f, 1) ** -slope, 0) * np.exp(-((f / highest) ** 2))
     phases = rng.standard_normal((*f.shape, 2), dtype=np.float32).view(np.complex64)[..., 0]
+    import scipy.fft  # SciPy loads for a third of a second, which a measured scene need not
+
     noise = np.asarray(scipy.fft.irfft2(amplitude * phases, s=(side, side), workers=-1))
     return (noise / noise.std()).astype(np.float32)
 

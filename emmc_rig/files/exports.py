@@ -88,7 +88,7 @@ def save_maps(folder: Path, maps: Mapping[str, NDArray], view_axes: ViewAxes = A
     with h5py.File(folder / MAPS, "w") as file:
         file.attrs[ATTRIBUTE] = stored_as(view_axes)
         for name, values in maps.items():
-            file.create_dataset(name, data=values, compression="lzf")
+            file.create_dataset(name, data=values)  # their noise does not compress
 
 
 def _fits(values: NDArray, shape: tuple[int, ...]) -> bool:

@@ -15,12 +15,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
-from scipy import sparse
 
 from emmc_rig.model.arguments import numbers_of, pair_of, refusal, required
 from emmc_rig.model.errors import CameraError, SensingError
 from emmc_rig.model.frames import SimulatedFrames
 from emmc_rig.model.geometry import (
+    CellWeights,
     Footprint,
     cell_weights,
     centred_grid,
@@ -357,9 +357,7 @@ class _Axis:
         edge = mask_position(self.samples_um[-1], self.views_um[-1], distance_um, self.lens_um)
         return float(edge) + self.footprint(distance_um).half_width_um
 
-    def weights(
-        self, view: int, plate: Plate, cell_count: int, offset_um: float
-    ) -> sparse.csr_array:
+    def weights(self, view: int, plate: Plate, cell_count: int, offset_um: float) -> CellWeights:
         """Return (sample, cell): the share of every mask cell seen from one view."""
         distance_um = plate.distance_mm * 1e3
         meets = mask_position(self.samples_um, self.views_um[view], distance_um, self.lens_um)
@@ -463,25 +461,17 @@ def _transmittances(
 
     def factors(
         axis: int, splits: int, sample_part: int, view_part: int
-    ) -> dict[tuple[str, int], sparse.csr_array]:
+    ) -> dict[tuple[str, int], CellWeights]:
         part = axes[axis].split(splits, sample_part, view_part)
         found = {}
         for name in names:
-            offset = camera.shots[shot].offset_um.get(name, (0.0, 0.0))[1 - axis]
-            for view in range(camera.views[axis]):
-                count = plates[name].cells.shape[1 + axis]
-                try:
-                    found[name, view] = part.weights(view, plates[name], count, offset)
-                except CameraError as fault:
-                    raise CameraError(f"mask '{name}', shot {shot}: {fault}") from fault
+            views = _weights_of_views(camera, axis, name, plates[name], shot, part)
+            found |= {(name, view): weights for view, weights in enumerate(views)}
         return found
 
     whole = [factors(axis, 1, 0, 0) for axis in (0, 1)]
     partly = {
-        name
-        for weights in whole
-        for (name, _), matrix in weights.items()
-        if (np.diff(matrix.indptr) > 1).any()
+        name for weights in whole for (name, _), matrix in weights.items() if matrix.splits_cells
     }
     splits = camera.footprint_splits if len(partly) > 1 else 1
     parts = [(i, j) for i in range(splits) for j in range(splits)]
@@ -533,6 +523,73 @@ def psi_layout(camera: Camera, size: tuple[int, int]) -> PsiLayout:
     return PsiLayout(shape, colour, k, camera.model_dump_json(), camera.view_axes)
 
 
+def seen_of_white(
+    camera: Camera, size: tuple[int, int], plates: dict[str, Plate]
+) -> NDArray[np.float64]:
+    """Return the sum over the views of Psi's weights, (shot, y, stored colour, x), without Psi.
+
+    Takes and raises what `build_imaging_matrix` does, but for shots that no light reaches.
+    """
+    shares, colour = _shares(camera, size)
+    stored = 3 if colour is None else 1
+    seen = np.empty((len(camera.shots), size[0], stored, size[1]))
+    for shot, share in enumerate(shares):
+        passed = _passed_to_all(camera, size, plates, shot) * share
+        if colour is not None:
+            index = colour[shot][..., None].astype(np.intp)
+            passed = np.take_along_axis(passed, index, axis=-1)
+        seen[shot] = passed.transpose(0, 2, 1)
+    return seen
+
+
+def _passed_to_all(
+    camera: Camera, size: tuple[int, int], plates: dict[str, Plate], shot: int
+) -> NDArray[np.float64]:
+    """Return the sum over the views of what `_transmittances` yields, (y, x, colour).
+
+    Rows and columns of one mask are separable, so that their sums over the views are summed apart.
+    """
+    names = camera.shot_masks(shot)
+    if len(names) != 1:
+        every = (passed for _, _, passed in _transmittances(camera, size, plates, shot))
+        return np.asarray(sum(every), dtype=np.float64)
+    (name,) = names
+    upper, right = (
+        CellWeights.summed([*_weights_of_views(camera, axis, name, plates[name], shot, along)])
+        for axis, along in enumerate(_axes(camera, size))
+    )
+    cells = plates[name].cells[shot % len(plates[name].cells)]
+    return np.stack([upper @ (right @ cells[:, :, c].T).T for c in range(3)], axis=-1)
+
+
+def _weights_of_views(
+    camera: Camera, axis: int, name: str, plate: Plate, shot: int, along: _Axis
+) -> Iterator[CellWeights]:
+    """Yield (sample, cell) of each view along an axis, 0: y, 1: x. Raises CameraError."""
+    offset = camera.shots[shot].offset_um.get(name, (0.0, 0.0))[1 - axis]
+    for view in range(camera.views[axis]):
+        try:
+            yield along.weights(view, plate, plate.cells.shape[1 + axis], offset)
+        except CameraError as fault:
+            raise CameraError(f"mask '{name}', shot {shot}: {fault}") from fault
+
+
+def _shares(
+    camera: Camera, size: tuple[int, int]
+) -> tuple[list[NDArray[np.float32]], NDArray[np.uint8] | None]:
+    """Return what an open camera's Psi has of each colour, (y, x, colour) of each shot, and the
+    colour that a sample's pixel sees, (shot, y, x); None where some see several."""
+    response = sensor_response(camera, size)
+    colours_seen = response.sum(axis=-1)
+    scale = camera.views[0] * camera.views[1] * camera.sensor.binning**2
+    shares = [
+        (one / np.maximum(seen, 1)[..., None] / scale).astype(np.float32)
+        for one, seen in zip(response, colours_seen, strict=True)
+    ]
+    single = bool((colours_seen <= 1).all())
+    return shares, response.argmax(axis=-1).astype(np.uint8) if single else None
+
+
 def build_imaging_matrix(
     camera: Camera, size: tuple[int, int], plates: dict[str, Plate] | None = None
 ) -> ImagingMatrix:
@@ -544,18 +601,11 @@ def build_imaging_matrix(
     colour filters. Raises CameraError for a mask smaller than the beam, for pixels that do not
     divide the light field, and for a shot that no light reaches.
     """
-    response = sensor_response(camera, size)
     plates = draw_plates(camera, size) if plates is None else plates
-    colours_seen = response.sum(axis=-1)
-    single = bool((colours_seen <= 1).all())
-    shots, views = len(camera.shots), camera.views
-    shape = (shots, *views, size[0], 1 if single else 3, size[1])
+    shares, colour = _shares(camera, size)
+    shape = (len(camera.shots), *camera.views, size[0], 3 if colour is None else 1, size[1])
     weights = np.empty(shape, dtype=np.float32)
-    colour = response.argmax(axis=-1).astype(np.uint8) if single else None
-    scale = views[0] * views[1] * camera.sensor.binning**2
-    for shot in range(shots):
-        seen = np.maximum(colours_seen[shot], 1)[..., None]
-        share = (response[shot] / seen / scale).astype(np.float32)
+    for shot, share in enumerate(shares):
         for v, u, passed in _transmittances(camera, size, plates, shot):
             passed *= share
             if colour is not None:

@@ -11,11 +11,11 @@ rays (cosine falloff), which whiteboard calibration measures.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from emmc_rig.model.errors import CameraError
 
@@ -77,17 +77,57 @@ def _covered(edge_um: NDArray[np.float64], footprint: Footprint) -> NDArray[np.f
     return (rise**2 / 2 / narrow + flat + fall - fall**2 / 2 / narrow) / wide
 
 
+@dataclass(frozen=True, eq=False)
+class CellWeights:
+    """A matrix (footprint, cell) of `cells` columns, in which a row is 0 but for a few neighbours.
+
+    first: (footprint,), the first of them. values: (footprint, neighbour).
+    """
+
+    first: NDArray[np.int64]
+    values: NDArray[np.float64]
+    cells: int
+
+    def __matmul__(self, of_cells: NDArray) -> NDArray[np.float64]:
+        """Return the product with an array (cell, any)."""
+        total = np.zeros((len(self.first), of_cells.shape[1]))
+        for step, share in enumerate(self.values.T):
+            if share.any():
+                total += share[:, None] * of_cells[np.minimum(self.first + step, self.cells - 1)]
+        return total
+
+    @property
+    def splits_cells(self) -> bool:
+        """Whether some footprint covers several cells."""
+        return bool(((self.values > 0).sum(axis=1) > 1).any())
+
+    @classmethod
+    def summed(cls, matrices: Sequence[CellWeights]) -> CellWeights:
+        """Return the sum of matrices of one shape, as those of neighbouring views."""
+        first = np.min([one.first for one in matrices], axis=0)
+        ends = [one.first + one.values.shape[1] for one in matrices]
+        values = np.zeros((len(first), int((np.max(ends, axis=0) - first).max())))
+        for one in matrices:
+            columns = (one.first - first)[:, None] + np.arange(one.values.shape[1])
+            np.add.at(values, (np.arange(len(first))[:, None], columns), one.values)
+        return cls(first, values, matrices[0].cells)
+
+    def toarray(self) -> NDArray[np.float64]:
+        """Return the whole matrix."""
+        return self @ np.eye(self.cells)
+
+
 def cell_weights(
     positions_um: NDArray[np.float64],
     footprint: Footprint,
     cell_um: float,
     cell_count: int,
-) -> sparse.csr_array:
+) -> CellWeights:
     """Return how much of each mask cell every footprint covers along one axis.
 
     positions_um: (n,) centres of the footprints on the mask, 0 at the middle of its
         `cell_count` cells.
-    Returns a sparse (n, cell_count) matrix whose rows sum to 1.
+    Returns a matrix (n, cell_count) whose rows sum to 1.
     Raises CameraError when a footprint reaches beyond the mask.
     """
     half = cell_count * cell_um / 2
@@ -107,10 +147,4 @@ def cell_weights(
     below[:, 0] = 0.0
     values = np.diff(below, axis=1)
     values[values < SMALLEST_SHARE] = 0
-    rows = np.repeat(np.arange(len(positions_um)), band)
-    columns = np.minimum(index[:, :-1].ravel(), cell_count - 1)
-    matrix = sparse.csr_array(
-        (values.ravel(), (rows, columns)), shape=(len(positions_um), cell_count)
-    )
-    matrix.eliminate_zeros()
-    return matrix
+    return CellWeights(first, values, cell_count)

@@ -16,6 +16,7 @@ import cv2
 import h5py
 import numpy as np
 
+from emmc_rig.model.bands import in_bands
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.reading import decode_picture, one_line, stored_arrays
@@ -93,15 +94,23 @@ def load_views(folder: str | os.PathLike) -> np.ndarray:
     if not paths:
         raise SceneError(f"{folder}: no views; they are named view_ROW_COL.png")
     rows, columns = grid_of_views(paths, folder, SceneError)
-    with ThreadPoolExecutor() as pool:
-        views = list(pool.map(read_picture, (paths[r, c] for r in rows for c in columns)))
-    for path, view in zip((paths[r, c] for r in rows for c in columns), views, strict=True):
-        if view.shape != views[0].shape:
+    places = {place: paths[rows[place[0]], columns[place[1]]] for place in np.ndindex(
+        len(rows), len(columns)
+    )}  # fmt: skip
+    first = read_picture(places[0, 0])
+    lf = np.empty((len(rows), len(columns), *first.shape), np.float32)
+
+    def read(place: tuple[int, ...]) -> None:
+        view = read_picture(places[place])
+        if view.shape != first.shape:
             raise SceneError(
-                f"{path}: {view.shape[0]}x{view.shape[1]} pixels, but the first view "
-                f"has {views[0].shape[0]}x{views[0].shape[1]}"
+                f"{places[place]}: {view.shape[0]}x{view.shape[1]} pixels, but the first view "
+                f"has {first.shape[0]}x{first.shape[1]}"
             )
-    lf = np.stack(views).reshape(len(rows), len(columns), *views[0].shape)
+        lf[place] = view
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(read, places))
     return check_light_field(lf, str(folder))
 
 
@@ -149,14 +158,17 @@ def save_views(folder: str | os.PathLike, lf: np.ndarray) -> None:
             cannot be written.
     """
     folder = _make_folder(folder)
-    pictures = {
-        f"view_{v}_{u}.png": lf[v, u] for v in range(lf.shape[0]) for u in range(lf.shape[1])
-    }
+    _save_views(folder, {place: _to_codes(lf[place]) for place in np.ndindex(lf.shape[:2])})
+
+
+def _save_views(folder: Path, codes: Mapping[tuple[int, ...], np.ndarray]) -> None:
+    """Write views, by row and column, into an existing folder: see `save_views`."""
+    pictures = {f"view_{v}_{u}.png": view for (v, u), view in codes.items()}
     for path in sorted(folder.iterdir()):
         if _VIEW_NAME.fullmatch(path.name) and path.name not in pictures:
             raise SceneError(f"{folder}: already holds {path.name} of another grid; empty it first")
     with ThreadPoolExecutor() as pool:
-        list(pool.map(_write_picture, (folder / name for name in pictures), pictures.values()))
+        list(pool.map(_write_codes, (folder / name for name in pictures), pictures.values()))
 
 
 def load_hdf5(path: str | os.PathLike) -> np.ndarray:
@@ -202,7 +214,9 @@ def save_hdf5(
         SceneError: not a light field even when clipped, or the file cannot be written.
     """
     path = Path(path)
-    lf = check_light_field(np.clip(lf, 0, 1), str(path))
+    if not (lf.min() >= 0 and lf.max() <= 1):
+        lf = np.clip(lf, 0, 1)
+    lf = check_light_field(lf, str(path))
     _make_folder(path.parent)
     try:
         with whole_file(path) as partial, h5py.File(partial, "w") as file:
@@ -348,6 +362,12 @@ def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
     return back * shrink, middle * shrink, front * shrink
 
 
+def sum_of_squares(values: np.ndarray) -> float:
+    """Return that of a picture (y, ...): of rows in its own type, of all rows in float64."""
+    rows = values.reshape(len(values), -1)
+    return float(np.einsum("yx,yx->y", rows, rows).sum(dtype=np.float64))
+
+
 def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Peak signal-to-noise ratio for peak 1 over all samples; infinite when they are equal.
 
@@ -360,9 +380,8 @@ def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
     """
     _check_same_shape(estimate, truth)
     squares = 0.0
-    for views, true in zip(estimate, truth, strict=True):
-        error = np.subtract(views, true, dtype=np.float64).ravel()
-        squares += float(error @ error)
+    for place in np.ndindex(truth.shape[: max(truth.ndim - 3, 0)]):
+        squares += sum_of_squares(np.asarray(estimate[place], np.float32) - truth[place])
     if squares == 0:
         return float("inf")
     return float(10 * np.log10(truth.size / squares))
@@ -387,14 +406,15 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
             f"SSIM needs views of {_SSIM_WINDOW_PX}x{_SSIM_WINDOW_PX} pixels or more, "
             f"these have {truth.shape[2]}x{truth.shape[3]}"
         )
-    with ThreadPoolExecutor() as pool:
-        means = list(
-            pool.map(
-                lambda place: _view_ssim(estimate[place], truth[place]),
-                np.ndindex(truth.shape[:2]),
-            )
-        )
-    return float(np.mean(means))
+    means = np.empty(truth.shape[0] * truth.shape[1])
+
+    def work(_: int, first: int, last: int) -> None:
+        for view in range(first, last):
+            place = divmod(view, truth.shape[1])
+            means[view] = _view_ssim(estimate[place], truth[place])
+
+    in_bands(work, len(means))
+    return float(means.mean())
 
 
 def export_pictures(
@@ -423,21 +443,27 @@ def export_pictures(
     """
     folder = _make_folder(folder)
     n_v, n_u, height, width, _ = lf.shape
-    save_views(folder / "views", lf)
-    if not shows_parallax(view_axes):
-        name = f"{picture_name(view_axes)}s"
-        _write_walk(folder / f"{name}.webp", lf, list(np.ndindex(n_v, n_u)))
-        return {"views": folder / "views", name: folder / f"{name}.webp"}
-    disparities_px = disparities_px or focus_disparities(lf)
-    _write_walk(folder / "parallax.webp", lf, _circular_walk(n_v, n_u))
-    pictures = {
-        "epi_horizontal": np.repeat(epi_horizontal(lf, n_v // 2, height // 2), 8, axis=0),
-        "epi_vertical": np.repeat(epi_vertical(lf, n_u // 2, width // 2), 8, axis=0),
-    }
-    for name, disparity_px in zip(("back", "middle", "front"), disparities_px, strict=True):
-        pictures[f"refocus_{name}"] = refocus(lf, disparity_px)
-    for name, picture in pictures.items():
-        _write_picture(folder / f"{name}.png", picture)
+    codes = {place: _to_codes(lf[place]) for place in np.ndindex(n_v, n_u)}
+    parallax = shows_parallax(view_axes)
+    animated = "parallax" if parallax else f"{picture_name(view_axes)}s"
+    walk = _circular_walk(n_v, n_u) if parallax else list(codes)
+    with ThreadPoolExecutor(1) as beside:  # it takes as long as all the others
+        animation = folder / f"{animated}.webp"
+        drawn = beside.submit(_write_walk, animation, [codes[place] for place in walk])
+        _save_views(_make_folder(folder / "views"), codes)
+        if not parallax:
+            drawn.result()
+            return {"views": folder / "views", animated: animation}
+        pictures = {
+            "epi_horizontal": np.repeat(epi_horizontal(lf, n_v // 2, height // 2), 8, axis=0),
+            "epi_vertical": np.repeat(epi_vertical(lf, n_u // 2, width // 2), 8, axis=0),
+        }
+        disparities_px = disparities_px or focus_disparities(lf)
+        for name, disparity_px in zip(("back", "middle", "front"), disparities_px, strict=True):
+            pictures[f"refocus_{name}"] = refocus(lf, disparity_px)
+        for name, picture in pictures.items():
+            _write_codes(folder / f"{name}.png", _to_codes(picture))
+        drawn.result()
     return {
         "views": folder / "views",
         "parallax": folder / "parallax.webp",
@@ -462,25 +488,26 @@ def read_picture(path: Path) -> np.ndarray:
     return picture
 
 
-def _write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write (y, x, 3) as an 8-bit PNG."""
-    if not cv2.imwrite(str(path), _to_codes(picture)):
+def _write_codes(path: Path, codes: np.ndarray) -> None:
+    """Write what `_to_codes` returns as a PNG."""
+    if not cv2.imwrite(str(path), codes):
         raise SceneError(f"{path}: cannot be written")
 
 
-def _write_walk(path: Path, lf: np.ndarray, walk: Sequence[tuple[int, ...]]) -> None:
-    """Write an endless animation of some views, (v, u) each, of a light field (v, u, y, x, 3)."""
+def _write_walk(path: Path, pictures: Sequence[np.ndarray]) -> None:
+    """Write an endless animation of pictures, as `_to_codes` returns them."""
     animation = cv2.Animation()
-    animation.frames = [_to_codes(lf[place]) for place in walk]
-    animation.durations = [max(60, 1600 // len(walk))] * len(walk)
+    animation.frames = pictures
+    animation.durations = [max(60, 1600 // len(pictures))] * len(pictures)
     if not cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, 92]):
         raise SceneError(f"{path}: cannot be written")
 
 
 def _to_codes(picture: np.ndarray) -> np.ndarray:
     """(y, x, 3) RGB values, clipped to [0, 1], as OpenCV's 8-bit BGR."""
-    codes = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
-    return np.ascontiguousarray(codes[..., ::-1])
+    scaled = np.clip(picture, 0, 1)
+    scaled *= 255
+    return cv2.cvtColor(np.rint(scaled, out=scaled).astype(np.uint8), cv2.COLOR_RGB2BGR)
 
 
 def _make_folder(folder: str | os.PathLike) -> Path:
@@ -524,23 +551,33 @@ def _check_same_shape(estimate: np.ndarray, truth: np.ndarray) -> None:
 
 
 def _view_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
-    """SSIM of one (y, x, c) view; float64, as variances are differences of near-equal numbers."""
+    """SSIM of one (y, x, c) view, colour by colour, in float32.
+
+    Variances are differences of near-equal numbers: taken around a middle grey, what rounding
+    leaves of them is a few times 1e-8, against 9e-4 that is added to them.
+    """
+    return float(np.mean([_plane_ssim(*planes) for planes in zip(
+        np.moveaxis(estimate, -1, 0), np.moveaxis(truth, -1, 0), strict=True
+    )]))  # fmt: skip
+
+
+def _plane_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
+    grey = np.float32(0.5)
 
     def window_mean(picture: np.ndarray) -> np.ndarray:
         edge = _SSIM_WINDOW_PX // 2
         size = _SSIM_WINDOW_PX, _SSIM_WINDOW_PX
         return cv2.GaussianBlur(picture, size, _SSIM_SIGMA_PX)[edge:-edge, edge:-edge]
 
-    a, b = estimate.astype(np.float64), truth.astype(np.float64)
+    a, b = estimate.astype(np.float32) - grey, truth.astype(np.float32) - grey
     mean_a, mean_b = window_mean(a), window_mean(b)
-    means_product = mean_a * mean_b
-    means_squares = mean_a * mean_a + mean_b * mean_b
-    covariance = window_mean(a * b) - means_product
-    variances = window_mean(a * a + b * b) - means_squares
-    similarity = ((2 * means_product + _SSIM_C1) * (2 * covariance + _SSIM_C2)) / (
-        (means_squares + _SSIM_C1) * (variances + _SSIM_C2)
-    )
-    return float(similarity.mean())
+    covariance = window_mean(a * b) - mean_a * mean_b
+    variances = window_mean(a * a + b * b) - (mean_a * mean_a + mean_b * mean_b)
+    mean_a += grey
+    mean_b += grey
+    numerator = (2 * mean_a * mean_b + _SSIM_C1) * (2 * covariance + _SSIM_C2)
+    denominator = (mean_a * mean_a + mean_b * mean_b + _SSIM_C1) * (variances + _SSIM_C2)
+    return float((numerator / denominator).mean(dtype=np.float64))
 
 
 def _circular_walk(n_v: int, n_u: int) -> list[tuple[int, int]]:

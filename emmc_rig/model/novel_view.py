@@ -10,7 +10,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from emmc_rig.model.lightfield import centre_view, disagreement, focus_disparities, small_grey_views
 
@@ -35,6 +34,8 @@ def sampled(picture: Array, y: Array, x: Array) -> Array:
     """Return a picture (y, x) or (y, x, c) at places (y, x), bilinear."""
     if picture.ndim == 3:
         return np.stack([sampled(picture[..., c], y, x) for c in range(picture.shape[2])], axis=-1)
+    from scipy.ndimage import map_coordinates  # SciPy loads for a third of a second
+
     return map_coordinates(picture, (y, x), order=1, mode="nearest", output=np.float32)
 
 

@@ -12,11 +12,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 
 from emmc_rig.model import kernels
 from emmc_rig.model.arguments import numbers_of, pair_of, path_of, refusal
@@ -33,6 +33,9 @@ from emmc_rig.model.view_axes import (
     axes_from,
     stored_as,
 )
+
+if TYPE_CHECKING:  # SciPy loads for a third of a second, which few need
+    from scipy import sparse
 
 Array = NDArray[np.floating]
 WEIGHTS_TAKE = "an array (shot, v, u, y, stored colour, x), float32 or float64"
@@ -317,6 +320,8 @@ class ImagingMatrix(PsiSizes):
 
     def to_scipy(self) -> sparse.csr_array:
         """Return Psi as an explicit sparse matrix without its zeros."""
+        from scipy import sparse
+
         _, _, views_u, rows, _, columns = self.weights.shape
         s, v, u, y, k, x = np.ogrid[tuple(slice(n) for n in self.weights.shape)]
         colour = k if self.colour is None else self.colour[s, y, x]
@@ -358,10 +363,13 @@ class ImagingMatrix(PsiSizes):
                 of samples that do not lie at its own pixel.
             ArgumentError: an argument of another type.
 
+        >>> from scipy import sparse
         >>> psi = ImagingMatrix.from_scipy(sparse.eye_array(6), views=(1, 1), size=(2, 3))
         >>> psi, psi.to_scipy().nnz
         (Psi(1 shot, 1x1 views, 2x3, three colours a pixel, 7.2e-05 MB), 18)
         """
+        from scipy import sparse
+
         if not sparse.issparse(matrix):
             raise refusal(matrix, "matrix", "a sparse matrix of SciPy")
         views = pair_of(views, "views", "rows and columns of views, such as (5, 5)")

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.exports import LIGHT_FIELD, MAPS
+from emmc_rig.files.exports import IN_SESSION, LIGHT_FIELD, MAPS
 from emmc_rig.files.folders import KEPT, is_session, kept_folder, result_folder
 from emmc_rig.files.psi import PSI, open_psi, psi_beside, read_frames
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics
@@ -40,10 +40,6 @@ from emmc_rig.processing.memory import (
 )
 from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
-from emmc_rig.session.measured_psi import psi_is_assumed
-from emmc_rig.session.readings import session_readings
-from emmc_rig.session.session import RECONSTRUCTION, Session
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import check_frames
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
@@ -245,9 +241,34 @@ def reconstruct_folder(
     as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
     without_shots: counted from 1, that are not used.
     """
+    metrics, result = _without_pictures(
+        folder, out, method, psi_path, dictionary_spec, settings, truth, on_step, chosen, pool,
+        as_zarr, without_shots,
+    )  # fmt: skip
+    if result is not None:
+        result.draw(out)
+    return metrics
+
+
+def _without_pictures(
+    folder: Path,
+    out: Path,
+    method: str = DEFAULT_METHOD,
+    psi_path: Path | None = None,
+    dictionary_spec: str | None = None,
+    settings: MethodSettings | None = None,
+    truth: str | None = None,
+    on_step: OnStep | None = None,
+    chosen: str | None = None,
+    pool: Pool | None = None,
+    as_zarr: bool = False,
+    without_shots: Sequence[int] = (),
+) -> tuple[dict, Result | None]:
+    """Return the metrics of `reconstruct_folder`, all but the pictures written, and what to draw;
+    None of a light field that is not drawn."""
     find_method(method)
     settings = settings or MethodSettings()
-    assumed = psi_path is None and is_session(folder) and psi_is_assumed(Session(folder))
+    assumed = psi_path is None and is_session(folder) and _is_assumed(folder)
     frames, psi_path = stored_frames(folder, out, psi_path)
     frames = _without(frames, without_shots)
     saved = open_psi(psi_path)
@@ -275,7 +296,7 @@ def reconstruct_folder(
                 blocks.write_shards(out / RESULT_GROUP, workers)
         further |= blocks.metrics()
         if not in_memory:
-            return _write_blocks(blocks, frames, folder, out, truth, further)
+            return _write_blocks(blocks, frames, folder, out, truth, further), None
         arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
         for name, array in arrays.items():
             blocks.write(name, array)
@@ -283,11 +304,11 @@ def reconstruct_folder(
         solved = replace(blocks.result(), light_field=light_field, maps=arrays)
         result = Result(solved, blocks.verdict(), saved.load(), frames)
     if is_session(folder):
-        result = replace(result, verdict=with_exposure(result.verdict, Session(folder)))
+        result = replace(result, verdict=with_exposure(result.verdict, folder))
     compared_with = _compared(result.light_field, truth, result.psi)
     metrics = {**result.metrics(), **further, **compared_with}
     result.write(out, metrics)
-    return metrics
+    return metrics, result
 
 
 def _write_blocks(
@@ -304,7 +325,7 @@ def _write_blocks(
     """
     psi, verdict = blocks.job.psi, blocks.verdict()
     if is_session(folder):
-        verdict = with_exposure(verdict, Session(folder))
+        verdict = with_exposure(verdict, folder)
     metrics = {
         **figures(blocks.result(), verdict, frames),
         "shots": psi.shots,
@@ -339,9 +360,20 @@ def _compared(light_field: Any, truth: str | None, psi: PsiSizes) -> dict[str, A
     return {"truth": truth, **compared(light_field, np.asarray(scene))}
 
 
-def with_exposure(verdict: Verdict, session: Session) -> Verdict:
+def with_exposure(verdict: Verdict, session: Path) -> Verdict:
     """Return the verdict with what speaks against the exposures of a session's shots."""
-    return verdict.with_reasons(exposure_reasons(shot_exposures(session)))
+    # What sessions need, the formats of cameras among it, loads for as long as all else here.
+    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+    from emmc_rig.session.session import Session
+
+    return verdict.with_reasons(exposure_reasons(shot_exposures(Session(session))))
+
+
+def _is_assumed(session: Path) -> bool:
+    from emmc_rig.session.measured_psi import psi_is_assumed
+    from emmc_rig.session.session import Session
+
+    return psi_is_assumed(Session(session))
 
 
 def ceiling_for(
@@ -423,11 +455,11 @@ def reconstruct_captures(
 def _outcome(place: Place, **given: Any) -> dict | Exception:
     """Return a capture's metrics, or what it failed by; raises StoppedError by Ctrl-C."""
     frames, out = place
-    of_session = frames / RECONSTRUCTION if is_session(frames) else None
+    of_session = frames / IN_SESSION if is_session(frames) else None
     try:
         with result_folder(out, "reconstruct", belongs_to=of_session, resumes=True) as folder:
             try:
-                return reconstruct_folder(frames, folder, **given)
+                metrics, result = _without_pictures(frames, folder, **given)
             except KeyboardInterrupt as stop:
                 if not (folder.parent / KEPT).is_dir():
                     raise
@@ -435,6 +467,10 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
                     f"stopped by Ctrl-C; blocks that are done are kept in {out}, and the same "
                     "command goes on"
                 ) from stop
+        if result is not None:  # the result is on the disk, whatever happens to its pictures
+            with result_folder(out, "reconstruct", belongs_to=of_session, adds=True) as folder:
+                result.draw(folder)
+        return metrics
     except ERRORS as fault:
         return fault
 
@@ -444,6 +480,9 @@ def session_frames(folder: Path) -> tuple[ImagingMatrix, Frames]:
 
     Raises AppError or CalibrationError.
     """
+    from emmc_rig.session.readings import session_readings
+    from emmc_rig.session.session import Session
+
     taken = session_readings(Session(folder))
     return taken.psi, Frames(taken.readings, np.sqrt(taken.variance), taken.usable)
 

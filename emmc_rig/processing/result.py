@@ -26,7 +26,6 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ATTRIBUTE, grid_name, stored_as
-from emmc_rig.pages.viewer import render_viewer
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
@@ -35,6 +34,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from emmc_rig.pages.result_figure import FigureSettings
+
+
+BACK_TO_FRONT = 5, 50, 95
+"""Percentiles of the disparity on which pictures are focused, as `focus_disparities` has them."""
 
 
 def compared(light_field: Any, truth: NDArray) -> dict[str, float]:
@@ -173,15 +176,24 @@ class Result:
         """
         with result_folder(Path(out), "reconstruct") as folder:
             self.write(folder, self.metrics())
+            self.draw(folder)
 
     def write(self, folder: Path, metrics: Mapping[str, Any]) -> None:
-        """Write light_field.h5, pictures/, maps.h5 and metrics.json into an existing folder."""
+        """Write light_field.h5, maps.h5 and metrics.json into an existing folder."""
         axes = self.psi.view_axes
         facts = {"method": self.method, ATTRIBUTE: stored_as(axes)}
         save_hdf5(folder / LIGHT_FIELD, self.light_field, facts)
-        export_pictures(folder / "pictures", self.light_field, view_axes=axes)
         save_maps(folder, {**self.maps, "misfit": self.misfit}, axes)
         write_metrics(folder, metrics)
+
+    def draw(self, folder: Path) -> None:
+        """Write pictures/ into an existing folder."""
+        focus = None
+        if self.disparity is not None:
+            back, middle, front = np.percentile(self.disparity, BACK_TO_FRONT)
+            focus = float(back), float(middle), float(front)
+        axes = self.psi.view_axes
+        export_pictures(folder / "pictures", self.light_field, focus, axes)
 
     def figure(
         self,
@@ -222,6 +234,8 @@ class Result:
 
         truth: the true light field, to wipe against.
         """
+        from emmc_rig.pages.viewer import render_viewer  # as its templates are
+
         return render_viewer(self._export(truth))
 
     def _export(self, truth: ArrayLike | None = None) -> Export:

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import in_bands
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey
 from reconstruction.adaptive.sweep import swept
-from reconstruction.adaptive.uncertainty import apart, deviation, features, stated
+from reconstruction.adaptive.uncertainty import blur_views, features, stated, variance_of_mean
 
 Array = NDArray[np.floating]
 Patches = Callable[[NDArray[np.bool_]], Array]
@@ -25,12 +26,12 @@ variation's, given which readings to fit and the order in which its views lie.""
 class Fits:
     """The models of surfaces, and last one without: sparse patches or total variation.
 
-    light_fields: (v, u, y, x, c) of each; residuals: frames less what each predicts, (shot,
-    pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's scale. patched:
-    whether the last are patches.
+    light_fields: (v, u, y, x, c) of each, as `mixture.stored`; residuals: frames less what each
+    predicts, (shot, pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's
+    scale. patched: whether the last are patches.
     """
 
-    light_fields: list[Array]
+    light_fields: list[NDArray[np.uint16]]
     residuals: list[Array]
     scene: FittedScene
     patched: bool
@@ -85,13 +86,15 @@ def fitted_models(
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
         scene.surfaces.release()
         seen = scene.surfaces.light_field(scale * scene.texture)
-        light_fields.append(np.clip(seen, 0, 1, out=seen))
+        light_fields.append(mixture.stored(np.clip(seen, 0, 1, out=seen)))
     assert scene is not None
     if patches is not None:
-        light_fields.append(patches(given.usable & ~held))
+        seen = patches(given.usable & ~held)
+        light_fields.append(mixture.stored(seen))
+        residuals.append(given.frames - given.psi.forward(seen))
     else:
         light_fields.append(survey.plain)
-    residuals.append(given.frames - given.psi.forward(light_fields[-1]))
+        residuals.append(survey.plain_residual)
     return Fits(light_fields, residuals, scene, patches is not None)
 
 
@@ -117,27 +120,46 @@ def averaged(survey: Survey, fits: Fits, disparity_sigma: Array) -> Mean:
     Their light fields are given back: what follows needs as much memory, and none of them.
     """
     given, held = survey.given, survey.held
-    if not held.any():
+    if held.any():
+        rule = mixture.beside_patches if fits.patched else mixture.shares_of
+        shares = rule(fits.residuals, given.noise, held)
+    else:
         shares = np.zeros((len(fits.residuals), *held.shape[1:]), dtype=np.float32)
         shares[0] = 1
-        return Mean(fits.light_fields[0], shares, None)
-    k = given.psi.binning
-    rule = mixture.beside_patches if fits.patched else mixture.shares_of
-    shares = rule(fits.residuals, given.noise, held)
-    light_field = mixture.mean_light_field(fits.light_fields, shares, k)
-    spread = mixture.spread(fits.light_fields, light_field, shares, k)
+    together = mixture.averaged(fits.light_fields, shares, given.psi.binning, survey.plain)
     fits.light_fields.clear()
+    light_field, spread = together.light_field, float(together.spread.mean(dtype=np.float64))
+    if not held.any():
+        return Mean(light_field, shares, None)
     residual = np.asarray(sum(s * one for s, one in zip(shares, fits.residuals, strict=True)))
-    sigma = deviation(fits.scene, survey.scale, spread, residual, given.noise, held)
-    plain = (given.frames - given.psi.forward(survey.plain)).astype(np.float32)
-    excess, its_own = (mixture.excess(one, given.noise, held) for one in (residual, plain))
+    excess, its_own = (
+        mixture.excess(one, given.noise, held) for one in (residual, survey.plain_residual)
+    )
     over_plain = excess / max(its_own, 1e-20)
-    if sigma is None:
+    variance = variance_of_mean(
+        fits.scene, survey.scale, together.spread, residual, given.noise, held
+    )
+    if variance is None:
         return Mean(light_field, shares, None, over_plain)
+    blur_views(together.apart)
     # The residuals, on which it is calibrated, show neither.
-    variance = np.square(sigma) + survey.unseen.astype(np.float32)
-    difference = apart(light_field, survey.plain)
-    variance += np.float32(over_plain / (1 + over_plain)) * difference
-    times, reported = stated(features(variance, difference, spread, disparity_sigma, light_field))
+    _add(variance, survey.unseen, over_plain / (1 + over_plain), together.apart)
+    of_samples = float(variance.mean(dtype=np.float64))
+    between = float(together.apart.mean(dtype=np.float64))
+    of = features(of_samples, between, spread, disparity_sigma, light_field)
+    times, reported = stated(of)
     variance *= times
     return Mean(light_field, shares, np.sqrt(variance, out=variance), over_plain, reported)
+
+
+def _add(variance: Array, unseen: Array, part: float, apart: Array) -> None:
+    """Add to a variance (v, u, y, x) that of a picture (y, x), and part of a squared difference."""
+    unseen, share = unseen.astype(np.float32), np.float32(part)
+    views_v, views_u = variance.shape[:2]
+
+    def work(_: int, first: int, last: int) -> None:
+        for view in range(first, last):
+            at = divmod(view, views_u)
+            variance[at] += unseen + share * apart[at]
+
+    in_bands(work, views_v * views_u)

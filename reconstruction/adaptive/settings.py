@@ -54,7 +54,7 @@ class AdaptiveSettings(Settings):
     )
     texture: TextureSettings = Field(default_factory=TextureSettings)
     start_steps: int = Field(
-        default=40, ge=1, description="of total variation, from which textures begin"
+        default=13, ge=1, description="of total variation, from which textures begin"
     )
     patches: int | None = Field(
         default=2, ge=1, description="shots from which sparse patches are in the mean; none: never"
@@ -76,5 +76,4 @@ def fast(settings: AdaptiveSettings) -> AdaptiveSettings:
         update={"steps": 8, "refine_steps": 5, "block_step": 6, "sweeps": ()}
     )
     coarser = {"step_px": 0.25, "lengths_px": (2.0,), "interleaved": False, "patches": None}
-    fewer = {"start_steps": settings.start_steps // 3 or 1, "texture": quick}
-    return settings.model_copy(update=coarser | fewer)
+    return settings.model_copy(update=coarser | {"texture": quick})

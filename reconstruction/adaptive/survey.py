@@ -16,6 +16,7 @@ from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
+from reconstruction.adaptive.mixture import stored
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.choices import choose_mu, contrast, smooth_guess
@@ -23,7 +24,7 @@ from reconstruction.colour import unseen_colour
 from reconstruction.errors import ReconstructionError
 from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.inputs import checked_inputs, checked_noise
-from reconstruction.tv import TVSettings, reconstruct_tv
+from reconstruction.wave import few_steps
 
 Array = NDArray[np.floating]
 COARSE_PX = 8.0, 2.0
@@ -99,8 +100,9 @@ def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
 class Survey:
     """given: what is fitted. scale: of the scene's contrast; bright: `given` over it. held: the
     readings kept from every fit. volume: beliefs about disparities. unseen: variance by colours
-    that frames do not show, (y, x). plain: light field of total variation. centre, picture: the
-    centre view's disparity (y, x) and picture (y, x, c), over the scale, to begin with.
+    that frames do not show, (y, x). plain: light field of total variation, as `mixture.stored`;
+    plain_residual: frames less what it predicts. centre, picture: the centre view's disparity (y,
+    x) and picture (y, x, c), over the scale, to begin with.
     """
 
     given: Readings
@@ -109,7 +111,8 @@ class Survey:
     held: NDArray[np.bool_]
     volume: search.Volume
     unseen: Array
-    plain: Array
+    plain: NDArray[np.uint16]
+    plain_residual: Array
     centre: Array
     picture: Array
 
@@ -157,12 +160,11 @@ def surveyed(
     fitted = given.usable & ~held
     mu = choose_mu(psi, given.frames[fitted], given.typical)
     # The model that surfaces must beat on the held-out readings, and from which they begin.
-    start = TVSettings(
-        mu=mu, max_steps=settings.start_steps, objective_every=settings.start_steps + 1
-    )
-    plain = reconstruct_tv(psi, given.frames, given.typical, start, fitted).light_field
+    plain = few_steps(psi, given.frames, fitted, mu, settings.start_steps)
     begun = centre_view(plain) / np.float32(scale)
-    return Survey(given, scale, bright, held, volume, unseen, plain, centre, begun)
+    missed = given.frames - psi.forward(plain)
+    kept = stored(plain)
+    return Survey(given, scale, bright, held, volume, unseen, kept, missed, centre, begun)
 
 
 def contrast_of(

@@ -15,7 +15,7 @@ WITHIN_ONE of them lie within one deviation: a split conformal calibration (Vovk
 readings instead of samples, which needs no true light field.
 
 Errors that the rays of a pixel average out stay unseen, as at a wrong disparity. A second estimate,
-total variation's, shows them (`apart`): were its errors independent, the squared difference would
+total variation's, shows them: were its errors independent, the squared difference would
 be the sum of both squared errors. It is shared out as the held-out residuals' mean squares are,
 unless one plane is the whole scene: its disparity is known.
 
@@ -28,14 +28,17 @@ scenes that were not fitted to lie from it is its interval (conformal, as Wen et
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
+from emmc_rig.model.bands import in_bands
+from emmc_rig.model.lightfield import sum_of_squares
 from reconstruction.adaptive.joint import FittedScene
 from reconstruction.adaptive.refine import slopes
 from reconstruction.result import SCALE, TAILS
@@ -72,31 +75,76 @@ def held_out(
     return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
 
 
-def _parts(scene: FittedScene, scale: float, noise_variance: float, spread: Array) -> Array:
-    """Return N, B and E of every sample, (3, v, u, y, x)."""
-    let_in = np.square(scene.texture - scene.clean).mean(axis=0)
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """let_in, steep, spread: (v, u, y, x). N is the first plus left_in, B and E are the others."""
+
+    let_in: Array
+    steep: Array
+    spread: Array
+    left_in: float
+
+    def of_rays(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> Iterator[NDArray[np.float64]]:
+        """Yield N, B and E of samples, (reading, ray)."""
+        rays = self.spread.shape[0] * self.spread.shape[1]
+        for part, more in ((self.let_in, self.left_in), (self.steep, 0.0), (self.spread, 0.0)):
+            yield part[:, :, y, x].reshape(rays, -1).T.astype(np.float64) + more
+
+    def weighted(self, weights: Sequence[float]) -> NDArray[np.float32]:
+        """Return the sum of N, B and E, so many times each, in place of the spread."""
+        let_in, steep, spread = (np.float32(one) for one in weights)
+
+        def work(_: int, first: int, last: int) -> None:
+            for view in range(first, last):
+                at = divmod(view, self.spread.shape[1])
+                out = self.spread[at]
+                out *= spread
+                out += let_in * self.let_in[at] + let_in * np.float32(self.left_in)
+                out += steep * self.steep[at]
+
+        in_bands(work, self.spread.shape[0] * self.spread.shape[1])
+        return self.spread
+
+
+def _parts(scene: FittedScene, scale: float, noise_variance: float, spread: Array) -> _Parts:
+    """Return the parts of every sample; the spread is blurred in place."""
+    let_in = np.float32(LET_IN) * np.square(scene.texture - scene.clean).mean(axis=0)
     steep = np.square(slopes(scene.clean)).mean(axis=1).sum(axis=0)
-    smooth = np.stack([cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (let_in, steep)])
-    seen = np.maximum(scene.surfaces.light_field(smooth), 0) * np.float32(scale**2)
-    parts = np.empty((3, *spread.shape), dtype=np.float32)
-    parts[0] = np.float32(LET_IN) * seen[..., 0] + np.float32(LEFT_IN * noise_variance)
-    parts[1] = seen[..., 1]
-    for v, u in np.ndindex(spread.shape[:2]):
-        parts[2, v, u] = cv2.GaussianBlur(spread[v, u], (0, 0), SMOOTH_PX)
-    return parts
+    smooth = np.stack([blurred(part) for part in (let_in, steep)])
+    # Cubic weights may overshoot below 0.
+    smooth *= np.float32(scale**2)
+    seen = scene.surfaces.light_field(smooth)
+    np.maximum(seen, 0, out=seen)
+    blur_views(spread)
+    return _Parts(seen[..., 0], seen[..., 1], spread, LEFT_IN * noise_variance)
 
 
-def _of_readings(scene: FittedScene, parts: Array, held: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return what parts (part, v, u, y, x) add to the variance of the held-out readings.
+def blurred(part: Array) -> Array:
+    """Return one picture (y, x), blurred by SMOOTH_PX."""
+    return np.asarray(cv2.GaussianBlur(part, (0, 0), SMOOTH_PX), dtype=np.float32)
 
-    (part, reading). The rays of a pixel meet the texture |disparity| apart per view step.
+
+def blur_views(values: NDArray[np.float32]) -> None:
+    """Blur every view of (v, u, y, x), in place."""
+
+    def work(_: int, first: int, last: int) -> None:
+        for view in range(first, last):
+            at = divmod(view, values.shape[1])
+            values[at] = blurred(values[at])
+
+    in_bands(work, values.shape[0] * values.shape[1])
+
+
+def _of_readings(scene: FittedScene, parts: _Parts, held: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return what N, B and E add to the variance of the held-out readings, (part, reading).
+    The rays of a pixel meet the texture |disparity| apart per view step.
     """
     psi = scene.surfaces.psi
     k = psi.binning
     shot, pixel_y, pixel_x = np.nonzero(held)
-    steps = np.indices(parts.shape[1:3]).reshape(2, -1).T
+    steps = np.indices(psi.views).reshape(2, -1).T
     apart = np.linalg.norm((steps[:, None] - steps[None]).astype(np.float64), axis=-1)
-    out = np.zeros((len(parts), len(shot)))
+    out = np.zeros((3, len(shot)))
     for sub_y in range(k):
         for sub_x in range(k):
             y, x = pixel_y * k + sub_y, pixel_x * k + sub_x
@@ -107,26 +155,12 @@ def _of_readings(scene: FittedScene, parts: Array, held: NDArray[np.bool_]) -> N
             gain = np.einsum("hac,hab,hbc->h", weights, alike, weights, optimize=True)
             share = np.square(weights).sum(axis=-1)
             share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-30)
-            for part, values in enumerate(parts):
-                rays = values[:, :, y, x].reshape(len(steps), -1).T
+            for part, rays in enumerate(parts.of_rays(y, x)):
                 out[part] += gain * (share * rays).sum(axis=1)
     return out
 
 
-def apart(light_field: Array, other: Array) -> NDArray[np.float32]:
-    """Return the squared difference of two light fields, blurred, averaged over colours.
-
-    On 64x80 middles of six scenes of group A and two built in, one and three shots, with it 0.49 to
-    0.80 of the errors lie within sigma (0.31 to 0.73 without), and 0.68 on average (0.60).
-    """
-    out = np.empty(light_field.shape[:4], dtype=np.float32)
-    for v, u in np.ndindex(out.shape[:2]):
-        square = np.square(light_field[v, u] - other[v, u]).mean(axis=-1)
-        out[v, u] = cv2.GaussianBlur(square, (0, 0), SMOOTH_PX)
-    return out
-
-
-def deviation(
+def variance_of_mean(
     scene: FittedScene,
     scale: float,
     spread: Array,
@@ -134,9 +168,9 @@ def deviation(
     noise: Array,
     held: NDArray[np.bool_],
 ) -> NDArray[np.float32] | None:
-    """Return the standard deviation of a mean of models, of a value of any colour, (v, u, y, x).
+    """Return the variance of a mean of models, of a value of any colour, (v, u, y, x).
 
-    None with too few readings held out.
+    None with too few readings held out. It takes the place of the spread.
 
     scene: the last fit, of a light field over `scale`. spread: variance (v, u, y, x) between
     the models. residual: of the mean; noise: variance of the readings; held: those kept from the
@@ -158,12 +192,35 @@ def deviation(
         tails = (FREEDOM + 1) * np.log1p(square / (FREEDOM * variance))
         return float(np.sum(np.log(variance) + tails))
 
-    logs = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
+    logs = lowest_point(surprise, np.log([0.1, 1.0]))
     over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), least)
     scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
     blur, apart = (float(one) for one in np.exp(logs))
-    weights = np.array([scale, scale * blur, scale * apart], dtype=np.float32)
-    return np.sqrt(np.tensordot(weights, parts, axes=1))
+    return parts.weighted((scale, scale * blur, scale * apart))
+
+
+def lowest_point(
+    of: Callable[[NDArray[np.float64]], float],
+    start: NDArray[np.float64],
+    step: float = 1.0,
+    smallest: float = 1e-3,
+) -> NDArray[np.float64]:
+    """Return about where a function of two values is least, by pattern search.
+
+    Of the eight points around, a step away along each axis, the best is gone to; where none is
+    better the step is halved (Hooke & Jeeves 1961). SciPy's minimisers load for a third of a
+    second, longer than this takes.
+    """
+    at, value = start, of(start)
+    while step > smallest:
+        around = [at + step * np.array(way) for way in product((-1, 0, 1), repeat=2) if any(way)]
+        values = [of(one) for one in around]
+        best = int(np.argmin(values))
+        if values[best] < value:
+            at, value = around[best], values[best]
+        else:
+            step /= 2
+    return at
 
 
 class Foretold(NamedTuple):
@@ -192,24 +249,30 @@ captures of the built-in scenes (`adaptive-fast`, 48x64) lie outside; with 1, 0.
 
 
 def features(
-    variance: Array, apart: Array, spread: Array, disparity_sigma: Array, of: Array
+    variance: float, apart: float, spread: float, disparity_sigma: Array, of: Array
 ) -> dict[str, float]:
     """Return the FEATURES of a capture, all natural logarithms.
 
-    variance: of the samples, as here without them, (v, u, y, x); over its mean are those of apart,
-    as `apart` returns it, and spread, the variance between the models. disparity_sigma (y, x):
-    median, in pixels. of: the light field, its standard deviation over its mean.
+    variance: the samples' mean, as here without them; over it are those of apart, the mean squared
+    difference of the two estimates, and spread, the mean variance between the models.
+    disparity_sigma (y, x): median, in pixels. of: the light field, its standard deviation over its
+    mean.
     """
-    whole = max(float(variance.mean(dtype=np.float64)), 1e-30)
-    # View by view: in float64 the light field is twice as large.
-    square = np.mean(
-        [np.square(of[at], dtype=np.float64).mean() for at in np.ndindex(of.shape[:2])]
-    )
-    mean = max(float(of.mean(dtype=np.float64)), 1e-30)
+    whole = max(variance, 1e-30)
+    sums = np.zeros((2, of.shape[0] * of.shape[1]))
+
+    def work(_: int, first: int, last: int) -> None:
+        for view in range(first, last):
+            picture = of[divmod(view, of.shape[1])]
+            sums[:, view] = sum_of_squares(picture), picture.sum(dtype=np.float64)
+
+    in_bands(work, sums.shape[1])
+    square, mean = sums.sum(axis=1) / of.size
+    mean = max(float(mean), 1e-30)
     values = {
-        "apart": apart.mean(dtype=np.float64) / whole,
+        "apart": apart / whole,
         "disparity": np.median(disparity_sigma),
-        "spread": spread.mean(dtype=np.float64) / whole,
+        "spread": spread / whole,
         "contrast": max(float(square) / mean**2 - 1, 0.0) ** 0.5,
     }
     return {name: float(np.log(max(float(value), 1e-30))) for name, value in values.items()}

@@ -79,7 +79,7 @@ METHODS = (
         "what is seen lies on surfaces, alike from all views but where one hides another; from two "
         "shots on that or what `tv-dict` assumes, each where it holds",
         "p patches 81 m^2/2 (2 + l d) + l (d + 28) m^3/6 for d disparities, l texture lengths; "
-        "2 x 8 x 12 x 32 N/6; twice 40 steps of tv; from two shots on that of tv-dict",
+        "2 x 8 x 12 x 32 N/6; 13 steps of tv; from two shots on that of tv-dict",
         "any number of shots; nothing to train; disparity and standard deviation wanted",
         partial(_solve, "adaptive", lambda settings: settings),
         "adaptive",

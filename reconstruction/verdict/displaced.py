@@ -14,12 +14,12 @@ Where Psi has no design, blur is that of its own shadow. Displacements are also 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.camera import Camera, build_imaging_matrix, camera_of
+from emmc_rig.model.camera import Camera, camera_of, draw_plates, seen_of_white
 from emmc_rig.model.errors import ModelError, SensingError
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.verdict.shadow import (
@@ -29,7 +29,7 @@ from reconstruction.verdict.shadow import (
     averaged,
     channels,
     relief_of,
-    tiles,
+    tile_edges,
 )
 
 Array = NDArray[np.floating]
@@ -45,6 +45,8 @@ by at least."""
 ALIKE = 0.5
 """Correlation below which the design says nothing about a Psi. 2x flags two broken results fewer of
 13."""
+FEWEST, MOST_CONDITION = 20, 1e8
+"""Readings for each value that a regression determines, and the condition of its matrix."""
 DECOYS_PX = (36, 12), (-24, 48), (36, -36), (-24, -24)
 """By how much derivatives are moved (y, x) so that they mean nothing: further than masks correlate,
 and by whole tiles of colour filters of 2, 3, 4 and 6 pixels."""
@@ -153,9 +155,13 @@ def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
 
     def drawn(dy_px: float, dx_px: float, distance: float = 1.0) -> Array:
         moved = _moved(camera, dy_px * pixel_um, dx_px * pixel_um, distance)
-        return relief_of(build_imaging_matrix(moved, psi.size), found.picture)[1]
+        plates = draw_plates(moved, psi.size) if distance != 1 else roomy
+        return relief_of(psi, seen_of_white(moved, psi.size, plates), found.picture)[1]
 
     try:
+        # Masks with room for all moves are drawn once.
+        step_um = STEP_PX * pixel_um
+        roomy = draw_plates(_moved(camera, step_um, step_um, 1), psi.size)
         own = drawn(0, 0)
         up, down = drawn(STEP_PX, 0), drawn(-STEP_PX, 0)
         right, left = drawn(0, STEP_PX), drawn(0, -STEP_PX)
@@ -166,7 +172,7 @@ def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
     norms = [float(np.sqrt(np.mean(np.square(one)))) for one in both]
     if min(norms) < LEAST_RELIEF or float(np.mean(both[0] * both[1])) < ALIKE * norms[0] * norms[1]:
         return None
-    darker = relief_of(_vignetted(psi, VIGNETTING_STEP), found.picture)[1]
+    darker = relief_of(psi, _vignetted(psi, VIGNETTING_STEP), found.picture)[1]
     return _Design(
         ((up - down) / (2 * STEP_PX), (right - left) / (2 * STEP_PX)),
         {
@@ -220,21 +226,41 @@ class _Tiled:
 
 
 def _tiled(found: Relief, shift_y: Array, shift_x: Array) -> _Tiled | None:
-    """Return the shifts that each tile's readings ask for, None where no tile determines any."""
-    fits = [
-        _regressed(
-            [one[:, y, x] for one in (found.masks, shift_y, shift_x)],
-            found.seen[:, y, x],
-            found.weight[:, y, x],
-        )
-        for y, x in tiles(found.good.shape[1:])
-    ]
-    known = [fit for fit in fits if fit is not None]
-    if not known:
+    """Return the shifts that each tile's readings ask for, None where no tile determines any.
+
+    The regression of `_regressed`, of all tiles at once.
+    """
+    rows, columns = (tile_edges(length) for length in found.good.shape[1:])
+    weight = found.weight.astype(np.float64)
+    base = [one.astype(np.float64) for one in (found.masks, shift_y, shift_x)]
+
+    def summed(values: NDArray) -> NDArray:
+        by_rows = np.add.reduceat(values.sum(axis=0), rows[:-1], axis=0)
+        return np.add.reduceat(by_rows, columns[:-1], axis=1).ravel()
+
+    def products(columns_: Sequence[Array], others: Sequence[Array]) -> Array:
+        sums = [[summed(one * other) for other in others] for one in columns_]
+        return np.moveaxis(np.array(sums), 2, 0)
+
+    weighted = [weight * one for one in base]
+    matrix = products(weighted, base)
+    enough = summed(weight > 0) >= FEWEST * len(base)
+    known = np.flatnonzero(enough)
+    known = known[np.linalg.cond(matrix[known]) <= MOST_CONDITION]
+    if not known.size:
         return None
-    return _Tiled(
-        np.array([fit.values[1:] for fit in known]), np.array([fit.deviations[1:] for fit in known])
-    )
+    inverse = np.zeros_like(matrix)
+    inverse[known] = np.linalg.inv(matrix[known])
+    values = (inverse @ products(weighted, [found.seen]))[..., 0]
+    left = found.seen.astype(np.float64)
+    shape = len(rows) - 1, len(columns) - 1
+    for one, of_tiles in zip(base, values.T, strict=True):
+        everywhere = of_tiles.reshape(shape).repeat(np.diff(rows), 0).repeat(np.diff(columns), 1)
+        left -= one * everywhere
+    scores = [one * left for one in weighted]
+    spread = inverse @ products(scores, scores) @ inverse
+    errors = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    return _Tiled(values[known, 1:], errors[known, 1:])
 
 
 def _decoys(
@@ -254,13 +280,16 @@ def _correlation(one: Array, other: Array) -> float:
     return abs(float(products[0])) / max(float(np.sqrt(products[1])), 1e-12)
 
 
-def _vignetted(psi: ImagingMatrix, lost: float) -> ImagingMatrix:
-    """Return Psi with the outermost views darker by a share, those between by its square law."""
-    v, u = (np.arange(n) - (n - 1) / 2 for n in psi.light_field_shape[:2])
+def _vignetted(psi: ImagingMatrix, lost: float) -> Array:
+    """Return the sum of Psi's weights over the views, (shot, y, stored colour, x), the outermost
+    views darker by a share, those between by its square law."""
+    v, u = (np.arange(n) - (n - 1) / 2 for n in psi.views)
     square = np.square(v)[:, None] + np.square(u)
     passed = 1 - lost * square / max(float(square.max()), 1e-12)
-    weights = psi.weights * passed[:, :, None, None, None].astype(psi.weights.dtype)
-    return replace(psi, weights=weights)
+    total = np.zeros((psi.shots, *psi.weights_shape[3:]))
+    for v, u in np.ndindex(psi.views):
+        total += passed[v, u] * psi.weights[:, v, u]
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,12 +304,12 @@ class _Fit:
 def _regressed(base: Sequence[Array], seen: Array, weight: Array) -> _Fit | None:
     """Return the weighted regression of the observed on the base; None where it is undetermined."""
     good = weight > 0
-    if good.sum() < 20 * len(base):
+    if good.sum() < FEWEST * len(base):
         return None
     columns = np.stack([one[good] for one in base], axis=1).astype(np.float64)
     weights, values = weight[good].astype(np.float64), seen[good].astype(np.float64)
     matrix = columns.T @ (columns * weights[:, None])
-    if np.linalg.cond(matrix) > 1e8:
+    if np.linalg.cond(matrix) > MOST_CONDITION:
         return None
     inverse = np.linalg.inv(matrix)
     found = inverse @ (columns.T @ (weights * values))

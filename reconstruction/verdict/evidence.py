@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.lightfield import centre_view
+from emmc_rig.model.lightfield import centre_view, sum_of_squares
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from reconstruction.colour import unseen_colour
@@ -195,7 +195,9 @@ def _colour_error(
 def _stated(result: Reconstruction) -> float | None:
     if "sigma" not in result.maps:
         return None
-    square = np.mean(np.square(result.maps["sigma"], dtype=np.float64))
+    sigma = result.maps["sigma"]
+    views = np.ndindex(sigma.shape[:2])
+    square = sum(sum_of_squares(sigma[view]) for view in views) / sigma.size
     square /= 10 ** (result.parameters.get(SCALE, 0.0) / 10)
     return float(np.sqrt(square) / max(float(result.light_field.mean(dtype=np.float64)), 1e-12))
 
@@ -205,9 +207,9 @@ def _parallax(light_field: Array, view_axes: ViewAxes) -> float | None:
     if not shows_parallax(view_axes) or light_field.shape[0] * light_field.shape[1] == 1:
         return None
     middle = centre_view(light_field)
-    square = float(np.mean(np.square(middle, dtype=np.float64)))
+    square = sum_of_squares(middle) / middle.size
     views = (light_field[v, u] - middle for v, u in np.ndindex(light_field.shape[:2]))
-    apart = float(np.mean([np.mean(np.square(one, dtype=np.float64)) for one in views]))
+    apart = sum(sum_of_squares(one) for one in views) / light_field.size
     return float(np.sqrt(apart / max(square, 1e-30)))
 
 

@@ -8,7 +8,6 @@ elsewhere or blurred, and 0 where they are other masks.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -75,17 +74,17 @@ def averaged(values: Array, good: NDArray, filters: NDArray[np.int64], deviation
 
 
 def relief_of(
-    psi: ImagingMatrix, picture: Array
+    psi: ImagingMatrix, white: Array, picture: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return what a picture (y, x, c), seen in all views, makes a Psi read.
 
     First of evenly grey masks, then what the masks add as a share of it, both
-    (shot, pixel_y, pixel_x).
+    (shot, pixel_y, pixel_x). white: Psi's weights summed over the views, or those of one like it,
+    (shot, y, stored colour, x).
     """
     k = psi.binning
     rows, columns = psi.frames_shape[1:]
-    white = psi.weights.sum(axis=(1, 2), dtype=np.float64)
-    white = white.reshape(psi.shots, rows, k, -1, columns, k).sum(axis=(2, 5))
+    white = white.reshape(psi.shots, rows, k, -1, columns, k).sum(axis=(2, 5), dtype=np.float64)
     colours = picture.reshape(rows, k, columns, k, 3).mean(axis=(1, 3))
     filters = channels(psi)
     every = np.ones(psi.frames_shape, dtype=bool)
@@ -106,7 +105,8 @@ def relief(
 ) -> Relief:
     """Return readings and masks around the smooth picture."""
     picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
-    level, masks = relief_of(psi, picture)
+    white = psi.weights.sum(axis=(1, 2), dtype=np.float64)
+    level, masks = relief_of(psi, white, picture)
     filters = channels(psi)
     floor = DIMMEST * float(np.median(level))
     good = usable & (level > max(floor, 3 * noise_sigma))
@@ -128,14 +128,9 @@ def relief(
     )
 
 
-def tiles(size: tuple[int, ...]) -> list[tuple[slice, slice]]:
-    """Return tiles of about TILE_PX a side that cover rows x columns of pixels."""
-    cuts = [np.linspace(0, n, max(1, n // TILE_PX) + 1).round().astype(int) for n in size]
-    return [
-        (slice(int(top), int(bottom)), slice(int(left), int(right)))
-        for top, bottom in itertools.pairwise(cuts[0])
-        for left, right in itertools.pairwise(cuts[1])
-    ]
+def tile_edges(length: int) -> NDArray[np.int64]:
+    """Return where tiles of about TILE_PX begin along an axis of so many pixels, and the end."""
+    return np.linspace(0, length, max(1, length // TILE_PX) + 1).round().astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ import pytest
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.geometry import (
+    CellWeights,
     Footprint,
     cell_weights,
     centred_grid,
@@ -156,9 +157,9 @@ def test_a_mask_of_magnified_cells_shows_one_cell_to_one_sample_shifted_by_whole
 def test_the_weights_of_every_footprint_sum_to_one(cell_um, pixel_um, aperture_um):
     positions_um = np.concatenate([centred_grid(40, 7.3), [-cell_um, -cell_um / 2, 0.0, cell_um]])
     count = int(np.ceil(400 / cell_um))
-    weights = cell_weights(positions_um, Footprint(pixel_um, aperture_um), cell_um, count)
+    weights = cell_weights(positions_um, Footprint(pixel_um, aperture_um), cell_um, count).toarray()
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
-    assert weights.toarray().min() >= 0
+    assert weights.min() >= 0
 
 
 @pytest.mark.parametrize("cell_um", [7.0, 24.0, 65.0])
@@ -207,3 +208,20 @@ def test_the_fresnel_number_is_a_squared_over_lambda_d():
     assert fresnel_number(48.0, 1.0) == pytest.approx(4 * fresnel_number(24.0, 1.0))
     assert fresnel_number(24.0, 2.0) == pytest.approx(fresnel_number(24.0, 1.0) / 2)
     assert fresnel_number(24.0, 0.0) == np.inf
+
+
+def test_weights_of_cells_multiply_as_the_matrix_they_stand_for():
+    footprint = Footprint(31.0, 17.0)
+    weights = cell_weights(np.array([-90.0, 3.0, 40.0, 95.0]), footprint, 24.0, 10)
+    cells = np.random.default_rng(0).random((10, 6))
+    assert weights.splits_cells
+    np.testing.assert_allclose(weights @ cells, weights.toarray() @ cells, rtol=1e-12)
+    assert not cell_weights(np.array([-12.0, 12.0]), Footprint(24.0, 0.0), 24.0, 10).splits_cells
+
+
+def test_weights_of_views_are_summed_as_the_matrices_they_stand_for():
+    footprint = Footprint(31.0, 17.0)
+    places = ([-90.0, 3.0], [-40.0, -60.0], [90.0, 0.0])
+    views = [cell_weights(np.array(at), footprint, 24.0, 10) for at in places]
+    summed = CellWeights.summed(views).toarray()
+    np.testing.assert_allclose(summed, sum(one.toarray() for one in views), rtol=1e-12)

@@ -9,6 +9,7 @@ from emmc_rig.model.camera import (
     Camera,
     build_imaging_matrix,
     draw_plates,
+    seen_of_white,
     shipped_cameras,
 )
 
@@ -203,3 +204,11 @@ def test_the_bench_camera_takes_the_shots_of_its_name_within_one_exposure(shots:
 @every_camera
 def test_shipped_masks_are_coarse_enough_for_ray_optics(name: str) -> None:
     assert SHIPPED[name].warnings() == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_white_is_seen_as_by_all_views_of_psi_together(name):
+    camera, size = SHIPPED[name], (14, 20)
+    psi = build_imaging_matrix(camera, size)
+    seen = seen_of_white(camera, size, draw_plates(camera, size))
+    np.testing.assert_allclose(seen, psi.weights.sum(axis=(1, 2)), rtol=1e-5, atol=1e-7)

@@ -6,11 +6,11 @@ import pytest
 from reconstruction.adaptive.mixture import (
     HIDDEN,
     PATCHES_POWER,
+    averaged,
     beside_patches,
     excess,
-    mean_light_field,
     shares_of,
-    spread,
+    stored,
 )
 
 SHAPE, NOISE = (2, 60, 80), 1e-6
@@ -69,16 +69,25 @@ def test_surfaces_or_patches_of_half_the_error_take_nearly_all(held, surface, pa
 def test_the_mean_of_light_fields_follows_the_shares_of_pixels():
     shares = np.stack([np.full((2, 3), 0.25), np.full((2, 3), 0.75)]).astype(np.float32)
     fields = [np.full((3, 3, 4, 6, 3), value, np.float32) for value in (0.4, 0.8)]
-    np.testing.assert_allclose(mean_light_field(fields, shares, 2), 0.7, rtol=1e-6)
+    fields = [stored(field) for field in fields]
+    together = averaged(fields, shares, 2, fields[1])
+    np.testing.assert_allclose(together.light_field, 0.7, rtol=2e-5)
 
 
 def test_the_spread_is_the_weighted_variance_of_light_fields():
-    fields = np.random.default_rng(3).random((2, 3, 3, 4, 6, 3)).astype(np.float32)
-    shares = np.stack([np.full((2, 3), 0.25), np.full((2, 3), 0.75)]).astype(np.float32)
-    mean = mean_light_field(list(fields), shares, 2)
-    apart = 0.25 * 0.75 * np.square(fields[0] - fields[1]).mean(axis=-1)
-    found = spread(list(fields), mean, shares, 2)
-    np.testing.assert_allclose(found, apart, rtol=1e-4, atol=1e-6)
+    rng = np.random.default_rng(3)
+    fields = rng.random((2, 3, 3, 4, 6, 3)).astype(np.float32)
+    one, other = fields
+    first = rng.random((2, 3)).astype(np.float32)
+    models = [stored(field) for field in fields]
+    together = averaged(models, np.stack([first, 1 - first]), 2, models[1])
+    share = first.repeat(2, axis=0).repeat(2, axis=1)
+    square = np.square(one - other).mean(axis=-1)
+    np.testing.assert_allclose(
+        together.light_field, share[..., None] * one + (1 - share[..., None]) * other, atol=1e-5
+    )
+    np.testing.assert_allclose(together.spread, share * (1 - share) * square, atol=2e-5)
+    np.testing.assert_allclose(together.apart, np.square(share) * square, atol=2e-5)
 
 
 def test_the_excess_of_residuals_is_their_square_beyond_the_noise_and_never_0(held):

@@ -12,7 +12,12 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.psi import read_frames
 from emmc_rig.model.lightfield import load_hdf5
-from emmc_rig.processing.reconstructing import load_settings, reconstruct_folder
+from emmc_rig.processing.reconstructing import (
+    load_settings,
+    reconstruct_captures,
+    reconstruct_folder,
+)
+from emmc_rig.processing.result import Result
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
@@ -39,6 +44,22 @@ def test_frames_become_a_light_field_with_pictures_and_metrics(
     assert metrics["psnr_db"] > 12
     assert json.loads((tmp_path / "metrics.json").read_text())["noise_sigma"] > 0
     assert any((tmp_path / "pictures").iterdir())
+
+
+def test_a_result_is_on_the_disk_before_its_pictures_are_drawn(frames, tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    monkeypatch.setattr(Result, "draw", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        list(reconstruct_captures([(frames, out)], None, None, None, print, method="tv"))
+    assert load_hdf5(out / "light_field.h5").shape == (5, 5, *SIZE, 3)
+    assert json.loads((out / "metrics.json").read_text())["method"] == "tv"
+    monkeypatch.undo()
+    ((_, metrics),) = reconstruct_captures([(frames, out)], None, None, None, print, method="tv")
+    assert metrics["method"] == "tv"
+    assert any((out / "pictures").iterdir())
 
 
 def test_the_noise_level_is_that_of_the_usable_pixels(frames):

@@ -1,6 +1,7 @@
 """Verdicts: their figures against theory, and that faults are named with reason and remedy."""
 
 import dataclasses
+import itertools
 import json
 
 import cv2
@@ -27,7 +28,7 @@ from reconstruction.screening import screened
 from reconstruction.tv import TVSettings, reconstruct_tv
 from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.compression import blockiness, quantised
-from reconstruction.verdict.displaced import displaced
+from reconstruction.verdict.displaced import _regressed, _tiled, displaced
 from reconstruction.verdict.evidence import Evidence, Read, gathered
 from reconstruction.verdict.kept import (
     compare_held_out,
@@ -38,7 +39,7 @@ from reconstruction.verdict.kept import (
 from reconstruction.verdict.pixels import pixel_figures
 from reconstruction.verdict.rules import LEVELS, verdict_from
 from reconstruction.verdict.run import reconstruct_judged
-from reconstruction.verdict.shadow import relief, shadow
+from reconstruction.verdict.shadow import Relief, relief, shadow, tile_edges
 from reconstruction.verdict.shots import _differences, _differing, compared, motion
 
 SIZE = (48, 64)
@@ -82,6 +83,31 @@ def test_masks_half_as_strong_show_at_half_strength(three):
     halved = even.level * (1 + 0.5 * even.masks)
     # The smooth picture follows what is left, by a little.
     np.testing.assert_allclose(shadow(relief_in(three, halved)).strength, 0.53, atol=0.06)
+
+
+def test_all_tiles_at_once_are_regressed_as_one_by_one():
+    rng = np.random.default_rng(0)
+    shape = (2, 50, 80)
+    masks, read, seen, shift_y, shift_x = rng.normal(size=(5, *shape)).astype(np.float32)
+    weight = (rng.random(shape) * (rng.random(shape) < 0.8)).astype(np.float32)
+    weight[:, :25, :27] = 0
+    good, level = weight > 0, np.ones(shape, np.float32)
+    found = Relief(level, masks, read, seen, good, weight, np.ones((50, 80, 3)))
+    tiled = _tiled(found, shift_y, shift_x)
+    rows, columns = (tile_edges(length) for length in shape[1:])
+    alone = [
+        _regressed(
+            [one[:, top:bottom, left:right] for one in (masks, shift_y, shift_x)],
+            seen[:, top:bottom, left:right],
+            weight[:, top:bottom, left:right],
+        )
+        for top, bottom in itertools.pairwise(rows)
+        for left, right in itertools.pairwise(columns)
+    ]
+    known = [fit for fit in alone if fit is not None]
+    assert len(known) == len(alone) - 1
+    np.testing.assert_allclose(tiled.shifts, [fit.values[1:] for fit in known], rtol=1e-6)
+    np.testing.assert_allclose(tiled.errors, [fit.deviations[1:] for fit in known], rtol=1e-6)
 
 
 def test_an_even_scene_behind_a_displaced_mask_shows_the_displacement():

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.formats.format import Array, Export, Format, write_picture
@@ -71,6 +70,8 @@ def _write_video(folder: Path, export: Export, ending: str, codec: str) -> None:
 
 def _write_gif(folder: Path, export: Export) -> None:
     # OpenCV's GIF has 216 fixed colours, seven times as far off.
+    from PIL import Image
+
     first, *others = (Image.fromarray(picture).quantize(256) for picture in walk(export))
     first.save(
         folder / "parallax.gif", save_all=True, append_images=others,

@@ -10,7 +10,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import scipy.io
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.child import read_in_child
@@ -24,7 +23,9 @@ ESLF = re.compile(r".*_(\d+)x(\d+)_eslf\.png")
 def _write_mat(folder: Path, export: Export) -> None:
     pictures = codes_of(export.light_field, 16)
     weight = np.full((*pictures.shape[:4], 1), 65535, np.uint16)
-    scipy.io.savemat(
+    from scipy.io import savemat  # SciPy loads for a third of a second
+
+    savemat(
         folder / "light_field.mat",
         {
             "LF": np.concatenate([pictures, weight], axis=-1),

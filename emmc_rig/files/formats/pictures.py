@@ -14,7 +14,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-import tifffile
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.child import read_in_child
@@ -44,6 +43,8 @@ def _tagged_linear(png: bytes) -> bytes:
 def _write_tiff(folder: Path, export: Export) -> None:
     for v, u in np.ndindex(export.light_field.shape[:2]):
         view = np.ascontiguousarray(export.light_field[v, u], np.float32)
+        import tifffile  # loads for a sixth of a second
+
         tifffile.imwrite(
             folder / f"view_{v}_{u}.tif", view, photometric="rgb", compression="zlib",
             description="linear RGB, 1 is white",
