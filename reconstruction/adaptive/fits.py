@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,19 +42,21 @@ def fitted_models(
     settings: AdaptiveSettings,
     on_step: Callable[[int], None],
     patches: Patches | None = None,
+    second: search.Volume | None = None,
 ) -> Fits:
     """Return a fit of surfaces for each of `settings.misfits`, and one without any.
 
     All fits of surfaces but the last search the disparity again with their texture (`sweep`); where
     that leads astray the last one, which keeps what the patches agreed on, predicts held-out
-    readings better. on_step: called with the number of steps done.
+    readings better. on_step: called with the number of steps done. second: beliefs of a second
+    search; they are fitted before, as the first misfit's are.
     """
     given, bright, held = survey.given, survey.bright, survey.held
     scale = np.float32(survey.scale)
 
-    def again(texture: Array, residual: Array, margin: int) -> Array:
+    def again(volume: search.Volume, texture: Array, residual: Array, margin: int) -> Array:
         beliefs = swept(
-            survey.volume,
+            volume,
             given.psi,
             bright.frames,
             bright.noise,
@@ -66,21 +69,27 @@ def fitted_models(
         )
         return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
 
+    *swept_first, last = settings.misfits
+    begun = [(survey.volume, survey.centre, misfit, True) for misfit in swept_first]
+    begun.append((survey.volume, survey.centre, last, False))
+    if second is not None:
+        centre = search.per_pixel(second, given.psi.size, given.psi.binning)
+        begun.insert(0, (second, centre, settings.misfits[0], True))
     light_fields, residuals, scene = [], [], None
-    for fit, misfit in enumerate(settings.misfits):
+    for fit, (volume, centre, misfit, sweeps) in enumerate(begun):
         # One layout of rays at a time: it is as large as the light field.
         scene = None
         done = fit * settings.texture.steps
         scene = solve(
             given.psi,
-            survey.centre,
+            centre,
             1 if settings.nearer == "larger" else -1,
             bright.frames,
             bright.precision(held, misfit),
             survey.picture,
             settings.texture,
             on_step=lambda step, done=done: on_step(done + step),
-            again=again if fit < len(settings.misfits) - 1 else None,
+            again=partial(again, volume) if sweeps else None,
         )
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
         scene.surfaces.release()

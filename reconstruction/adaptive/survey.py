@@ -98,7 +98,8 @@ def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
 @dataclass(frozen=True, eq=False)
 class Survey:
     """given: what is fitted. scale: of the scene's contrast; bright: `given` over it. held: the
-    readings kept from every fit. volume: beliefs about disparities. unseen: variance by colours
+    readings kept from every fit. data, prior, rough: of the fine search, for another one. volume:
+    beliefs about disparities. unseen: variance by colours
     that frames do not show, (y, x). plain: light field of total variation. centre, picture: the
     centre view's disparity (y, x) and picture (y, x, c), over the scale, to begin with.
     """
@@ -107,6 +108,9 @@ class Survey:
     scale: float
     bright: Readings
     held: NDArray[np.bool_]
+    data: search.SearchData
+    prior: TexturePrior
+    rough: search.Volume
     volume: search.Volume
     unseen: Array
     plain: Array
@@ -162,7 +166,9 @@ def surveyed(
     )
     plain = reconstruct_tv(psi, given.frames, given.typical, start, fitted).light_field
     begun = centre_view(plain) / np.float32(scale)
-    return Survey(given, scale, bright, held, volume, unseen, plain, centre, begun)
+    return Survey(
+        given, scale, bright, held, data, fine, rough, volume, unseen, plain, centre, begun
+    )
 
 
 def contrast_of(
