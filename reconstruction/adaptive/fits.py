@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.joint import FittedScene, solve
+from reconstruction.adaptive.second import surfaces_fail
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey
 from reconstruction.adaptive.sweep import swept
@@ -48,8 +49,11 @@ def fitted_models(
 
     All fits of surfaces but the last search the disparity again with their texture (`sweep`); where
     that leads astray the last one, which keeps what the patches agreed on, predicts held-out
-    readings better. on_step: called with the number of steps done. second: beliefs of a second
-    search; they are fitted before, as the first misfit's are.
+    readings better. on_step: called with the number of steps done.
+
+    second: beliefs of a second search. Then there is a fit of the first misfit for each search,
+    since closer ones follow what wide disparities err by: with them the mean of 12 crops is 0.01 dB
+    worse.
     """
     given, bright, held = survey.given, survey.bright, survey.held
     scale = np.float32(survey.scale)
@@ -69,12 +73,16 @@ def fitted_models(
         )
         return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
 
-    *swept_first, last = settings.misfits
-    begun = [(survey.volume, survey.centre, misfit, True) for misfit in swept_first]
-    begun.append((survey.volume, survey.centre, last, False))
-    if second is not None:
-        centre = search.per_pixel(second, given.psi.size, given.psi.binning)
-        begun.insert(0, (second, centre, settings.misfits[0], True))
+    first, size, k = settings.misfits[0], given.psi.size, given.psi.binning
+    if second is None:
+        *others, last = settings.misfits
+        begun = [(survey.volume, survey.centre, misfit, True) for misfit in others]
+        begun.append((survey.volume, survey.centre, last, False))
+    else:
+        begun = [
+            (survey.volume, survey.centre, first, True),
+            (second, search.per_pixel(second, size, k), first, True),
+        ]
     light_fields, residuals, scene = [], [], None
     for fit, (volume, centre, misfit, sweeps) in enumerate(begun):
         # One layout of rays at a time: it is as large as the light field.
@@ -96,12 +104,14 @@ def fitted_models(
         seen = scene.surfaces.light_field(scale * scene.texture)
         light_fields.append(np.clip(seen, 0, 1, out=seen))
     assert scene is not None
-    if patches is not None:
+    enough = given.psi.shots >= (settings.patches or 1)
+    patched = patches is not None and (enough or surfaces_fail(survey, residuals))
+    if patches is not None and patched:
         light_fields.append(patches(given.usable & ~held))
     else:
         light_fields.append(survey.plain)
     residuals.append(given.frames - given.psi.forward(light_fields[-1]))
-    return Fits(light_fields, residuals, scene, patches is not None)
+    return Fits(light_fields, residuals, scene, patched)
 
 
 @dataclass(frozen=True, eq=False)

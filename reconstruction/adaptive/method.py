@@ -29,7 +29,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Patches, averaged, fitted_models
-from reconstruction.adaptive.second import beside_picture, searched_again
+from reconstruction.adaptive.second import searched_again
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import checked, checked_disparity, surveyed
 from reconstruction.adaptive.uncertainty import within_db
@@ -60,7 +60,7 @@ def reconstruct_adaptive(
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
     it is known, in place of the one searched. patches: see `Patches`; they are asked for from
-    `settings.patches` shots on, and where disparities are large beside the picture.
+    `settings.patches` shots on, or where surfaces fail (`second`).
     Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
@@ -80,12 +80,12 @@ def reconstruct_adaptive(
     survey = surveyed(given, settings, known, report)
     second = searched_again(survey, settings) if known is None else None
     if second is not None:
-        total += settings.texture.steps
-    if psi.shots < (settings.patches or 1) and not beside_picture(survey):
-        patches = None
+        total = 2 * settings.texture.steps + 3
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second)
     size, k = psi.size, psi.binning
-    disparity_sigma = np.sqrt(search.variance_per_pixel(survey.volume, size, k))
+    # The less sure of two searches knows better how sure to be.
+    believed = survey.volume if second is None else second
+    disparity_sigma = np.sqrt(search.variance_per_pixel(believed, size, k))
     mean = averaged(survey, fits, disparity_sigma)
     residual = (given.frames - given.psi.forward(mean.light_field)).astype(np.float32)
     maps = {

@@ -8,9 +8,9 @@ import pytest
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive import method, second
+from reconstruction.adaptive import fits, method, second
 from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.second import beside_picture, searched_again
+from reconstruction.adaptive.second import searched_again, surfaces_fail
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.adaptive.survey import checked, surveyed
 
@@ -49,10 +49,21 @@ def test_a_few_wide_patches_are_not_worth_a_second_search(survey, share, again):
     assert (found is not None) == again
 
 
-@pytest.mark.parametrize(("disparity", "beside"), [(2.3, False), (2.5, True)])
-def test_disparities_are_large_beside_a_small_picture(survey, disparity, beside):
-    assert beside_picture(believing(survey, disparity)) == beside
-    assert 4 * 2.3 < second.BESIDE * min(SIZE) < 4 * 2.5
+@pytest.mark.parametrize(
+    ("disparity", "missed", "takes"),
+    [(4.0, 0.4, True), (-4.0, 0.4, True), (4.0, 0.3, False), (1.7, 0.6, False)],
+)
+def test_one_shot_surfaces_fail_where_surfaces_miss_and_disparities_are_large(
+    survey, disparity, missed, takes
+):
+    given = survey.given
+    rng = np.random.default_rng(0)
+    wild = (given.frames + rng.normal(0, 0.1, given.frames.shape)).astype(np.float32)
+    unlike = replace(believing(survey, disparity), given=replace(given, frames=wild))
+    plain = wild - given.psi.forward(survey.plain)
+    # Of two fits of surfaces the better counts.
+    assert surfaces_fail(unlike, [missed * plain, plain]) == takes
+    assert 4 * 1.7 < second.BESIDE * min(SIZE) < 4 * 4.0
 
 
 def test_the_second_search_is_less_sure(survey):
@@ -92,16 +103,20 @@ def test_a_known_disparity_is_not_searched_again(monkeypatch, known):
     assert bool(asked) != known
 
 
-@pytest.mark.parametrize("beside", [False, True])
-def test_one_shot_takes_sparse_patches_where_disparities_are_large(monkeypatch, beside):
+@pytest.mark.parametrize("fail", [False, True])
+def test_one_shot_asks_for_patches_where_surfaces_fail(monkeypatch, fail):
     trial, asked = wide_trial(1), []
 
     def patches(usable):
         asked.append(usable)
         return np.full(trial.truth.shape, 0.5, np.float32)
 
-    monkeypatch.setattr(method, "beside_picture", lambda _: beside)
+    monkeypatch.setattr(fits, "surfaces_fail", lambda *_: fail)
     reconstruct_adaptive(
-        trial.psi, trial.readings, trial.noise_sigma, AdaptiveSettings(), patches=patches
+        trial.psi,
+        trial.readings,
+        trial.noise_sigma,
+        fast(AdaptiveSettings()).model_copy(update={"patches": 2}),
+        patches=patches,
     )
-    assert bool(asked) == beside
+    assert bool(asked) == fail
