@@ -338,7 +338,9 @@ def surveyed(
         picture = smooth_guess(flat, read, use).astype(np.float32)
         noise = np.full(read.shape, noise_sigma**2)
         own = settings.adaptive.contrast or contrast_of(flat, read, picture, noise, use)
-        adaptive = settings.adaptive.model_copy(update={"contrast": own})
+        # What a block would decide by its own size is decided for all.
+        count = settings.adaptive.patches if patched else None
+        adaptive = settings.adaptive.model_copy(update={"contrast": own, "patches": count})
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])

@@ -8,7 +8,8 @@
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
    `shrinkage`, `refine`, `sweep`).
-5. Textures that follow the readings more or less closely, and sparse patches from two shots on or
+5. Where disparities are wide they are searched a second time, less sure (`second`).
+6. Textures that follow the readings more or less closely, and sparse patches from two shots on or
    total variation, are averaged by how well they predict readings kept from all of them (`fits`,
    `mixture`), which also calibrate the standard deviation of the result (`uncertainty`).
 
@@ -28,6 +29,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Patches, averaged, fitted_models
+from reconstruction.adaptive.second import searched_again
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import checked, checked_disparity, surveyed
 from reconstruction.adaptive.uncertainty import within_db
@@ -57,7 +59,8 @@ def reconstruct_adaptive(
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
-    it is known, in place of the one searched. patches: see `Patches`.
+    it is known, in place of the one searched. patches: see `Patches`; they are asked for from
+    `settings.patches` shots on, or where surfaces fail (`second`).
     Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
@@ -75,9 +78,14 @@ def reconstruct_adaptive(
     given = checked(psi, frames, noise_sigma, usable)
     known = None if disparity is None else checked_disparity(disparity, psi)
     survey = surveyed(given, settings, known, report)
-    fits = fitted_models(survey, settings, lambda step: report(2 + step), patches)
+    second = searched_again(survey, settings) if known is None else None
+    if second is not None:
+        total = 2 * settings.texture.steps + 3
+    fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second)
     size, k = psi.size, psi.binning
-    disparity_sigma = np.sqrt(search.variance_per_pixel(survey.volume, size, k))
+    # The less sure of two searches knows better how sure to be.
+    believed = survey.volume if second is None else second
+    disparity_sigma = np.sqrt(search.variance_per_pixel(believed, size, k))
     mean = averaged(survey, fits, disparity_sigma)
     residual = (given.frames - given.psi.forward(mean.light_field)).astype(np.float32)
     maps = {

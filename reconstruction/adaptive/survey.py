@@ -99,16 +99,20 @@ def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
 @dataclass(frozen=True, eq=False)
 class Survey:
     """given: what is fitted. scale: of the scene's contrast; bright: `given` over it. held: the
-    readings kept from every fit. volume: beliefs about disparities. unseen: variance by colours
-    that frames do not show, (y, x). plain: light field of total variation, as `mixture.stored`;
-    plain_residual: frames less what it predicts. centre, picture: the centre view's disparity (y,
-    x) and picture (y, x, c), over the scale, to begin with.
+    readings kept from every fit. data, prior, rough: of the fine search, for another one. volume:
+    beliefs about disparities. unseen: variance by colours that frames do not show, (y, x). plain:
+    light field of total variation, as `mixture.stored`; plain_residual: frames less what it
+    predicts. centre, picture: the centre view's disparity (y, x) and picture (y, x, c), over the
+    scale, to begin with.
     """
 
     given: Readings
     scale: float
     bright: Readings
     held: NDArray[np.bool_]
+    data: search.SearchData
+    prior: TexturePrior
+    rough: search.Volume
     volume: search.Volume
     unseen: Array
     plain: NDArray[np.uint16]
@@ -163,8 +167,10 @@ def surveyed(
     plain = few_steps(psi, given.frames, fitted, mu, settings.start_steps)
     begun = centre_view(plain) / np.float32(scale)
     missed = given.frames - psi.forward(plain)
-    kept = stored(plain)
-    return Survey(given, scale, bright, held, volume, unseen, kept, missed, centre, begun)
+    return Survey(
+        given, scale, bright, held, data, fine, rough, volume, unseen, stored(plain), missed,
+        centre, begun,
+    )  # fmt: skip
 
 
 def contrast_of(

@@ -37,10 +37,15 @@ def sparse_patches(settings: SparseSettings, binning: int) -> SparseSettings:
     return settings.model_copy(update={"stride": stride, "solver": solver})
 
 
+def may_take_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
+    """Return whether `adaptive` may average with sparse patches: if one fits."""
+    return settings.patches is not None and min(psi.size) >= max(usual_patch(psi.binning))
+
+
 def takes_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
-    """Return whether `adaptive` averages with sparse patches: from so many shots, if one fits."""
-    enough = settings.patches is not None and psi.shots >= settings.patches
-    return enough and min(psi.size) >= max(usual_patch(psi.binning))
+    """Return whether `adaptive` averages with sparse patches whatever the scene: from so many
+    shots."""
+    return may_take_patches(psi, settings) and psi.shots >= (settings.patches or 1)
 
 
 @lru_cache(maxsize=1)
@@ -66,7 +71,7 @@ def _solve(
 
     result = reconstruct_adaptive(
         psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step,
-        patches=patches if takes_patches(psi, adaptive) else None,
+        patches=patches if may_take_patches(psi, adaptive) else None,
     )  # fmt: skip
     return dataclasses.replace(result, method=name)
 
