@@ -66,7 +66,7 @@ def fitted_models(
         )
         return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
 
-    light_fields, residuals, scene = [], [], None
+    light_fields, residuals, scene, begun = [], [], None, None
     for fit, misfit in enumerate(settings.misfits):
         # One layout of rays at a time: it is as large as the light field.
         scene = None
@@ -81,7 +81,9 @@ def fitted_models(
             settings.texture,
             on_step=lambda step, done=done: on_step(done + step),
             again=again if fit < len(settings.misfits) - 1 else None,
+            begun=begun,
         )
+        begun = scene.begun
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
         scene.surfaces.release()
         seen = scene.surfaces.light_field(scale * scene.texture)
