@@ -1,9 +1,10 @@
 """Psi of textured surfaces, laid out for many products: where its rays meet the texture.
 
-Where the rays of a reading meet the texture close together, which small disparities make them do,
-their taps are summed to a box of the texture, 4 bytes a sample; else each ray that is not dark is
-kept, 16 bytes. Operations of a product: a sample of a box 1, a ray 32; of laying out: about 40 a
-ray. Where all cells together are too many, they are laid out anew, a band of rows at a time.
+Where the rays of a reading meet the texture close together, which all but large disparities make
+them do, their taps are summed to a box of the texture, 2 bytes a sample and rows of whole vectors
+(`lanes`); else each ray that is not dark is kept, 16 bytes. Operations of a product: a sample of a
+box 2, a ray 64; of laying out: about 60 a ray. Where all cells together are too many, they are laid
+out anew, a band of rows at a time.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from math import floor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,18 +20,29 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands, summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.adaptive.lanes import (
+    LANES,
+    TAPS,
+    add_box,
+    add_taps,
+    read_box,
+    read_taps,
+)
 
 Array = NDArray[np.floating]
-TAPS = 4
-MOST_CELLS = 240_000_000
-"""That are held at a time: 4 bytes each."""
-RAY = 4
-"""Cells of a ray: its first tap, as an integer, the fractions along y and x, and its weight."""
+MOST_ROWS = 30_000_000
+"""Of cells that are held at a time: 16 bytes each."""
+BOX_ROWS = 3
+"""Rows of a box for every ray that it sums, at most: a ray takes as long as three or four rows."""
+FINEST = 32767
+"""Steps of a box's cells up to its largest: 16 bits, of which rounding takes 1e-5 of a reading."""
 
 
 class Cells(NamedTuple):
-    """boxes: (reading, 4), first row and column, height and width; height 0: rays. starts:
-    (reading + 1,), where each reading's cells begin. values: the cells; taps: the same as integers.
+    """boxes: (reading, 4), first row and column, height, and vectors of a row; height 0: rays.
+    starts: (reading + 1,), where each reading's rows begin. values: (row, LANES) int16, a vector
+    of a box, in units of `scales` (reading,); or a ray: its first tap, as an integer of 32 bits in
+    `taps` (row, 4), the fractions along y and x, and its weight, in `rays` (row, 4).
     colour: Psi's map; binning: k; size: rows and columns of a texture; stored: colours of Psi."""
 
     colour: Any
@@ -40,31 +51,10 @@ class Cells(NamedTuple):
     stored: Any
     boxes: Any
     starts: Any
+    scales: Any
     values: Any
+    rays: Any
     taps: Any
-
-
-@njit(inline="always")
-def cubic(fraction, taps):
-    """Set the four weights of Catmull-Rom interpolation at a fraction in [0, 1)."""
-    t = fraction
-    taps[0] = ((-0.5 * t + 1.0) * t - 0.5) * t
-    taps[1] = (1.5 * t - 2.5) * t * t + 1.0
-    taps[2] = ((-1.5 * t + 2.0) * t + 0.5) * t
-    taps[3] = (0.5 * t - 0.5) * t * t
-
-
-@njit(inline="always")
-def first_tap(position, margin, last):
-    """Return the first of four taps within a padded texture, and the fraction beyond the second."""
-    whole = floor(position)
-    first = whole + margin - 1
-    fraction = np.float32(position - whole)
-    if first < 0:
-        return 0, np.float32(0.0)
-    if first > last:
-        return last, np.float32(1.0)
-    return first, fraction
 
 
 @njit(forceinline=True, fastmath=True)
@@ -118,10 +108,7 @@ def _bound(weights, y, taps, reach):
 
 @njit(cache=True, nogil=True)
 def _measure(weights, disparity, margin, binning, size, first_row, last_row, boxes, counts):
-    """Set boxes (reading, 4) to first row and column, height and width, and counts to the cells.
-
-    A reading whose rays are kept one by one has a height of 0.
-    """
+    """Set boxes (reading, 4) and the rows of cells that they or their rays take, see `Cells`."""
     shots, views_v, views_u, _, stored, columns = weights.shape
     pixels_y, pixels_x = weights.shape[3] // binning, columns // binning
     taps = np.empty((binning, 2, views_v * views_u, columns), np.int32)
@@ -139,27 +126,32 @@ def _measure(weights, disparity, margin, binning, size, first_row, last_row, box
                 mine = reach[:, pixel_x * binning : (pixel_x + 1) * binning]
                 entries = mine[4].sum()
                 boxes[reading] = 0
-                counts[reading] = RAY * entries
+                counts[reading] = entries
                 if entries == 0:
                     continue
                 top, left = mine[0].min(), mine[2].min()
                 height = mine[1].max() - top + TAPS
-                width = mine[3].max() - left + TAPS
-                if height * width * stored <= TAPS * TAPS * entries:
-                    boxes[reading, 0], boxes[reading, 1] = top, left
-                    boxes[reading, 2], boxes[reading, 3] = height, width
-                    counts[reading] = height * width * stored
+                vectors = -(-(mine[3].max() - left + TAPS) // LANES)
+                rows = height * vectors * stored
+                if rows <= BOX_ROWS * entries and vectors * LANES <= size[1]:
+                    boxes[reading, 0] = top
+                    boxes[reading, 1] = min(left, size[1] - vectors * LANES)
+                    boxes[reading, 2], boxes[reading, 3] = height, vectors
+                    counts[reading] = rows
 
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _lay(weights, disparity, margin, laid, first_row, last_row):
     """Set the cells of readings: boxes of taps, or rays."""
-    colour, binning, size, stored, boxes, starts, cells, taps_of = laid
+    colour, binning, size, stored, boxes, starts, scales, values, rays, taps_of = laid
     shots, views_v, views_u, _, _, columns = weights.shape
     pixels_y, pixels_x = weights.shape[3] // binning, columns // binning
-    taps = np.empty((binning, 2, views_v * views_u, columns), np.int32)
-    fractions = np.empty((binning, 2, views_v * views_u, columns), np.float32)
-    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    views = views_v * views_u
+    taps = np.empty((binning, 2, views, columns), np.int32)
+    fractions = np.empty((binning, 2, views, columns), np.float32)
+    lit, light = np.empty(views + 1, np.int32), np.empty(views + 1, np.float32)
+    flat = values.reshape(-1)
+    box = np.empty(BOX_ROWS * LANES * binning * binning * views * stored, np.float32)
     for pixel_y in range(first_row, last_row):
         for sub_y in range(binning):
             y = pixel_y * binning + sub_y
@@ -168,112 +160,92 @@ def _lay(weights, disparity, margin, laid, first_row, last_row):
             for pixel_x in range(pixels_x):
                 reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
                 at, end = starts[reading], starts[reading + 1]
-                top, left, height, width = boxes[reading]
-                merged = height > 0
-                if merged:
-                    cells[at:end] = 0
+                top, left, height = boxes[reading, 0], boxes[reading, 1], boxes[reading, 2]
+                width = boxes[reading, 3] * LANES
+                cells = (end - at) * LANES if height > 0 else 0
+                for n in range(cells):
+                    box[n] = 0
                 for sub_y in range(binning):
                     y = pixel_y * binning + sub_y
                     for sub_x in range(binning):
                         x = pixel_x * binning + sub_x
-                        for ray in range(views_v * views_u):
-                            v, u = ray // views_u, ray % views_u
-                            for k in range(stored):
-                                w = weights[s, v, u, y, k, x]
-                                if w == 0:
-                                    continue
+                        for k in range(stored):
+                            # Listed first: no processor predicts which rays are dark.
+                            count = 0
+                            for v in range(views_v):
+                                for u in range(views_u):
+                                    w = weights[s, v, u, y, k, x]
+                                    lit[count], light[count] = v * views_u + u, w
+                                    count += 1 if w != 0 else 0
+                            c = colour[s, y, x] if stored == 1 else k
+                            for n in range(count):
+                                ray, w = lit[n], light[n]
                                 iy, ix = taps[sub_y, 0, ray, x], taps[sub_y, 1, ray, x]
                                 fy, fx = fractions[sub_y, 0, ray, x], fractions[sub_y, 1, ray, x]
-                                if merged:
-                                    cubic(fy, wy)
-                                    cubic(fx, wx)
-                                    first = at + (k * height + iy - top) * width + ix - left
-                                    for i in range(TAPS):
-                                        share = w * wy[i]
-                                        for j in range(TAPS):
-                                            cells[first + i * width + j] += share * wx[j]
+                                if height > 0:
+                                    first = (k * height + iy - top) * width + ix - left
+                                    add_taps(box, first, width, fy, fx, w)
                                     continue
-                                c = colour[s, y, x] if stored == 1 else k
-                                taps_of[at] = (c * size[0] + iy) * size[1] + ix
-                                cells[at + 1] = fy
-                                cells[at + 2] = fx
-                                cells[at + 3] = w
-                                at += RAY
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _read(laid, first_row, last_row, texture, frames):
-    """Set pixel rows of frames (shot, pixel_y, pixel_x) to what they see of a flat texture."""
-    colour, binning, size, stored, boxes, starts, cells, taps_of = laid
-    shots, pixels_y, pixels_x = frames.shape
-    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-    for pixel_y in range(first_row, last_row):
-        for s in range(shots):
-            for pixel_x in range(pixels_x):
-                reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
-                at, end = starts[reading], starts[reading + 1]
-                top, left, height, width = boxes[reading]
-                total = np.float32(0)
-                while at < end:
-                    if height == 0:
-                        tap = taps_of[at]
-                        cubic(cells[at + 1], wy)
-                        cubic(cells[at + 2], wx)
-                        seen = np.float32(0)
-                        for i in range(TAPS):
-                            line = np.float32(0)
-                            for j in range(TAPS):
-                                line += wx[j] * texture[tap + i * size[1] + j]
-                            seen += wy[i] * line
-                        total += cells[at + 3] * seen
-                        at += RAY
-                        continue
-                    for k in range(stored):
-                        c = colour[s, pixel_y * binning, pixel_x * binning] if stored == 1 else k
-                        first = (c * size[0] + top) * size[1] + left
-                        for _ in range(height):
-                            for j in range(width):
-                                total += cells[at + j] * texture[first + j]
-                            at += width
-                            first += size[1]
-                frames[s, pixel_y, pixel_x] = total
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _return(laid, first_row, last_row, frames, texture):
-    """Add to a flat texture what `_read` would see of it, times pixel rows of frames."""
-    colour, binning, size, stored, boxes, starts, cells, taps_of = laid
-    shots, pixels_y, pixels_x = frames.shape
-    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
-    for pixel_y in range(first_row, last_row):
-        for s in range(shots):
-            for pixel_x in range(pixels_x):
-                reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
-                at, end = starts[reading], starts[reading + 1]
-                top, left, height, width = boxes[reading]
-                value = frames[s, pixel_y, pixel_x]
-                if value == 0:
+                                taps_of[at, 0] = (c * size[0] + iy) * size[1] + ix
+                                rays[at, 1], rays[at, 2], rays[at, 3] = fy, fx, w
+                                at += 1
+                if height == 0:
+                    rays[at:end] = 0
                     continue
-                while at < end:
-                    if height == 0:
-                        tap = taps_of[at]
-                        cubic(cells[at + 1], wy)
-                        cubic(cells[at + 2], wx)
-                        share = value * cells[at + 3]
-                        for i in range(TAPS):
-                            line = share * wy[i]
-                            for j in range(TAPS):
-                                texture[tap + i * size[1] + j] += line * wx[j]
-                        at += RAY
-                        continue
+                largest = np.float32(1e-30)
+                for n in range(cells):
+                    largest = max(largest, abs(box[n]))
+                scales[reading] = largest / FINEST
+                steps = np.float32(FINEST) / largest
+                for n in range(cells):
+                    flat[at * LANES + n] = np.int16(np.rint(box[n] * steps))
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _pass(laid, first_row, last_row, texture, frames, precision, missed):
+    """Add to a flat texture the adjoint of what a texture misses of frames, times precision.
+
+    frames, precision: (shot, pixel_y, pixel_x). The cells of a reading are read and returned while
+    the processor has them at hand. missed: empty: set frames to what they see instead.
+    """
+    colour, binning, size, stored, boxes, starts, scales, values, rays, taps = laid
+    shots, pixels_y, pixels_x = frames.shape
+    wide, read_only = size[1], missed.size == 0
+    for pixel_y in range(first_row, last_row):
+        for s in range(shots):
+            for pixel_x in range(pixels_x):
+                weight = precision[s, pixel_y, pixel_x]
+                if weight == 0:
+                    continue
+                reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
+                at, end, seen = starts[reading], starts[reading + 1], np.float32(0)
+                height, vectors, scale = boxes[reading, 2], boxes[reading, 3], scales[reading]
+                c = colour[s, pixel_y * binning, pixel_x * binning] if stored == 1 else 0
+                first = (c * size[0] + boxes[reading, 0]) * wide + boxes[reading, 1]
+                if height == 0:
+                    for row in range(at, end):
+                        fy, fx, w = rays[row, 1], rays[row, 2], rays[row, 3]
+                        seen += w * read_taps(texture, taps[row, 0], wide, fy, fx)
+                else:
                     for k in range(stored):
-                        c = colour[s, pixel_y * binning, pixel_x * binning] if stored == 1 else k
-                        first = (c * size[0] + top) * size[1] + left
-                        for _ in range(height):
-                            for j in range(width):
-                                texture[first + j] += cells[at + j] * value
-                            at += width
-                            first += size[1]
+                        box = first + k * size[0] * wide, at + k * height * vectors
+                        seen += scale * read_box(
+                            texture, box[0], wide, values, box[1], height, vectors
+                        )
+                if read_only:
+                    frames[s, pixel_y, pixel_x] = seen
+                    continue
+                share = weight * (frames[s, pixel_y, pixel_x] - seen)
+                if height == 0:
+                    for row in range(at, end):
+                        fy, fx, w = rays[row, 1], rays[row, 2], rays[row, 3]
+                        add_taps(missed, taps[row, 0], wide, fy, fx, share * w)
+                else:
+                    for k in range(stored):
+                        box = first + k * size[0] * wide, at + k * height * vectors
+                        add_box(
+                            missed, box[0], wide, values, box[1], height, vectors, scale * share
+                        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,18 +259,25 @@ class Layout:
     def read(self, texture: Array, frames: Array) -> None:
         """Set the rows of frames (shot, pixel_y, pixel_x) to what they see of (c, y, x)."""
         start, texture = self.rows.start, np.ascontiguousarray(texture, dtype=np.float32)
+        all_of_them, nothing = np.ones_like(frames), np.empty(0, dtype=np.float32)
 
         def work(_: int, first: int, last: int) -> None:
-            _read(self.cells, start + first, start + last, texture.reshape(-1), frames)
+            rows = start + first, start + last
+            _pass(self.cells, *rows, texture.reshape(-1), frames, all_of_them, nothing)
 
         in_bands(work, len(self.rows))
 
-    def add_adjoint(self, frames: Array, sums: Array) -> None:
-        """Add the adjoint of `read` of float32 frames to sums (2, flat texture), by two threads."""
-        start = self.rows.start
+    def add_missed(self, texture: Array, frames: Array, precision: Array, sums: Array) -> None:
+        """Add the adjoint of precision * (frames - what they see of a texture) to sums.
+
+        texture: (c, y, x); frames, precision: (shot, pixel_y, pixel_x), all float32 and contiguous.
+        sums: (2, flat texture), of which bands of rows side by side take turns.
+        """
+        start, texture = self.rows.start, texture.reshape(-1)
 
         def work(which: int, first: int, last: int) -> None:
-            _return(self.cells, start + first, start + last, frames, sums[which])
+            rows = start + first, start + last
+            _pass(self.cells, *rows, texture, frames, precision, sums[which])
 
         summed_in_bands(work, len(self.rows), self.reach_rows)
 
@@ -314,31 +293,41 @@ def _reach_rows(psi: ImagingMatrix, disparity: Array) -> float:
 
 
 def laid_out(
-    psi: ImagingMatrix, disparity: Array, margin: int, shape: tuple[int, int, int]
+    psi: ImagingMatrix,
+    disparity: Array,
+    margin: int,
+    shape: tuple[int, int, int],
+    alike: Layout | None = None,
 ) -> Iterator[Layout]:
-    """Yield where bands of pixel rows see textures (c, y, x) of a shape, MOST_CELLS at a time.
+    """Yield where bands of pixel rows see textures (c, y, x) of a shape, MOST_ROWS at a time.
 
-    disparity: (v, u, y, x).
+    disparity: of every ray, (v, u, y, x). alike: the layout of all rows of another Psi, both of one
+    colour in store, of the same disparity; its dark rays are dark in this Psi, too.
     """
     readings, rows = int(np.prod(psi.frames_shape)), psi.frames_shape[1]
-    counts = np.zeros(readings, dtype=np.int64)
-    boxes = np.zeros((readings, 4), dtype=np.int32)
     size, stored = shape[1:], psi.weights.shape[4]
+    if alike is not None:
+        boxes, counts = alike.cells.boxes, np.diff(alike.cells.starts)
+    else:
+        counts = np.zeros(readings, dtype=np.int64)
+        boxes = np.zeros((readings, 4), dtype=np.int32)
 
-    def measure(_: int, first: int, last: int) -> None:
-        _measure(psi.weights, disparity, margin, psi.binning, size, first, last, boxes, counts)
+        def measure(_: int, first: int, last: int) -> None:
+            _measure(psi.weights, disparity, margin, psi.binning, size, first, last, boxes, counts)
 
-    in_bands(measure, rows)
+        in_bands(measure, rows)
     by_row = counts.reshape(psi.frames_shape)
     before = np.cumsum(by_row.sum(axis=(0, 2))) - 1
-    cuts = np.flatnonzero(np.diff(before // max(MOST_CELLS, 1))) + 1
+    cuts = np.flatnonzero(np.diff(before // max(MOST_ROWS, 1))) + 1
+    scales = np.empty(readings, dtype=np.float32)
     for begin, end in pairwise([0, *cuts.tolist(), rows]):
         within = np.zeros_like(by_row)
         within[:, begin:end] = by_row[:, begin:end]
         starts = np.concatenate([[0], np.cumsum(within)])
-        values = np.empty(starts[-1], dtype=np.float32)
+        values = np.empty((starts[-1], LANES), dtype=np.int16)
+        rays, taps = values.view(np.float32), values.view(np.int32)
         cells = Cells(
-            psi.colour_map, psi.binning, size, stored, boxes, starts, values, values.view(np.int32)
+            psi.colour_map, psi.binning, size, stored, boxes, starts, scales, values, rays, taps
         )
 
         def lay(_: int, first: int, last: int, begin: int = begin, cells: Cells = cells) -> None:

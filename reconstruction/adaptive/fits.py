@@ -77,15 +77,15 @@ def fitted_models(
     first, size, k = settings.misfits[0], given.psi.size, given.psi.binning
     if second is None:
         *others, last = settings.misfits
-        begun = [(survey.volume, survey.centre, misfit, True) for misfit in others]
-        begun.append((survey.volume, survey.centre, last, False))
+        planned = [(survey.volume, survey.centre, misfit, True) for misfit in others]
+        planned.append((survey.volume, survey.centre, last, False))
     else:
-        begun = [
+        planned = [
             (survey.volume, survey.centre, first, True),
             (second, search.per_pixel(second, size, k), first, True),
         ]
-    light_fields, residuals, scene = [], [], None
-    for fit, (volume, centre, misfit, sweeps) in enumerate(begun):
+    light_fields, residuals, scene, begun = [], [], None, None
+    for fit, (volume, centre, misfit, sweeps) in enumerate(planned):
         # One layout of rays at a time: it is as large as the light field.
         scene = None
         done = fit * settings.texture.steps
@@ -99,7 +99,9 @@ def fitted_models(
             settings.texture,
             on_step=lambda step, done=done: on_step(done + step),
             again=partial(again, volume) if sweeps else None,
+            begun=begun,
         )
+        begun = scene.begun if second is None else None
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
         scene.surfaces.release()
         seen = scene.surfaces.light_field(scale * scene.texture)

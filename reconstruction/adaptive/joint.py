@@ -39,6 +39,10 @@ class TextureSettings(Settings):
     block_step: int = Field(default=4, ge=1, le=8)
     reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
     fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
+    sharpen_steps: int = Field(default=8, ge=1, description="of these when disparity is sharpened")
+    shared_steps: int = Field(
+        default=0, ge=0, description="first steps, which all fits of a scene have in common"
+    )
     sweeps: tuple[int, ...] = Field(
         default=(5, 10), description="steps that search the disparity again first"
     )
@@ -55,14 +59,24 @@ class TextureSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
+class Begun:
+    """The textures (c, y, x) after some steps: now, a step before, and that less its noise."""
+
+    now: Array
+    before: Array
+    clean: Array
+
+
+@dataclass(frozen=True, eq=False)
 class FittedScene:
     """Surfaces, their texture (c, y, x), the same less its noise (`clean`), and the centre view's
-    disparity (y, x), without the margin that the textures have."""
+    disparity (y, x), without the margin that the textures have. begun: after the shared steps."""
 
     surfaces: Surfaces
     texture: Array
     clean: Array
     centre: Array
+    begun: Begun
 
 
 def surfaces_of(
@@ -83,6 +97,7 @@ def solve(
     settings: TextureSettings,
     on_step: Callable[[int], None] | None = None,
     again: Callable[[Array, Array, int], Array] | None = None,
+    begun: Begun | None = None,
 ) -> FittedScene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
@@ -90,27 +105,29 @@ def solve(
     disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
     not usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the
     disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given its residual of
-    the frames, and the margin.
+    the frames, and the margin. begun: of another fit of the same centre, from which to go on.
     """
     furthest = float(np.abs(centre).max()) + settings.room_px
     half = max(psi.light_field_shape[:2]) // 2
     margin = int(np.ceil(furthest * half)) + 4
     around = ((margin, margin), (margin, margin))
     padded = searched = np.pad(centre, around, mode="edge")
-    begun = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge")
     colours = picture.shape[-1]
     surfaces = surfaces_of(psi, padded, margin, nearer, colours)
     rows_squared = np.einsum("ssyx->syx", psi.gram)
-    now = begun.astype(np.float32)
-    before, clean = now, now
+    now = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge").astype(np.float32)
+    at = kept = begun or Begun(now, now, now)
     sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
-    for step, sigma in enumerate(sigmas):
+    for step in range(0 if begun is None else settings.shared_steps, settings.steps):
+        if step == settings.shared_steps:
+            kept = at
+        now, clean, sigma = at.now, at.clean, float(sigmas[step])
         if step:
-            ahead = now + np.float32(settings.momentum) * (now - before)
+            ahead = now + np.float32(settings.momentum) * (now - at.before)
             clean = denoised(
                 ahead,
                 clean if step > 1 else ahead,
-                float(sigma),
+                sigma,
                 settings.block_step,
                 step,
                 settings.threshold,
@@ -128,15 +145,19 @@ def solve(
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
             residual = frames - surfaces.forward(now)
             padded = refined(
-                surfaces, padded, now, residual, doubted.astype(np.float32), settings.slope_px
+                surfaces,
+                padded,
+                now,
+                residual,
+                doubted.astype(np.float32),
+                settings.slope_px,
+                settings.sharpen_steps,
             )
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
-        before, now = (
-            now,
-            fitted(surfaces, frames, precision, clean, float(sigma), settings.fit_steps),
-        )
+        fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps)
+        at = Begun(fit, now, clean)
         if on_step is not None:
             on_step(step + 1)
     inner = np.s_[margin : margin + centre.shape[0], margin : margin + centre.shape[1]]
-    return FittedScene(surfaces, now, clean, np.ascontiguousarray(padded[inner]))
+    return FittedScene(surfaces, at.now, at.clean, np.ascontiguousarray(padded[inner]), kept)

@@ -8,7 +8,7 @@ other views see there. The rays are laid out (`assembly`), once where memory all
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import chain
 
 import numpy as np
@@ -17,32 +17,42 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.assembly import TAPS, Layout, cubic, first_tap, laid_out
+from reconstruction.adaptive.assembly import Layout, laid_out
+from reconstruction.adaptive.lanes import TAPS, read_taps
 
 Array = NDArray[np.floating]
+
+
+@njit(inline="always")
+def _first_tap(position, margin, last):
+    """Return the first of four taps within a padded texture, and the fraction beyond the second."""
+    whole = np.floor(position)
+    first = np.int64(whole) + margin - 1
+    fraction = position - whole
+    if first < 0:
+        first, fraction = np.int64(0), np.float32(0)
+    if first > last:
+        first, fraction = last, np.float32(1)
+    return first, fraction
 
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _render(disparity, texture, margin, first, last, out):
     """Set rows first to last - 1 of out (v, u, y, x, c) to what rays see of (c, y, x)."""
     views_v, views_u, _, columns, colours = out.shape
-    last_y, last_x = texture.shape[1] - TAPS, texture.shape[2] - TAPS
-    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    last_y, wide = texture.shape[1] - TAPS, texture.shape[2]
+    flat, plane = texture.reshape(-1), texture.shape[1] * wide
     for v in range(views_v):
         for u in range(views_u):
+            down, right = np.float32(views_v // 2 - v), np.float32(views_u // 2 - u)
             for y in range(first, last):
                 for x in range(columns):
                     d = disparity[v, u, y, x]
-                    iy, fy = first_tap(y - d * (v - views_v // 2), margin, last_y)
-                    ix, fx = first_tap(x - d * (u - views_u // 2), margin, last_x)
-                    cubic(fy, wy)
-                    cubic(fx, wx)
+                    iy, fy = _first_tap(np.float32(y) + d * down, margin, last_y)
+                    ix, fx = _first_tap(np.float32(x) + d * right, margin, wide - TAPS)
                     for c in range(colours):
-                        value = np.float32(0)
-                        for i in range(TAPS):
-                            for j in range(TAPS):
-                                value += wy[i] * wx[j] * texture[c, iy + i, ix + j]
-                        out[v, u, y, x, c] = value
+                        at = c * plane + iy * wide + ix
+                        out[v, u, y, x, c] = read_taps(flat, at, wide, fy, fx)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -53,8 +63,9 @@ def _steepen(weights, colour, disparity, hidden, slopes, margin, first, last, ou
     that by the ray's disparity; none where the ray sees what lies behind.
     """
     shots, views_v, views_u, _, stored, columns = weights.shape
-    last_y, last_x = slopes.shape[2] - TAPS, slopes.shape[3] - TAPS
-    wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
+    last_y, wide = slopes.shape[2] - TAPS, slopes.shape[3]
+    flat, plane = slopes.reshape(-1), slopes.shape[2] * wide
+    other = slopes.shape[1] * plane
     for y in range(first, last):
         for v in range(views_v):
             for u in range(views_u):
@@ -62,25 +73,18 @@ def _steepen(weights, colour, disparity, hidden, slopes, margin, first, last, ou
                 for x in range(columns):
                     if hidden[v, u, y, x] or (down == 0 and right == 0):
                         continue
+                    d = disparity[v, u, y, x]
+                    iy, fy = _first_tap(np.float32(y) + d * down, margin, last_y)
+                    ix, fx = _first_tap(np.float32(x) + d * right, margin, wide - TAPS)
                     for s in range(shots):
                         change = np.float32(0)
                         for k in range(stored):
                             w = weights[s, v, u, y, k, x]
-                            if w == 0:
-                                continue
-                            d = disparity[v, u, y, x]
-                            iy, fy = first_tap(y + d * down, margin, last_y)
-                            ix, fx = first_tap(x + d * right, margin, last_x)
-                            cubic(fy, wy)
-                            cubic(fx, wx)
                             c = colour[s, y, x] if stored == 1 else k
-                            for i in range(TAPS):
-                                along = np.float32(0)
-                                for j in range(TAPS):
-                                    steep = down * slopes[0, c, iy + i, ix + j]
-                                    steep += right * slopes[1, c, iy + i, ix + j]
-                                    along += wx[j] * steep
-                                change += w * wy[i] * along
+                            at = c * plane + iy * wide + ix
+                            steep = down * read_taps(flat, at, wide, fy, fx)
+                            steep += right * read_taps(flat, at + other, wide, fy, fx)
+                            change += w * steep
                         out[s, v, u, y, 0, x] = change
 
 
@@ -90,8 +94,10 @@ class Surfaces:
     disparity: (v, u, y, x) of every ray, hidden: (v, u, y, x) uint8, 1 where the ray sees what the
     centre view does not: there it sees the texture beside it. Textures have the shape
     `texture_shape`, (c, y, x), padded by `margin` samples on all sides; colours: of them, 1 for a
-    Psi that sees only the first.
+    Psi that sees only the first. alike: see `laid_out`.
     """
+
+    _whole: Layout | None
 
     def __init__(
         self,
@@ -100,12 +106,12 @@ class Surfaces:
         hidden: NDArray[np.uint8],
         margin: int,
         colours: int = 3,
+        alike: Layout | None = None,
     ) -> None:
         self.psi, self.disparity, self.hidden, self.margin = psi, disparity, hidden, margin
         rows, columns = psi.size
         self.texture_shape = (colours, rows + 2 * margin, columns + 2 * margin)
-
-        self._whole: Layout | None = None
+        self._alike, self._whole = alike, None
 
     def release(self) -> None:
         """Give back the memory of the rays' layout; a later product lays them out again."""
@@ -114,7 +120,7 @@ class Surfaces:
     def _bands(self) -> Iterable[Layout]:
         """Return the layouts of bands of rows; one of all rows is kept."""
         if self._whole is None:
-            bands = laid_out(self.psi, self.disparity, self.margin, self.texture_shape)
+            bands = laid_out(self.psi, self.disparity, self.margin, self.texture_shape, self._alike)
             first = next(bands)
             if len(first.rows) < self.psi.frames_shape[1]:
                 return chain([first], bands)
@@ -130,20 +136,35 @@ class Surfaces:
 
     def adjoint(self, frames: Array) -> Array:
         """Return the adjoint of `forward`, (c, y, x)."""
-        frames = np.ascontiguousarray(frames, dtype=np.float32)
-        sums = np.zeros((2, int(np.prod(self.texture_shape))), dtype=np.float32)
-        for band in self._bands():
-            band.add_adjoint(frames, sums)
+        nothing = np.zeros(self.texture_shape, dtype=np.float32)
+        return self.missed(nothing, frames, np.ones_like(frames, dtype=np.float32))
+
+    def missed(self, texture: Array, frames: Array, precision: Array) -> Array:
+        """Return the adjoint of precision * (frames - forward(texture)), see `add_missed`."""
+        sums = np.zeros((2, *self.texture_shape), dtype=np.float32)
+        self.add_missed(texture, frames, precision, sums)
         sums[0] += sums[1]
-        return sums[0].reshape(self.texture_shape)
+        return sums[0]
 
-    def derivative(self, slopes: Array) -> tuple[Callable, Callable]:
-        """Return how frames change with the centre view's disparity, and the adjoint of that.
+    def add_missed(self, texture: Array, frames: Array, precision: Array, sums: Array) -> None:
+        """Add the adjoint of precision * (frames - forward(texture)) to the sum of sums[0, 1].
 
-        slopes: (2, c, y, x), derivatives of the centre view's texture along y and x. The first maps
-        (y, x), padded, to (shot, pixel_y, pixel_x); what is hidden keeps its disparity.
+        texture: (c, y, x). frames, precision: (shot, pixel_y, pixel_x). sums: (2, c, y, x).
+        """
+        texture, frames, precision = (
+            np.ascontiguousarray(one, dtype=np.float32) for one in (texture, frames, precision)
+        )
+        for band in self._bands():
+            band.add_missed(texture, frames, precision, sums.reshape(2, -1))
+
+    def derivative(self, slopes: Array) -> Surfaces:
+        """Return how frames change with the centre view's disparity (1, y, x), padded.
+
+        slopes: (2, c, y, x), derivatives of the centre view's texture along y and x. What is hidden
+        keeps its disparity.
         """
         psi = self.psi
+        slopes = np.ascontiguousarray(slopes, dtype=np.float32)
         steep = np.zeros((*psi.weights.shape[:4], 1, psi.size[1]), dtype=np.float32)
 
         def work(_: int, first: int, last: int) -> None:
@@ -153,15 +174,13 @@ class Surfaces:
         in_bands(work, psi.size[0])
         colours = np.zeros((psi.shots, *psi.size), np.uint8)
         steep_psi = ImagingMatrix(steep, colours, psi.binning)
-        changes = Surfaces(steep_psi, self.disparity, self.hidden, self.margin, 1)
-        return (
-            lambda change: changes.forward(change[None]),
-            lambda residual: changes.adjoint(residual)[0],
-        )
+        alike = self._whole if psi.weights.shape[4] == 1 else None
+        return Surfaces(steep_psi, self.disparity, self.hidden, self.margin, 1, alike)
 
     def light_field(self, texture: Array) -> Array:
         """Return the light field (v, u, y, x, c) of a texture (c, y, x)."""
         out = np.empty((*self.disparity.shape, texture.shape[0]), dtype=np.float32)
+        texture = np.ascontiguousarray(texture, dtype=np.float32)
 
         def work(_: int, first: int, last: int) -> None:
             _render(self.disparity, texture, self.margin, first, last, out)

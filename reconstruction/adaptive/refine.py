@@ -9,10 +9,13 @@ neighbours are Laplace distributed (reweighted squares keep edges).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import in_bands
+from emmc_rig.model.compiling import njit
 from reconstruction.adaptive.rays import Surfaces
 
 Array = NDArray[np.floating]
@@ -22,27 +25,79 @@ TRUSTED_STEP_PX = 0.25
 """Largest step, and the deviation that one is expected to have. 2x +0.02, 0.5x -0.01 dB."""
 
 
+@njit(cache=True, fastmath=True, nogil=True)
+def _applied(sums, direction, residual, ridge, first, last, products):
+    """Set sums[0] (row, x) to ridge * direction - sums[0] - sums[1], the operator's product q.
+
+    products: (row, 4), set to d.q, r.q, q.q and r.r of direction d and residual r.
+    """
+    for row in range(first, last):
+        one, other, along, left = sums[0, row], sums[1, row], direction[row], residual[row]
+        dq, rq, qq, rr = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        for x in range(along.size):
+            product = ridge * along[x] - one[x] - other[x]
+            one[x] = product
+            dq += product * along[x]
+            rq += product * left[x]
+            qq += product * product
+            rr += left[x] * left[x]
+        products[row, 0], products[row, 1], products[row, 2], products[row, 3] = dq, rq, qq, rr
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _stepped(sums, direction, residual, solution, step, turn, first, last):
+    """Take a step along the direction (row, x), turn it, and clear the sums."""
+    for row in range(first, last):
+        product, other, along = sums[0, row], sums[1, row], direction[row]
+        left, found = residual[row], solution[row]
+        for x in range(along.size):
+            found[x] += step * along[x]
+            left[x] -= step * product[x]
+            along[x] = left[x] + turn * along[x]
+            product[x] = 0
+            other[x] = 0
+
+
 def conjugate_gradients(
-    apply: Callable[[Array], Array], rhs: Array, steps: int, rtol: float = 1e-5
+    subtract: Callable[[Array, Array], None],
+    ridge: float,
+    rhs: Array,
+    steps: int,
+    rtol: float = 1e-5,
 ) -> Array:
-    """Return the solution of apply(x) = rhs from x = 0, apply symmetric and positive definite."""
-    x = np.zeros_like(rhs)
-    residual = rhs.copy()
-    direction = residual.copy()
-    square = float(np.vdot(residual, residual))
-    first = square
+    """Return the solution of A(x) + ridge x = rhs, (..., y, x), from x = 0.
+
+    A, symmetric and positive semidefinite, is given by subtract(x, sums), which subtracts A(x) from
+    the sum of sums[0] and sums[1], both of x's shape.
+
+    The square of the next residual r - s q follows from products of this one, so that a step is two
+    passes over memory: q and its products, then all that moves.
+    """
+    sums = np.zeros((2, *rhs.shape), dtype=np.float32)
+    solution, residual, direction = np.zeros_like(rhs), rhs.copy(), rhs.copy()
+    moved = [one.reshape(-1, rhs.shape[-1]) for one in (direction, residual, solution)]
+    by_row = sums.reshape(2, -1, rhs.shape[-1])
+    products = np.empty((by_row.shape[1], 4), dtype=np.float32)
+
+    def apply(_: int, begin: int, end: int) -> None:
+        _applied(by_row, *moved[:2], np.float32(ridge), begin, end, products)
+
+    first = after = float(np.vdot(rhs, rhs))
     for _ in range(steps):
-        if square <= rtol**2 * first or square == 0:
+        if after <= rtol**2 * first:
             break
-        applied = apply(direction)
-        step = np.float32(square / float(np.vdot(direction, applied)))
-        # Not x += ...: pyright follows what a loop rebinds, here for 12 s.
-        np.add(x, step * direction, out=x)
-        np.subtract(residual, step * applied, out=residual)
-        before, square = square, float(np.vdot(residual, residual))
-        np.multiply(direction, np.float32(square / before), out=direction)
-        np.add(direction, residual, out=direction)
-    return x
+        subtract(direction, sums)
+        in_bands(apply, len(products))
+        dq, rq, qq, square = products.sum(axis=0, dtype=np.float64)
+        step = square / dq
+        after = max(square - 2 * step * rq + step**2 * qq, 0.0)
+        by = np.float32(step), np.float32(after / square)
+
+        def move(_: int, begin: int, end: int, by: tuple[Any, Any] = by) -> None:
+            _stepped(by_row, *moved, *by, begin, end)
+
+        in_bands(move, len(products))
+    return solution
 
 
 def fitted(
@@ -60,13 +115,14 @@ def fitted(
 
     precision: (shot, pixel_y, pixel_x), the inverse variance of each reading, 0 to leave it out.
     """
-    ridge = np.float32(1 / sigma**2)
-    rhs = surfaces.adjoint(precision * (frames - surfaces.forward(prior)))
-
-    def normal(textures: Array) -> Array:
-        return surfaces.adjoint(precision * surfaces.forward(textures)) + ridge * textures
-
-    return prior + conjugate_gradients(normal, rhs, steps)
+    nothing = np.zeros_like(frames)
+    change = conjugate_gradients(
+        lambda texture, sums: surfaces.add_missed(texture, nothing, precision, sums),
+        1 / sigma**2,
+        surfaces.missed(prior, frames, precision),
+        steps,
+    )
+    return prior + change
 
 
 def slopes(texture: Array) -> Array:
@@ -110,13 +166,14 @@ def refined(
     texture: (c, y, x) of the centre view, padded. residual: the frames less what the texture
     explains; precision: inverse variance of it, both (shot, pixel_y, pixel_x).
     """
-    spread, gather = surfaces.derivative(slopes(texture))
-    weights = _smoothness(centre, slope_px)
-    ridge = np.float32(1 / TRUSTED_STEP_PX**2)
+    changes = surfaces.derivative(slopes(texture))
+    weights, nothing = _smoothness(centre, slope_px), np.zeros_like(residual)
 
-    def normal(change: Array) -> Array:
-        return gather(precision * spread(change)) + _roughness(weights, change) + ridge * change
+    def subtract(change: Array, sums: Array) -> None:
+        changes.add_missed(change, nothing, precision, sums)
+        sums[0, 0] -= _roughness(weights, change[0])
 
-    rhs = gather(precision * residual) - _roughness(weights, centre)
-    step = conjugate_gradients(normal, rhs, steps)
+    rhs = changes.missed(np.zeros_like(centre)[None], residual, precision)
+    rhs[0] -= _roughness(weights, centre)
+    step = conjugate_gradients(subtract, 1 / TRUSTED_STEP_PX**2, rhs, steps)[0]
     return centre + np.clip(step, -TRUSTED_STEP_PX, TRUSTED_STEP_PX)

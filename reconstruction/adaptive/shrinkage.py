@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands, summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
+from reconstruction.adaptive.lanes import add_box, copy_box
 
 Array = NDArray[np.floating]
 SIDE = 8
@@ -219,6 +220,8 @@ def _shrink(rows, guide, side, cuts, unlike, reach, starts_y, starts_x, total, w
     squares = np.empty(2 * reach + 1 + LANES, np.float32)
     distances = np.empty(STACK, np.float32)
     places = np.empty((STACK, 2), np.int64)
+    _, length, begins, _ = rows.shape
+    flat_rows, flat_total = rows.reshape(-1), total.reshape(-1)
     for y in starts_y:
         for x in starts_x:
             count = _alike(
@@ -226,12 +229,9 @@ def _shrink(rows, guide, side, cuts, unlike, reach, starts_y, starts_x, total, w
             )
             for c in range(rows.shape[0]):
                 for k in range(count):
-                    block = stack[k]
-                    for i in range(SIDE):
-                        row = rows[c, places[k, 0] + i, places[k, 1]]
-                        for j in range(SIDE):
-                            block[i * SIDE + j] = row[j]
-                    _columns_analysed(block, side)
+                    at = ((c * length + places[k, 0]) * begins + places[k, 1]) * SIDE
+                    copy_box(flat_rows, at, begins * SIDE, flat, k * SIDE, SIDE, 1)
+                    _columns_analysed(stack[k], side)
                 _hadamard(stack, count)
                 mean = flat[0]
                 kept = 1 + _cut(flat[: count * SIDE * SIDE], cuts[c])
@@ -239,12 +239,9 @@ def _shrink(rows, guide, side, cuts, unlike, reach, starts_y, starts_x, total, w
                 _hadamard(stack, count)
                 share = np.float32(1.0) / kept
                 for k in range(count):
-                    block = stack[k]
-                    _columns_synthesised(block, side)
-                    for i in range(SIDE):
-                        row = total[c, places[k, 0] + i, places[k, 1]]
-                        for j in range(SIDE):
-                            row[j] += share * block[i * SIDE + j]
+                    _columns_synthesised(stack[k], side)
+                    at = ((c * length + places[k, 0]) * begins + places[k, 1]) * SIDE
+                    add_box(flat_total, at, begins * SIDE, flat, k * SIDE, SIDE, 1, share)
                     weight[c, places[k, 0], places[k, 1]] += share
 
 

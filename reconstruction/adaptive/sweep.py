@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.assembly import TAPS, cubic
+from reconstruction.adaptive.lanes import TAPS
 from reconstruction.adaptive.search import (
     Volume,
     compatibility,
@@ -51,6 +51,16 @@ LEAST_BELIEF = 1e-5
 """Of a disparity that the patches do not believe in: they may be wrong. 2x 0.00, 0.5x 0.00 dB."""
 
 
+@njit(inline="always")
+def cubic(fraction, taps):
+    """Set the four weights of Catmull-Rom interpolation at a fraction in [0, 1)."""
+    t = fraction
+    taps[0] = ((-0.5 * t + 1.0) * t - 0.5) * t
+    taps[1] = (1.5 * t - 2.5) * t * t + 1.0
+    taps[2] = ((-1.5 * t + 2.0) * t + 0.5) * t
+    taps[3] = (0.5 * t - 0.5) * t * t
+
+
 @njit(cache=True, fastmath=True, nogil=True)
 def _see(weights, colour, texture, disparity, margin, binning, first, last, frames):
     """Add to pixel rows of frames (shot, pixel_y, pixel_x) what they see of a plane.
@@ -62,47 +72,49 @@ def _see(weights, colour, texture, disparity, margin, binning, first, last, fram
     colours, _, wide = texture.shape
     wy, wx = np.empty(TAPS, np.float32), np.empty(TAPS, np.float32)
     line, seen = np.empty((colours, wide), np.float32), np.empty(columns, np.float32)
-    has = np.empty((shots, colours), np.bool_)
+    has, sums = np.empty((shots, colours), np.bool_), np.empty((shots, columns), np.float32)
     none = np.float32(0)
     for y in range(first * binning, last * binning):
         for s in range(shots):
             for c in range(colours):
                 has[s, c] = stored > 1 or np.any(colour[s, y] == c)
+            for x in range(columns):
+                sums[s, x] = 0
         for v in range(views_v):
             down = -disparity * (v - views_v // 2)
             cubic(np.float32(down - floor(down)), wy)
+            p, q, r, t = wy[0], wy[1], wy[2], wy[3]
             top = y + margin + floor(down) - 1
             for c in range(colours):
                 a, b = texture[c, top], texture[c, top + 1]
                 d, e = texture[c, top + 2], texture[c, top + 3]
                 for x in range(wide):
-                    line[c, x] = wy[0] * a[x] + wy[1] * b[x] + wy[2] * d[x] + wy[3] * e[x]
+                    line[c, x] = p * a[x] + q * b[x] + r * d[x] + t * e[x]
             for u in range(views_u):
                 right = -disparity * (u - views_u // 2)
                 cubic(np.float32(right - floor(right)), wx)
+                f, g, h, i = wx[0], wx[1], wx[2], wx[3]
                 left = margin + floor(right) - 1
                 for c in range(colours):
                     if not has[:, c].any():
                         continue
                     taps = line[c, left : left + columns + TAPS - 1]
                     for x in range(columns):
-                        seen[x] = (
-                            wx[0] * taps[x]
-                            + wx[1] * taps[x + 1]
-                            + wx[2] * taps[x + 2]
-                            + wx[3] * taps[x + 3]
-                        )
+                        seen[x] = f * taps[x] + g * taps[x + 1] + h * taps[x + 2] + i * taps[x + 3]
                     for s in range(shots):
                         if not has[s, c]:
                             continue
-                        row, filters = frames[s, y // binning], colour[s, y]
+                        row, filters = sums[s], colour[s, y]
                         for k in range(stored):
                             if stored > 1 and min(k, colours - 1) != c:
                                 continue
                             w = weights[s, v, u, y, k]
                             for x in range(columns):
                                 open = stored > 1 or filters[x] == c
-                                row[x // binning] += (w[x] if open else none) * seen[x]
+                                row[x] += (w[x] if open else none) * seen[x]
+        for s in range(shots):
+            for x in range(columns):
+                frames[s, y // binning, x // binning] += sums[s, x]
 
 
 def plane_frames(psi: ImagingMatrix, texture: Array, disparity: float, margin: int) -> Array:

@@ -6,8 +6,6 @@ the further of the surfaces beside them.
 
 from __future__ import annotations
 
-from math import floor
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,38 +17,52 @@ REACH = 0.75
 """A point covers the samples within this distance along each axis."""
 SAME_SURFACE = 0.35
 """Disparities that differ less, in pixels, are those of one surface."""
+SETTLING = 2
+"""Steps to the point that a ray meets on a slanted surface."""
+EMPTY = np.float32(-1e30)
+"""Disparity of rays that no point reaches, until they are given one."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def _carry(centre, margin, nearer, dv, du, out, mark):
-    """Set out and mark (y, x) to disparities and hidden rays of the view dv, du steps off."""
+    """Set out and mark (y, x) to disparities and hidden rays of the view dv, du steps off.
+
+    A point covers one or two samples along each axis, so that it is written to four places of which
+    some are the same; what leaves the view goes to samples laid around it.
+    """
     rows, columns = out.shape
-    for y in range(rows):
-        for x in range(columns):
-            out[y, x] = np.nan
-            mark[y, x] = 0
+    wide = columns + 2
+    front = np.full((rows + 2) * wide, EMPTY, np.float32)
+    top, bottom = np.empty((2, centre.shape[1]), np.int32)
+    left, right = np.empty((2, centre.shape[1]), np.int32)
+    far, none = np.float32(REACH), np.float32(0)
+    last_y, last_x = np.float32(rows + 1), np.float32(columns + 1)
     for qy in range(centre.shape[0]):
-        for qx in range(centre.shape[1]):
-            d = centre[qy, qx]
-            ty, tx = qy - margin + d * dv, qx - margin + d * du
-            y0, x0 = floor(ty), floor(tx)
-            for y in range(y0, y0 + 2):
-                if y < 0 or y >= rows or abs(y - ty) > REACH:
-                    continue
-                for x in range(x0, x0 + 2):
-                    if x < 0 or x >= columns or abs(x - tx) > REACH:
-                        continue
-                    before = out[y, x]
-                    if np.isnan(before) or nearer * (d - before) > 0:
-                        out[y, x] = d
+        line = centre[qy]
+        for qx in range(line.size):
+            ty = np.float32(qy - margin + 1) + line[qx] * dv
+            tx = np.float32(qx - margin + 1) + line[qx] * du
+            top[qx] = np.int32(min(max(np.floor(ty + (1 - far)), none), last_y))
+            bottom[qx] = np.int32(min(max(np.floor(ty + far), none), last_y))
+            left[qx] = np.int32(min(max(np.floor(tx + (1 - far)), none), last_x))
+            right[qx] = np.int32(min(max(np.floor(tx + far), none), last_x))
+        for qx in range(line.size):
+            d = nearer * line[qx]
+            upper, lower = top[qx] * wide, bottom[qx] * wide
+            for at in (
+                upper + left[qx], upper + right[qx], lower + left[qx], lower + right[qx],
+            ):  # fmt: skip
+                front[at] = max(front[at], d)
     for y in range(rows):
         for x in range(columns):
-            if np.isnan(out[y, x]):
+            d = front[(y + 1) * wide + x + 1]
+            out[y, x] = nearer * d
+            mark[y, x] = d == EMPTY
+    for y in range(rows):
+        for x in range(columns):
+            if mark[y, x]:
                 _fill(out, y, x, nearer, mark)
-    for y in range(rows):
-        for x in range(columns):
-            if mark[y, x] == 0:
-                out[y, x] = _settled(centre, margin, out[y, x], y, x, dv, du)
+    _settle(centre, margin, dv, du, out, mark)
 
 
 @njit(forceinline=True)
@@ -64,7 +76,7 @@ def _fill(out, y, x, nearer, mark):
         step_x = (-1, 1, 0, 0)[direction]
         yy, xx = y + step_y, x + step_x
         while 0 <= yy < rows and 0 <= xx < columns:
-            if not np.isnan(out[yy, xx]) and mark[yy, xx] == 0:
+            if not mark[yy, xx]:
                 if not have or nearer * (out[yy, xx] - found) < 0:
                     found = out[yy, xx]
                     have = True
@@ -72,24 +84,28 @@ def _fill(out, y, x, nearer, mark):
             yy += step_y
             xx += step_x
     out[y, x] = found
-    mark[y, x] = 1
 
 
-@njit(forceinline=True)
-def _settled(centre, margin, d, y, x, dv, du):
-    """Return the disparity of a ray on a slanted surface: that of the point it meets there."""
+@njit(forceinline=True, fastmath=True)
+def _settle(centre, margin, dv, du, out, mark):
+    """Set the disparity of rays on slanted surfaces to that of the points they meet there."""
     last_y, last_x = centre.shape[0] - 2, centre.shape[1] - 2
-    for _ in range(3):
-        py, px = y + margin - d * dv, x + margin - d * du
-        iy, ix = min(max(floor(py), 0), last_y), min(max(floor(px), 0), last_x)
-        fy, fx = min(max(py - iy, 0.0), 1.0), min(max(px - ix, 0.0), 1.0)
-        met = (1 - fy) * ((1 - fx) * centre[iy, ix] + fx * centre[iy, ix + 1]) + fy * (
-            (1 - fx) * centre[iy + 1, ix] + fx * centre[iy + 1, ix + 1]
-        )
-        if abs(met - d) > SAME_SURFACE:
-            break
-        d = met
-    return d
+    low, high_y, high_x = np.float32(0), np.float32(last_y + 1), np.float32(last_x + 1)
+    near = np.float32(SAME_SURFACE)
+    for y in range(out.shape[0]):
+        line, hidden = out[y], mark[y]
+        for _ in range(SETTLING):
+            for x in range(line.size):
+                d = line[x]
+                py = min(max(np.float32(y + margin) - d * dv, low), high_y)
+                px = min(max(np.float32(x + margin) - d * du, low), high_x)
+                iy, ix = min(np.int32(py), last_y), min(np.int32(px), last_x)
+                fy, fx = py - np.float32(iy), px - np.float32(ix)
+                above = centre[iy, ix] + fx * (centre[iy, ix + 1] - centre[iy, ix])
+                below = centre[iy + 1, ix] + fx * (centre[iy + 1, ix + 1] - centre[iy + 1, ix])
+                met = above + fy * (below - above)
+                same = abs(met - d) <= near and hidden[x] == 0
+                line[x] = met if same else d
 
 
 def carried(
@@ -102,12 +118,12 @@ def carried(
     """
     disparity = np.empty(shape, dtype=np.float32)
     hidden = np.empty(shape, dtype=np.uint8)
-    centre = np.ascontiguousarray(centre, dtype=np.float32)
+    centre, front = np.ascontiguousarray(centre, dtype=np.float32), np.float32(nearer)
 
     def work(_: int, first: int, last: int) -> None:
         for v, u in list(np.ndindex(shape[:2]))[first:last]:
-            dv, du = v - shape[0] // 2, u - shape[1] // 2
-            _carry(centre, margin, nearer, dv, du, disparity[v, u], hidden[v, u])
+            dv, du = np.float32(v - shape[0] // 2), np.float32(u - shape[1] // 2)
+            _carry(centre, margin, front, dv, du, disparity[v, u], hidden[v, u])
 
     in_bands(work, shape[0] * shape[1])
     return disparity, hidden

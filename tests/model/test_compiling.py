@@ -76,7 +76,9 @@ def test_a_helper_changed_in_another_file_changes_what_kernels_compute(copied, m
     before, kept, _ = run(copied)
     assert kept == 0
     assert run(copied)[:2] == (before, 1)
-    edit(copied / "reconstruction/adaptive/assembly.py", "* t * t + 1.0", "* t * t + 1.3")
+    edit(
+        copied / "reconstruction/adaptive/lanes.py", "(0.0, 1.0, 0.0, 0.0)", "(0.0, 1.3, 0.0, 0.0)"
+    )
     after = run(copied)[0]
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(copied / "empty"))
     anew, kept, folder = run(copied)

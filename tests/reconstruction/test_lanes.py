@@ -1,0 +1,98 @@
+"""Vector instructions of kernels against NumPy."""
+
+import numpy as np
+import pytest
+from numba import njit
+
+from reconstruction.adaptive.lanes import (
+    LANES,
+    TAPS,
+    add_box,
+    add_taps,
+    copy_box,
+    read_box,
+    read_taps,
+)
+
+WIDE, HEIGHT, START, AT = 40, 5, 3, 87
+
+
+@njit
+def reads_box(texture, cells, vectors):
+    return read_box(texture, AT, WIDE, cells, START, HEIGHT, vectors)
+
+
+@njit
+def adds_box(texture, cells, vectors, value):
+    add_box(texture, AT, WIDE, cells, START, HEIGHT, vectors, value)
+
+
+@njit
+def copies_box(texture, cells, vectors):
+    copy_box(texture, AT, WIDE, cells, START, HEIGHT, vectors)
+
+
+@njit
+def reads_taps(texture, fraction_y, fraction_x):
+    return read_taps(texture, AT, WIDE, fraction_y, fraction_x)
+
+
+@njit
+def adds_taps(texture, fraction_y, fraction_x, value):
+    add_taps(texture, AT, WIDE, fraction_y, fraction_x, value)
+
+
+def below(texture, vectors):
+    """A view of what lies below the box."""
+    picture = texture.reshape(-1, WIDE)
+    top, left = divmod(AT, WIDE)
+    return picture[top : top + HEIGHT, left : left + vectors * LANES]
+
+
+@pytest.mark.parametrize("vectors", [1, 2, 3])
+@pytest.mark.parametrize("kind", [np.int16, np.float32])
+def test_boxes_are_read_and_added_as_sums_of_products(kind, vectors):
+    rng = np.random.default_rng(vectors)
+    texture = rng.normal(size=12 * WIDE).astype(np.float32)
+    cells = (100 * rng.normal(size=(START + HEIGHT * vectors + 2, LANES))).astype(kind)
+    box = cells[START : START + HEIGHT * vectors].reshape(HEIGHT, -1)
+    seen = float((box * below(texture, vectors)).sum(dtype=np.float64))
+    assert reads_box(texture, cells, vectors) == pytest.approx(seen, rel=1e-5, abs=1e-2)
+    expected = texture.copy()
+    below(expected, vectors)[:] += np.float32(0.3) * box
+    adds_box(texture, cells, vectors, np.float32(0.3))
+    np.testing.assert_allclose(texture, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_box_is_copied_and_nothing_beside_it():
+    texture = np.arange(12 * WIDE, dtype=np.float32)
+    cells = np.full((START + HEIGHT * 2 + 2, LANES), -1, np.float32)
+    copies_box(texture, cells, 2)
+    box = cells[START : START + HEIGHT * 2].reshape(HEIGHT, -1)
+    np.testing.assert_array_equal(box, below(texture, 2))
+    assert (cells[:START] == -1).all()
+    assert (cells[START + HEIGHT * 2 :] == -1).all()
+
+
+@pytest.mark.parametrize("fractions", [(0.0, 0.0), (0.3, 0.9), (1.0, 0.5)])
+def test_taps_are_those_of_catmull_and_rom_and_their_adjoint(fractions):
+    def weights(t):
+        """The cubic through four values that has their central differences as slopes."""
+        at = np.array([1, t, t**2, t**3])
+        hermite = np.array([[1, 0, -3, 2], [0, 0, 3, -2], [0, 1, -2, 1], [0, 0, -1, 1]])
+        ends_and_slopes = np.array(
+            [[0, 1, 0, 0], [0, 0, 1, 0], [-0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]]
+        )
+        return (hermite @ at) @ ends_and_slopes
+
+    both = np.outer(weights(fractions[0]), weights(fractions[1]))
+    texture = np.random.default_rng(0).normal(size=12 * WIDE).astype(np.float32)
+    top, left = divmod(AT, WIDE)
+    part = np.s_[top : top + TAPS, left : left + TAPS]
+    seen = (both * texture.reshape(-1, WIDE)[part]).sum()
+    given = [np.float32(fraction) for fraction in fractions]
+    assert reads_taps(texture, *given) == pytest.approx(seen, rel=1e-4, abs=1e-5)
+    expected = texture.copy()
+    expected.reshape(-1, WIDE)[part] += 0.7 * both
+    adds_taps(texture, *given, np.float32(0.7))
+    np.testing.assert_allclose(texture, expected, rtol=1e-5, atol=1e-5)
