@@ -141,7 +141,7 @@ class Volume:
     """Probabilities of disparities on a grid of patches.
 
     centres: rows and columns of the patches' centres, in pixels. probability: (row, column,
-    disparity); evidence: theirs, log-likelihoods, -inf where not evaluated. kind: (row, column) of
+    disparity); evidence: theirs, log-likelihoods, -inf where excluded. kind: (row, column) of
     the texture. decisive: (row, column), whether the patch's own evidence prefers any disparity.
     at_end: share of deciding patches at the range's ends. computed: share of the patches whose
     evidence is their own. between: the same of a grid between these patches, of the same
@@ -322,11 +322,19 @@ def fine(
         """Return a grid's evidence and beliefs; given: of another that may settle them."""
         rows, columns = grids[number]
         centres = rows + (side - 1) / 2, columns + (side - 1) / 2
-        settled, of_given = _settled(given, centres) if given else (np.False_, np.float32(0))
-        part = asked[number] & ~settled[..., None]
-        values, kind, decisive = _on_grid(data, patches, grids[number], prior, labels, every, part)
-        evidence = np.where(settled[..., None], of_given, values[..., used])
-        decisive |= settled
+        part = asked[number]
+        settled = np.zeros(part.shape[:2], dtype=bool)
+        if given is not None:
+            settled, settled_evidence, settled_decisive = _settled(given, centres)
+            part = part & ~settled[..., None]
+        evidence, kind, decisive = _on_grid(
+            data, patches, grids[number], prior, labels, every, part
+        )
+        evidence = evidence[..., used]
+        evidence[~decisive & ~settled] = _extended(evidence[~decisive & ~settled])
+        if given is not None:
+            evidence[settled] = settled_evidence[settled]
+            decisive[settled] = settled_decisive[settled]
         likely = evidence - np.where(decisive[..., None], np.float32(0), rare)
         chances = posteriors(likely * own, pairs)
         share = 1 - float(settled.mean())
@@ -350,11 +358,23 @@ def _spanned(asked: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
     return np.isfinite(_between(known[None], every)[0])
 
 
+def _extended(evidence: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return evidence (patch, label) of patches that do not decide also where not evaluated.
+
+    It is nearly flat: linear between labels evaluated, constant beyond. Else what the rough search
+    left out there would be excluded, though no patch of either speaks against it.
+    """
+    label = np.arange(evidence.shape[1])
+    known = np.isfinite(evidence)
+    out = [np.interp(label, label[at], row[at]) for row, at in zip(evidence, known, strict=True)]
+    return np.array(out, dtype=np.float32).reshape(evidence.shape)
+
+
 def _settled(
     volume: Volume, centres: tuple[Array, Array]
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.bool_]]:
     """Return at which of these centres patches would tell nothing new, (row, column), and the
-    evidence there of a volume's patches, (row, column, disparity), interpolated.
+    evidence of a volume's patches there, interpolated, and whether all these decide.
 
     There all patches around believe in disparities within AGREED_PX of each other.
     """
@@ -372,9 +392,14 @@ def _settled(
         for row, down in corners[0]
         for column, across in corners[1]
     ]
-    low, high, all_sure = (
+    low, high, all_sure, decisive = (
         reduce(np.stack([values[at] for at, _ in around]), axis=0)
-        for reduce, values in ((np.min, likeliest), (np.max, likeliest), (np.all, sure))
+        for reduce, values in (
+            (np.min, likeliest),
+            (np.max, likeliest),
+            (np.all, sure),
+            (np.all, volume.decisive),
+        )
     )
     # Where weights are 0 evidence may be -inf.
     evidence = sum(
@@ -383,7 +408,7 @@ def _settled(
         )
         for at, weight in around
     )
-    return all_sure & (high - low <= AGREED_PX), evidence
+    return all_sure & (high - low <= AGREED_PX), evidence, decisive
 
 
 def _packed(asked: NDArray[np.bool_]) -> NDArray[np.int64]:
