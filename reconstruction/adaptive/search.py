@@ -1,13 +1,15 @@
 """Search the disparities of a capture, from coarse to fine: where, and which, they may be.
 
 The likelihood of disparities is evaluated for wide patches of every third pixel, half a pixel apart
-where they are small and one beyond; the range grows while its ends are wanted. Each tile of the
+where they are small and one beyond; the range grows while its ends are wanted. Each patch of the
 fine search then evaluates only what the coarse one left possible there, so that cost grows with the
-disparities a scene really has.
+disparities a scene really has; it does so in steps of SMOOTH_PX, and in finer ones only beside the
+best of a patch that decides.
 
 Where patches lie is arbitrary, and changes the disparities they agree on: shifted by 3 pixels, they
 make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). So what two grids of
-patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md).
+patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md). Of the second grid
+only those patches are evaluated around which the first is not sure, or does not agree.
 
 Neighbouring patches agree by belief propagation: their disparities differ as d - d' is Laplace
 distributed, or, with a small probability, are not related (another object). Messages are passed
