@@ -66,7 +66,7 @@ decides: the log-likelihood of fine textures waves with a period of 0.75 px."""
 KEPT = 4
 """Kinds of texture that patches of the fine search compare further after their first probe. The
 coarse search compares all: its disparities, far apart, would lose the right one."""
-NEAR = 4.0
+CONTENDING = 4.0
 """Log-likelihood below a patch's best within which it is evaluated at all disparities: interpolated
 there instead, it made buttercup's crops 0.3 to 0.5 dB worse."""
 SURE, AGREED_PX = 0.9, 0.25
@@ -453,7 +453,7 @@ def _near_best(evidence: NDArray[np.float32], every: int) -> NDArray[np.bool_]:
     """Return which labels lie between evidence (patch, label) at each `every`-th of them, and next
     to one that is nearly the best: (patch, label)."""
     known = np.isfinite(evidence)
-    good = evidence > evidence.max(axis=1, keepdims=True) - NEAR
+    good = evidence > evidence.max(axis=1, keepdims=True) - CONTENDING
     between = known[:, 1:] & known[:, :-1] & (good[:, 1:] | good[:, :-1])
     out = np.zeros((len(evidence), every * (evidence.shape[1] - 1) + 1), dtype=bool)
     for one in range(1, every):
