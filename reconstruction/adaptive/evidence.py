@@ -10,9 +10,10 @@ did not see (Occam's factor, log det). So it does for l, which differs from leaf
 of several lengths are compared, and the likelihood is their mean. With one length alone a picture
 that is finer than it seems to lie nearer to d = 0, where fewer rays of a pixel are averaged.
 
-Operations of a patch: m^2 / 2 (2 + L D) S + m R S + L (D + 4 H) m^3 / 6 with R rays a pixel (25, or
-25 k^2), S distinct separations of them (81), L lengths, D disparities, H pairs of amplitude and
-colourfulness, each probed at 4 of the disparities.
+Products of a patch: m R S for spectra of its rays, 2 m^2 / 2 S to correlate them, m^2 / 2 S of each
+texture (a length and a disparity) for its covariance, and m^3 / 6 of each and of each of P trials
+of the kinds, for its factor; R rays a pixel (25, or 25 k^2), S distinct separations of them (81).
+For m = 64 and 20 textures, P = 27: 0.1, 0.3, 3.5 and 2.1 million.
 """
 
 from __future__ import annotations

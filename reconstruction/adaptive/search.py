@@ -1,13 +1,15 @@
 """Search the disparities of a capture, from coarse to fine: where, and which, they may be.
 
 The likelihood of disparities is evaluated for wide patches of every third pixel, half a pixel apart
-where they are small and one beyond; the range grows while its ends are wanted. Each tile of the
+where they are small and one beyond; the range grows while its ends are wanted. Each patch of the
 fine search then evaluates only what the coarse one left possible there, so that cost grows with the
-disparities a scene really has.
+disparities a scene really has; it does so in steps of SMOOTH_PX, and in finer ones only beside the
+best of a patch that decides.
 
 Where patches lie is arbitrary, and changes the disparities they agree on: shifted by 3 pixels, they
 make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). So what two grids of
-patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md).
+patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md). Of the second grid
+only those patches are evaluated around which the first is not sure, or does not agree.
 
 Neighbouring patches agree by belief propagation: their disparities differ as d - d' is Laplace
 distributed, or, with a small probability, are not related (another object). Messages are passed
@@ -64,7 +66,7 @@ decides: the log-likelihood of fine textures waves with a period of 0.75 px."""
 KEPT = 4
 """Kinds of texture that patches of the fine search compare further after their first probe. The
 coarse search compares all: its disparities, far apart, would lose the right one."""
-NEAR = 4.0
+CONTENDING = 4.0
 """Log-likelihood below a patch's best within which it is evaluated at all disparities: interpolated
 there instead, it made buttercup's crops 0.3 to 0.5 dB worse."""
 SURE, AGREED_PX = 0.9, 0.25
@@ -141,7 +143,7 @@ class Volume:
     """Probabilities of disparities on a grid of patches.
 
     centres: rows and columns of the patches' centres, in pixels. probability: (row, column,
-    disparity); evidence: theirs, log-likelihoods, -inf where not evaluated. kind: (row, column) of
+    disparity); evidence: theirs, log-likelihoods, -inf where excluded. kind: (row, column) of
     the texture. decisive: (row, column), whether the patch's own evidence prefers any disparity.
     at_end: share of deciding patches at the range's ends. computed: share of the patches whose
     evidence is their own. between: the same of a grid between these patches, of the same
@@ -322,11 +324,19 @@ def fine(
         """Return a grid's evidence and beliefs; given: of another that may settle them."""
         rows, columns = grids[number]
         centres = rows + (side - 1) / 2, columns + (side - 1) / 2
-        settled, of_given = _settled(given, centres) if given else (np.False_, np.float32(0))
-        part = asked[number] & ~settled[..., None]
-        values, kind, decisive = _on_grid(data, patches, grids[number], prior, labels, every, part)
-        evidence = np.where(settled[..., None], of_given, values[..., used])
-        decisive |= settled
+        part = asked[number]
+        settled = np.zeros(part.shape[:2], dtype=bool)
+        if given is not None:
+            settled, settled_evidence, settled_decisive = _settled(given, centres)
+            part = part & ~settled[..., None]
+        evidence, kind, decisive = _on_grid(
+            data, patches, grids[number], prior, labels, every, part
+        )
+        evidence = evidence[..., used]
+        evidence[~decisive & ~settled] = _extended(evidence[~decisive & ~settled])
+        if given is not None:
+            evidence[settled] = settled_evidence[settled]
+            decisive[settled] = settled_decisive[settled]
         likely = evidence - np.where(decisive[..., None], np.float32(0), rare)
         chances = posteriors(likely * own, pairs)
         share = 1 - float(settled.mean())
@@ -350,11 +360,23 @@ def _spanned(asked: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
     return np.isfinite(_between(known[None], every)[0])
 
 
+def _extended(evidence: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return evidence (patch, label) of patches that do not decide also where not evaluated.
+
+    It is nearly flat: linear between labels evaluated, constant beyond. Else what the rough search
+    left out there would be excluded, though no patch of either speaks against it.
+    """
+    label = np.arange(evidence.shape[1])
+    known = np.isfinite(evidence)
+    out = [np.interp(label, label[at], row[at]) for row, at in zip(evidence, known, strict=True)]
+    return np.array(out, dtype=np.float32).reshape(evidence.shape)
+
+
 def _settled(
     volume: Volume, centres: tuple[Array, Array]
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.bool_]]:
     """Return at which of these centres patches would tell nothing new, (row, column), and the
-    evidence there of a volume's patches, (row, column, disparity), interpolated.
+    evidence of a volume's patches there, interpolated, and whether all these decide.
 
     There all patches around believe in disparities within AGREED_PX of each other.
     """
@@ -372,9 +394,14 @@ def _settled(
         for row, down in corners[0]
         for column, across in corners[1]
     ]
-    low, high, all_sure = (
+    low, high, all_sure, decisive = (
         reduce(np.stack([values[at] for at, _ in around]), axis=0)
-        for reduce, values in ((np.min, likeliest), (np.max, likeliest), (np.all, sure))
+        for reduce, values in (
+            (np.min, likeliest),
+            (np.max, likeliest),
+            (np.all, sure),
+            (np.all, volume.decisive),
+        )
     )
     # Where weights are 0 evidence may be -inf.
     evidence = sum(
@@ -383,7 +410,7 @@ def _settled(
         )
         for at, weight in around
     )
-    return all_sure & (high - low <= AGREED_PX), evidence
+    return all_sure & (high - low <= AGREED_PX), evidence, decisive
 
 
 def _packed(asked: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -426,7 +453,7 @@ def _near_best(evidence: NDArray[np.float32], every: int) -> NDArray[np.bool_]:
     """Return which labels lie between evidence (patch, label) at each `every`-th of them, and next
     to one that is nearly the best: (patch, label)."""
     known = np.isfinite(evidence)
-    good = evidence > evidence.max(axis=1, keepdims=True) - NEAR
+    good = evidence > evidence.max(axis=1, keepdims=True) - CONTENDING
     between = known[:, 1:] & known[:, :-1] & (good[:, 1:] | good[:, :-1])
     out = np.zeros((len(evidence), every * (evidence.shape[1] - 1) + 1), dtype=bool)
     for one in range(1, every):

@@ -23,6 +23,7 @@ from reconstruction.adaptive.search import (
     Volume,
     _asked,
     _between,
+    _extended,
     _near_best,
     _packed,
     _possible,
@@ -449,6 +450,12 @@ def test_evidence_between_disparities_is_that_of_a_cubic():
     np.testing.assert_allclose(_between(known, 2), expected, rtol=1e-6)
 
 
+def test_evidence_that_decides_nothing_excludes_nothing():
+    known = np.array([[-np.inf, 1.0, -np.inf, 2.0, -np.inf, -np.inf]], np.float32)
+    np.testing.assert_allclose(_extended(known), [[1, 1, 1.5, 2, 2, 2]])
+    assert _extended(known[:0]).shape == (0, 6)
+
+
 def test_labels_evaluated_have_those_possible_between_them():
     possible = np.zeros((1, 2, 7), dtype=bool)
     possible[0, 0, 3] = possible[0, 1, 4] = True
@@ -471,7 +478,8 @@ def test_a_second_grid_is_settled_where_patches_around_are_sure_and_agree():
     at = np.arange(3) * 6.0, np.arange(4) * 6.0
     volume = Volume(labels, at, chances, evidence, kind, kind == 0)
     between = at[0][:2] + 3, np.array([0.0, *(at[1][:3] + 3)])
-    settled, found = _settled(volume, between)
+    settled, found, decisive = _settled(volume, between)
+    assert decisive.all()
     expected = [[True, True, True, False], [False, False, True, True]]
     np.testing.assert_array_equal(settled, expected)
     mean = evidence[:2, 1:3].mean(axis=(0, 1))
