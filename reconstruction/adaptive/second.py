@@ -25,7 +25,8 @@ from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Survey
 
 LOOSER = 4.0
-"""Misfit of the second search over that of the first."""
+"""Misfit of the second search over that of the first. Twice, alone, two crops of dice (64x80, three
+shots) have 25.7 and 29.6 dB, four times 27.2 and 31.4; they had 25.3 and 27.8."""
 WIDE_PX = 10.0
 """Pixels over which the rays of one pixel spread from where on a disparity is wide: a patch has
 4 to 8. Of fish, up to 8, the second search gains nothing."""
