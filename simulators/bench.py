@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
-from scipy.stats.qmc import Sobol
 
 from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
@@ -35,6 +34,7 @@ from simulators.flaws import (
     OpticsFlaws,
     SensorFlaws,
 )
+from simulators.sobol import sobol_points
 
 Array = NDArray[np.floating]
 LAMPS = {
@@ -88,7 +88,7 @@ def ray_points(views: tuple[int, int], count: int, axes: int = 4) -> NDArray[np.
     u, v, and with six axes where in the blur of an edge.
     """
     rngs = [np.random.default_rng(view) for view in range(views[0] * views[1])]
-    points = [Sobol(axes, rng=rng).random(count) for rng in rngs]
+    points = [sobol_points(count, axes, rng) for rng in rngs]
     return np.reshape(points, (*views, count, axes))
 
 
@@ -114,6 +114,14 @@ def _met(x, y, u, v, lens_um, distance_um, slope_x, slope_y, sag, glass_um, inde
     return at_x, at_y
 
 
+@njit(forceinline=True, fastmath=True)
+def _place(column, row, start, height, width):
+    """Return which of all cells lies there on a mask whose first is `start`; 0 beside the mask."""
+    j, i = int(np.floor(column)), int(np.floor(row))
+    beside = (i < 0) | (j < 0) | (i >= height) | (j >= width)
+    return 0 if beside else start + i * width + j
+
+
 @row_kernel("readings", 0, fastmath=True)
 def trace(
     begin,
@@ -137,11 +145,11 @@ def trace(
     scene: (v f, u f, y g, x g, colour) with finer = (f, g); or 1 x 1 x 1 x 1 x 3 for a whiteboard.
     points: (v, u, ray, 4). lengths_um: lens distance, sample pitch, sample width, aperture cell,
     open width of a cell. openings_um: (opening, 3), x, y and half side of the squares at the lens
-    that the aperture plate leaves open. cells: (all cells, colour); starts, shapes: where each
-    mask lies in it, (rows, columns). plates: per mask distance_um, x_um, y_um, what turns um on
-    the mask into cells (column from x and y, row from x and y), the displacement of its rays per
-    cubed um off the axis, the width of its edges in um, and the slopes, sag, glass and index that
-    `_met` takes. falloff: (v, u, y, x), or all 1.
+    that the aperture plate leaves open. cells: (1 + all cells, colour), the first opaque; starts,
+    shapes: where each mask lies in it, (rows, columns). plates: per mask distance_um, x_um, y_um,
+    what turns um on the mask into cells (column from x and y, row from x and y), the displacement
+    of its rays per cubed um off the axis, the width of its edges in um, and the slopes, sag, glass
+    and index that `_met` takes. falloff: (v, u, y, x), or all 1.
     points: (v, u, ray, 4 or 6), 6 where edges are blurred: the last two are normal.
     """
     rows, columns = readings.shape
@@ -150,10 +158,16 @@ def trace(
     board = scene.shape[2] == 1
     f, g = finer
     even = falloff.shape[3] == 1
+    passed = np.empty((3, columns), np.float32)
+    weight = np.empty((3, columns), np.float32)
+    place = np.empty(columns, np.int64)
+    total = np.zeros(columns)
+    seen = np.zeros(columns)
     for y in range(begin, end):
-        passed = np.empty((3, columns), np.float32)
-        total = np.zeros(columns)
-        seen = np.zeros(columns)
+        seen[:] = 0
+        for c in range(3):
+            for x in range(columns):
+                weight[c, x] = response[y, x, c]
         for v in range(views_v):
             for u in range(views_u):
                 total[:] = 0
@@ -191,52 +205,50 @@ def trace(
                         start = starts[mask]
                         slope_x, slope_y, sag, glass_um, index = plates[mask, 9:]
                         flat = slope_x == 0 and slope_y == 0 and sag == 0 and glass_um == 0
-                        for x in range(columns):
-                            to_column, to_row = column + along * x, row + across * x
-                            if not flat:
-                                ray_x = first_x + x * pitch_um
-                                met_x, met_y = _met(
-                                    ray_x,
-                                    ray_y,
-                                    ray_u,
-                                    ray_v,
-                                    lens_um,
-                                    plates[mask, 0],
-                                    slope_x,
-                                    slope_y,
-                                    sag,
-                                    glass_um,
-                                    index,
+                        if flat and bend == 0:
+                            for x in range(columns):
+                                place[x] = _place(
+                                    column + along * x, row + across * x, start, height, width
                                 )
-                                more_x = met_x - ((1 - ratio) * ray_x + ratio * ray_u)
-                                more_y = met_y - ((1 - ratio) * ray_y + ratio * ray_v)
-                                to_column += column_x * more_x + column_y * more_y
-                                to_row += row_x * more_x + row_y * more_y
-                            if bend != 0:
+                        else:
+                            for x in range(columns):
+                                to_column, to_row = column + along * x, row + across * x
                                 ray_x = first_x + x * pitch_um
+                                if not flat:
+                                    met_x, met_y = _met(
+                                        ray_x,
+                                        ray_y,
+                                        ray_u,
+                                        ray_v,
+                                        lens_um,
+                                        plates[mask, 0],
+                                        slope_x,
+                                        slope_y,
+                                        sag,
+                                        glass_um,
+                                        index,
+                                    )
+                                    more_x = met_x - ((1 - ratio) * ray_x + ratio * ray_u)
+                                    more_y = met_y - ((1 - ratio) * ray_y + ratio * ray_v)
+                                    to_column += column_x * more_x + column_y * more_y
+                                    to_row += row_x * more_x + row_y * more_y
                                 cubed = bend * (ray_x * ray_x + ray_y * ray_y)
                                 to_column += cubed * (column_x * ray_x + column_y * ray_y)
                                 to_row += cubed * (row_x * ray_x + row_y * ray_y)
-                            j = int(np.floor(to_column))
-                            i = int(np.floor(to_row))
-                            if i < 0 or j < 0 or i >= height or j >= width:
-                                for c in range(3):
-                                    passed[c, x] = 0
-                            else:
-                                for c in range(3):
-                                    passed[c, x] *= cells[start + i * width + j, c]
+                                place[x] = _place(to_column, to_row, start, height, width)
+                        for c in range(3):
+                            for x in range(columns):
+                                passed[c, x] *= cells[place[x], c]
                     fine_v, fine_u = v * f + int(in_v * f), u * f + int(in_u * f)
                     fine_y, fine_x = y * g + int(in_y * g), int(in_x * g)
                     for c in range(3):
                         if board:
                             for x in range(columns):
-                                total[x] += passed[c, x] * response[y, x, c]
+                                total[x] += passed[c, x] * weight[c, x]
                         else:
                             line = scene[fine_v, fine_u, fine_y]
                             for x in range(columns):
-                                total[x] += (
-                                    passed[c, x] * response[y, x, c] * line[fine_x + x * g, c]
-                                )
+                                total[x] += passed[c, x] * weight[c, x] * line[fine_x + x * g, c]
                 for x in range(columns):
                     share = falloff[0, 0, 0, 0] if even else falloff[v, u, y, x]
                     seen[x] += share * total[x]
@@ -409,7 +421,7 @@ class Bench:
         lens, sensor = camera.lens, camera.sensor
         cell_um = lens.aperture_cell_um
         names = camera.shot_masks(self.shot) if self.masks_in else ()
-        cells, starts, shapes, plates = [np.zeros((0, 3), np.float32)], [], [], []
+        cells, starts, shapes, plates = [np.zeros((1, 3), np.float32)], [], [], []
         for name in names:
             frames = self._plates[name]
             plate, frame, grain_um = frames[self.shot % len(frames)]

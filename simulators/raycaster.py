@@ -21,6 +21,7 @@ Textures are (side, side, 4) RGBA in [0, 1], side a power of two.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -198,16 +199,15 @@ def _windows(
     return of_cards, of_balls
 
 
-_compiled = njit(
-    nogil=True,
-    cache=True,
-    error_model="numpy",
-    forceinline=True,
-    fastmath={"contract", "arcp", "nsz", "reassoc"},
-)
+_rules: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "arcp", "nsz", "reassoc"},
+}
+_kernel, _helper = njit(cache=True, **_rules), njit(forceinline=True, **_rules)
 
 
-@_compiled
+@_helper
 def _texel(texels, offset, side, p, q, tiled):
     """Bilinear RGBA at texture coordinates (p, q); `side` is a power of two."""
     x, y = p * side - 0.5, q * side - 0.5
@@ -232,14 +232,14 @@ def _texel(texels, offset, side, p, q, tiled):
     return r, green, b, alpha
 
 
-@_compiled
+@_helper
 def _around(texels, offset, side, x, y, z):
     """The surroundings in a direction: Lambert's equal-area map, its middle towards the viewer."""
     k = 0.5 / np.sqrt(max(2 * (1 + z), 1e-9))
     return _texel(texels, offset, side, 0.5 + k * x, 0.5 + k * y, False)
 
 
-@_compiled
+@_helper
 def _on_card(card, s, t):
     """Texture coordinates of a point of a card."""
     w = 1 / (card.h20 * s + card.h21 * t + card.h22)
@@ -248,7 +248,7 @@ def _on_card(card, s, t):
     return p, q
 
 
-@_compiled
+@_helper
 def _nearest(s, t, d, ds, dt, dd, start, straight, card_windows, ball_windows, cards, balls):
     """First surface along the ray after `start`: distance, and card, or number of cards + ball.
 
@@ -300,7 +300,7 @@ def _nearest(s, t, d, ds, dt, dd, start, straight, card_windows, ball_windows, c
     return best, found
 
 
-@_compiled
+@_helper
 def _shadow(s, t, d, balls, lighting):
     """Light that the balls leave at a point of a card, 0 to 1, with a soft edge."""
     light = 1.0
@@ -320,7 +320,7 @@ def _shadow(s, t, d, balls, lighting):
     return light
 
 
-@_compiled
+@_kernel
 def _trace_colours(
     view, a_s, a_t, card_windows, ball_windows,
     cards, balls, texels, around, around_side, lighting,
@@ -442,7 +442,7 @@ def _trace_colours(
         view[row, column, 2] += min(max(b * brightness, 0.0), 1.0) / (n * n)
 
 
-@_compiled
+@_kernel
 def _trace_disparity(
     disparity, a_s, a_t, card_windows, ball_windows,
     cards, balls, texels, around, around_side, lighting,

@@ -64,15 +64,7 @@ def render(
     Raises:
         SceneError: unknown name, a size or number of views too small, or a negative seed.
     """
-    if name not in SCENES:
-        hint = did_you_mean(name, SCENES, 0.4)
-        raise SceneError(f"no built-in scene '{name}': {hint}built in are {', '.join(SCENES)}")
-    if min(views) < 1:
-        raise SceneError(f"{views[0]}x{views[1]} views: needs 1x1 or more")
-    if min(size) < _SMALLEST_PX:
-        raise SceneError(f"{size[0]}x{size[1]} pixels: needs {_SMALLEST_PX}x{_SMALLEST_PX} or more")
-    if seed < 0:
-        raise SceneError(f"seed {seed}: needs 0 or more")
+    _check(name, views, size, seed)
     known = change is None
     tables = _tables(name, seed) if known else tabulated(change(_world(name, seed)))
     return rendered(tables, views, size)
@@ -93,11 +85,36 @@ def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> R
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         list(pool.map(paint, range(len(apertures))))
+    return RenderedScene(light_field.reshape(*views, *size, 3), _disparity_px(tables, views, size))
+
+
+def rendered_disparity_px(
+    name: str, views: tuple[int, int], size: tuple[int, int], seed: int
+) -> np.ndarray:
+    """Return the disparity alone of what `render` returns, (y, x) float32; raises SceneError."""
+    _check(name, views, size, seed)
+    return _disparity_px(_tables(name, seed), views, size)
+
+
+def _check(name: str, views: tuple[int, int], size: tuple[int, int], seed: int) -> None:
+    if name not in SCENES:
+        hint = did_you_mean(name, SCENES, 0.4)
+        raise SceneError(f"no built-in scene '{name}': {hint}built in are {', '.join(SCENES)}")
+    if min(views) < 1:
+        raise SceneError(f"{views[0]}x{views[1]} views: needs 1x1 or more")
+    if min(size) < _SMALLEST_PX:
+        raise SceneError(f"{size[0]}x{size[1]} pixels: needs {_SMALLEST_PX}x{_SMALLEST_PX} or more")
+    if seed < 0:
+        raise SceneError(f"seed {seed}: needs 0 or more")
+
+
+def _disparity_px(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+    steps = max(views)
     disparity = np.empty(size, np.float32)
-    a_t, a_s = apertures[views[0] // 2 * views[1] + views[1] // 2]
+    a_t, a_s = ((n // 2 - (n - 1) / 2) / steps for n in views)
     measure_disparity(disparity, a_s, a_t, tables)
     disparity *= size[1] / steps
-    return RenderedScene(light_field.reshape(*views, *size, 3), disparity)
+    return disparity
 
 
 @lru_cache(maxsize=2)

@@ -28,7 +28,7 @@ from emmc_rig.model.lightfield import (
 from emmc_rig.model.view_axes import ANGLES, shows_parallax
 from emmc_rig.model.view_order import ViewOrder, order_of
 from simulators.raycaster import World
-from simulators.scenes import SCENES, render
+from simulators.scenes import SCENES, render, rendered_disparity_px
 
 APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 """How much finer the simulated rig sees a scene than it is reconstructed, along each axis."""
@@ -209,7 +209,7 @@ def fine_scene(
     (height, width), (n_v, n_u) = _asked_shape(size, views)[::-1]
     fine_views = n_v * aperture_factor, n_u * aperture_factor
     fine_size = height * pixel_factor, width * pixel_factor
-    disparity_px = render(spec, (n_v, n_u), (height, width), seed).disparity_px
+    disparity_px = rendered_disparity_px(spec, (n_v, n_u), (height, width), seed)
     samples = render(spec, fine_views, fine_size, seed).light_field
     truth = box_average(samples, aperture_factor, pixel_factor)
     provenance = (
