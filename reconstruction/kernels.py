@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.kernels import correct_row, gather_row, spread_row
 
@@ -288,14 +288,14 @@ def sweep(
             pass
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def variation_rows(light_field, stencils, metric, totals):
+@row_kernel("light_field", 2, fastmath=True)
+def variation_rows(begin, end, light_field, stencils, metric, totals):
     """Set totals (y,) to DV_K of every row of a light field (v, u, y, colour, x)."""
     views_v, views_u, rows, _, width = light_field.shape
     flat = light_field.reshape((views_v, views_u, rows, 3 * width))
-    for y in prange(rows):
-        square = np.empty(width, light_field.dtype)
-        lines = np.empty((3, width), light_field.dtype)
+    square = np.empty(width, light_field.dtype)
+    lines = np.empty((3, width), light_field.dtype)
+    for y in range(begin, end):
         total = 0.0
         for v in range(views_v):
             for u in range(views_u):

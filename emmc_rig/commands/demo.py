@@ -52,7 +52,7 @@ def demo(
 ) -> None:
     """Run the whole loop on the simulated rig, and write a report."""
     import emmc_rig as emmc
-    from emmc_rig.commands.first_run import compiled_first
+    from emmc_rig.commands.first_run import helped_to_compile
     from emmc_rig.demo import DemoSettings, run_demo
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size, stated_words
@@ -89,7 +89,7 @@ def demo(
     with (
         result_folder(out, "demo") as folder,
         shown_progress() as bars,
-        compiled_first(bars, method, camera, shots),
+        helped_to_compile(method, camera, shots),
     ):
         metrics = run_demo(settings, folder, bars)
     stated = stated_words(metrics)

@@ -1,87 +1,95 @@
-"""The first run on a machine compiles kernels: it says so, and other processes compile first.
+"""The first run on a machine compiles kernels: it says so, and other processes help.
 
-Numba keeps what it compiled on the disk, so that what one process compiled another loads. When this
-process needs a first kernel, one other searches disparities in a small light field and one fits it:
-each needs kernels that the other does not. Of a method that does neither, one process reconstructs.
-
-This process waits for them, and then loads what they compiled: else it would compile the same.
+Numba keeps what it compiled on the disk, and who needs a kernel that another process is compiling
+waits for it (`emmc_rig.model.compiling`). So this process goes its way, from the simulated capture
+to the first kernels of the reconstruction, while others compile those that it needs later. They
+begin with what takes longest, and all cores are busy until all is compiled. The others end with
+this process.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import get_num_threads
 from numba.core import event
 from numpy.typing import NDArray
 
 from emmc_rig.commands.output import say
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.progress import Watcher
 from reconstruction.result import Progress
 
 SIZE = (48, 64)
 """Of the light field that is compiled for: no kernel depends on it."""
 NOISE = 0.002
-PARTS = {"adaptive": ("search", "fit"), "adaptive-fast": ("search", "fit")}
-"""What the other processes do for a method; for one that is not here, the whole of it."""
+PARTS = {
+    "adaptive": ("variation", "fit", "search"),
+    "adaptive-fast": ("variation", "fit", "search"),
+}
+"""What the other processes do for a method: first what takes longest, last what this process comes
+to first; for one that is not here, the whole of it."""
 
 
 @dataclass
-class CompileFirst(event.Listener):
-    """Lets other processes compile when the first kernel is about to be.
+class Helpers(event.Listener):
+    """Other processes that compile, started when the first kernel is about to be.
 
-    method: and then the other arguments of this module. watcher: is shown the stage.
+    method: and then the other arguments of this module. ended: ends them when it is closed.
     """
 
-    watcher: Watcher
     method: str
     arguments: Sequence[str]
-    done: bool = field(default=False, init=False)
+    ended: ExitStack
+    started: bool = field(default=False, init=False)
 
     def on_start(self, event: event.Event) -> None:
         """A kernel that the disk does not hold is about to be compiled."""
-        if self.done:
+        if self.started:
             return
-        self.done = True
+        self.started = True
         say("first run", "compiling kernels for this machine, once; later runs start at once")
-        self.watcher.begin("compile", None)
-        quiet = subprocess.DEVNULL  # Ctrl-C reaches them too, and what fails there fails here
-        commands = [
-            [sys.executable, "-m", __name__, part, *self.arguments]
-            for part in PARTS.get(self.method, (self.method,))
-        ]
-        processes = [
-            subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
-            for command in commands
-        ]
-        try:
-            for process in processes:
-                process.wait()
-        finally:
-            for process in processes:
-                process.kill()
-                process.wait()
+        parts = PARTS.get(self.method, (self.method,))
+        others = min(len(parts), get_num_threads() - 1)  # on one core they would only be in the way
+        with suppress(OSError):  # no process more can be had
+            for first in range(others):
+                self._start(",".join(parts[first::others]))
+
+    def _start(self, parts: str) -> None:
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__, parts, *self.arguments],
+            stdin=subprocess.PIPE,  # closed when this process ends, however it does
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,  # what fails there fails here
+        )
+        self.ended.enter_context(process)
+        self.ended.callback(process.kill)
 
     def on_end(self, event: event.Event) -> None:
         """Nothing: the kernel is compiled here."""
 
 
 @contextmanager
-def compiled_first(watcher: Watcher, method: str, camera: str, shots: int | None) -> Iterator[None]:
-    """Have kernels compiled before a run that reconstructs by this method and camera needs them."""
+def helped_to_compile(method: str, camera: str, shots: int | None) -> Iterator[None]:
+    """Have other processes compile, too, while a run reconstructs by this method and camera."""
     arguments = (camera, *(() if shots is None else (str(shots),)))
-    with event.install_listener("numba:compile", CompileFirst(watcher, method, arguments)):
+    with (
+        ExitStack() as ended,
+        event.install_listener("numba:compile", Helpers(method, arguments, ended)),
+    ):
         yield
 
 
 def compile_for(part: str, camera: str, shots: int | None) -> None:
     """Reconstruct a small light field, or do that part of it: its kernels are compiled and kept."""
     import emmc_rig as emmc
+    from reconstruction.tv import TVSettings, reconstruct_tv
 
     described = emmc.camera(camera, shots)
     psi = described.psi(SIZE)
@@ -95,6 +103,8 @@ def compile_for(part: str, camera: str, shots: int | None) -> None:
     frames = psi @ light_field
     if part == "search":
         _search(psi, frames)
+    elif part == "variation":
+        reconstruct_tv(psi, frames, NOISE, TVSettings(max_steps=1))
     elif part == "fit":
         _fit(psi, frames, near, texture)
     else:
@@ -133,5 +143,13 @@ def _fit(
     scene.surfaces.light_field(scene.texture)
 
 
+def _end_with_parent() -> None:
+    """End this process when the one that started it ends, and with it this process's input."""
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
+
+
 if __name__ == "__main__":
-    compile_for(sys.argv[1], sys.argv[2], int(sys.argv[3]) if sys.argv[3:] else None)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    for named in sys.argv[1].split(","):
+        compile_for(named, sys.argv[2], int(sys.argv[3]) if sys.argv[3:] else None)

@@ -1,14 +1,18 @@
 """Machine code kept on the disk: it is never older than a source that it was made of."""
 
 import ast
+import fcntl
+import importlib.util
 import os
 import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from emmc_rig.model import compiling
@@ -147,14 +151,14 @@ def kernels():
             for node in ast.walk(ast.parse(file.read_text())):
                 if isinstance(node, ast.FunctionDef):
                     how = " ".join(map(ast.unparse, node.decorator_list))
-                    if re.match(r"njit|row_kernel|_compiled\b", how):
+                    if re.match(r"njit|row_kernel|_helper\b|_kernel\b", how):
                         yield file, node, how
 
 
 def test_what_a_kernel_calls_is_compiled_into_it():
     """Else which of several copies of the machine code it calls depends on what was loaded first.
 
-    `_compiled` of the ray caster is an `njit` that does so.
+    `_helper` of the ray caster is an `njit` that does so.
     """
     every = list(kernels())
     names = {node.name for _, node, _ in every}
@@ -167,7 +171,97 @@ def test_what_a_kernel_calls_is_compiled_into_it():
     assert {"cubic", "_dual_rows", "_texel"} <= called
     for file, node, how in every:
         if node.name in called:
-            assert re.search(r"forceinline=True|inline='always'|_compiled", how), (file, node.name)
+            assert re.search(r"forceinline=True|inline='always'|_helper", how), (file, node.name)
+
+
+KERNEL = """
+from emmc_rig.model.compiling import njit
+
+@njit(forceinline=True)
+def half(x):
+    return x / 2
+
+@njit(cache=True)
+def halves(values):
+    total = 0.0
+    for x in values:
+        total += half(x)
+    return total
+"""
+CALL = """
+import sys
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from own_kernel import halves
+print("ready", flush=True)
+sys.stdin.readline()
+assert halves(np.ones(6)) == 3
+print(sum(halves.stats.cache_misses.values()))
+"""
+
+
+@pytest.fixture
+def own_kernel(tmp_path, monkeypatch):
+    """A module with a kernel of its own and no machine code yet."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(compiling._numba, "CACHE_DIR", "")
+    file = tmp_path / "own_kernel.py"
+    file.write_text(KERNEL)
+    spec = importlib.util.spec_from_file_location("own_kernel", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def held(own_kernel):
+    """The lock of that kernel, held as by another process that compiles it."""
+    line = own_kernel.halves.py_func.__code__.co_firstlineno
+    folder = compiling._folder(Path(own_kernel.__file__), "")
+    assert folder is not None
+    with (folder / f"halves-{line}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield file
+
+
+def test_of_two_processes_that_need_a_kernel_one_compiles_it(own_kernel, tmp_path):
+    typed = [sys.executable, "-c", CALL, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    both = [subprocess.Popen(typed, cwd=ROOT, **pipes) for _ in range(2)]
+    for one in both:
+        assert one.stdout.readline() == "ready\n"
+    for one in both:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    missed = [int(one.communicate(timeout=100)[0]) for one in both]
+    assert sorted(missed) == [0, 1]
+
+
+def test_a_kernel_that_another_process_compiles_is_waited_for(own_kernel, held):
+    found = []
+    waiting = threading.Thread(target=lambda: found.append(own_kernel.halves(np.ones(6))))
+    waiting.start()
+    waiting.join(0.3)
+    assert not found
+    fcntl.flock(held, fcntl.LOCK_UN)
+    waiting.join(60)
+    assert found == [3]
+
+
+def test_a_process_that_never_ends_compiling_is_not_waited_for_forever(
+    own_kernel, held, monkeypatch
+):
+    monkeypatch.setattr(compiling, "WAIT_S", 0.1)
+    assert own_kernel.halves(np.ones(6)) == 3
+
+
+def test_what_is_compiled_into_kernels_alone_says_so_when_it_is_called(own_kernel):
+    assert own_kernel.halves(np.ones(6)) == 3
+    with pytest.raises(TypeError, match="call its `py_func`"):
+        own_kernel.half(1.0)
+    assert own_kernel.half.py_func(1.0) == 0.5
 
 
 @pytest.mark.slow
