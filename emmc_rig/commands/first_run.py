@@ -23,7 +23,9 @@ from numba.core import event
 from numpy.typing import NDArray
 
 from emmc_rig.commands.output import say
+from emmc_rig.model.compiling import is_kept
 from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction import kernels
 from reconstruction.result import Progress
 
 SIZE = (48, 64)
@@ -35,6 +37,8 @@ PARTS = {
 }
 """What the other processes do for a method: first what takes longest, last what this process comes
 to first; for one that is not here, the whole of it."""
+
+NOT_KEPT = "no folder to keep them can be written to (set NUMBA_CACHE_DIR to one that can)"
 
 
 @dataclass
@@ -54,6 +58,9 @@ class Helpers(event.Listener):
         if self.started:
             return
         self.started = True
+        if not is_kept(kernels.__file__):
+            say("note", f"compiling kernels, as every run here: {NOT_KEPT}")
+            return
         say("first run", "compiling kernels for this machine, once; later runs start at once")
         parts = PARTS.get(self.method, (self.method,))
         others = min(len(parts), get_num_threads() - 1)  # on one core they would only be in the way

@@ -48,7 +48,7 @@ _within = threading.local()
 """Set in a thread that compiles or loads a kernel."""
 
 
-class _Within(CPUDispatcher):
+class _Inlined(CPUDispatcher):
     """What is compiled into kernels alone: machine code that Python could call is not made."""
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
@@ -72,7 +72,7 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
     def compiled(kernel: Callable) -> Callable[..., Any]:
         if is_helper:
             helper = numba.njit(*arguments, **options)(kernel)
-            helper.__class__ = _Within
+            helper.__class__ = _Inlined
             return helper
         folder = _folder(Path(kernel.__code__.co_filename), _user_folder()) if cache else None
         if folder is None:
@@ -140,6 +140,11 @@ def _take(descriptor: int) -> None:
             time.sleep(LOOK_S)
         else:
             return
+
+
+def is_kept(file: str) -> bool:
+    """Return whether the machine code of this file's kernels is kept for later processes."""
+    return _folder(Path(file), _user_folder()) is not None
 
 
 def _user_folder() -> str:

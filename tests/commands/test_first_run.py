@@ -84,6 +84,19 @@ def test_a_run_that_compiles_nothing_starts_nothing(started):
     assert not started
 
 
+def test_where_nothing_is_kept_that_is_said_and_no_process_is_started(started, monkeypatch, capsys):
+    monkeypatch.setattr(first_run, "is_kept", lambda file: False)
+
+    @njit
+    def fifth(x):
+        return x / 5
+
+    with first_run.helped_to_compile("adaptive", "rgbw-mono", None):
+        assert fifth(5.0) == 1
+    assert not started
+    assert "as every run here: no folder to keep them" in capsys.readouterr().err
+
+
 def test_where_no_process_can_be_started_the_run_compiles_alone(monkeypatch):
     def refuse(*typed, **options):
         raise BlockingIOError("Resource temporarily unavailable")

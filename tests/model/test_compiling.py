@@ -121,6 +121,18 @@ def test_where_the_folder_beside_the_source_is_not_writable_the_users_keeps_the_
     assert run(copied)[:2] == (before, 1)
 
 
+def test_whether_machine_code_is_kept_is_known(tmp_path, monkeypatch):
+    file = tmp_path / "kernels.py"
+    file.write_text("ONE = 1\n")
+    monkeypatch.setattr(compiling._numba, "CACHE_DIR", "")
+    assert compiling.is_kept(str(file))
+    (tmp_path / "__pycache__" / "kernels").rename(tmp_path / "before")
+    (tmp_path / "__pycache__" / "kernels").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    compiling._folder.cache_clear()
+    assert not compiling.is_kept(str(file))
+
+
 def test_code_that_no_process_used_for_a_month_is_removed(tmp_path):
     file = tmp_path / "kernels.py"
     file.write_text("ONE = 1\n")
