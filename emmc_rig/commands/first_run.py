@@ -111,7 +111,7 @@ def compile_for(part: str, camera: str, shots: int | None) -> None:
     if part == "search":
         _search(psi, frames)
     elif part == "variation":
-        reconstruct_tv(psi, frames, NOISE, TVSettings(max_steps=1))
+        reconstruct_tv(psi, frames, NOISE, TVSettings(max_steps=1, objective_every=1))
     elif part == "fit":
         _fit(psi, frames, near, texture)
     else:
