@@ -28,7 +28,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction import kernels
 from reconstruction.result import Progress
 
-SIZE = (48, 64)
+SIZE = (32, 40)
 """Of the light field that is compiled for: no kernel depends on it."""
 NOISE = 0.002
 PARTS = {
