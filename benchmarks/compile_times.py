@@ -15,6 +15,7 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators")
@@ -47,10 +48,11 @@ def compiled_by_demo(camera: str, size: tuple[int, int], method: str) -> dict[st
         def on_end(self, event: event.Event) -> None:
             started, inner = open_ones.pop()
             seconds = time.thread_time() - started
-            function = event.data["dispatcher"].py_func
+            details: Any = event.data
+            function = details["dispatcher"].py_func
             name = f"{function.__module__}.{function.__qualname__}"
             cost = costs[NUMBAS if name.startswith("numba.") else name]
-            cost.signatures.add(f"{name}{event.data['args']}")
+            cost.signatures.add(f"{name}{details['args']}")
             cost.own_seconds += seconds - sum(inner)
             if open_ones:
                 open_ones[-1][1].append(seconds)

@@ -86,9 +86,9 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
         lock = folder / f"{kernel.__qualname__}-{kernel.__code__.co_firstlineno}.lock"
         compile_or_load = made.compile
 
-        def one_compiles(signature: Any) -> Any:
+        def one_compiles(sig: Any) -> Any:
             with _locked(lock), _uncollected():
-                return compile_or_load(signature)
+                return compile_or_load(sig)
 
         made.compile = one_compiles
         return made

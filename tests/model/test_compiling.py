@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -241,7 +242,7 @@ def held(own_kernel):
 def test_of_two_processes_that_need_a_kernel_one_compiles_it(own_kernel, tmp_path):
     typed = [sys.executable, "-c", CALL, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    both = [subprocess.Popen(typed, cwd=ROOT, **pipes) for _ in range(2)]
+    both: list[Any] = [subprocess.Popen(typed, cwd=ROOT, **pipes) for _ in range(2)]
     for one in both:
         assert one.stdout.readline() == "ready\n"
     for one in both:

@@ -92,7 +92,7 @@ def snell(x, u, thickness, index):
 
 def test_glass_bends_rays_by_snells_law():
     for x, u in ((0.0, 9_000.0), (2_500.0, -12_000.0)):
-        found = _met(x, 0.0, u, 0.0, LENS_UM, DISTANCE_UM, 0.0, 0.0, 0.0, 300.0, 1.52)
+        found = _met.py_func(x, 0.0, u, 0.0, LENS_UM, DISTANCE_UM, 0.0, 0.0, 0.0, 300.0, 1.52)
         assert found[0] == pytest.approx(snell(x, u, 300.0, 1.52), abs=1e-4)
         assert found[1] == 0
 
@@ -102,7 +102,7 @@ def test_a_tilted_mask_is_met_where_the_ray_crosses_its_plane():
     to = (u - x) / LENS_UM
     # x + to z with z = d + slope (x + to z)
     z = (DISTANCE_UM + slope * x) / (1 - slope * to)
-    found = _met(x, 0.0, u, 0.0, LENS_UM, DISTANCE_UM, slope, 0.0, 0.0, 0.0, 1.52)
+    found = _met.py_func(x, 0.0, u, 0.0, LENS_UM, DISTANCE_UM, slope, 0.0, 0.0, 0.0, 1.52)
     assert found[0] == pytest.approx(x + to * z, abs=1e-3)
 
 
