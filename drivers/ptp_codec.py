@@ -10,6 +10,7 @@ import math
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 from typing import Annotated, Any, Self, get_type_hints
 
 from drivers.errors import CameraFormatError
@@ -269,6 +270,7 @@ class _Dataset:
     """Fields in wire order, each with its layout: see `_Reader.take`, "*" of a list, "text"."""
 
     @classmethod
+    @cache  # hints are texts that Python compiles anew each time
     def _layouts(cls) -> dict[str, str]:
         hints = get_type_hints(cls, include_extras=True)
         return {name: hint.__metadata__[0] for name, hint in hints.items()}

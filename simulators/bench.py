@@ -92,6 +92,24 @@ def ray_points(views: tuple[int, int], count: int, axes: int = 4) -> NDArray[np.
     return np.reshape(points, (*views, count, axes))
 
 
+def lens_points_um(points: Array, cell_um: float, fill: float) -> Array:
+    """Return where the rays of `ray_points` meet the lens, x and y from its axis: (v, u, ray, 2).
+
+    fill: the open share of the side of an aperture cell.
+    """
+    y_um, x_um = (centred_grid(count, cell_um) for count in points.shape[:2])
+    cells_um = np.stack(np.meshgrid(x_um, y_um), axis=-1)
+    return cells_um[:, :, np.newaxis] + fill * cell_um * (points[..., 2:4] - 0.5)
+
+
+def _passes(lens_um: Array, openings_um: Array) -> NDArray[np.bool_]:
+    """Return which rays the plate lets through; openings (opening, 3): x, y, half side."""
+    passes = np.zeros(lens_um.shape[:-1], dtype=bool)
+    for opening in openings_um:
+        passes |= (np.abs(lens_um - opening[:2]) <= opening[2]).all(axis=-1)
+    return passes
+
+
 @njit(forceinline=True, fastmath=True)
 def _met(x, y, u, v, lens_um, distance_um, slope_x, slope_y, sag, glass_um, index):
     """Return where the ray from sensor point (x, y) to lens point (u, v) meets a mask.
@@ -131,8 +149,9 @@ def trace(
     response,
     lamp,
     points,
+    at_lens_um,
+    passes,
     lengths_um,
-    openings_um,
     cells,
     starts,
     shapes,
@@ -143,18 +162,18 @@ def trace(
     """Set readings (y, x), per sample, to the mean over rays of lamp x masks x scene x response.
 
     scene: (v f, u f, y g, x g, colour) with finer = (f, g); or 1 x 1 x 1 x 1 x 3 for a whiteboard.
-    points: (v, u, ray, 4). lengths_um: lens distance, sample pitch, sample width, aperture cell,
-    open width of a cell. openings_um: (opening, 3), x, y and half side of the squares at the lens
-    that the aperture plate leaves open. cells: (1 + all cells, colour), the first opaque; starts,
-    shapes: where each mask lies in it, (rows, columns). plates: per mask distance_um, x_um, y_um,
-    what turns um on the mask into cells (column from x and y, row from x and y), the displacement
-    of its rays per cubed um off the axis, the width of its edges in um, and the slopes, sag, glass
-    and index that `_met` takes. falloff: (v, u, y, x), or all 1.
+    points: (v, u, ray, 4). at_lens_um: (v, u, ray, 2), where the rays meet the lens, x and y.
+    passes: (v, u, ray), whether the aperture plate lets them through. lengths_um: lens distance,
+    sample pitch, sample width. cells: (1 + all cells, colour), the first opaque; starts, shapes:
+    where each mask lies in it, (rows, columns). plates: per mask distance_um, x_um, y_um, what
+    turns um on the mask into cells (column from x and y, row from x and y), the displacement of
+    its rays per cubed um off the axis, the width of its edges in um, and the slopes, sag, glass and
+    index that `_met` takes. falloff: (v, u, y, x), or all 1.
     points: (v, u, ray, 4 or 6), 6 where edges are blurred: the last two are normal.
     """
     rows, columns = readings.shape
     views_v, views_u, count = points.shape[0], points.shape[1], points.shape[2]
-    lens_um, pitch_um, width_um, cell_um, open_um = lengths_um
+    lens_um, pitch_um, width_um = lengths_um
     board = scene.shape[2] == 1
     f, g = finer
     even = falloff.shape[3] == 1
@@ -170,20 +189,14 @@ def trace(
                 weight[c, x] = response[y, x, c]
         for v in range(views_v):
             for u in range(views_u):
+                if not passes[v, u].any():
+                    continue
                 total[:] = 0
                 for ray in range(count):
-                    in_x, in_y, in_u, in_v = points[v, u, ray, :4]
-                    ray_u = (u - (views_u - 1) / 2) * cell_um + (in_u - 0.5) * open_um
-                    ray_v = (v - (views_v - 1) / 2) * cell_um + (in_v - 0.5) * open_um
-                    blocked = True
-                    for opening in openings_um:
-                        if (
-                            abs(ray_u - opening[0]) <= opening[2]
-                            and abs(ray_v - opening[1]) <= opening[2]
-                        ):
-                            blocked = False
-                    if blocked:
+                    if not passes[v, u, ray]:
                         continue
+                    in_x, in_y, in_u, in_v = points[v, u, ray, :4]
+                    ray_u, ray_v = at_lens_um[v, u, ray]
                     first_x = -(columns - 1) / 2 * pitch_um + (in_x - 0.5) * width_um
                     ray_y = (y - (rows - 1) / 2) * pitch_um + (in_y - 0.5) * width_um
                     for c in range(3):
@@ -311,6 +324,7 @@ class Bench:
         self._points = ray_points(views, rays_per_view, axes)
         self._points[..., 4:] = ndtri(self._points[..., 4:])
         lens = camera.lens
+        self._at_lens_um = lens_points_um(self._points, lens.aperture_cell_um, lens.aperture_fill)
         lengths_um = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
         self._falloff = optics.falloff(size, views, lengths_um)
         self._plates = {
@@ -419,7 +433,6 @@ class Bench:
         """
         camera = self.camera
         lens, sensor = camera.lens, camera.sensor
-        cell_um = lens.aperture_cell_um
         names = camera.shot_masks(self.shot) if self.masks_in else ()
         cells, starts, shapes, plates = [np.zeros((1, 3), np.float32)], [], [], []
         for name in names:
@@ -456,14 +469,13 @@ class Bench:
             (response / seen).astype(np.float32),
             np.array(lamp),
             self._points,
+            self._at_lens_um,
+            _passes(self._at_lens_um, openings),
             (
                 lens.distance_mm * 1e3,
                 sensor.sample_pitch_um,
                 sensor.sample_pitch_um * sensor.pixel_fill,
-                cell_um,
-                cell_um * lens.aperture_fill,
             ),
-            openings,
             np.concatenate(cells),
             np.array(starts, dtype=np.int64),
             np.array(shapes, dtype=np.int64).reshape(-1, 2),

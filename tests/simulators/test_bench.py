@@ -5,7 +5,7 @@ import pytest
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.masks import CFA
-from simulators.bench import NO_ERRORS, Bench, MountingErrors, ray_points
+from simulators.bench import NO_ERRORS, Bench, MountingErrors, lens_points_um, ray_points
 
 SIZE = (12, 18)
 CENTRED = {"mask_x": 0.0, "mask_y": 0.0, "aperture_x": 0.0, "aperture_y": 0.0}
@@ -195,3 +195,14 @@ def test_ray_points_fill_every_projection_evenly():
     counts = np.histogram(points[0, 0, :, 0], bins=16, range=(0, 1))[0]
     np.testing.assert_array_equal(counts, 16)
     assert not np.array_equal(points[0, 0], points[0, 1])
+
+
+def test_rays_meet_the_lens_in_the_open_part_of_their_aperture_cell():
+    points = ray_points((2, 3), 64)
+    at_um = lens_points_um(points, 1000.0, 0.8)
+    assert at_um.shape == (2, 3, 64, 2)
+    middles_um = np.array([[[-1000, -500], [0, -500], [1000, -500]],
+                           [[-1000, 500], [0, 500], [1000, 500]]])  # fmt: skip
+    away_um = at_um - middles_um[:, :, np.newaxis]
+    assert 380 < np.abs(away_um).max() <= 400
+    np.testing.assert_allclose(away_um[1, 2, :, 0], 800 * (points[1, 2, :, 2] - 0.5), atol=1e-9)
