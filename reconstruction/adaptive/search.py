@@ -263,7 +263,10 @@ def coarse(
 
 
 def _possible(
-    volume: Volume, patches: EvidencePatches, grid: tuple[Array, Array], labels: Array
+    volume: Volume,
+    patches: EvidencePatches,
+    grid: tuple[NDArray[np.int64], NDArray[np.int64]],
+    labels: Array,
 ) -> NDArray[np.bool_]:
     """Return which `labels` are near what may be at or around each patch, (row, column, label).
 
@@ -341,7 +344,7 @@ def _asked(possible: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
     have one to both sides."""
     padded = np.pad(possible, ((0, 0), (0, 0), (every - 1, every - 1)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * every - 1, axis=2)
-    return windows[:, :, ::every].any(axis=-1)
+    return np.logical_or.reduce(windows[:, :, ::every], axis=-1)
 
 
 def _spanned(asked: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
