@@ -235,8 +235,9 @@ def patch_evidence(
     if possible is None:
         possible = np.ones((count, len(disparities)), dtype=bool)
     padded = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
-    asked = possible[padded].reshape(-1, LANES, len(disparities)).any(axis=1)
-    used = asked.any(axis=0)
+    groups = possible[padded].reshape(-1, LANES, len(disparities))
+    asked = np.logical_or.reduce(groups, axis=1)
+    used = np.logical_or.reduce(asked, axis=0)
     waves, separations, back = _spectrum(psi.light_field_shape[:2], psi.binning)
     pairs, offsets, pixels_apart = _sets(places[:, None, 1:] - places[None, :, 1:])
     lengths = [replace(prior, length_px=length) for length in (prior.length_px, *prior.finer_px)]

@@ -27,6 +27,7 @@ _FLOAT = ir.FloatType()
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 _TILE_OF = ir.ArrayType(_VECTOR, SIDE * SIDE)
 _EACH = range(SIDE)
+_intrinsic: Any = intrinsic
 
 
 class _Tile(types.Type):
@@ -120,13 +121,13 @@ def _function(returned: Any, kinds: Any, write: Any) -> Any:
     return returned(*known), generate
 
 
-@intrinsic
+@_intrinsic
 def zero_tile(context):
     """Return a tile of zeros."""
     return _function(_TILE, (), lambda code: ir.Constant(_TILE_OF, None))
 
 
-@intrinsic
+@_intrinsic
 def load_tile(context, flat, at):
     """Return the tile at flat[at]."""
 
@@ -138,7 +139,7 @@ def load_tile(context, flat, at):
     return _function(_TILE, (flat, at), write)
 
 
-@intrinsic
+@_intrinsic
 def store_tile(context, tile, flat, at):
     """Put a tile at flat[at]."""
 
@@ -150,7 +151,7 @@ def store_tile(context, tile, flat, at):
     return _function(types.void, (tile, flat, at), write)
 
 
-@intrinsic
+@_intrinsic
 def scatter_tile(context, tile, flat, at, apart, places, first):
     """Put the vector of each row r and column c at flat[at + r * apart + places[first + c]].
 
@@ -168,7 +169,7 @@ def scatter_tile(context, tile, flat, at, apart, places, first):
     return _function(types.void, (tile, flat, at, apart, places, first), write)
 
 
-@intrinsic
+@_intrinsic
 def multiplied(context, tile, other):
     """Return the product of two tiles, entry by entry."""
 
@@ -179,7 +180,7 @@ def multiplied(context, tile, other):
     return _function(_TILE, (tile, other), write)
 
 
-@intrinsic
+@_intrinsic
 def combined(context, tile, other, flat):
     """Return a tile times the vector at flat[0], plus another times that at flat[LANES]."""
 
@@ -197,7 +198,7 @@ def combined(context, tile, other, flat):
     return _function(_TILE, (tile, other, flat), write)
 
 
-@intrinsic
+@_intrinsic
 def plus_diagonal(context, tile, flat, at):
     """Return a tile plus the SIDE vectors at flat[at], on its diagonal."""
 
@@ -210,7 +211,7 @@ def plus_diagonal(context, tile, flat, at):
     return _function(_TILE, (tile, flat, at), write)
 
 
-@intrinsic
+@_intrinsic
 def plus_outer(context, tile, table, rows, first, term, vectors, at, apart):
     """Return a tile plus the outer product of numbers and vectors.
 
@@ -235,7 +236,7 @@ def plus_outer(context, tile, table, rows, first, term, vectors, at, apart):
     return _function(_TILE, (tile, table, rows, first, term, vectors, at, apart), write)
 
 
-@intrinsic
+@_intrinsic
 def less_products(context, tile, flat, left, right):
     """Return a tile less the product of that at flat[left] and the transpose of that at right."""
 
@@ -252,7 +253,7 @@ def less_products(context, tile, flat, left, right):
     return _function(_TILE, (tile, flat, left, right), write)
 
 
-@intrinsic
+@_intrinsic
 def factored(context, tile, least):
     """Return the Cholesky factor of a tile, the inverses of its pivots on the diagonal.
 
@@ -278,7 +279,7 @@ def factored(context, tile, least):
     return _function(_TILE, (tile, least), write)
 
 
-@intrinsic
+@_intrinsic
 def divided(context, tile, flat, factor):
     """Return a tile divided by the transpose of the factor (`factored`) at flat[factor]."""
 
@@ -295,7 +296,7 @@ def divided(context, tile, flat, factor):
     return _function(_TILE, (tile, flat, factor), write)
 
 
-@intrinsic
+@_intrinsic
 def take_applied(context, tile, flat, source, target):
     """Take a tile times the SIDE vectors at flat[source] off those at flat[target]."""
 
@@ -310,7 +311,7 @@ def take_applied(context, tile, flat, source, target):
     return _function(types.void, (tile, flat, source, target), write)
 
 
-@intrinsic
+@_intrinsic
 def substitute(context, tile, flat, at):
     """Divide the SIDE vectors at flat[at] by a factor (`factored`)."""
 
@@ -337,7 +338,7 @@ def _conjugate_product(code: _Code, flat: Any, here: Any, there: Any) -> list[An
     ]
 
 
-@intrinsic
+@_intrinsic
 def meet(context, flat, here, there, out, at):
     """Put the product of the complex number at flat[here] and the conjugate of that at [there] at
     out[at]: real and imaginary part follow each other."""
@@ -349,7 +350,7 @@ def meet(context, flat, here, there, out, at):
     return _function(types.void, (flat, here, there, out, at), write)
 
 
-@intrinsic
+@_intrinsic
 def meet_too(context, flat, here, there, out, at):
     """Add such a product, see `meet`, to what is at out[at]."""
 

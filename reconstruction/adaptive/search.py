@@ -8,8 +8,7 @@ best of a patch that decides.
 
 Where patches lie is arbitrary, and changes the disparities they agree on: shifted by 3 pixels, they
 make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). So what two grids of
-patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md). Of the second grid
-only those patches are evaluated around which the first is not sure, or does not agree.
+patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md).
 
 Neighbouring patches agree by belief propagation: their disparities differ as d - d' is Laplace
 distributed, or, with a small probability, are not related (another object). Messages are passed
@@ -69,9 +68,6 @@ coarse search compares all: its disparities, far apart, would lose the right one
 CONTENDING = 4.0
 """Log-likelihood below a patch's best within which it is evaluated at all disparities: interpolated
 there instead, it made buttercup's crops 0.3 to 0.5 dB worse."""
-SURE, AGREED_PX = 0.9, 0.25
-"""Patches of the second grid are not evaluated where those of the first around them believe, with
-this probability, in disparities within AGREED_PX, and agree as closely."""
 
 
 def compatibility(
@@ -145,9 +141,8 @@ class Volume:
     centres: rows and columns of the patches' centres, in pixels. probability: (row, column,
     disparity); evidence: theirs, log-likelihoods, -inf where excluded. kind: (row, column) of
     the texture. decisive: (row, column), whether the patch's own evidence prefers any disparity.
-    at_end: share of deciding patches at the range's ends. computed: share of the patches whose
-    evidence is their own. between: the same of a grid between these patches, of the same
-    disparities.
+    at_end: share of deciding patches at the range's ends. between: the same of a grid between these
+    patches, of the same disparities.
     """
 
     disparities: NDArray[np.float64]
@@ -157,7 +152,6 @@ class Volume:
     kind: NDArray[np.int64]
     decisive: NDArray[np.bool_]
     at_end: float = 0.0
-    computed: float = 1.0
     between: Volume | None = None
 
     @property
@@ -269,14 +263,19 @@ def coarse(
 
 
 def _possible(
-    volume: Volume, patches: EvidencePatches, grid: tuple[Array, Array], labels: Array
+    volume: Volume,
+    patches: EvidencePatches,
+    grid: tuple[NDArray[np.int64], NDArray[np.int64]],
+    labels: Array,
 ) -> NDArray[np.bool_]:
     """Return which `labels` are near what may be at or around each patch, (row, column, label).
 
     grid: rows and columns of the patches' corners.
     """
     around = 1.5 * np.diff(volume.centres[0]).max(initial=1.0)
-    likely = volume.probability > POSSIBLE
+    # The likeliest in any case: of many disparities all may be less than POSSIBLE.
+    best = volume.probability.max(axis=-1, keepdims=True)
+    likely = volume.probability >= np.minimum(best, np.float32(POSSIBLE))
     near_row, near_column = (
         (centres >= corners[:, None] - around)
         & (centres <= corners[:, None] + patches.side + around)
@@ -320,30 +319,24 @@ def fine(
     own = np.float32((patches.stride / side) ** 2)
     pairs = compatibility(labels[used], slope_px * patches.stride, jump)
 
-    def evaluated(number: int, given: Volume | None) -> Volume:
-        """Return a grid's evidence and beliefs; given: of another that may settle them."""
-        rows, columns = grids[number]
-        centres = rows + (side - 1) / 2, columns + (side - 1) / 2
-        part = asked[number]
-        settled = np.zeros(part.shape[:2], dtype=bool)
-        if given is not None:
-            settled, settled_evidence, settled_decisive = _settled(given, centres)
-            part = part & ~settled[..., None]
-        evidence, kind, decisive = _on_grid(
-            data, patches, grids[number], prior, labels, every, part
-        )
+    between = None
+    for grid, wanted in zip(reversed(grids), reversed(asked), strict=True):
+        evidence, kind, decisive = _on_grid(data, patches, grid, prior, labels, every, wanted)
         evidence = evidence[..., used]
-        evidence[~decisive & ~settled] = _extended(evidence[~decisive & ~settled])
-        if given is not None:
-            evidence[settled] = settled_evidence[settled]
-            decisive[settled] = settled_decisive[settled]
+        evidence[~decisive] = _extended(evidence[~decisive])
         likely = evidence - np.where(decisive[..., None], np.float32(0), rare)
-        chances = posteriors(likely * own, pairs)
-        share = 1 - float(settled.mean())
-        return Volume(labels[used], centres, chances, evidence, kind, decisive, rough.at_end, share)
-
-    volume = evaluated(0, None)
-    return volume if len(grids) == 1 else replace(volume, between=evaluated(1, volume))
+        between = Volume(
+            labels[used],
+            (grid[0] + (side - 1) / 2, grid[1] + (side - 1) / 2),
+            posteriors(likely * own, pairs),
+            evidence,
+            kind,
+            decisive,
+            rough.at_end,
+            between,
+        )
+    assert between is not None
+    return between
 
 
 def _asked(possible: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
@@ -351,7 +344,7 @@ def _asked(possible: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
     have one to both sides."""
     padded = np.pad(possible, ((0, 0), (0, 0), (every - 1, every - 1)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * every - 1, axis=2)
-    return windows[:, :, ::every].any(axis=-1)
+    return np.logical_or.reduce(windows[:, :, ::every], axis=-1)
 
 
 def _spanned(asked: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
@@ -370,47 +363,6 @@ def _extended(evidence: NDArray[np.float32]) -> NDArray[np.float32]:
     known = np.isfinite(evidence)
     out = [np.interp(label, label[at], row[at]) for row, at in zip(evidence, known, strict=True)]
     return np.array(out, dtype=np.float32).reshape(evidence.shape)
-
-
-def _settled(
-    volume: Volume, centres: tuple[Array, Array]
-) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.bool_]]:
-    """Return at which of these centres patches would tell nothing new, (row, column), and the
-    evidence of a volume's patches there, interpolated, and whether all these decide.
-
-    There all patches around believe in disparities within AGREED_PX of each other.
-    """
-    likeliest = volume.disparities[volume.probability.argmax(axis=-1)]
-    near = np.abs(likeliest[..., None] - volume.disparities) <= AGREED_PX
-    sure = (volume.probability * near).sum(axis=-1) >= SURE
-    corners = []
-    for at, known in zip(centres, volume.centres, strict=True):
-        place = np.interp(at, known, np.arange(len(known)))
-        before = np.floor(place).astype(int)
-        after = np.minimum(before + 1, len(known) - 1)
-        corners.append(((before, 1 - place + before), (after, place - before)))
-    around = [
-        (np.ix_(row, column), np.outer(down, across)[..., None].astype(np.float32))
-        for row, down in corners[0]
-        for column, across in corners[1]
-    ]
-    low, high, all_sure, decisive = (
-        reduce(np.stack([values[at] for at, _ in around]), axis=0)
-        for reduce, values in (
-            (np.min, likeliest),
-            (np.max, likeliest),
-            (np.all, sure),
-            (np.all, volume.decisive),
-        )
-    )
-    # Where weights are 0 evidence may be -inf.
-    evidence = sum(
-        np.multiply(
-            volume.evidence[at], weight, where=weight > 0, out=np.zeros_like(volume.evidence[at])
-        )
-        for at, weight in around
-    )
-    return all_sure & (high - low <= AGREED_PX), evidence, decisive
 
 
 def _packed(asked: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -473,16 +425,13 @@ def _on_grid(
     """Return evidence (row, column, label), kinds, and whether patches decide, (row, column).
 
     grid: rows and columns of corners. asked: (row, column, each `every`-th label), to evaluate;
-    others are evaluated where it matters, and else interpolated. Patches that ask for nothing have
-    evidence of -inf, and do not decide.
+    others are evaluated where it matters, and else interpolated.
     """
     corners = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
     shape = corners.shape[:2]
-    evidence = np.full((*shape, len(labels)), -np.inf, dtype=np.float32)
-    kind, deciding = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=bool)
+    evidence = np.empty((*shape, len(labels)), dtype=np.float32)
+    kind, deciding = np.empty(shape, dtype=np.int64), np.empty(shape, dtype=bool)
     order = _packed(asked.reshape(-1, asked.shape[2]))
-    if not len(order):
-        return evidence, kind, deciding
     at = np.unravel_index(order, shape)
     found = evidence_at(data, patches, corners[at], labels[::every], prior, asked[at])
     kind[at], deciding[at] = found.kind, _deciding(found.log_likelihood)

@@ -27,7 +27,6 @@ from reconstruction.adaptive.search import (
     _near_best,
     _packed,
     _possible,
-    _settled,
     _spanned,
     compatibility,
     per_pixel,
@@ -431,6 +430,11 @@ def test_a_disparity_is_possible_near_where_the_rough_search_believes_it():
     others = (np.abs(labels) <= 0.75) | (np.abs(labels - 1) <= 1)
     np.testing.assert_array_equal(found[:, 0], [near_first] * 2)
     np.testing.assert_array_equal(found[:, 1], [near_first | others] * 2)
+    # Of many disparities none may be as probable as is asked: the likeliest is possible.
+    vague = replace(volume, probability=(rough * 0.01).astype(np.float32))
+    np.testing.assert_array_equal(
+        _possible(vague, EvidencePatches(8, 6), corners, labels)[:, 0], [near_first] * 2
+    )
     far = _possible(volume, EvidencePatches(8, 6), (np.array([0]), np.array([60])), labels)
     np.testing.assert_array_equal(far[0, 0], False)
 
@@ -464,29 +468,6 @@ def test_labels_evaluated_have_those_possible_between_them():
     assert [np.flatnonzero(one).tolist() for one in found[0]] == [[1, 2], [2]]
     assert np.flatnonzero(_spanned(found[0, 0], 2)).tolist() == [2, 3, 4]
     assert np.flatnonzero(_spanned(np.array([1, 0, 1, 1], bool), 2)).tolist() == [0, 4, 5, 6]
-
-
-def test_a_second_grid_is_settled_where_patches_around_are_sure_and_agree():
-    labels, kind = np.arange(4) * 0.25, np.zeros((3, 4), int)
-    chances = np.zeros((3, 4, 4), np.float32)
-    chances[..., 0] = 1
-    chances[:, 1:, :2] = 0.02, 0.98  # the next label agrees
-    chances[0, 3] = 0, 0, 0, 1  # another surface
-    chances[2, 0] = 0.6, 0, 0, 0.4  # not sure
-    evidence = np.log(chances + 1e-3)
-    evidence[1, 1, 3] = -np.inf
-    at = np.arange(3) * 6.0, np.arange(4) * 6.0
-    volume = Volume(labels, at, chances, evidence, kind, kind == 0)
-    between = at[0][:2] + 3, np.array([0.0, *(at[1][:3] + 3)])
-    settled, found, decisive = _settled(volume, between)
-    assert decisive.all()
-    expected = [[True, True, True, False], [False, False, True, True]]
-    np.testing.assert_array_equal(settled, expected)
-    mean = evidence[:2, 1:3].mean(axis=(0, 1))
-    np.testing.assert_allclose(found[0, 2], mean, rtol=1e-5)
-    assert found[0, 2, 3] == -np.inf
-    # Beyond the first column it is that of the first.
-    np.testing.assert_allclose(found[0, 0], evidence[:2, 0].mean(axis=0), rtol=1e-5)
 
 
 def test_disparities_beside_the_best_known_are_evaluated():
