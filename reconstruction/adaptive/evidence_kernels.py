@@ -37,6 +37,8 @@ SIZE = SIDE * SIDE * LANES
 """Numbers of a tile."""
 LEAST = 1e-12
 """Of a squared pivot: of a covariance that is not positive definite in float32."""
+LOWEST = np.float32(-1e30)
+"""Below any log-likelihood; fast arithmetic knows no infinity."""
 LOGS = 8
 """Tiles of pivots between logarithms: 32 of 1e6 each are far from the end of float64."""
 
@@ -305,7 +307,7 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
         if stored == 1:
             _compare_colours(given, seen, alike)
         each = count // lengths
-        best[:] = -np.inf
+        best[:] = LOWEST
         for kind in range(kinds):
             ranks[kind, :] = kind
         # First kinds are tried, then all textures with the best: one loop, since what it calls is
@@ -317,8 +319,8 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
                 if rank == 0:
                     _rank(best, ranks)
                     if probe == 0:
-                        best[:] = -np.inf
-                        most_likely[:] = -np.inf
+                        best[:] = LOWEST
+                        most_likely[:] = LOWEST
             else:
                 length, rank, h = turn // each, 0, turn
             for lane in range(LANES):

@@ -276,11 +276,12 @@ def _possible(
     # The likeliest in any case: of many disparities all may be less than POSSIBLE.
     best = volume.probability.max(axis=-1, keepdims=True)
     likely = volume.probability >= np.minimum(best, np.float32(POSSIBLE))
-    near_row, near_column = (
-        (centres >= corners[:, None] - around)
-        & (centres <= corners[:, None] + patches.side + around)
-        for centres, corners in zip(volume.centres, grid, strict=True)
-    )
+    sides = []
+    for centres, corners in zip(volume.centres, grid, strict=True):
+        apart = np.abs(centres - corners[:, None] - patches.side / 2)
+        # The nearest in any case: on a small sensor one patch may be all that the rough search has.
+        sides.append(apart <= np.maximum(around + patches.side / 2, apart.min(axis=1)[:, None]))
+    near_row, near_column = sides
     rows = np.stack([likely[near].any(axis=0) for near in near_row])
     both = np.stack([rows[:, near].any(axis=1) for near in near_column], axis=1)
     apart = np.abs(labels - volume.disparities[:, None])

@@ -435,8 +435,9 @@ def test_a_disparity_is_possible_near_where_the_rough_search_believes_it():
     np.testing.assert_array_equal(
         _possible(vague, EvidencePatches(8, 6), corners, labels)[:, 0], [near_first] * 2
     )
-    far = _possible(volume, EvidencePatches(8, 6), (np.array([0]), np.array([60])), labels)
-    np.testing.assert_array_equal(far[0, 0], False)
+    # Far from all, what the nearest believe counts.
+    far = _possible(volume, EvidencePatches(8, 6), (np.array([20]), np.array([90])), labels)
+    np.testing.assert_array_equal(far[0, 0], near_first)
 
 
 def test_evidence_between_disparities_is_that_of_a_cubic():
