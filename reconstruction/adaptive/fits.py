@@ -46,7 +46,8 @@ def fitted_models(
 
     All fits of surfaces but the last search the disparity again with their texture (`sweep`); where
     that leads astray the last one, which keeps what the patches agreed on, predicts held-out
-    readings better. on_step: called with the number of steps done.
+    readings better. The first steps are those of the first fit: there the texture presumed is so
+    uncertain that the misfit matters little. on_step: called with the number of steps done.
     """
     given, bright, held = survey.given, survey.bright, survey.held
     scale = np.float32(survey.scale)
