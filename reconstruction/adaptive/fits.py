@@ -50,7 +50,8 @@ def fitted_models(
 
     All fits of surfaces but the last search the disparity again with their texture (`sweep`); where
     that leads astray the last one, which keeps what the patches agreed on, predicts held-out
-    readings better. on_step: called with the number of steps done.
+    readings better. The first steps are those of the first fit: there the texture presumed is so
+    uncertain that the misfit matters little. on_step: called with the number of steps done.
 
     second: beliefs of a second search. Then there is a fit of the first misfit for each search,
     since closer ones follow what wide disparities err by: with them the mean of 12 crops is 0.01 dB

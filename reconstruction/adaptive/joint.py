@@ -39,9 +39,10 @@ class TextureSettings(Settings):
     block_step: int = Field(default=4, ge=1, le=8)
     reach: int = Field(default=9, ge=0, description="samples around within which blocks are alike")
     fit_steps: int = Field(default=6, ge=1, description="of conjugate gradients in each step")
-    sharpen_steps: int = Field(default=8, ge=1, description="of these when disparity is sharpened")
     shared_steps: int = Field(
-        default=0, ge=0, description="first steps, which all fits of a scene have in common"
+        default=5,
+        ge=0,
+        description="first steps, before the first sweep, which all fits of a scene share",
     )
     sweeps: tuple[int, ...] = Field(
         default=(5, 10), description="steps that search the disparity again first"
@@ -118,8 +119,9 @@ def solve(
     now = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge").astype(np.float32)
     at = kept = begun or Begun(now, now, now)
     sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
-    for step in range(0 if begun is None else settings.shared_steps, settings.steps):
-        if step == settings.shared_steps:
+    shared = min(settings.shared_steps, settings.steps - 1)
+    for step in range(0 if begun is None else shared, settings.steps):
+        if step == shared:
             kept = at
         now, clean, sigma = at.now, at.clean, float(sigmas[step])
         if step:
@@ -145,13 +147,7 @@ def solve(
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
             residual = frames - surfaces.forward(now)
             padded = refined(
-                surfaces,
-                padded,
-                now,
-                residual,
-                doubted.astype(np.float32),
-                settings.slope_px,
-                settings.sharpen_steps,
+                surfaces, padded, now, residual, doubted.astype(np.float32), settings.slope_px
             )
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)

@@ -6,13 +6,13 @@ Numba vectorises no loop as short as a row of a box. These are written as vector
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
+from numba.extending import intrinsic as numba_intrinsic
 
 LANES = 8
 """Cells of a vector: the rows of a box are padded to whole vectors."""
@@ -26,6 +26,8 @@ CUBIC = (
 """Coefficients of the four weights of Catmull-Rom interpolation, those of the third power first."""
 _FLOAT, _INDEX, _LANE = ir.FloatType(), ir.IntType(64), ir.IntType(32)
 _FAST = ("fast",)
+intrinsic = cast(Callable[[Callable], Callable[..., Any]], numba_intrinsic)
+"""A kernel calls it without its first parameter, Numba's context of types."""
 
 
 class _Code:
