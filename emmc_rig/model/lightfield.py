@@ -363,9 +363,9 @@ def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
 
 
 def sum_of_squares(values: np.ndarray) -> float:
-    """Return that of a picture (y, ...): of rows in its own type, of all rows in float64."""
-    rows = values.reshape(len(values), -1)
-    return float(np.einsum("yx,yx->y", rows, rows).sum(dtype=np.float64))
+    """Return that of a picture, summed in float64."""
+    flat = np.asarray(values, dtype=np.float64).ravel()
+    return float(flat @ flat)
 
 
 def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
@@ -381,7 +381,7 @@ def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
     _check_same_shape(estimate, truth)
     squares = 0.0
     for place in np.ndindex(truth.shape[: max(truth.ndim - 3, 0)]):
-        squares += sum_of_squares(np.asarray(estimate[place], np.float32) - truth[place])
+        squares += sum_of_squares(np.subtract(estimate[place], truth[place], dtype=np.float64))
     if squares == 0:
         return float("inf")
     return float(10 * np.log10(truth.size / squares))
@@ -551,33 +551,29 @@ def _check_same_shape(estimate: np.ndarray, truth: np.ndarray) -> None:
 
 
 def _view_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
-    """SSIM of one (y, x, c) view, colour by colour, in float32.
-
-    Variances are differences of near-equal numbers: taken around a middle grey, what rounding
-    leaves of them is a few times 1e-8, against 9e-4 that is added to them.
-    """
-    return float(np.mean([_plane_ssim(*planes) for planes in zip(
-        np.moveaxis(estimate, -1, 0), np.moveaxis(truth, -1, 0), strict=True
-    )]))  # fmt: skip
+    """SSIM of one (y, x, c) view, a colour at a time, which takes a third of the memory."""
+    colours = range(truth.shape[-1])
+    return float(np.mean([_plane_ssim(estimate[..., c], truth[..., c]) for c in colours]))
 
 
 def _plane_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
-    grey = np.float32(0.5)
+    """SSIM of (y, x); float64, as variances are differences of near-equal numbers."""
 
     def window_mean(picture: np.ndarray) -> np.ndarray:
         edge = _SSIM_WINDOW_PX // 2
         size = _SSIM_WINDOW_PX, _SSIM_WINDOW_PX
         return cv2.GaussianBlur(picture, size, _SSIM_SIGMA_PX)[edge:-edge, edge:-edge]
 
-    a, b = estimate.astype(np.float32) - grey, truth.astype(np.float32) - grey
+    a, b = estimate.astype(np.float64), truth.astype(np.float64)
     mean_a, mean_b = window_mean(a), window_mean(b)
-    covariance = window_mean(a * b) - mean_a * mean_b
-    variances = window_mean(a * a + b * b) - (mean_a * mean_a + mean_b * mean_b)
-    mean_a += grey
-    mean_b += grey
-    numerator = (2 * mean_a * mean_b + _SSIM_C1) * (2 * covariance + _SSIM_C2)
-    denominator = (mean_a * mean_a + mean_b * mean_b + _SSIM_C1) * (variances + _SSIM_C2)
-    return float((numerator / denominator).mean(dtype=np.float64))
+    means_product = mean_a * mean_b
+    means_squares = mean_a * mean_a + mean_b * mean_b
+    covariance = window_mean(a * b) - means_product
+    variances = window_mean(a * a + b * b) - means_squares
+    similarity = ((2 * means_product + _SSIM_C1) * (2 * covariance + _SSIM_C2)) / (
+        (means_squares + _SSIM_C1) * (variances + _SSIM_C2)
+    )
+    return float(similarity.mean())
 
 
 def _circular_walk(n_v: int, n_u: int) -> list[tuple[int, int]]:

@@ -199,7 +199,7 @@ def test_a_beam_wider_than_the_mask_is_refused_and_the_cells_needed_are_named():
 
 def test_a_beam_that_just_fills_the_mask_is_accepted():
     footprint = Footprint(24.0, 24.0)
-    weights = cell_weights(np.array([-96.0, 96.0]), footprint, 24.0, 10)
+    weights = cell_weights(np.array([-96.0, 96.0]), footprint, 24.0, 10).toarray()
     np.testing.assert_allclose(weights.sum(axis=1), 1)
 
 
