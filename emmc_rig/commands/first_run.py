@@ -96,7 +96,7 @@ def helped_to_compile(method: str, camera: str, shots: int | None) -> Iterator[N
 def compile_for(part: str, camera: str, shots: int | None) -> None:
     """Reconstruct a small light field, or do that part of it: its kernels are compiled and kept."""
     import emmc_rig as emmc
-    from reconstruction.tv import TVSettings, reconstruct_tv
+    from reconstruction.wave import few_steps
 
     described = emmc.camera(camera, shots)
     psi = described.psi(SIZE)
@@ -111,7 +111,7 @@ def compile_for(part: str, camera: str, shots: int | None) -> None:
     if part == "search":
         _search(psi, frames)
     elif part == "variation":
-        reconstruct_tv(psi, frames, NOISE, TVSettings(max_steps=1, objective_every=1))
+        few_steps(psi, frames, np.ones(frames.shape, dtype=bool), 0.01, count=1)
     elif part == "fit":
         _fit(psi, frames, near, texture)
     else:
