@@ -90,9 +90,9 @@ def test_taps_are_those_of_catmull_and_rom_and_their_adjoint(fractions):
     top, left = divmod(AT, WIDE)
     part = np.s_[top : top + TAPS, left : left + TAPS]
     seen = (both * texture.reshape(-1, WIDE)[part]).sum()
-    given = [np.float32(fraction) for fraction in fractions]
-    assert reads_taps(texture, *given) == pytest.approx(seen, rel=1e-4, abs=1e-5)
+    down, right = np.float32(fractions[0]), np.float32(fractions[1])
+    assert reads_taps(texture, down, right) == pytest.approx(seen, rel=1e-4, abs=1e-5)
     expected = texture.copy()
     expected.reshape(-1, WIDE)[part] += 0.7 * both
-    adds_taps(texture, *given, np.float32(0.7))
+    adds_taps(texture, down, right, np.float32(0.7))
     np.testing.assert_allclose(texture, expected, rtol=1e-5, atol=1e-5)
