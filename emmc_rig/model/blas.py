@@ -22,6 +22,8 @@ def one_blas_thread() -> Iterator[None]:
 
     Also a decorator.
     """
+    import scipy.linalg  # noqa: F401 - a library that is loaded later would not be limited
+
     with _lock:
         _inside.append(threadpool_limits(1, "blas") if not _inside else _inside[0])
     try:

@@ -28,14 +28,14 @@ scenes that were not fitted to lie from it is its interval (conformal, as Wen et
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.lightfield import sum_of_squares
@@ -192,35 +192,11 @@ def variance_of_mean(
         tails = (FREEDOM + 1) * np.log1p(square / (FREEDOM * variance))
         return float(np.sum(np.log(variance) + tails))
 
-    logs = lowest_point(surprise, np.log([0.1, 1.0]))
+    logs = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
     over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), least)
     scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
     blur, apart = (float(one) for one in np.exp(logs))
     return parts.weighted((scale, scale * blur, scale * apart))
-
-
-def lowest_point(
-    of: Callable[[NDArray[np.float64]], float],
-    start: NDArray[np.float64],
-    step: float = 1.0,
-    smallest: float = 1e-3,
-) -> NDArray[np.float64]:
-    """Return about where a function of two values is least, by pattern search.
-
-    Of the eight points around, a step away along each axis, the best is gone to; where none is
-    better the step is halved (Hooke & Jeeves 1961). SciPy's minimisers load for a third of a
-    second, longer than this takes.
-    """
-    at, value = start, of(start)
-    while step > smallest:
-        around = [at + step * np.array(way) for way in product((-1, 0, 1), repeat=2) if any(way)]
-        values = [of(one) for one in around]
-        best = int(np.argmin(values))
-        if values[best] < value:
-            at, value = around[best], values[best]
-        else:
-            step /= 2
-    return at
 
 
 class Foretold(NamedTuple):

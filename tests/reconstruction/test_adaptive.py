@@ -41,7 +41,6 @@ from reconstruction.adaptive.uncertainty import (
     features,
     foretold_db,
     held_out,
-    lowest_point,
     within_db,
 )
 from reconstruction.adaptive.visibility import carried
@@ -348,16 +347,6 @@ def test_intervals_hold_true_psnrs_and_deviations_most_errors():
 def test_an_interval_is_wider_where_patches_do_not_decide():
     assert 1 < within_db(1.0) < within_db(0.5) < within_db(0.2)
     assert within_db(None) == within_db(1.0)
-
-
-def test_a_pattern_search_ends_where_a_function_is_least_and_where_it_is_flat():
-    def bowl(at):
-        return 3 * (at[0] - 2.3) ** 2 + (at[1] + at[0] - 1) ** 2
-
-    assert lowest_point(bowl, np.array([-2.0, 0.0])) == pytest.approx([2.3, -1.3], abs=5e-3)
-    slope = lowest_point(lambda at: 1 + np.exp(at[0]) + at[1] ** 2, np.zeros(2))
-    assert slope[0] < -30
-    assert slope[1] == pytest.approx(0, abs=1e-3)
 
 
 def test_what_a_capture_foretells_does_not_depend_on_its_brightness():
