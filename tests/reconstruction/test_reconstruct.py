@@ -58,6 +58,7 @@ def test_a_result_is_on_the_disk_before_its_pictures_are_drawn(frames, tmp_path,
     assert json.loads((out / "metrics.json").read_text())["method"] == "tv"
     monkeypatch.undo()
     ((_, metrics),) = reconstruct_captures([(frames, out)], None, None, None, print, method="tv")
+    assert not isinstance(metrics, Exception)
     assert metrics["method"] == "tv"
     assert any((out / "pictures").iterdir())
 

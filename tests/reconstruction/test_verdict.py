@@ -106,6 +106,7 @@ def test_all_tiles_at_once_are_regressed_as_one_by_one():
     ]
     known = [fit for fit in alone if fit is not None]
     assert len(known) == len(alone) - 1
+    assert tiled is not None
     np.testing.assert_allclose(tiled.shifts, [fit.values[1:] for fit in known], rtol=1e-6)
     np.testing.assert_allclose(tiled.errors, [fit.deviations[1:] for fit in known], rtol=1e-6)
 
