@@ -147,6 +147,12 @@ def _data_bytes() -> int:
     return pages * resource.getpagesize()
 
 
+class _Pipe:
+    """The output: NumPy would ask a file for its position, which a pipe has not."""
+
+    write = staticmethod(sys.stdout.buffer.write)
+
+
 def main() -> int:
     """Read what standard input asks for; return the exit code."""
     job = parse_json(sys.stdin.buffer.read(), "the job", ValueError)
@@ -156,7 +162,7 @@ def main() -> int:
     try:
         arrays = [read(path) for path in job["paths"]]
         array = np.stack(arrays) if len(arrays) > 1 else np.asarray(arrays[0])
-        np.lib.format.write_array(sys.stdout.buffer, array, allow_pickle=False)
+        np.lib.format.write_array(_Pipe(), array, allow_pickle=False)
     except MemoryError:
         print("it unpacks to more than a file of its size can hold", file=sys.stderr)
         return 1

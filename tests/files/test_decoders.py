@@ -25,6 +25,7 @@ from emmc_rig.bench.rig_config import ImagedRig, rig_description
 from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.child import read_in_child
 from emmc_rig.files.psi import SavedPsi, ShardedPsi, save_shards
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SensingError
@@ -520,3 +521,17 @@ def test_a_raw_file_that_claims_more_than_its_bytes_hold_is_not_unpacked(tmp_pat
     )
     assert "cannot hold 20000x20000 pixels" in said
     assert megabytes < 100
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+def test_arrays_come_from_the_child_whether_or_not_python_buffers_its_output(
+    tmp_path, monkeypatch, buffered
+):
+    """PYTHONUNBUFFERED, set on many machines, makes another kind of file of the child's output."""
+    if buffered:
+        monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    else:
+        monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    np.savez(tmp_path / "a.npz", frames=np.arange(12).reshape(3, 4))
+    found = read_in_child("npz", [tmp_path / "a.npz"])
+    np.testing.assert_array_equal(found, np.arange(12).reshape(3, 4))

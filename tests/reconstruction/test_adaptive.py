@@ -1,5 +1,6 @@
 """Adaptive reconstruction: its parts against dense algebra and SciPy, the whole when planted."""
 
+import itertools
 from dataclasses import replace
 
 import cv2
@@ -331,17 +332,21 @@ def test_sigma_is_calibrated_on_the_planted_plane(planted):
 
 @pytest.mark.slow
 def test_intervals_hold_true_psnrs_and_deviations_most_errors():
+    """Of twelve captures nine at least: of intervals for 9 in 10, in 97 of 100 cases."""
     held = []
-    for scene in ("deep-occlusions", "dark", "non-lambertian"):
-        for camera in ("rgbw-bayer-1shot", "rgbw-bayer-3shots"):
-            given = trial_of(Capture(scene, camera, (48, 64), seed=7, noise=0.003))
-            found = given.solved("adaptive-fast")
-            low_db, high_db = found.stated["stated_interval_db"]
-            held.append(low_db < given.psnr_db(found.light_field) < high_db)
-            assert high_db - low_db == pytest.approx(2 * within_db(found.parameters["decided"]))
-            error = np.abs(found.light_field - given.truth)
-            assert 0.5 < np.mean(error <= found.maps["sigma"][..., None]) < 0.8
-    assert sum(held) >= 5
+    for scene, camera, seed in itertools.product(
+        ("deep-occlusions", "dark", "non-lambertian"),
+        ("rgbw-bayer-1shot", "rgbw-bayer-3shots"),
+        (7, 8),
+    ):
+        given = trial_of(Capture(scene, camera, (48, 64), seed=seed, noise=0.003))
+        found = given.solved("adaptive-fast")
+        low_db, high_db = found.stated["stated_interval_db"]
+        held.append(low_db < given.psnr_db(found.light_field) < high_db)
+        assert high_db - low_db == pytest.approx(2 * within_db(found.parameters["decided"]))
+        error = np.abs(found.light_field - given.truth)
+        assert 0.5 < np.mean(error <= found.maps["sigma"][..., None]) < 0.8
+    assert sum(held) >= 9
 
 
 def test_an_interval_is_wider_where_patches_do_not_decide():
