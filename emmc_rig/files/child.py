@@ -150,7 +150,10 @@ def _data_bytes() -> int:
 class _Pipe:
     """The output: NumPy would ask a file for its position, which a pipe has not."""
 
-    write = staticmethod(sys.stdout.buffer.write)
+    @staticmethod
+    def write(data: bytes) -> None:
+        """Send a part of the array."""
+        sys.stdout.buffer.write(data)
 
 
 def main() -> int:

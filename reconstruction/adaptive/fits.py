@@ -54,7 +54,7 @@ def fitted_models(
     uncertain that the misfit matters little. on_step: called with the number of steps done.
 
     second: beliefs of a second search. Then there is a fit of the first misfit for each search, as
-    closer ones follow what wide disparities err by: with them the mean of 12 crops is 0.01 dB worse.
+    closer ones follow what wide disparities err by: with them 12 crops are 0.01 dB worse.
     The scene returned is of the first search: of a disperser (smem/fern_root, a capture by others)
     the second foretells readings better with bands 0.9 px apart, which the prism puts 2 px apart.
     """
