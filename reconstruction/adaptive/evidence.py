@@ -160,6 +160,7 @@ def _sets(
     """
     pairs = np.stack(np.tril_indices(len(pixels_apart)), axis=1)
     apart, which = np.unique(pixels_apart[pairs[:, 0], pairs[:, 1]], axis=0, return_inverse=True)
+    which = which.ravel()  # by NumPy 2.0 it has the axes of what is compared
     order = np.argsort(which, kind="stable")
     counts = np.bincount(which)
     sets = -(-counts // SIDE)

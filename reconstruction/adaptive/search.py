@@ -410,7 +410,7 @@ def _between(evidence: NDArray[np.float32], every: int) -> NDArray[np.float32]:
     out = np.full((len(evidence), every * (evidence.shape[1] - 1) + 1), -np.inf, np.float32)
     ways, which = np.unique(np.packbits(known, axis=1), axis=0, return_inverse=True)
     for way in range(len(ways)):
-        patches = np.flatnonzero(which == way)
+        patches = np.flatnonzero(which.ravel() == way)
         steps = np.diff(known[patches[0]].astype(np.int8), prepend=0, append=0)
         for first, end in zip(np.flatnonzero(steps > 0), np.flatnonzero(steps < 0), strict=True):
             finer = slice(every * first, every * (end - 1) + 1)
