@@ -56,6 +56,16 @@ def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None
         band.result()
 
 
+def in_views(work: Callable[[tuple[int, int]], None], views: tuple[int, ...]) -> None:
+    """Call work((v, u)) for each of the rows and columns of views, in threads."""
+
+    def band(_: int, first: int, last: int) -> None:
+        for view in range(first, last):
+            work(divmod(view, views[1]))
+
+    in_bands(band, views[0] * views[1])
+
+
 def summed_in_bands(work: Callable[[int, int, int], None], rows: int, reach_rows: float) -> None:
     """Call work(sums, first, last + 1) for bands of rows that add to one of two sums, 0 or 1.
 

@@ -16,7 +16,7 @@ import cv2
 import h5py
 import numpy as np
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_views
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.reading import decode_picture, one_line, stored_arrays
@@ -406,14 +406,12 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
             f"SSIM needs views of {_SSIM_WINDOW_PX}x{_SSIM_WINDOW_PX} pixels or more, "
             f"these have {truth.shape[2]}x{truth.shape[3]}"
         )
-    means = np.empty(truth.shape[0] * truth.shape[1])
+    means = np.empty(truth.shape[:2])
 
-    def work(_: int, first: int, last: int) -> None:
-        for view in range(first, last):
-            place = divmod(view, truth.shape[1])
-            means[view] = _view_ssim(estimate[place], truth[place])
+    def work(place: tuple[int, int]) -> None:
+        means[place] = _view_ssim(estimate[place], truth[place])
 
-    in_bands(work, len(means))
+    in_views(work, means.shape)
     return float(means.mean())
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_views
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.second import surfaces_fail
@@ -178,11 +178,8 @@ def averaged(survey: Survey, fits: Fits, disparity_sigma: Array) -> Mean:
 def _add(variance: Array, unseen: Array, part: float, apart: Array) -> None:
     """Add to a variance (v, u, y, x) that of a picture (y, x), and part of a squared difference."""
     unseen, share = unseen.astype(np.float32), np.float32(part)
-    views_v, views_u = variance.shape[:2]
 
-    def work(_: int, first: int, last: int) -> None:
-        for view in range(first, last):
-            at = divmod(view, views_u)
-            variance[at] += unseen + share * apart[at]
+    def work(at: tuple[int, int]) -> None:
+        variance[at] += unseen + share * apart[at]
 
-    in_bands(work, views_v * views_u)
+    in_views(work, variance.shape[:2])

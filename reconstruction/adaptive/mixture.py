@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_views
 
 Array = NDArray[np.floating]
 WINDOW_PX = 12.0
@@ -119,14 +119,11 @@ def stored(light_field: Array) -> NDArray[np.uint16]:
     All models of the mean are at hand at its end, and the first ones while others are fitted.
     """
     levels: NDArray[np.uint16] = np.empty(light_field.shape, dtype=np.uint16)
-    views_v, views_u = light_field.shape[:2]
 
-    def work(_: int, first: int, last: int) -> None:
-        for view in range(first, last):
-            at = divmod(view, views_u)
-            levels[at] = np.rint(light_field[at] * np.float32(LEVELS))
+    def work(at: tuple[int, int]) -> None:
+        levels[at] = np.rint(light_field[at] * np.float32(LEVELS))
 
-    in_bands(work, views_v * views_u)
+    in_views(work, light_field.shape[:2])
     return levels
 
 
@@ -156,30 +153,28 @@ def averaged(
     models: as `stored`. shares: see `shares_of`. other: the light field that the mean is compared
     with, stored.
     """
-    views_v, views_u, rows, columns, colours = models[0].shape
+    *views, rows, columns, colours = models[0].shape
     alone = [share.repeat(binning, axis=0).repeat(binning, axis=1) for share in shares]
     # As wide as lines of samples: a share for each value.
     wide = [np.repeat(share, colours, axis=1) for share in alone]
     mean = np.empty(models[0].shape, dtype=np.float32)
-    spread: NDArray[np.float32] = np.empty((views_v, views_u, rows, columns), dtype=np.float32)
+    spread: NDArray[np.float32] = np.empty((*views, rows, columns), dtype=np.float32)
     apart = np.empty_like(spread)
 
     def square(one: Array, another: Array) -> Array:
         difference = (one - another).reshape(rows, columns, colours)
         return np.einsum("yxc,yxc->yx", difference, difference) / np.float32(colours)
 
-    def work(_: int, first: int, last: int) -> None:
-        for view in range(first, last):
-            at = divmod(view, views_u)
-            views = [_values(one[at]).reshape(rows, -1) for one in models]
-            of_view = mean[at].reshape(rows, -1)
-            np.multiply(wide[0], views[0], out=of_view)
-            for share, one in zip(wide[1:], views[1:], strict=True):
-                of_view += share * one
-            spread[at] = alone[0] * square(views[0], of_view)
-            for share, one in zip(alone[1:], views[1:], strict=True):
-                spread[at] += share * square(one, of_view)
-            apart[at] = square(_values(other[at]).reshape(rows, -1), of_view)
+    def work(at: tuple[int, int]) -> None:
+        seen = [_values(one[at]).reshape(rows, -1) for one in models]
+        of_view = mean[at].reshape(rows, -1)
+        np.multiply(wide[0], seen[0], out=of_view)
+        for share, one in zip(wide[1:], seen[1:], strict=True):
+            of_view += share * one
+        spread[at] = alone[0] * square(seen[0], of_view)
+        for share, one in zip(alone[1:], seen[1:], strict=True):
+            spread[at] += share * square(one, of_view)
+        apart[at] = square(_values(other[at]).reshape(rows, -1), of_view)
 
-    in_bands(work, views_v * views_u)
+    in_views(work, mean.shape[:2])
     return Together(mean, spread, apart)

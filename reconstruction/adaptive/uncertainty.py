@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_views
 from emmc_rig.model.lightfield import sum_of_squares
 from reconstruction.adaptive.joint import FittedScene
 from reconstruction.adaptive.refine import slopes
@@ -94,15 +94,13 @@ class _Parts:
         """Return the sum of N, B and E, so many times each, in place of the spread."""
         let_in, steep, spread = (np.float32(one) for one in weights)
 
-        def work(_: int, first: int, last: int) -> None:
-            for view in range(first, last):
-                at = divmod(view, self.spread.shape[1])
-                out = self.spread[at]
-                out *= spread
-                out += let_in * self.let_in[at] + let_in * np.float32(self.left_in)
-                out += steep * self.steep[at]
+        def work(at: tuple[int, int]) -> None:
+            out = self.spread[at]
+            out *= spread
+            out += let_in * self.let_in[at] + let_in * np.float32(self.left_in)
+            out += steep * self.steep[at]
 
-        in_bands(work, self.spread.shape[0] * self.spread.shape[1])
+        in_views(work, self.spread.shape[:2])
         return self.spread
 
 
@@ -127,12 +125,10 @@ def blurred(part: Array) -> Array:
 def blur_views(values: NDArray[np.float32]) -> None:
     """Blur every view of (v, u, y, x), in place."""
 
-    def work(_: int, first: int, last: int) -> None:
-        for view in range(first, last):
-            at = divmod(view, values.shape[1])
-            values[at] = blurred(values[at])
+    def work(at: tuple[int, int]) -> None:
+        values[at] = blurred(values[at])
 
-    in_bands(work, values.shape[0] * values.shape[1])
+    in_views(work, values.shape[:2])
 
 
 def _of_readings(scene: FittedScene, parts: _Parts, held: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -235,15 +231,13 @@ def features(
     mean.
     """
     whole = max(variance, 1e-30)
-    sums = np.zeros((2, of.shape[0] * of.shape[1]))
+    sums = np.zeros((2, *of.shape[:2]))
 
-    def work(_: int, first: int, last: int) -> None:
-        for view in range(first, last):
-            picture = of[divmod(view, of.shape[1])]
-            sums[:, view] = sum_of_squares(picture), picture.sum(dtype=np.float64)
+    def work(at: tuple[int, int]) -> None:
+        sums[:, *at] = sum_of_squares(of[at]), of[at].sum(dtype=np.float64)
 
-    in_bands(work, sums.shape[1])
-    square, mean = sums.sum(axis=1) / of.size
+    in_views(work, of.shape[:2])
+    square, mean = sums.reshape(2, -1).sum(axis=1) / of.size
     mean = max(float(mean), 1e-30)
     values = {
         "apart": apart / whole,

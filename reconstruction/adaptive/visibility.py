@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import in_bands
+from emmc_rig.model.bands import in_views
 from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]
@@ -120,10 +120,9 @@ def carried(
     hidden = np.empty(shape, dtype=np.uint8)
     centre, front = np.ascontiguousarray(centre, dtype=np.float32), np.float32(nearer)
 
-    def work(_: int, first: int, last: int) -> None:
-        for v, u in list(np.ndindex(shape[:2]))[first:last]:
-            dv, du = np.float32(v - shape[0] // 2), np.float32(u - shape[1] // 2)
-            _carry(centre, margin, front, dv, du, disparity[v, u], hidden[v, u])
+    def work(view: tuple[int, int]) -> None:
+        dv, du = (np.float32(at - n // 2) for at, n in zip(view, shape, strict=False))
+        _carry(centre, margin, front, dv, du, disparity[view], hidden[view])
 
-    in_bands(work, shape[0] * shape[1])
+    in_views(work, shape[:2])
     return disparity, hidden

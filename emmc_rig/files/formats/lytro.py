@@ -21,10 +21,10 @@ ESLF = re.compile(r".*_(\d+)x(\d+)_eslf\.png")
 
 
 def _write_mat(folder: Path, export: Export) -> None:
-    pictures = codes_of(export.light_field, 16)
-    weight = np.full((*pictures.shape[:4], 1), 65535, np.uint16)
     from scipy.io import savemat  # SciPy loads for a third of a second
 
+    pictures = codes_of(export.light_field, 16)
+    weight = np.full((*pictures.shape[:4], 1), 65535, np.uint16)
     savemat(
         folder / "light_field.mat",
         {

@@ -41,10 +41,10 @@ def _tagged_linear(png: bytes) -> bytes:
 
 
 def _write_tiff(folder: Path, export: Export) -> None:
+    import tifffile  # loads for a sixth of a second
+
     for v, u in np.ndindex(export.light_field.shape[:2]):
         view = np.ascontiguousarray(export.light_field[v, u], np.float32)
-        import tifffile  # loads for a sixth of a second
-
         tifffile.imwrite(
             folder / f"view_{v}_{u}.tif", view, photometric="rgb", compression="zlib",
             description="linear RGB, 1 is white",
