@@ -123,12 +123,11 @@ def reconstruct(
 
 def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
     """Return each folder of frames with the folder to write."""
-    from emmc_rig.files.exports import IN_SESSION
-    from emmc_rig.files.folders import is_session
+    from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session
 
     default = Path("emmc-reconstruction")
     if len(frames) == 1:
-        place = frames[0] / IN_SESSION if is_session(frames[0]) else default
+        place = frames[0] / SESSION_RECONSTRUCTION if is_session(frames[0]) else default
         return [(frames[0], out or place)]
     names = [folder.resolve().name for folder in frames]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -137,7 +136,7 @@ def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
             f"several captures are called {twice[0]}, and each needs a folder of its name in --out"
         )
     return [
-        (folder, folder / IN_SESSION)
+        (folder, folder / SESSION_RECONSTRUCTION)
         if out is None and is_session(folder)
         else (folder, (out or default) / name)
         for folder, name in zip(frames, names, strict=True)

@@ -10,7 +10,7 @@ import h5py
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import is_session
+from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session
 from emmc_rig.files.formats import Export
 from emmc_rig.files.psi import FRAMES
 from emmc_rig.files.results import METRICS
@@ -24,7 +24,6 @@ from simulators.scenes import SCENES
 
 LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
 """Of a result's folder."""
-IN_SESSION = "reconstruction"
 
 
 def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | None = None) -> Export:
@@ -36,7 +35,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     folder = path_in(spec)
     axes = ANGLES
     if is_session(folder):
-        folder = folder / IN_SESSION
+        folder = folder / SESSION_RECONSTRUCTION
         if not (folder / LIGHT_FIELD).is_file():
             raise AppError(f"{spec}: not reconstructed yet; run: emmc-rig reconstruct {spec}")
     if (folder / LIGHT_FIELD).is_file():

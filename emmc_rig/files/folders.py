@@ -34,6 +34,8 @@ NEW, KEPT, LOCK = "new", "kept", "lock"
 MOVES = "moves.json"
 """Of version 0.2, while it replaced a result."""
 SESSION_HEADER, SESSION_JOURNAL = "session.json", "journal.jsonl"
+SESSION_RECONSTRUCTION = "reconstruction"
+"""A folder of a session, by default of what `reconstruct` writes."""
 
 
 @dataclass(frozen=True)

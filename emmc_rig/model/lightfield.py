@@ -334,6 +334,10 @@ def small_grey_views(lf: np.ndarray, most_columns: int) -> tuple[np.ndarray, flo
     return small.reshape(*grey.shape[:2], size[1], size[0], 1), shrink
 
 
+BACK_TO_FRONT = 5, 50, 95
+"""Percentiles of a scene's disparity on which pictures are focused."""
+
+
 def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
     """Estimate where the scene's back, middle and front are, by a plane sweep over the views.
 
@@ -357,7 +361,7 @@ def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
         candidates = np.linspace(back - margin, front + margin, 41)
         spread = np.stack([disagreement(small, float(d), 5) for d in candidates])
         best = candidates[spread.argmin(axis=0)][inner][textured]
-        back, middle, front = (float(d) for d in np.percentile(best, (5, 50, 95)))
+        back, middle, front = (float(d) for d in np.percentile(best, BACK_TO_FRONT))
         margin = float(candidates[1] - candidates[0])
     return back * shrink, middle * shrink, front * shrink
 

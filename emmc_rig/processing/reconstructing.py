@@ -17,8 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.exports import IN_SESSION, LIGHT_FIELD, MAPS
-from emmc_rig.files.folders import KEPT, is_session, kept_folder, result_folder
+from emmc_rig.files.exports import LIGHT_FIELD, MAPS
+from emmc_rig.files.folders import (
+    KEPT,
+    SESSION_RECONSTRUCTION,
+    is_session,
+    kept_folder,
+    result_folder,
+)
 from emmc_rig.files.psi import PSI, open_psi, psi_beside, read_frames
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics
 from emmc_rig.files.scenes import open_scene
@@ -218,39 +224,18 @@ def is_one_block(size: tuple[int, int], settings: MethodSettings | None) -> bool
     return size[0] * size[1] <= (settings or MethodSettings()).blocks.whole
 
 
-def reconstruct_folder(
-    folder: Path,
-    out: Path,
-    method: str = DEFAULT_METHOD,
-    psi_path: Path | None = None,
-    dictionary_spec: str | None = None,
-    settings: MethodSettings | None = None,
-    truth: str | None = None,
-    on_step: OnStep | None = None,
-    chosen: str | None = None,
-    pool: Pool | None = None,
-    as_zarr: bool = False,
-    without_shots: Sequence[int] = (),
-) -> dict:
+def reconstruct_folder(folder: Path, out: Path, *given: Any, **named: Any) -> dict:
     """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
 
-    A light field of more than one block, see `reconstruction.tiles`, is computed by the pool, from
-    what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
-    was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
-    default as many processes as threads; if one is given, it computes small light fields, too.
-    as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
-    without_shots: counted from 1, that are not used.
+    given, named: the further arguments of `reconstruct_undrawn`.
     """
-    metrics, result = _without_pictures(
-        folder, out, method, psi_path, dictionary_spec, settings, truth, on_step, chosen, pool,
-        as_zarr, without_shots,
-    )  # fmt: skip
+    metrics, result = reconstruct_undrawn(folder, out, *given, **named)
     if result is not None:
         result.draw(out)
     return metrics
 
 
-def _without_pictures(
+def reconstruct_undrawn(
     folder: Path,
     out: Path,
     method: str = DEFAULT_METHOD,
@@ -264,8 +249,17 @@ def _without_pictures(
     as_zarr: bool = False,
     without_shots: Sequence[int] = (),
 ) -> tuple[dict, Result | None]:
-    """Return the metrics of `reconstruct_folder`, all but the pictures written, and what to draw;
-    None of a light field that is not drawn."""
+    """Reconstruct a folder's frames into an existing folder `out`, all but the pictures.
+
+    Returns the metrics, and what to draw: None of a light field that is not drawn.
+
+    A light field of more than one block, see `reconstruction.tiles`, is computed by the pool, from
+    what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
+    was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
+    default as many processes as threads; if one is given, it computes small light fields, too.
+    as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
+    without_shots: counted from 1, that are not used.
+    """
     find_method(method)
     settings = settings or MethodSettings()
     assumed = psi_path is None and is_session(folder) and _is_assumed(folder)
@@ -417,7 +411,7 @@ def reconstruct_captures(
 
     workers: processes; None and one capture that is one block: this process and its threads.
     memory: bytes of all processes together, kept by computing less at a time. on_step: called with
-    the progress of a single capture, or with the captures done. given: see `reconstruct_folder`.
+    the progress of a single capture, or with the captures done. given: see `reconstruct_undrawn`.
     Raises WorkersError, and AppError for a ceiling that is too low.
     """
     alone = len(places) == 1
@@ -455,11 +449,11 @@ def reconstruct_captures(
 def _outcome(place: Place, **given: Any) -> dict | Exception:
     """Return a capture's metrics, or what it failed by; raises StoppedError by Ctrl-C."""
     frames, out = place
-    of_session = frames / IN_SESSION if is_session(frames) else None
+    of_session = frames / SESSION_RECONSTRUCTION if is_session(frames) else None
     try:
         with result_folder(out, "reconstruct", belongs_to=of_session, resumes=True) as folder:
             try:
-                metrics, result = _without_pictures(frames, folder, **given)
+                metrics, result = reconstruct_undrawn(frames, folder, **given)
             except KeyboardInterrupt as stop:
                 if not (folder.parent / KEPT).is_dir():
                     raise

@@ -18,6 +18,7 @@ from emmc_rig.files.formats import Export
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import (
+    BACK_TO_FRONT,
     export_pictures,
     psnr_db,
     replicate_centre,
@@ -34,10 +35,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from emmc_rig.pages.result_figure import FigureSettings
-
-
-BACK_TO_FRONT = 5, 50, 95
-"""Percentiles of the disparity on which pictures are focused, as `focus_disparities` has them."""
 
 
 def compared(light_field: Any, truth: NDArray) -> dict[str, float]:

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import is_session, refuse_missing
+from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session, refuse_missing
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.session.session import RECONSTRUCTION, Session
+from emmc_rig.session.session import Session
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def summary(session: Session) -> Summary:
 
 def reconstructed(session: Path) -> tuple[str, float | None]:
     """Return verdict and stated PSNR of its reconstruction, "" and None where there is none."""
-    metrics = session / RECONSTRUCTION / METRICS
+    metrics = session / SESSION_RECONSTRUCTION / METRICS
     try:
         read = parse_json(metrics.read_bytes(), str(metrics), AppError)
         stated_db = read.get("stated_db")

@@ -47,6 +47,7 @@ from emmc_rig.files.folders import (
     PARTIAL,
     SESSION_HEADER,
     SESSION_JOURNAL,
+    SESSION_RECONSTRUCTION,
     refuse_missing,
 )
 from emmc_rig.files.results import METRICS
@@ -89,9 +90,10 @@ PLAN, CAMERA, RIG, ORDER = "plan.yaml", "camera.json", "rig.json", "frames.json"
 FROZEN = (HEADER, PLAN, CAMERA, RIG, ORDER)
 AMENDED = (PLAN, CAMERA, RIG, ORDER)
 FRAMES, REPORT, LOCK = "frames", "report.html", "session.lock"
-CALIBRATION, RECONSTRUCTION = "calibration", "reconstruction"
+CALIBRATION = "calibration"
 KNOWN = {
-    *FROZEN, JOURNAL, FRAMES, REPORT, METRICS, LOCK, CALIBRATION, RECONSTRUCTION, FILES, PARTIAL
+    *FROZEN, JOURNAL, FRAMES, REPORT, METRICS, LOCK, CALIBRATION, SESSION_RECONSTRUCTION, FILES,
+    PARTIAL,
 }  # fmt: skip
 FORMAT = 1
 LISTED = "`emmc-rig session list` shows the sessions there are"

@@ -1,7 +1,7 @@
 """Search the disparities of a capture, from coarse to fine: where, and which, they may be.
 
 The likelihood of disparities is evaluated for wide patches of every third pixel, half a pixel apart
-where they are small and one beyond; the range grows while its ends are wanted. Each patch of the
+where they are small and one beyond; the range grows while its ends are wanted. Each tile of the
 fine search then evaluates only what the coarse one left possible there, so that cost grows with the
 disparities a scene really has; it does so in steps of SMOOTH_PX, and in finer ones only beside the
 best of a patch that decides.
@@ -346,7 +346,8 @@ def _shared(possible: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return what is possible at any patch of a tile for each of them, (row, column, label).
 
     The rough search alone is no reason to exclude what patches beside one allow: of a capture by
-    others (a single disperser, 2 px between bands) patches kept to their own agreed on 0.5 px.
+    others (smem/resolution_target, a disperser by 2 px a band) patches kept to their own agreed on
+    1.7 px.
     """
     out = np.empty_like(possible)
     for top in range(0, possible.shape[0], TILE):

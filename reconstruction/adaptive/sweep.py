@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.lanes import TAPS
+from reconstruction.adaptive.lanes import CUBIC, TAPS
 from reconstruction.adaptive.search import (
     Volume,
     compatibility,
@@ -54,11 +54,11 @@ LEAST_BELIEF = 1e-5
 @njit(inline="always")
 def cubic(fraction, taps):
     """Set the four weights of Catmull-Rom interpolation at a fraction in [0, 1)."""
-    t = fraction
-    taps[0] = ((-0.5 * t + 1.0) * t - 0.5) * t
-    taps[1] = (1.5 * t - 2.5) * t * t + 1.0
-    taps[2] = ((-1.5 * t + 2.0) * t + 0.5) * t
-    taps[3] = (0.5 * t - 0.5) * t * t
+    for tap in range(TAPS):
+        weight = CUBIC[0][tap]
+        for power in range(1, TAPS):
+            weight = weight * fraction + CUBIC[power][tap]
+        taps[tap] = weight
 
 
 @njit(cache=True, fastmath=True, nogil=True)

@@ -21,6 +21,7 @@ from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import fitted, slopes
 from reconstruction.adaptive.register_tiles import LANES
 from reconstruction.adaptive.search import (
+    TILE,
     Volume,
     _asked,
     _between,
@@ -28,6 +29,7 @@ from reconstruction.adaptive.search import (
     _near_best,
     _packed,
     _possible,
+    _shared,
     _spanned,
     compatibility,
     per_pixel,
@@ -453,6 +455,14 @@ def test_evidence_that_decides_nothing_excludes_nothing():
     known = np.array([[-np.inf, 1.0, -np.inf, 2.0, -np.inf, -np.inf]], np.float32)
     np.testing.assert_allclose(_extended(known), [[1, 1, 1.5, 2, 2, 2]])
     assert _extended(known[:0]).shape == (0, 6)
+
+
+def test_patches_of_a_tile_evaluate_what_any_of_them_allows():
+    possible = np.zeros((TILE + 2, TILE, 3), dtype=bool)
+    possible[0, 5, 1] = possible[TILE + 1, 0, 2] = True
+    found = _shared(possible)
+    np.testing.assert_array_equal(found[:TILE], np.broadcast_to([0, 1, 0], (TILE, TILE, 3)))
+    np.testing.assert_array_equal(found[TILE:], np.broadcast_to([0, 0, 1], (2, TILE, 3)))
 
 
 def test_labels_evaluated_have_those_possible_between_them():
