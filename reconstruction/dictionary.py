@@ -14,6 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.lightfield import OPPONENT
@@ -293,8 +294,6 @@ def _grid(
 
 
 def _edge(blur_px: float) -> Callable[[NDArray], NDArray]:
-    from scipy.special import erf  # SciPy loads for a third of a second
-
     return lambda t: erf(t / (np.sqrt(2) * blur_px))
 
 

@@ -15,6 +15,7 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigvals_banded
 
 from reconstruction import kernels
 from reconstruction.errors import ReconstructionError
@@ -78,10 +79,6 @@ def _difference_norm_squared(order: int, samples: int | None) -> float:
         return 4.0**order
     if samples <= order:
         return 0.0
-    if order == 1:
-        return 2 + 2 * float(np.cos(np.pi / samples))
-    from scipy.linalg import eigvals_banded  # loads for a third of a second, which few need
-
     size = samples - order
     band = [(-1) ** k * comb(2 * order, order + k) for k in range(min(order + 1, size))]
     lower = np.repeat(np.array(band, dtype=np.float64)[:, None], size, axis=1)

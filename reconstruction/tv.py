@@ -154,16 +154,16 @@ def reconstruct_tv(
     )
 
 
-def sweeping(
-    problem: Problem, gamma: np.floating, relaxation: np.floating, light_field: Array
-) -> tuple[Callable[..., None], NDArray[np.int64]]:
-    """Return a step of the solver on light_field (v, u, y, c, x), in place, and its bands of rows.
+def prepared(
+    problem: Problem, gamma: np.floating, relaxation: np.floating
+) -> tuple[kernels.FrameFit, kernels.Steps]:
+    """Return what steps of the solver fit and how far they go, gamma the primal one.
 
     The steps do not depend on the size of the picture, so that its tiles take the same ones.
     """
-    psi, order, dtype = problem.psi, problem.order, light_field.dtype
+    psi, dtype = problem.psi, problem.psi.weights.dtype
     spread = float(np.linalg.norm(problem.metric, 2)) ** 2
-    norm_squared = spread * norm_squared_of(order, (*light_field.shape[:2], None, None))
+    norm_squared = spread * norm_squared_of(problem.order, (*psi.views, None, None))
     pull = problem.pixel_weight()
     total = 1 / gamma + pull
     inverse = psi.inverted_blocks(np.where(problem.usable, total, np.inf))
@@ -173,7 +173,15 @@ def sweeping(
         pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]
         fit = fit._replace(share=share, pulled=np.ascontiguousarray(pulled, dtype=dtype))
     dual_step = dtype.type(1 / (norm_squared * gamma))
-    steps = kernels.Steps(gamma, dual_step, dtype.type(problem.mu), relaxation, problem.metric)
+    return fit, kernels.Steps(gamma, dual_step, dtype.type(problem.mu), relaxation, problem.metric)
+
+
+def sweeping(
+    problem: Problem, gamma: np.floating, relaxation: np.floating, light_field: Array
+) -> tuple[Callable[..., None], NDArray[np.int64]]:
+    """Return a step of the solver on light_field (v, u, y, c, x), in place, and bands of rows."""
+    psi, order, dtype = problem.psi, problem.order, light_field.dtype
+    fit, steps = prepared(problem, gamma, relaxation)
     bands = row_bands(psi.frames_shape[1], get_num_threads())
     taps = stencils(order, (*light_field.shape[:3], light_field.shape[4]), dtype)
     dual = np.zeros((*light_field.shape[:3], len(taps.reach), *light_field.shape[3:]), dtype)

@@ -21,11 +21,9 @@ from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.kernels import correct_row
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction import kernels
 from reconstruction.choices import choose_primal_step, contrast, smooth_guess
-from reconstruction.differences import norm_squared
-from reconstruction.problem import colour_metric
-from reconstruction.tv import TVSettings
+from reconstruction.problem import Problem, colour_metric
+from reconstruction.tv import TVSettings, prepared
 
 Array = NDArray[np.floating]
 
@@ -244,14 +242,10 @@ def few_steps(
     usual, dtype = TVSettings(), psi.weights.dtype.type
     guess = smooth_guess(psi, frames, usable)
     gamma = choose_primal_step(contrast(guess), mu, usual.chroma_weight)
-    metric = colour_metric(usual.chroma_weight)
-    spread = float(np.linalg.norm(metric, 2)) ** 2
-    dual = 1 / (spread * norm_squared(1, (*psi.views, None, None)) * gamma)
-    relax = dtype(usual.relaxation)
-    steps = kernels.Steps(dtype(gamma), dtype(dual), dtype(mu), relax, metric.astype(dtype))
-    inverse = psi.inverted_blocks(np.where(usable, 1 / gamma, np.inf))
-    data = kernels.FrameFit(psi.weights, psi.colour_map, inverse, frames, psi.binning)
-    unmix = np.linalg.inv(metric).astype(dtype)
+    metric = colour_metric(usual.chroma_weight).astype(dtype)
+    problem = Problem(psi, frames, usable, mu, 1, metric)
+    data, steps = prepared(problem, dtype(gamma), dtype(usual.relaxation))
+    unmix = np.linalg.inv(metric)
     out = np.empty(psi.light_field_shape, dtype=np.float32)
     rows = psi.frames_shape[1]
 

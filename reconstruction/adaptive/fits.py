@@ -109,7 +109,7 @@ def fitted_models(
         seen = scene.surfaces.light_field(scale * scene.texture)
         light_fields.append(mixture.stored(np.clip(seen, 0, 1, out=seen)))
     assert scene is not None
-    enough = given.psi.shots >= (settings.patches or 1)
+    enough = settings.patched(given.psi.shots)
     patched = patches is not None and (enough or surfaces_fail(survey, residuals))
     if patches is not None and patched:
         seen = patches(given.usable & ~held)

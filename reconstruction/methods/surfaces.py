@@ -45,7 +45,7 @@ def may_take_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
 def takes_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
     """Return whether `adaptive` averages with sparse patches whatever the scene: from so many
     shots."""
-    return may_take_patches(psi, settings) and psi.shots >= (settings.patches or 1)
+    return may_take_patches(psi, settings) and settings.patched(psi.shots)
 
 
 @lru_cache(maxsize=1)
