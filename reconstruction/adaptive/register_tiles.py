@@ -16,18 +16,18 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, register_model
+from numba.extending import models, register_model
+
+from reconstruction.adaptive.vectors import FLOAT, Code, function, intrinsic
 
 LANES = 16
 """Problems side by side: a vector register of AVX-512; other processors take several for it."""
 SIDE = 4
 """Of a tile. Its 16 vectors and 8 of what it is the product of fit the 32 registers."""
 
-_FLOAT = ir.FloatType()
-_VECTOR = ir.VectorType(_FLOAT, LANES)
+_VECTOR = ir.VectorType(FLOAT, LANES)
 _TILE_OF = ir.ArrayType(_VECTOR, SIDE * SIDE)
 _EACH = range(SIDE)
-_intrinsic: Any = intrinsic
 
 
 class _Tile(types.Type):
@@ -44,32 +44,15 @@ class _TileModel(models.PrimitiveModel):
         super().__init__(manager, kind, _TILE_OF)
 
 
-class _Code:
-    """Writes the instructions of one function."""
-
-    def __init__(self, builder: Any) -> None:
-        self.builder = builder
-
-    def place(self, flat: Any, at: Any, further: int = 0) -> Any:
-        at = self.builder.add(at, ir.Constant(at.type, further))
-        return self.builder.gep(flat, [at])
+class _Code(Code):
+    """Writes vectors of LANES and tiles of them."""
 
     def read(self, flat: Any, at: Any, number: int = 0) -> Any:
         """Return the vector that lies `number` vectors beyond an index."""
-        where = self.place(flat, at, number * LANES)
-        return self.builder.load(self.builder.bitcast(where, _VECTOR.as_pointer()), align=4)
+        return self.load(flat, at, LANES, number * LANES)
 
     def write(self, flat: Any, at: Any, number: int, vector: Any) -> None:
-        where = self.place(flat, at, number * LANES)
-        self.builder.store(vector, self.builder.bitcast(where, _VECTOR.as_pointer()), align=4)
-
-    def spread(self, number: Any) -> Any:
-        """Return a vector of one number."""
-        one = self.builder.insert_element(
-            ir.Constant(_VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0)
-        )
-        mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        return self.builder.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), mask)
+        self.store(vector, flat, at, number * LANES)
 
     def called(self, name: str, *vectors: Any) -> Any:
         """Return what an intrinsic of the compiler makes of vectors."""
@@ -102,32 +85,16 @@ class _Code:
 
 
 def _function(returned: Any, kinds: Any, write: Any) -> Any:
-    """Return the signature of a function of arrays, indices and tiles, and what generates it.
-
-    write: called with a `_Code` and the arguments; arrays are pointers to their first number.
-    """
-    known = [types.intp if isinstance(kind, types.Integer) else kind for kind in kinds]
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        given = [
-            context.make_array(kind)(context, builder, value).data
-            if isinstance(kind, types.Array)
-            else value
-            for kind, value in zip(signature.args, values, strict=True)
-        ]
-        out = write(_Code(builder), *given)
-        return context.get_dummy_value() if out is None else out
-
-    return returned(*known), generate
+    return function(returned, kinds, write, _Code)
 
 
-@_intrinsic
+@intrinsic
 def zero_tile(context):
     """Return a tile of zeros."""
     return _function(_TILE, (), lambda code: ir.Constant(_TILE_OF, None))
 
 
-@_intrinsic
+@intrinsic
 def load_tile(context, flat, at):
     """Return the tile at flat[at]."""
 
@@ -139,7 +106,7 @@ def load_tile(context, flat, at):
     return _function(_TILE, (flat, at), write)
 
 
-@_intrinsic
+@intrinsic
 def store_tile(context, tile, flat, at):
     """Put a tile at flat[at]."""
 
@@ -151,7 +118,7 @@ def store_tile(context, tile, flat, at):
     return _function(types.void, (tile, flat, at), write)
 
 
-@_intrinsic
+@intrinsic
 def scatter_tile(context, tile, flat, at, apart, places, first):
     """Put the vector of each row r and column c at flat[at + r * apart + places[first + c]].
 
@@ -169,7 +136,7 @@ def scatter_tile(context, tile, flat, at, apart, places, first):
     return _function(types.void, (tile, flat, at, apart, places, first), write)
 
 
-@_intrinsic
+@intrinsic
 def multiplied(context, tile, other):
     """Return the product of two tiles, entry by entry."""
 
@@ -180,7 +147,7 @@ def multiplied(context, tile, other):
     return _function(_TILE, (tile, other), write)
 
 
-@_intrinsic
+@intrinsic
 def combined(context, tile, other, flat):
     """Return a tile times the vector at flat[0], plus another times that at flat[LANES]."""
 
@@ -198,7 +165,7 @@ def combined(context, tile, other, flat):
     return _function(_TILE, (tile, other, flat), write)
 
 
-@_intrinsic
+@intrinsic
 def plus_diagonal(context, tile, flat, at):
     """Return a tile plus the SIDE vectors at flat[at], on its diagonal."""
 
@@ -211,7 +178,7 @@ def plus_diagonal(context, tile, flat, at):
     return _function(_TILE, (tile, flat, at), write)
 
 
-@_intrinsic
+@intrinsic
 def plus_outer(context, tile, table, rows, first, term, vectors, at, apart):
     """Return a tile plus the outer product of numbers and vectors.
 
@@ -228,7 +195,7 @@ def plus_outer(context, tile, table, rows, first, term, vectors, at, apart):
         for row in _EACH:
             start = code.builder.load(code.place(rows, first, row))
             number = code.builder.load(code.place(table, code.builder.add(start, term)))
-            number = code.spread(number)
+            number = code.spread(number, LANES)
             for column in _EACH:
                 out[row][column] = code.plus(out[row][column], number, read[column])
         return code.tile(out)
@@ -236,7 +203,7 @@ def plus_outer(context, tile, table, rows, first, term, vectors, at, apart):
     return _function(_TILE, (tile, table, rows, first, term, vectors, at, apart), write)
 
 
-@_intrinsic
+@intrinsic
 def less_products(context, tile, flat, left, right):
     """Return a tile less the product of that at flat[left] and the transpose of that at right."""
 
@@ -253,7 +220,7 @@ def less_products(context, tile, flat, left, right):
     return _function(_TILE, (tile, flat, left, right), write)
 
 
-@_intrinsic
+@intrinsic
 def factored(context, tile, least):
     """Return the Cholesky factor of a tile, the inverses of its pivots on the diagonal.
 
@@ -262,7 +229,7 @@ def factored(context, tile, least):
 
     def write(code, tile, least):
         out = code.rows(tile)
-        least, one = code.spread(least), ir.Constant(_VECTOR, [1.0] * LANES)
+        least, one = code.spread(least, LANES), ir.Constant(_VECTOR, [1.0] * LANES)
         for column in _EACH:
             for row in range(column, SIDE):
                 for term in range(column):
@@ -279,7 +246,7 @@ def factored(context, tile, least):
     return _function(_TILE, (tile, least), write)
 
 
-@_intrinsic
+@intrinsic
 def divided(context, tile, flat, factor):
     """Return a tile divided by the transpose of the factor (`factored`) at flat[factor]."""
 
@@ -296,7 +263,7 @@ def divided(context, tile, flat, factor):
     return _function(_TILE, (tile, flat, factor), write)
 
 
-@_intrinsic
+@intrinsic
 def take_applied(context, tile, flat, source, target):
     """Take a tile times the SIDE vectors at flat[source] off those at flat[target]."""
 
@@ -311,7 +278,7 @@ def take_applied(context, tile, flat, source, target):
     return _function(types.void, (tile, flat, source, target), write)
 
 
-@_intrinsic
+@intrinsic
 def substitute(context, tile, flat, at):
     """Divide the SIDE vectors at flat[at] by a factor (`factored`)."""
 
@@ -338,7 +305,7 @@ def _conjugate_product(code: _Code, flat: Any, here: Any, there: Any) -> list[An
     ]
 
 
-@_intrinsic
+@intrinsic
 def meet(context, flat, here, there, out, at):
     """Put the product of the complex number at flat[here] and the conjugate of that at [there] at
     out[at]: real and imaginary part follow each other."""
@@ -350,7 +317,7 @@ def meet(context, flat, here, there, out, at):
     return _function(types.void, (flat, here, there, out, at), write)
 
 
-@_intrinsic
+@intrinsic
 def meet_too(context, flat, here, there, out, at):
     """Add such a product, see `meet`, to what is at out[at]."""
 
