@@ -43,14 +43,14 @@ sphinx_gallery_conf = {
 }
 
 
-def write_commands(_: object) -> None:
-    """Write commands.md: every command with its options, from the command line itself."""
+def write_command_line(_: object) -> None:
+    """Write command-line.md: every command with its options, from the command line itself."""
     command = typer.main.get_command(command_line)
     context = typer.Context(command, info_name="emmc-rig")
-    text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Commands")
-    Path(__file__).with_name("commands.md").write_text(text, encoding="utf-8")
+    text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Every option")
+    Path(__file__).with_name("command-line.md").write_text(text, encoding="utf-8")
 
 
 def setup(app: object) -> None:
     """Register what happens before pages are read."""
-    app.connect("builder-inited", write_commands)  # type: ignore[attr-defined]
+    app.connect("builder-inited", write_command_line)  # type: ignore[attr-defined]

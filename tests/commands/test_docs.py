@@ -1,9 +1,10 @@
 """The documentation is run: every command block, as it stands, in order, in one fresh folder.
 
 A comment before a block says why it is only parsed, not run: it needs hardware, or real files, or
-takes minutes. EMMC_SIZE, which the README names, makes the rest small.
+takes minutes. EMMC_SIZE, which docs/commands.md names, makes the rest small.
 """
 
+import csv
 import re
 import runpy
 import shlex
@@ -175,3 +176,19 @@ def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
             lost = [path for path in before if after.get(path) != before[path]]
             grown = [path for path in lost if path.name == "journal.jsonl"]
             assert all(ours.get(path) == before[path] or path in grown for path in lost), lost
+
+
+def test_the_page_of_results_its_charts_and_the_readmes_table_are_what_the_command_makes():
+    made = runpy.run_path(str(ROOT / "benchmarks" / "results_page.py"))["made"]()
+    charts = {path for path in made if path.suffix == ".svg"}
+    assert charts == set((ROOT / "docs" / "results" / "charts").iterdir())
+    stale = [path.name for path, text in made.items() if path.read_text("utf-8") != text]
+    assert not stale, "run `python benchmarks/results_page.py`"
+
+
+def test_every_csv_of_results_says_when_and_by_which_command_it_was_measured():
+    results = ROOT / "docs" / "results"
+    with (results / "runs.csv").open(newline="", encoding="utf-8") as opened:
+        runs = {row["file"]: row for row in csv.DictReader(opened)}
+    assert set(runs) == {path.name for path in results.glob("*.csv")} - {"runs.csv"}
+    assert all(row["date"] and row["version"] and row["command"] for row in runs.values())
