@@ -5,6 +5,7 @@ takes minutes. EMMC_SIZE, which docs/commands.md names, makes the rest small.
 """
 
 import csv
+import itertools
 import re
 import runpy
 import shlex
@@ -119,6 +120,40 @@ def test_every_camera_and_bench_is_drawn_as_the_script_draws_it(tmp_path):
     for name in script["PICTURES"]:
         assert f"pictures/bench-{name}.svg" in (ROOT / "docs" / "day-one.md").read_text()
         assert (pictures / f"bench-{name}.svg").read_text() == script["drawn"](name)
+
+
+def test_every_concept_is_drawn_as_the_script_draws_it_and_shown():
+    pictures = ROOT / "docs" / "pictures"
+    script = runpy.run_path(str(pictures / "draw_concepts.py"))
+    shown = set(
+        re.findall(r"pictures/concepts-([\w-]+)\.svg", (ROOT / "docs/concepts.md").read_text())
+    )
+    assert shown == set(script["PICTURES"])
+    for name in shown:
+        assert (pictures / f"concepts-{name}.svg").read_text() == script["drawn"](name)
+
+
+@pytest.mark.slow
+def test_every_step_of_adaptive_has_its_picture():
+    script = runpy.run_path(str(ROOT / "docs" / "pictures" / "draw_adaptive.py"))
+    page = (ROOT / "docs" / "adaptive.md").read_text()
+    for name, figure in script["figures"]((32, 40)).items():
+        assert f"pictures/adaptive-{name}.webp" in page
+        assert (ROOT / "docs" / "pictures" / f"adaptive-{name}.webp").is_file()
+        assert all(axes.has_data() for axes in figure.axes)
+
+
+def test_the_readmes_animation_turns_a_view_beside_the_frame():
+    script = runpy.run_path(str(ROOT / "docs" / "pictures" / "draw_parallax.py"))
+    light_field = np.random.default_rng(0).random((5, 5, 16, 20, 3)).astype(np.float32)
+    pictures = script["animation"](light_field[0, 0, ..., 0], light_field, np.ones((16, 20)))
+    left, right = (
+        np.stack([np.asarray(one)[:30, part] for one in pictures])
+        for part in (slice(0, 37), slice(54, None))
+    )
+    assert (left == left[0]).all()
+    assert all((one != other).any() for one, other in itertools.pairwise(right))
+    assert 1e5 < (ROOT / "docs" / "pictures" / "parallax.webp").stat().st_size < 1.5e6
 
 
 @pytest.mark.parametrize("name", ["plot_8_turntable", "plot_9_power_meter"])
