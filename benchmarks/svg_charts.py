@@ -221,7 +221,7 @@ def _step(length: float) -> float:
 
 def _ticks(low: float, high: float) -> list[float]:
     step = _step(high - low)
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step - 1e-9)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [round(number * step, 10) for number in range(first, last + 1)]
 
 

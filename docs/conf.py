@@ -23,8 +23,9 @@ extensions = [
 ]
 html_theme = "furo"
 html_title = f"emmc-rig {release}"
+html_static_path = ["static"]
+html_css_files = ["gallery.css"]
 exclude_patterns = ["_build", "examples", "gallery/index.md"]
-myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 suppress_warnings = ["config.cache"]  # the gallery's settings hold classes
 

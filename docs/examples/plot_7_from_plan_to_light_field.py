@@ -32,7 +32,7 @@ darks:
 work = TemporaryDirectory()
 plan = Path(work.name, "plan.yaml")
 plan.write_text(PLAN)
-rig = emmc.rig("simulated", scene="near-planar", size=(48, 64), rays=128)
+rig = emmc.rig("simulated", scene="near-planar", size=(48, 64), rays=256)
 session = emmc.capture(plan, rig)
 session
 

@@ -172,7 +172,7 @@ def drawn(name: str) -> str:
 def framed(parts: Parts, wide: int = WIDTH, high: int = HEIGHT) -> str:
     """Return a picture as SVG, on white."""
     head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" viewBox="0 0 {wide} {high}" '
         f'font-family="sans-serif" font-size="14" fill="{INK}">'
     )
     return "\n".join([head, box(0, 0, wide, high, "#fff", "none"), *parts, "</svg>"]) + "\n"
