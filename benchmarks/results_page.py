@@ -97,7 +97,7 @@ def whole_frames() -> Section:
         {"whole-frames": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
         table,
         (
-            f"{len(scenes)} real light fields from one frame each, PSNR",
+            f"PSNR of {len(scenes)} real light fields from one frame each",
             f"{reached}, {lead:.1f} dB above `tv-dict`",
         ),
     )
@@ -109,6 +109,7 @@ CAMERAS = {"one shot": "rgbw-bayer-1shot", "three shots": "rgbw-bayer-3shots"}
 def speed() -> Section:
     """Accuracy and processor time of every method."""
     rows = [row for row in rows_of("chart-group-b-64x80") if row["level"] == "default"]
+    scenes = {row["scene"] for row in rows}
     named: dict[str, dict[str, tuple[float, float]]] = {}
     for shots, camera in CAMERAS.items():
         for method in sorted({row["method"] for row in rows}):
@@ -134,13 +135,13 @@ def speed() -> Section:
         f"`adaptive` leads `{second[1]}` by {best[1] - second[0]:.1f} dB with one shot; "
         f"`adaptive-fast` is {best[1] - fast[1]:.1f} dB below it in {fast[0] / best[0]:.0%} of its "
         "time.".replace("%", " %"),
-        "Up is better, left is faster. Each point is the mean of six light fields of group B, "
-        "which no setting was tuned on, cut to 64x80; time is of one core.",
+        f"Up is better, left is faster. Each point is the mean of {len(scenes)} light fields of "
+        "group B, which no setting was tuned on, cut to 64x80; time is of one core.",
         ("chart-group-b-64x80", "chart-group-a-64x80"),
         {"speed": svg_charts.points(answer, ("processor seconds", "PSNR, dB"), named)},
         table,
         (
-            "Six light fields that nothing was tuned on, 64x80, one shot",
+            f"The same of {len(scenes)} that nothing was tuned on, cut to 64x80",
             f"{best[1]:.1f} dB in {best[0]:.1f} s, next best `{second[1]}` {second[0]:.1f} dB",
         ),
     )
@@ -158,7 +159,7 @@ def three_shots() -> Section:
         "What do three shots give?",
         f"With the mask moved between three shots `adaptive` leads `tv-dict` by "
         f"{min(leads):.1f} to {max(leads):.1f} dB.",
-        "To the right is better. All thirteen light fields, cut to 256x256; the last ones have "
+        f"To the right is better. {len(scenes)} light fields, cut to 256x256; the last ones have "
         "disparities wider than the search.",
         ("three-shots",),
         {"three-shots": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
@@ -246,6 +247,7 @@ def verdicts() -> Section:
     def flagged(row: Row) -> bool:
         return row["verdict"] != "trust"
 
+    faults = len({row["fault"] for row in rows} - {"none"})
     series = {}
     for group, of in groups.items():
         line = []
@@ -268,7 +270,7 @@ def verdicts() -> Section:
         "Is a broken result flagged?",
         f"Of results that a fault broke {counts['broken'][1]} are flagged in light fields that the "
         f"limits were not set on, of good ones {counts['good'][1]}.",
-        "Twelve faults in steps, one shot, `adaptive-fast`. The line should be at 0 % to the left, "
+        f"{faults} faults in steps, one shot, `adaptive-fast`. The line should be at 0 % to the left, "
         "where a fault costs nothing, and at 100 % from 3 dB on. Flagged is any verdict but "
         "*trust*.",
         ("verdicts-real",),
@@ -342,6 +344,11 @@ def breaking() -> Section:
             cells.append(of)
         most = f"{median(cells[0]):.2g} ({min(cells[0]):.2g}, {max(cells[0]):.2g})"
         table.append((words, _plain(most), _plain(f"{median(cells[1]):.2g}")))
+    shifts = [
+        number(row, "below_best_to")
+        for row in rows
+        if (row["fault"], row["method"]) == ("mask-shift", "adaptive-fast")
+    ]
     points: dict[str, list[tuple[float, float]]] = {}
     for row in rows_of("stability-real"):
         if (row["fault"], row["method"], row["screened"]) == (
@@ -356,10 +363,10 @@ def breaking() -> Section:
     middle = [(x, mean(dict(line)[x] for line in every)) for x in shared]
     return Section(
         "How much does a method bear?",
-        "The more a scene shows otherwise, the less it bears: a dark scene hides a mask that is "
-        "0.3 pixels off, a clean one loses 3 dB at 0.04.",
-        "The table says from which strength on a fault costs 3 dB, over six light fields, 48x64, "
-        "three shots. Frames are cleaned up before. The thin lines are single light fields.",
+        f"It follows the scene: a mask that is off costs 3 dB from {min(shifts):.2g} pixels on in the "
+        f"cleanest light field, and from {max(shifts):.2g} in the darkest.",
+        f"The table says from which strength on a fault costs 3 dB, over {len(every)} light fields, "
+        "48x64, three shots. Frames are cleaned up before. The thin lines are single light fields.",
         ("stability-real-breaking", "stability-real"),
         {
             "mask-shift": svg_charts.lines(
@@ -443,7 +450,7 @@ def mask_design() -> Section:
         "Which mask to order?",
         f"Before a monochrome sensor with three shots the designed mask gains {max(gains):.1f} dB "
         "(shipped since as `rgbw-mono-3shots`); behind Bayer filters the mask hardly counts.",
-        "To the right is better. Mean of six light fields of group B, 96x96, diffraction included, "
+        "To the right is better. Mean of the light fields of group B, 96x96, diffraction included, "
         "equal exposure.",
         ("design",),
         {
@@ -473,7 +480,7 @@ def learning() -> Section:
     )
     return Section(
         "What does training buy?",
-        f"A small network, trained on random worlds in 50 minutes, gains {over:.1f} dB over total "
+        f"A small network, trained on random worlds, gains {over:.1f} dB over total "
         f"variation and stays {under:.1f} dB below `adaptive`, which is trained on nothing.",
         "To the right is better. Group B, 128x160, one shot. The network is the plug-in "
         "`benchmarks/unrolled_plugin`.",
@@ -495,6 +502,7 @@ def others() -> Section:
     }
     level = {(row["capture"], row["method"]): row["level"] for row in rows}
     captures = sorted({row["capture"] for row in rows})
+    cameras = len({capture.split("/")[0] for capture in captures})
     dots = {
         method: [round(by[capture, method], 3) for capture in captures]
         for method in ("tv", "adaptive-fast")
@@ -512,7 +520,7 @@ def others() -> Section:
         table.append((capture, level[capture, "adaptive-fast"], level[capture, "tv"]))
     return Section(
         "Does it work on cameras that others built?",
-        f"Eight captures of three cameras: {len(worse)} of {len(by)} results predict readings "
+        f"{len(captures)} captures of {cameras} cameras: {len(worse)} of {len(by)} results predict readings "
         f"worse than interpolation, trusted of these: {trusted or 'none'}. A mask some rows off or "
         f"mirrored is refused in {refused}.",
         "Readings kept from the fit (validation), 1 is what interpolation without any camera model "
