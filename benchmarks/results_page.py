@@ -367,7 +367,8 @@ def breaking() -> Section:
         "It follows the scene: a mask that is off costs 3 dB from "
         f"{shifts[strict]:.2g} pixels on in {strict}, and from {shifts[mild]:.2g} in {mild}.",
         f"The table says from which strength on a fault costs 3 dB, over {len(every)} light "
-        "fields, 48x64, three shots. Frames are cleaned up before. The thin lines are single light fields.",
+        "fields, 48x64, three shots. Frames are cleaned up before. The thin lines are single light "
+        "fields.",
         ("stability-real-breaking", "stability-real"),
         {
             "mask-shift": svg_charts.lines(
