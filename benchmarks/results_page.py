@@ -80,7 +80,9 @@ def whole_frames() -> Section:
     reached = f"{min(dots['adaptive']):.1f} to {max(dots['adaptive']):.1f} dB"
     answer = f"One frame each: adaptive is {lead:.1f} dB above tv-dict"
     methods = [one for one in ("tv-dict", "adaptive-fast", "adaptive") if one in of[scenes[0]]]
-    table = [("light field", "size", *(f"`{method}`" for method in methods), "seconds")]
+    table: list[tuple[str, ...]] = [
+        ("light field", "size", *(f"`{method}`" for method in methods), "seconds")
+    ]
     for scene in scenes:
         first = of[scene]["adaptive"]
         cells = (f"{number(of[scene][method], 'psnr_db'):.2f} dB" for method in methods)
