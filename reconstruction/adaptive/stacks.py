@@ -1,0 +1,204 @@
+"""Vector instructions of stacks of blocks: cosines in a block, Walsh-Hadamard across a stack.
+
+A block is SIDE x SIDE numbers. It lies in SIDE vectors, so that its transforms never leave the
+registers. Stacks are flat float32 arrays (block, row, column) of up to STACK blocks; pictures are
+flat float32 arrays, too. No index is checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+
+from reconstruction.adaptive.vectors import FLOAT, LANE, Code, function, intrinsic
+
+SIDE = 8
+STACK = 16
+"""A power of two: a vector of each block fits the registers of AVX2."""
+_C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
+    float(0.5 * np.cos(k * np.pi / (2 * SIDE))) for k in range(1, SIDE)
+)
+_ROW = ir.VectorType(FLOAT, SIDE)
+_COUNTS = ir.VectorType(LANE, SIDE)
+_INDEX = ir.IntType(64)
+_FAST = ("fast",)
+
+
+class _Row:
+    """A vector of which sums and products can be written as formulas."""
+
+    def __init__(self, builder: Any, values: Any) -> None:
+        self.builder, self.values = builder, values
+
+    def __add__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fadd(self.values, other.values, flags=_FAST))
+
+    def __sub__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fsub(self.values, other.values, flags=_FAST))
+
+    def __rmul__(self, number: float) -> _Row:
+        by = ir.Constant(_ROW, [number] * SIDE)
+        return _Row(self.builder, self.builder.fmul(self.values, by, flags=_FAST))
+
+
+def _analysed(rows: Sequence[_Row]) -> list[_Row]:
+    """Return the eight cosine coefficients of eight values."""
+    a, b, c, d, e, f, g, h = rows
+    a, h, b, g, c, f, d, e = a + h, a - h, b + g, b - g, c + f, c - f, d + e, d - e
+    return [
+        _C4 * (a + d + b + c),
+        _C1 * h + _C3 * g + _C5 * f + _C7 * e,
+        _C2 * (a - d) + _C6 * (b - c),
+        _C3 * h - _C7 * g - _C1 * f - _C5 * e,
+        _C4 * (a + d - b - c),
+        _C5 * h - _C1 * g + _C7 * f + _C3 * e,
+        _C6 * (a - d) - _C2 * (b - c),
+        _C7 * h - _C5 * g + _C3 * f - _C1 * e,
+    ]
+
+
+def _synthesised(rows: Sequence[_Row]) -> list[_Row]:
+    """Return the eight values of eight cosine coefficients: the inverse of `_analysed`."""
+    a, b, c, d, e, f, g, h = rows
+    outer, inner = _C4 * (a + e), _C4 * (a - e)
+    p, q = _C2 * c + _C6 * g, _C6 * c - _C2 * g
+    k = _C1 * b + _C3 * d + _C5 * f + _C7 * h
+    m = _C3 * b - _C7 * d - _C1 * f - _C5 * h
+    n = _C5 * b - _C1 * d + _C7 * f + _C3 * h
+    o = _C7 * b - _C5 * d + _C3 * f - _C1 * h
+    return [
+        outer + p + k, inner + q + m, inner - q + n, outer - p + o,
+        outer - p - o, inner - q - n, inner + q - m, outer + p - k,
+    ]  # fmt: skip
+
+
+class _Code(Code):
+    """Writes transforms of blocks and stacks."""
+
+    def block_at(self, flat: Any, at: Any, wide: Any) -> list[Any]:
+        """Return the addresses of a block's rows, `wide` numbers apart, as indices."""
+        return [self.builder.add(at, self.builder.mul(wide, _INDEX(row))) for row in range(SIDE)]
+
+    def rows(self, flat: Any, indices: Sequence[Any]) -> list[_Row]:
+        return [_Row(self.builder, self.load(flat, at, SIDE)) for at in indices]
+
+    def transposed(self, rows: Sequence[_Row]) -> list[_Row]:
+        """Return a block with rows and columns exchanged: halves, quarters, and numbers of it."""
+        out, lanes = [row.values for row in rows], range(SIDE)
+        for apart in (4, 2, 1):
+            upper = [n + SIDE - apart if n & apart else n for n in lanes]
+            lower = [n + SIDE if n & apart else n + apart for n in lanes]
+            for row in (n for n in lanes if not n & apart):
+                pair = out[row], out[row + apart]
+                out[row], out[row + apart] = (
+                    self.builder.shuffle_vector(*pair, ir.Constant(_COUNTS, which))
+                    for which in (upper, lower)
+                )
+        return [_Row(self.builder, row) for row in out]
+
+    def across(self, rows: Sequence[_Row]) -> list[_Row]:
+        """Return the Walsh-Hadamard transform of a power of two of rows, not normalised."""
+        if len(rows) == 1:
+            return list(rows)
+        half = len(rows) // 2
+        pairs = list(zip(rows[:half], rows[half:], strict=True))
+        sums, differences = [a + b for a, b in pairs], [a - b for a, b in pairs]
+        return [*self.across(sums), *self.across(differences)]
+
+    def dropped(self, row: _Row, least: Any, kept: Any) -> tuple[_Row, Any]:
+        """Return a row without what is nearer zero than `least`, and the counts of what is not."""
+        kind = ir.FunctionType(_ROW, [_ROW])
+        name = f"llvm.fabs.v{SIDE}f32"
+        size = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        drop = self.builder.fcmp_ordered("<", self.builder.call(size, [row.values]), least)
+        values = self.builder.select(drop, ir.Constant(_ROW, [0.0] * SIDE), row.values)
+        stays = self.builder.zext(self.builder.not_(drop), _COUNTS)
+        return _Row(self.builder, values), self.builder.add(kept, stays)
+
+
+def _block(code: _Code, stack: Any, number: Any) -> list[Any]:
+    """Return the indices of a block's rows in a stack."""
+    return code.block_at(stack, code.builder.mul(number, _INDEX(SIDE * SIDE)), _INDEX(SIDE))
+
+
+@intrinsic
+def stack_block(context, picture, at, wide, stack, number):
+    """Set a block of a stack to the cosine coefficients of a picture's from picture[at] on.
+
+    wide: numbers from row to row of the picture.
+    """
+
+    def write(code, picture, at, wide, stack, number):
+        rows = _analysed(code.rows(picture, code.block_at(picture, at, wide)))
+        rows = _analysed(code.transposed(rows))
+        for row, to in zip(rows, _block(code, stack, number), strict=True):
+            code.store(row.values, stack, to)
+
+    return function(types.void, (picture, at, wide, stack, number), write, _Code)
+
+
+@intrinsic
+def add_block(context, stack, number, share, picture, at, wide):
+    """Add a share of the block whose coefficients `stack_block` set to a picture."""
+
+    def write(code, stack, number, share, picture, at, wide):
+        rows = _synthesised(code.rows(stack, _block(code, stack, number)))
+        rows = _synthesised(code.transposed(rows))
+        share = code.spread(share, SIDE)
+        for row, to in zip(rows, code.block_at(picture, at, wide), strict=True):
+            added = code.builder.fmul(row.values, share, flags=_FAST)
+            before = code.load(picture, to, SIDE)
+            code.store(code.builder.fadd(before, added, flags=_FAST), picture, to)
+
+    return function(types.void, (stack, number, share, picture, at, wide), write, _Code)
+
+
+@intrinsic
+def shrink_stack(context, stack, count, least):
+    """Drop what is nearer zero than `least` of the transform across a stack; return what is kept.
+
+    count: of its blocks, a power of two. The stack's mean (0, 0, 0) stays, and counts where it is
+    not nearer zero.
+    """
+
+    def write(code, stack, count, least):
+        builder = code.builder
+        total = cgutils.alloca_once(builder, LANE)
+        builder.store(LANE(0), total)
+        sizes = [2**power for power in range(STACK.bit_length())]
+        for size in sizes:
+            with builder.if_then(builder.icmp_signed("==", count, count.type(size))):
+                # Transformed twice, a stack is `size` times as large.
+                cut = builder.fmul(least, ir.Constant(FLOAT, float(np.sqrt(size))))
+                _shrink_rows(code, stack, size, code.spread(cut, SIDE), total)
+        return builder.load(total)
+
+    return function(types.int32, (stack, count, least), write, _Code)
+
+
+def _shrink_rows(code: _Code, stack: Any, size: int, least: Any, total: Any) -> None:
+    builder = code.builder
+    kept = cgutils.alloca_once(builder, _COUNTS)
+    builder.store(ir.Constant(_COUNTS, [0] * SIDE), kept)
+    with cgutils.for_range(builder, _INDEX(SIDE)) as loop:
+        first = builder.mul(loop.index, _INDEX(SIDE))
+        places = [builder.add(first, _INDEX(SIDE * SIDE * block)) for block in range(size)]
+        seen, counts = code.across(code.rows(stack, places)), builder.load(kept)
+        left = []
+        for row in seen:
+            row, counts = code.dropped(row, least, counts)
+            left.append(row)
+        builder.store(counts, kept)
+        mean = builder.extract_element(seen[0].values, LANE(0))
+        with_mean = builder.insert_element(left[0].values, mean, LANE(0))
+        is_first = builder.icmp_signed("==", loop.index, _INDEX(0))
+        left[0] = _Row(builder, builder.select(is_first, with_mean, left[0].values))
+        for row, place in zip(code.across(left), places, strict=True):
+            code.store((1 / size * row).values, stack, place)
+    for lane in range(SIDE):
+        of_lane = builder.extract_element(builder.load(kept), LANE(lane))
+        builder.store(builder.add(builder.load(total), of_lane), total)
