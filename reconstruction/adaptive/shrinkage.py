@@ -6,7 +6,8 @@ Walsh-Hadamard across the stack); coefficients below a threshold are dropped, an
 back, averaged with the inverse of the number of coefficients kept. What a scene repeats, along an
 edge or in a texture, is so learned from the scene itself.
 
-Operations of a reference block: 3 x 64 per block searched, 3 x 2 x 64 x 14 per block of the stack.
+Operations of a reference block, 4 samples from the next: 3 x 16 + 3 per block searched, as blocks
+share quarters, and 3 x 2 x 64 x 14 per block of the stack.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
-from reconstruction.adaptive.stacks import SIDE, STACK, add_block, shrink_stack, stack_block
+from reconstruction.adaptive.stacks import (
+    CELL,
+    SIDE,
+    STACK,
+    add_block,
+    cells_apart,
+    shrink_stack,
+    stack_block,
+)
 
 Array = NDArray[np.floating]
 REACH = 9
@@ -26,88 +35,102 @@ REACH = 9
 ALIKE = 4.0
 """Mean square difference of blocks that are stacked, at most, over the noise's variance. 2x -0.03,
 0.5x +0.02 dB."""
-LANES = 16
-"""Blocks searched side by side."""
 _OPPONENT = OPPONENT.astype(np.float32)
 
 
-@njit(forceinline=True, fastmath=True)
-def _unlikeness(guide, y, x, top, left, width, squares):
-    """Set squares (width,) to those of how far the blocks right of (top, left) are from (y, x)'s.
+@njit(forceinline=True)
+def _row_apart(guide, y, cells, reach, wide, apart):
+    """Set apart (cell, displacement) for the cells that begin at columns `cells` of row y.
 
-    guide: with columns to spare.
+    guide: flat, `wide` numbers a row, with `reach` rows and columns before the picture's first.
     """
-    for n in range(width):
-        squares[n] = 0
-    for i in range(SIDE):
-        own = guide[y + i, x : x + SIDE]
-        a, b, c, d, e, f, g, h = own[0], own[1], own[2], own[3], own[4], own[5], own[6], own[7]
-        row = guide[top + i, left:]
-        for n in range(width):
-            p, q, r, s = row[n] - a, row[n + 1] - b, row[n + 2] - c, row[n + 3] - d
-            t, u, v, w = row[n + 4] - e, row[n + 5] - f, row[n + 6] - g, row[n + 7] - h
-            squares[n] += p * p + q * q + r * r + s * s + t * t + u * u + v * v + w * w
+    height = 2 * reach + 1
+    for n in range(cells.size):
+        first = y * wide + cells[n]
+        own, vectors = first + reach * (wide + 1), _vectors(reach)
+        cells_apart(guide, own, first, wide, apart, n * height * vectors * SIDE, height, vectors)
 
 
-@njit(forceinline=True, fastmath=True)
-def _alike(guide, y, x, last_x, reach, unlike, squares, distances, places):
-    """Set places (STACK, 2) to the blocks most like that at (y, x), itself first.
+@njit(forceinline=True)
+def _vectors(reach):
+    """Return how many vectors hold the displacements along a row."""
+    return (2 * reach + SIDE) // SIDE
 
-    last_x: the last column where blocks begin. unlike: the mean square difference beyond which
-    blocks are not stacked. Returns how many, a power of two.
+
+@njit(forceinline=True)
+def _most_alike(squares, limit, reach, top, bottom, left, right, distances, found):
+    """Set found (STACK,) to the displacements of the blocks most like one, its own first.
+
+    squares: of how far blocks displaced by -reach to reach rows and columns are from it, rows of
+    whole vectors; found: counted alike. limit: from which on blocks are not stacked. top to right:
+    the displacements along both axes, counted from -reach, whose blocks lie in the picture. Returns
+    how many are found, a power of two.
     """
-    limit = unlike * SIDE * SIDE
-    found = 1
-    distances[0] = -1
-    places[0, 0], places[0, 1] = y, x
-    left, right = max(0, x - reach), min(last_x, x + reach)
-    width = -(-(right - left + 1) // LANES) * LANES
-    for yy in range(max(0, y - reach), min(guide.shape[0] - SIDE, y + reach) + 1):
-        _unlikeness(guide, y, x, yy, left, width, squares)
-        for xx in range(left, right + 1):
-            square = squares[xx - left]
-            worst = limit if found < STACK else min(limit, distances[STACK - 1])
-            if square >= worst or (yy == y and xx == x):
+    wide = _vectors(reach) * SIDE
+    own = reach * wide + reach
+    number, worst = 1, limit
+    distances[0], found[0] = -1, own
+    for row in range(top, bottom + 1):
+        for n in range(row * wide + left, row * wide + right + 1):
+            square = squares[n]
+            if square >= worst or n == own:
                 continue
-            at = found if found < STACK else STACK - 1
-            if found < STACK:
-                found += 1
+            number = min(number + 1, STACK)
+            at = number - 1
             while at > 1 and distances[at - 1] > square:
-                distances[at] = distances[at - 1]
-                places[at, 0], places[at, 1] = places[at - 1, 0], places[at - 1, 1]
+                distances[at], found[at] = distances[at - 1], found[at - 1]
                 at -= 1
-            distances[at] = square
-            places[at, 0], places[at, 1] = yy, xx
+            distances[at], found[at] = square, n
+            if number == STACK:
+                worst = min(limit, distances[STACK - 1])
     count = 1
-    while count * 2 <= found:
+    while count * 2 <= number:
         count *= 2
     return count
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _shrink(picture, guide, cuts, unlike, reach, starts_y, starts_x, total, weight):
+def _shrink(picture, guide, cuts, unlike, reach, starts_y, starts_x, cells, corners, total, weight):
     """Add the blocks' estimates of a picture to total (c, y, x), and their weights to weight.
 
-    weight: (c, y, x), where blocks begin.
+    guide: with `reach` rows and columns before the picture's, and more behind. cells: the columns
+    where cells begin; corners (2, block): the number of the left and of the right ones of each
+    block of starts_x. weight: flat, where blocks begin.
+
+    What two rows of blocks share of their distances, a row of cells, is computed once.
     """
-    stack = np.empty(STACK * SIDE * SIDE, np.float32)
-    squares = np.empty(2 * reach + 1 + LANES, np.float32)
-    distances = np.empty(STACK, np.float32)
-    places = np.empty((STACK, 2), np.int64)
     colours, length, wide = picture.shape
-    flat, flat_total = picture.reshape(-1), total.reshape(-1)
+    flat, flat_total, flat_guide = picture.reshape(-1), total.reshape(-1), guide.reshape(-1)
+    guide_wide, row = guide.shape[1], _vectors(reach) * SIDE
+    size = (2 * reach + 1) * row
+    above, below = np.empty(cells.size * size, np.float32), np.empty(cells.size * size, np.float32)
+    known = np.int64(-1)
+    stack, squares = np.empty(STACK * SIDE * SIDE, np.float32), np.empty(size, np.float32)
+    distances, found = np.empty(STACK, np.float32), np.empty(STACK, np.int64)
+    limit = unlike * SIDE * SIDE
     for y in starts_y:
-        for x in starts_x:
-            count = _alike(guide, y, x, wide - SIDE, reach, unlike, squares, distances, places)
+        above, below = below, above
+        if known != y:
+            _row_apart(flat_guide, y, cells, reach, guide_wide, above)
+        known = y + CELL
+        _row_apart(flat_guide, known, cells, reach, guide_wide, below)
+        top, bottom = max(0, reach - y), min(2 * reach, length - SIDE - y + reach)
+        for block in range(starts_x.size):
+            x, left, right = starts_x[block], corners[0, block] * size, corners[1, block] * size
+            for n in range(size):
+                squares[n] = above[left + n] + above[right + n] + below[left + n] + below[right + n]
+            first, last = max(0, reach - x), min(2 * reach, wide - SIDE - x + reach)
+            count = _most_alike(squares, limit, reach, top, bottom, first, last, distances, found)
+            for k in range(count):
+                found[k] = (y + found[k] // row - reach) * wide + x + found[k] % row - reach
             for c in range(colours):
+                plane = c * length * wide
                 for k in range(count):
-                    at = (c * length + places[k, 0]) * wide + places[k, 1]
-                    stack_block(flat, at, wide, stack, k)
+                    stack_block(flat, plane + found[k], wide, stack, k)
                 share = np.float32(1.0) / (1 + shrink_stack(stack, count, cuts[c]))
                 for k in range(count):
-                    at = (c * length + places[k, 0]) * wide + places[k, 1]
-                    add_block(stack, k, share, flat_total, at, wide)
-                    weight[c, places[k, 0], places[k, 1]] += share
+                    add_block(stack, k, share, flat_total, plane + found[k], wide)
+                    weight[plane + found[k]] += share
 
 
 def _starts(length: int, step: int, first: int) -> NDArray[np.int64]:
@@ -148,17 +171,20 @@ def denoised(
     mixing = _OPPONENT if len(picture) == 3 else np.eye(len(picture), dtype=np.float32)
     opponent = np.ascontiguousarray(np.einsum("oc,cyx->oyx", mixing, picture, optimize=True))
     luminance = np.ascontiguousarray(np.einsum("c,cyx->yx", mixing[0], guide, optimize=True))
-    spare = np.pad(luminance, ((0, 0), (0, SIDE + LANES)))
+    around = np.pad(luminance, ((reach, reach), (reach, reach + SIDE)))
     rows = _starts(picture.shape[1], step, first)
     columns = _starts(picture.shape[2], step, first)
     cuts = np.array([1, chroma, chroma], dtype=np.float32) * np.float32(threshold * sigma)
+    cells = np.union1d(columns, columns + CELL)
+    corners = np.searchsorted(cells, [columns, columns + CELL])
     totals = np.zeros((2, *picture.shape), dtype=np.float32)
     weights = np.zeros_like(totals)
     unlike = np.float32(ALIKE * sigma**2)
 
     def work(which: int, begin: int, end: int) -> None:
-        added = totals[which], weights[which]
-        _shrink(opponent, spare, cuts, unlike, reach, rows[begin:end], columns, *added)
+        added = totals[which], weights[which].reshape(-1)
+        starts = rows[begin:end], columns, cells, corners
+        _shrink(opponent, around, cuts, unlike, reach, *starts, *added)
 
     summed_in_bands(work, len(rows), (reach + SIDE / 2) / step)
     weight = np.stack([_spread(part) for part in weights[0] + weights[1]])

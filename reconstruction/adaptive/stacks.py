@@ -1,8 +1,8 @@
-"""Vector instructions of stacks of blocks: cosines in a block, Walsh-Hadamard across a stack.
+"""Vector instructions of blocks: which are alike, cosines in one, Walsh-Hadamard across a stack.
 
 A block is SIDE x SIDE numbers. It lies in SIDE vectors, so that its transforms never leave the
-registers. Stacks are flat float32 arrays (block, row, column) of up to STACK blocks; pictures are
-flat float32 arrays, too. No index is checked.
+registers; a quarter of it is a cell. Stacks, (block, row, column) of up to STACK blocks, and
+pictures are flat float32 arrays. No index is checked.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numba.core import cgutils, types
 from reconstruction.adaptive.vectors import FLOAT, LANE, Code, function, intrinsic
 
 SIDE = 8
+CELL = SIDE // 2
 STACK = 16
 """A power of two: a vector of each block fits the registers of AVX2."""
 _C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
@@ -25,7 +26,8 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
 _ROW = ir.VectorType(FLOAT, SIDE)
 _COUNTS = ir.VectorType(LANE, SIDE)
 _INDEX = ir.IntType(64)
-_FAST = ("fast",)
+_FUSED = ("contract",)
+"""Sums stay in the order written: a butterfly is no sum of all it spans."""
 
 
 class _Row:
@@ -35,14 +37,14 @@ class _Row:
         self.builder, self.values = builder, values
 
     def __add__(self, other: _Row) -> _Row:
-        return _Row(self.builder, self.builder.fadd(self.values, other.values, flags=_FAST))
+        return _Row(self.builder, self.builder.fadd(self.values, other.values, flags=_FUSED))
 
     def __sub__(self, other: _Row) -> _Row:
-        return _Row(self.builder, self.builder.fsub(self.values, other.values, flags=_FAST))
+        return _Row(self.builder, self.builder.fsub(self.values, other.values, flags=_FUSED))
 
     def __rmul__(self, number: float) -> _Row:
         by = ir.Constant(_ROW, [number] * SIDE)
-        return _Row(self.builder, self.builder.fmul(self.values, by, flags=_FAST))
+        return _Row(self.builder, self.builder.fmul(self.values, by, flags=_FUSED))
 
 
 def _analysed(rows: Sequence[_Row]) -> list[_Row]:
@@ -79,9 +81,9 @@ def _synthesised(rows: Sequence[_Row]) -> list[_Row]:
 class _Code(Code):
     """Writes transforms of blocks and stacks."""
 
-    def block_at(self, flat: Any, at: Any, wide: Any) -> list[Any]:
-        """Return the addresses of a block's rows, `wide` numbers apart, as indices."""
-        return [self.builder.add(at, self.builder.mul(wide, _INDEX(row))) for row in range(SIDE)]
+    def row_starts(self, at: Any, wide: Any, count: int = SIDE) -> list[Any]:
+        """Return the indices of rows `wide` numbers apart, the first one's first."""
+        return [self.builder.add(at, self.builder.mul(wide, _INDEX(row))) for row in range(count)]
 
     def rows(self, flat: Any, indices: Sequence[Any]) -> list[_Row]:
         return [_Row(self.builder, self.load(flat, at, SIDE)) for at in indices]
@@ -120,9 +122,39 @@ class _Code(Code):
         return _Row(self.builder, values), self.builder.add(kept, stays)
 
 
-def _block(code: _Code, stack: Any, number: Any) -> list[Any]:
-    """Return the indices of a block's rows in a stack."""
-    return code.block_at(stack, code.builder.mul(number, _INDEX(SIDE * SIDE)), _INDEX(SIDE))
+def _block(code: _Code, number: Any) -> list[Any]:
+    """Return the indices of the rows of a stack's block."""
+    return code.row_starts(code.builder.mul(number, _INDEX(SIDE * SIDE)), _INDEX(SIDE))
+
+
+@intrinsic
+def cells_apart(context, guide, own, first, wide, squares, at, height, vectors):
+    """Set squares[at] and on to the squares of how far cells of a picture are from one of its own.
+
+    own: where the cell begins, first: where the first other one does, in the flat picture `guide`,
+    whose rows are `wide` numbers apart. The others begin at `height` rows of `vectors` * SIDE.
+    """
+
+    def write(code, guide, own, first, wide, squares, at, height, vectors):
+        builder, steps = code.builder, range(CELL)
+        cell = [
+            [code.spread(builder.load(code.place(guide, row, n)), SIDE) for n in steps]
+            for row in code.row_starts(own, wide, CELL)
+        ]
+        with cgutils.for_range(builder, height) as down, cgutils.for_range(builder, vectors) as to:
+            begin = builder.add(first, builder.mul(to.index, _INDEX(SIDE)))
+            begin = builder.add(begin, builder.mul(down.index, wide))
+            total = ir.Constant(_ROW, [0.0] * SIDE)
+            for row, numbers in zip(code.row_starts(begin, wide, CELL), cell, strict=True):
+                for n, number in enumerate(numbers):
+                    apart = builder.fsub(code.load(guide, row, SIDE, n), number, flags=_FUSED)
+                    square = builder.fmul(apart, apart, flags=_FUSED)
+                    total = builder.fadd(total, square, flags=_FUSED)
+            vector = builder.add(builder.mul(down.index, vectors), to.index)
+            code.store(total, squares, builder.add(at, builder.mul(vector, _INDEX(SIDE))))
+
+    kinds = guide, own, first, wide, squares, at, height, vectors
+    return function(types.void, kinds, write, _Code)
 
 
 @intrinsic
@@ -133,9 +165,9 @@ def stack_block(context, picture, at, wide, stack, number):
     """
 
     def write(code, picture, at, wide, stack, number):
-        rows = _analysed(code.rows(picture, code.block_at(picture, at, wide)))
+        rows = _analysed(code.rows(picture, code.row_starts(at, wide)))
         rows = _analysed(code.transposed(rows))
-        for row, to in zip(rows, _block(code, stack, number), strict=True):
+        for row, to in zip(rows, _block(code, number), strict=True):
             code.store(row.values, stack, to)
 
     return function(types.void, (picture, at, wide, stack, number), write, _Code)
@@ -146,13 +178,13 @@ def add_block(context, stack, number, share, picture, at, wide):
     """Add a share of the block whose coefficients `stack_block` set to a picture."""
 
     def write(code, stack, number, share, picture, at, wide):
-        rows = _synthesised(code.rows(stack, _block(code, stack, number)))
+        rows = _synthesised(code.rows(stack, _block(code, number)))
         rows = _synthesised(code.transposed(rows))
         share = code.spread(share, SIDE)
-        for row, to in zip(rows, code.block_at(picture, at, wide), strict=True):
-            added = code.builder.fmul(row.values, share, flags=_FAST)
+        for row, to in zip(rows, code.row_starts(at, wide), strict=True):
+            added = code.builder.fmul(row.values, share, flags=_FUSED)
             before = code.load(picture, to, SIDE)
-            code.store(code.builder.fadd(before, added, flags=_FAST), picture, to)
+            code.store(code.builder.fadd(before, added, flags=_FUSED), picture, to)
 
     return function(types.void, (stack, number, share, picture, at, wide), write, _Code)
 
