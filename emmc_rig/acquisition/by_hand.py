@@ -82,7 +82,7 @@ def with_hands(rig: RigType, frames: Iterable[PlannedFrame]) -> RigType:
         pinholes = {*moved} <= {*APERTURE}
         without = (
             "write `views: []` and `open:` boards under whiteboards in the plan, which need no "
-            "pinhole (emmc-rig calibrate --plan --leave-out aperture)"
+            "pinhole (emmc-rig calibrate --plan --skip aperture)"
             if pinholes
             else "plan shots at one place of the mask"
         )

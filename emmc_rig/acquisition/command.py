@@ -32,7 +32,7 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.bench.hardware import FOCUS, Rig
-from emmc_rig.bench.rig_config import Ask, RigChoice, opened_rig
+from emmc_rig.bench.rig_config import AnyRig, Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
@@ -145,7 +145,8 @@ def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session 
     """
     if is_session(request.out):
         session = Session(request.out, disk)
-        if session.stored and json.loads(json.dumps(dict(request.rig))) != session.rig:
+        asked = json.loads(json.dumps(dict(request.rig)))
+        if session.stored and asked != AnyRig.under_new_names(session.rig):
             raise AppError(
                 f"session {session.folder.name} was begun with another rig: "
                 f"{json.dumps(session.rig)}; leave --rig out, or name another --out"

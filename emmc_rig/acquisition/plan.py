@@ -75,8 +75,10 @@ class PlannedShot(Settings):
 class OpenBoard(Settings):
     """A whiteboard through the masks with the aperture open: what a fit of the mask needs.
 
-    mask_um: x, y beyond the first shot's own place. held_out: no fit sees it, it judges them.
+    mask_um: x, y beyond the first shot's own place. validation: no fit uses it, it judges them.
     """
+
+    renamed: ClassVar = {"held_out": "validation"}
 
     mask_um: tuple[float, float] = (0.0, 0.0)
     window: tuple[int, int] = Field(
@@ -85,7 +87,7 @@ class OpenBoard(Settings):
         "of the aperture is open",
     )
     repeats: Repeats = 2
-    held_out: bool = False
+    validation: bool = False
 
 
 class Boards(Settings):
@@ -95,7 +97,7 @@ class Boards(Settings):
         default="all", description="all, or a list of [v, u]; [] for none"
     )
     open: tuple[OpenBoard, ...] = Field(
-        default=(), description="masks in, whole aperture: for the parametric route of `calibrate`"
+        default=(), description="masks in, whole aperture: for the calibration method parametric"
     )
     shots: Literal["all"] | tuple[Annotated[int, Field(ge=0)], ...] = Field(
         default="all", description="for which shots the pinhole is stepped: all, or a list"
@@ -362,8 +364,8 @@ shots:
 whiteboards:
   views: all                # or a list: [[0, 0], [2, 2]]
   open:                     # masks in, whole aperture
-    - {{held_out: true}}      # by which `emmc-rig calibrate` judges the Psi that it measures
-    # - {{mask_um: [0, 0]}}   # for the parametric route: few frames, see `calibrate --plan`
+    - {{validation: true}}    # not used for Psi: `emmc-rig calibrate` judges Psi by it
+    # - {{mask_um: [0, 0]}}   # to fit the mask from few frames, see `calibrate --plan`
   # lamps: [white]          # default: what the sensor needs
   repeats: 2
   references: 4

@@ -1,6 +1,6 @@
 """What a capture shows: bar, time left and the brightest readings on a terminal; words elsewhere.
 
-On a terminal p pauses and resumes, and q stops after the present frame.
+On a terminal p pauses and resumes, and q stops after the current frame.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class CaptureDisplay(CaptureWatcher):
 
     def left(self, seconds: float, guessed: int) -> None:
         """Show how long the rest will take."""
-        unknown = f", and the exposures of {guessed} not metered yet" if guessed else ""
+        unknown = f" (excludes {guessed} exposures not metered yet)" if guessed else ""
         self._left = f"about {shown_seconds(seconds)} left{unknown}"
         self._update()
 

@@ -26,11 +26,11 @@ CameraSpec = Annotated[
     typer.Option("--camera", help=f"{CAMERA_HELP}, simulated or a YAML file"),
 ]
 RigOption = Annotated[
-    str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
+    str | None, typer.Option("--rig", help="simulated: as --camera simulated", hidden=True)
 ]
 ExposureOption = Annotated[
     str | None,
-    typer.Option("--exposure", help="in seconds, or as 20ms (default: as the camera is set)"),
+    typer.Option("--exposure", help="as 0.02 or 20ms (default: as the camera is set)"),
 ]
 GainOption = Annotated[
     float | None, typer.Option("--gain", help="1: the lowest ISO (default: as the camera is set)")
@@ -52,7 +52,7 @@ def register(app: typer.Typer) -> None:
 
 
 def camera_info(camera: CameraSpec = "ptp:", rig: RigOption = None) -> None:
-    """Show what a camera is, and what it can be set to."""
+    """Show a camera's model and settings."""
     camera = _chosen(camera, rig)
     with closing(open_camera(camera)) as device:
         rows = list(camera_rows(device))

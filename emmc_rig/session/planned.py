@@ -10,6 +10,8 @@ Kind = Literal[
     "dark", "metering", "reference", "whiteboard", "open", "held-out", "check", "turned", "shot"
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+VALIDATION: Kind = "held-out"
+"""What sessions call the open whiteboards that no fit uses, since version 0.2."""
 
 SHOT_DARK = "dark-shot"
 """How ids of darks begin that are exposed as the shots are."""

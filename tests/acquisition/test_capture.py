@@ -583,6 +583,16 @@ def test_frames_of_another_rig_are_refused(tmp_path):
         begun_session(other)
 
 
+def test_a_session_goes_on_whose_rig_was_described_by_keys_of_an_earlier_version(tmp_path):
+    rig = still_rig()
+    earlier = replace(request_for(tmp_path, text=ONE_SHOT), rig={"stands_um": {"focus": 9.0}})
+    session = new_session(earlier, planned_frames(earlier, rig))
+    Sequencer(session, earlier.plan, rig).run()
+    assert begun_session(replace(earlier, rig={"fixed_positions_um": {"focus": 9.0}})) is not None
+    with pytest.raises(AppError, match="another rig"):
+        begun_session(replace(earlier, rig={"fixed_positions_um": {"focus": 8.0}}))
+
+
 def resident_bytes():
     """How much memory this process has now; 0 where the system does not tell so simply."""
     statm = Path("/proc/self/statm")

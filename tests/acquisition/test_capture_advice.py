@@ -300,7 +300,7 @@ def a_target_without_boards(bench):
     calibration_plan(bench)
 
 
-@walk("--until: no open whiteboard of the plan is held out")
+@walk("--until: no open whiteboard of the plan has `validation: true`")
 def a_target_without_a_judge(bench):
     bench.small_camera(whiteboards={**PLAN["whiteboards"], "open": [{"repeats": 1}]})
     yield bench.refused(*CAPTURE, "--until", "30dB")

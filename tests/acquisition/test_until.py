@@ -40,7 +40,11 @@ CAMERA = {
 PLAN = {
     "camera": "camera.yaml",
     "shots": [{"exposure_s": 0.05}] * 3,
-    "whiteboards": {"views": [[1, 1]], "shots": [0], "open": [{"repeats": 2}, {"held_out": True}]},
+    "whiteboards": {
+        "views": [[1, 1]],
+        "shots": [0],
+        "open": [{"repeats": 2}, {"validation": True}],
+    },
     "darks": {"repeats": 2},
 }
 
@@ -92,7 +96,7 @@ def session_until(folder, target, reason):
 def enough(tmp_path_factory):
     """A session that needed one shot of three."""
     folder = tmp_path_factory.mktemp("enough")
-    return session_until(folder, "12dB", "the target is reached, 2 shots spared")
+    return session_until(folder, "12dB", "the target is reached, 2 shots not needed")
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +136,7 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
 def test_its_page_shows_what_was_decided_and_when(every):
     page = sheet(Session(every))
     assert "Shots: what they gave" in page
-    assert "dB stated, " in page
+    assert "estimated accuracy " in page
     metrics = json.loads((every / "metrics.json").read_text())
     assert metrics["decided"][0]["shots"] == [0]
     assert metrics["spared"] == 0
@@ -249,7 +253,7 @@ def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_
         ({"darks": None}, "30", "no darks"),
         ({"whiteboards": {"views": [[1, 1]]}}, "30", "neither open whiteboards nor the pinhole"),
         ({"whiteboards": {"shots": [0]}}, "30", "neither open whiteboards nor the pinhole"),
-        ({"whiteboards": {"open": [{}]}}, "30", "held out"),
+        ({"whiteboards": {"open": [{}]}}, "30", "has `validation: true`"),
     ],
 )
 def test_a_capture_that_cannot_spare_shots_says_why_and_makes_nothing(

@@ -157,11 +157,13 @@ def test_unknown_names_and_sizes_are_one_line(run):
     assert (code, "more_shots_step_um" in one_line(err)) == (1, True)
 
 
-def test_solver_settings_that_make_no_sense_are_one_line(run):
-    for option, value in (("--mu", -1), ("--mu", "nan"), ("--chroma-weight", 0)):
-        code, _, err = run("demo", *SMALL, "--method", "tv", option, value, "--out", "r")
+def test_solver_settings_that_make_no_sense_are_one_line(run, tmp_path):
+    settings = tmp_path / "settings.yaml"
+    for name, value in (("mu", -1), ("mu", ".nan"), ("chroma_weight", 0)):
+        settings.write_text(f"tv: {{{name}: {value}}}\n")
+        code, _, err = run("reconstruct", "frames", "--settings", settings)
         assert code == 1
-        assert option.strip("-").replace("-", "_") in one_line(err)
+        assert f"tv.{name}" in one_line(err)
 
 
 def test_wrong_usage_is_exit_code_2(run):

@@ -192,7 +192,7 @@ def whiteboards(folder, bench, pinhole_s):
     for view in np.ndindex(bench.optics.views):
         take(4, "whiteboard", pinhole_s, view=view)
     for x, y in ((0, 0), (15, -21)):
-        take(4, "held-out", 0.15, mask_x_um=x, mask_y_um=y)
+        take(4, "validation", 0.15, mask_x_um=x, mask_y_um=y)
     take(2, "shot", 0.15, shot=0)
     with (folder / "table.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))

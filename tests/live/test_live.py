@@ -746,7 +746,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "code", "reported"),
     [
-        (("--camera", "nonsense:"), 1, "no such kind of camera"),
+        (("--camera", "nonsense:"), 1, "no such camera driver"),
         (("--rig", "nowhere.yaml"), 1, "nowhere.yaml"),
         (("--rig", "simulated", "--camera", "simulated"), 2, "either --rig"),
         (("--rig", "simulated", "--host", "203.0.113.7"), 1, "cannot serve"),

@@ -157,6 +157,15 @@ def test_only_what_was_chosen_and_previewed_is_written_and_nothing_when_the_file
     assert rig.read_text() == RIG_YAML + "by_hand: false\n"
 
 
+def test_a_place_is_written_where_a_file_of_an_earlier_version_has_it(tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG_YAML + "stands_um: {focus: 9000}\n")
+    files = Files(rig=rig)
+    files.preview(found(), ["focus"])
+    files.save()
+    assert rig.read_text() == RIG_YAML + "stands_um: {focus: 8000.0}\n"
+
+
 def test_a_text_that_cannot_be_edited_in_place_is_left_and_the_line_to_write_is_named():
     block = "camera: x\nshots:\n  - exposure_s:\n      - 0.1\n      - 0.2\n"
     with pytest.raises(AppError, match=r"write shots\.0\.exposure_s: 0\.5"):
