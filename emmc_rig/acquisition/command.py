@@ -249,7 +249,7 @@ def disk_faults_named(session: Session) -> Iterator[None]:
             errno.EDQUOT: "the disk quota is spent; make room",
             errno.EROFS: "the disk is read-only; make it writable",
             errno.EACCES: "this user may not write there; change that",
-        }.get(fault.errno or 0, f"{fault.strerror or fault}; mend that")
+        }.get(fault.errno or 0, f"{fault.strerror or fault}; correct that")
         raise AppError(
             f"{session.folder}: {why}, then run the same command to go on; "
             f"{len(session.stored)} of {len(session.needed)} frames are safe"
@@ -271,14 +271,14 @@ def way_on_named(request: CaptureRequest, session: Session) -> Iterator[None]:
         if not isinstance(fault, GaveUpError):
             raise
         if not is_session(session.folder):
-            way = "nothing was captured; mend it, then run the same command"
+            way = "nothing was captured; correct it, then run the same command"
         elif is_session(request.plan_path):
             way = (
-                f"{kept} frames are kept: mend it, then run the same command, or with a copy of "
+                f"{kept} frames are kept: correct it, then run the same command, or with a copy of "
                 f"the plan that you edited: emmc-rig capture COPY.yaml --out {request.out}"
             )
         else:
-            way = f"{kept} frames are kept: mend it, then run the same command"
+            way = f"{kept} frames are kept: correct it, then run the same command"
         raise AppError(f"{fault}; {way}") from fault
 
 

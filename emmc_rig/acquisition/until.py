@@ -147,7 +147,7 @@ def stated_psnr_db(result: Reconstruction) -> float:
     """Return the PSNR that a result's own deviation stands for; raises AppError without one."""
     stated_db = result.stated["stated_db"]
     if stated_db is None:
-        raise AppError(f"{result.method} states no deviation of its light field: use {METHOD}")
+        raise AppError(f"{result.method} estimates no accuracy: use {METHOD}")
     return stated_db
 
 

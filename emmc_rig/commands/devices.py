@@ -176,7 +176,7 @@ def check(
         one = found[0]
         tell(f"{camera}: {one.shots} of {one.of_shots} shots, {one.by_hand} mask moves by hand")
         show_table(
-            ("calibration", "axes", "by hand", "error of Psi"),
+            ("calibration", "axes", "by hand", "calibration error"),
             [
                 (
                     way.name,
@@ -189,7 +189,14 @@ def check(
         )
     else:
         show_table(
-            ("camera", "shots", "calibration", "by hand", "error of Psi", "one more part"),
+            (
+                "camera",
+                "shots",
+                "calibration",
+                "by hand",
+                "calibration error",
+                "with one more axis",
+            ),
             [
                 (
                     one.camera,

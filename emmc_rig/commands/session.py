@@ -64,6 +64,7 @@ def show(session: Folder) -> None:
     from emmc_rig.pages.session_sheet import events
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.listing import summary
+    from emmc_rig.session.planned import kind_name
     from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
 
@@ -75,7 +76,7 @@ def show(session: Folder) -> None:
     tell(f"  {'size':<12} {shown_bytes(listed.bytes)}")
     tell(f"  {'frames':<12} {listed.stored} of {listed.planned}")
     for kind, (done, planned) in counts(opened).items():
-        tell(f"  {kind:<12} {done} of {planned}")
+        tell(f"  {kind_name(kind):<12} {done} of {planned}")
     if opened.amendments:
         plans = Counter(entry.plan for entry in opened.stored.values())
         for number in range(opened.amendments + 1):
@@ -86,7 +87,7 @@ def show(session: Folder) -> None:
         names = ", ".join(leftovers)
         tell(f"  {len(leftovers)} leftover(s) of a crash, which do not count: {names}")
     for name in foreign:
-        tell(f"  {name}: not of this session")
+        tell(f"  {name}: not part of this session")
     for reason in exposure_reasons(shot_exposures(opened)):
         tell(f"  {reason.level:<12} {reason.what}; {reason.remedy}")
     for kind, line in events(opened):

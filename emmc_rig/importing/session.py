@@ -229,7 +229,7 @@ def _check_values(frames: NDArray, name: str, white_dn: int) -> None:
     """Raise AppError for what no sensor reads out."""
     if frames.dtype.kind == "f" and not np.isfinite(frames).all():
         bad = int(np.count_nonzero(~np.isfinite(frames)))
-        raise AppError(f"{name}: {bad} pixel(s) are no numbers (NaN or infinite); mend the file")
+        raise AppError(f"{name}: {bad} pixel(s) are no numbers (NaN or infinite); correct the file")
     low, high = frames.min(), frames.max()
     if low < 0:
         raise AppError(
@@ -389,7 +389,7 @@ class _Import:
         if row.kind not in ("shot", "dark"):
             raise AppError(f"{where}: its exposure is not known; write exposure_s into the table")
         exposure_s = float(own_s[shot] if row.kind == "shot" else max(own_s))
-        self._note(f"exposures that nothing states are the camera's: {exposure_s:g} s")
+        self._note(f"exposures that no file states are taken from the camera: {exposure_s:g} s")
         return exposure_s
 
     def _compare_exposures(self, said_s: float, other_s: float, start: str, who: str) -> None:
@@ -710,8 +710,8 @@ class _Import:
                 )
             return
         self._note(
-            "how bright white is nobody states: electrons_per_s is taken as "
-            f"{electrons_per_s:.3g}, so that the brightest of the scene is {BRIGHTEST:g}"
+            f"the camera's electrons_per_s is not known: taken as {electrons_per_s:.3g}, for which "
+            f"the brightest readings of the shots are {BRIGHTEST:g}"
         )
         noise = noise.model_copy(update={"electrons_per_s": electrons_per_s})
         sensor = self._camera.sensor.model_copy(update={"noise": noise})

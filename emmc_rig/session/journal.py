@@ -281,8 +281,8 @@ class ComparedEntry(Entry):
 
     def __str__(self) -> str:
         return (
-            f"{self.id} taken again: shifted by ({self.x_px:+.3f}, {self.y_px:+.3f}) px, "
-            f"likeness {self.likeness:.3f}"
+            f"{self.id} captured again: shifted by ({self.x_px:+.3f}, {self.y_px:+.3f}) px, "
+            f"correlation {self.likeness:.3f}"
         )
 
 

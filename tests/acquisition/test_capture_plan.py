@@ -196,7 +196,7 @@ def test_a_bad_plan_gives_one_line_that_names_what_is_wrong(tmp_path, changes, l
         ({"camera": "conventional", "shots": [{"mask_um": [1, 1]}]}, "no mask to move"),
         (
             {"camera": "programmable-aperture", "shots": [{"camera_shot": 3}, {}]},
-            "leave camera_shot out",
+            "camera_shot has no effect",
         ),
     ],
 )

@@ -123,7 +123,7 @@ def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
 def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough):
     code, out, _ = program("session", "verify", enough)
     assert code == 0
-    assert "2 more frame(s) planned, which the scene did not need" in out
+    assert "2 more frame(s) planned, which were not needed" in out
     code, out, _ = program("session", "show", enough)
     assert "shot         1 of 1" in out
     assert "12 wanted; no more, the target is reached" in out
@@ -278,7 +278,7 @@ def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cos
     assert stated_psnr_db(few) == pytest.approx(18.5)
     assert few.stated["stated_interval_db"] == pytest.approx([16.5, 20.5])
     assert result_with().stated == {"stated_db": None, "stated_interval_db": None}
-    with pytest.raises(AppError, match="states no deviation"):
+    with pytest.raises(AppError, match="estimates no accuracy"):
         stated_psnr_db(result_with())
 
 

@@ -92,7 +92,7 @@ def test_a_photograph_of_the_mask_and_four_files_become_the_light_field(tmp_path
     assert 10 * np.log10(1 / np.mean((field - truth) ** 2)) > 34
     found = verdict(tmp_path / "bench")
     assert found["level"] == "trust", found["reasons"]
-    assert "which no whiteboard measured" in metrics_of(tmp_path / "bench")["assumed"]
+    assert "not calibrated" in metrics_of(tmp_path / "bench")["assumed"]
 
 
 def gamma(bits):

@@ -428,7 +428,7 @@ def test_in_the_dark_an_exposure_climbs_to_4_s_and_comes_back_and_says_what_to_d
         until(watch, lambda state: state["figures"])
         watch.auto_expose()
         dark = until(watch, lambda state: state["trouble"]["setting"])
-        assert "dark at 4 s too: light the lamp" in dark["trouble"]["setting"]
+        assert "dark at 4 s too: switch the lamp on" in dark["trouble"]["setting"]
         until(watch, lambda state: state["settings"]["exposure_s"] == 0.01)
         assert max(asked_s) == 4.0
         camera.light = 2.0

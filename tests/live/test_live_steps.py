@@ -74,7 +74,7 @@ def test_a_peak_and_its_deviation_are_those_of_the_parabola():
     assert abs(off.mean()) < 4 * off.std() / np.sqrt(300)
     # Stated by the larger of errors and scatter, it is a little too large on average.
     assert 0.9 < np.median(stated) / off.std() < 1.5
-    with pytest.raises(AppError, match="no sharpest place"):
+    with pytest.raises(AppError, match="no sharpest position"):
         peak(places, places / 10, errors)
 
 
