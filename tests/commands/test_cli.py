@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,12 +11,15 @@ import time
 import cv2
 import numpy as np
 import pytest
+import typer
 import yaml
 from programs import one_line
 
+from emmc_rig import cli
 from emmc_rig.version import __version__
 
 SMALL = ["--size", "24x32"]
+COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def views_in(folder, rows=2, columns=2, size=(24, 32)):
@@ -182,7 +186,10 @@ def test_version_and_help_are_printed(run):
     assert run("--version")[:2] == (0, f"emmc-rig {__version__}\n")
     code, out, _ = run("--help")
     assert code == 0
-    assert "demo" in out
+    panels = re.findall(r"─ (\w+) ─", out)
+    assert panels == ["Options", "Bench", "Results", "Studies"]
+    listed = re.findall(r"^│ ([a-z]+) ", out, re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
 
 
 @pytest.mark.slow
