@@ -1,4 +1,4 @@
-"""Screening of frames before any method: bad shots and pixels are left out, flicker is evened.
+"""Clean-up of frames before any method: bad shots and pixels are excluded, flicker is evened.
 
 Only Psi and the frames are needed. A smooth picture that explains their local means predicts every
 reading except for the scene's fine texture, which is alike in all shots and in neighbouring pixels.
@@ -95,23 +95,23 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     double = double_shots(flat, frames, usable)
     usable = _without(usable, double)
     if dark:
-        notes.append(f"left out {_shots(dark)}: dark, while the others are not")
+        notes.append(f"excluded {_shots(dark)}: dark, while the others are not")
     if double:
         notes.append(
-            f"left out {_shots(double)}: the same as another, although by Psi the masks moved; "
-            "look at the stage, or measure Psi again"
+            f"excluded {_shots(double)}: the same as another, although in Psi the masks moved; "
+            "check the stage, or calibrate again"
         )
     gains = shot_gains(flat, frames, usable)
     if (gains != 1).any():
         frames = (frames / gains[:, None, None]).astype(frames.dtype)
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
-        notes.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
+        notes.append(f"scaled the shots to equal brightness: they differed by {spread:.1%}")
     rows, columns = dead_lines(flat, frames, usable)
     lines = rows[:, None] | columns
     if lines.any():
         usable = usable & ~lines
         notes.append(
-            "left out whole lines, whose readings hardly vary while those beside do: "
+            "excluded dead lines, whose readings hardly vary while their neighbours' do: "
             + " and ".join(
                 f"{name} {', '.join(map(str, np.flatnonzero(dead)))}"
                 for name, dead in (("rows", rows), ("columns", columns))
@@ -122,7 +122,7 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     if bad.any():
         usable = usable & ~bad
         notes.append(
-            f"left out {int(bad.sum())} pixels ({bad.mean():.2%}) that differ from their neighbours"
+            f"excluded {int(bad.sum())} bad pixels ({bad.mean():.2%}), unlike their neighbours"
         )
     return Screened(frames, usable, tuple(notes), dark, double, gains, bad, lines)
 

@@ -54,15 +54,16 @@ BREAK_COLUMNS = (
 """`..._to`: the strength from which on it is broken; empty: not within the sweep. Then in words."""
 PANEL_INCHES, COLUMNS = (3.9, 2.75), 3
 FLOOR_DB = 6.0
-"""Below the least of the copied centre view: further down, a curve says nothing more."""
+"""Below the least of the baseline: further down, a curve says nothing more."""
 CAVEATS = (
     "A method breaks where it falls 3 dB below its best on that curve, and where it falls below "
-    "the true centre view copied to every view. Between measured strengths the curve is taken as "
-    "straight.",
-    "The readings are made by the real Psi with the sensor's noise on the grid of the "
-    "reconstruction; where mask, lens or shots are at fault, the methods are given the design's.",
-    "Turning and scaling a mask moves its rim most: the larger the picture, the sooner it breaks.",
-    "Contrast: the PSNR is that of the picture stretched back to full contrast.",
+    "the baseline: the true centre view in all places. Between measured strengths curves are "
+    "interpolated linearly.",
+    "Frames are simulated with the faulty Psi and the sensor's noise, on the grid of the "
+    "reconstruction; the methods are given the Psi of the design.",
+    "Turning or scaling a mask moves its rim most: the larger the picture, the smaller the error "
+    "that breaks a method.",
+    "Contrast: PSNR is measured after stretching the picture back to full contrast.",
 )
 
 
@@ -171,12 +172,12 @@ def _row(point: Point, result: dict) -> dict[str, object]:
 
 def _about(study: StabilityStudy, left_out: Sequence[str]) -> list[str]:
     settings = study.settings
-    size = "all of it" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
+    size = "whole views" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     lines = [
         f"{len(study.results)} points on {', '.join(Path(s).stem for s in settings.scenes)}, "
         f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
     ]
-    return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]
+    return [*lines, *([f"Excluded: {'; '.join(left_out)}."] if left_out else [])]
 
 
 def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) -> Path:
@@ -219,7 +220,7 @@ def _known(levels: Levels) -> tuple[list[int], list[float]]:
 
 
 def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
-    """End the axis a little below the copied view, where lower values add nothing; return where."""
+    """End the axis a little below the baseline, where lower values add nothing; return where."""
     views = [view for curve in curves for view in curve.views if view is not None]
     levels = [level for curve in curves for level in curve.levels if level is not None]
     if not levels:
@@ -246,7 +247,7 @@ def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) ->
     lines.append(Line2D([], [], color=INK, linestyle="", marker="x"))
     names.append(f"{LOST_DB:g} dB below its best")
     lines.append(Line2D([], [], color=FAINT, linestyle=":"))
-    names.append("copied true centre view")
+    names.append("baseline: centre view in all places")
     legend_below(figure, lines, names, 5)
 
 
@@ -265,15 +266,18 @@ def _head(curves: Sequence[Curve]) -> Head:
     broken = Counter({curve.method: 0 for curve in first})
     broken.update(curve.method for curve in first if curve.below_best() is not None)
     if not broken:
-        why = "no method ran under any of the faults"
-        return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
+        why = "none of the methods could be measured"
+        return Head("nothing measured", why, ["list the faults: `emmc-rig stability --list`"])
     (best, least), *others = reversed(broken.most_common())
     return Head(
         best,
         f"falls {LOST_DB:g} dB below its best under {least} of {faults} faults, the fewest",
         [
-            "keep your bench below the strengths of the breaking points",
-            *(f"compare {name}: under {count} of {faults} faults" for name, count in others),
+            "keep the errors of your bench below the breaking points",
+            *(
+                f"for comparison, {name}: under {count} of {faults} faults"
+                for name, count in others
+            ),
         ],
     )
 
