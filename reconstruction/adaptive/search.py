@@ -8,7 +8,7 @@ best of a patch that decides.
 
 Where patches lie is arbitrary, and changes the disparities they agree on: shifted by 3 pixels, they
 make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). So what two grids of
-patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md).
+patches believe, one between the other, is averaged: +0.2 dB (benchmarks/tried.md).
 
 Neighbouring patches agree by belief propagation: their disparities differ as d - d' is Laplace
 distributed, or, with a small probability, are not related (another object). Messages are passed
