@@ -146,7 +146,8 @@ class Figure(NamedTuple):
 ESTIMATES = "logarithm; the accuracy is estimated from it"
 FIGURES = {
     "psnr_db": Figure("PSNR", ".2f", "dB", "peak 1, over all {picture}s, pixels and colours"),
-    "stated_db": Figure("Estimated accuracy", ".2f", "dB", "PSNR, by the method, without the truth"),
+    "stated_db": Figure("Estimated accuracy", ".2f", "dB",
+        "PSNR, by the method, without the truth"),
     "stated_interval_db": Figure("Its interval", ".1f", "dB",
         "from and to; it holds the true PSNR in 9 of 10 captures"),
     "ssim": Figure("SSIM", ".4f", "",
