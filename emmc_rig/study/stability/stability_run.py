@@ -35,7 +35,15 @@ from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, machine, provenance
-from emmc_rig.study.stability.curves import LOST_DB, Curve, Levels, break_row, breaking_rows, curves
+from emmc_rig.study.stability.curves import (
+    LOST_DB,
+    Curve,
+    Levels,
+    break_row,
+    breaking_rows,
+    curves,
+    place_words,
+)
 from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.stability_study import StabilitySettings, StabilityStudy, planned
 from reconstruction.methods import METHODS
@@ -54,11 +62,11 @@ BREAK_COLUMNS = (
 """`..._to`: the strength from which on it is broken; empty: not within the sweep. Then in words."""
 PANEL_INCHES, COLUMNS = (3.9, 2.75), 3
 FLOOR_DB = 6.0
-"""Below the least of the copied centre view: further down, a curve says nothing more."""
+"""Below the least of the baseline: further down, a curve says nothing more."""
 CAVEATS = (
     "A method breaks where it falls 3 dB below its best on that curve, and where it falls below "
-    "the true centre view copied to every view. Between measured strengths the curve is taken as "
-    "straight.",
+    "the baseline, the true centre view in all places. Between measured strengths the curve is "
+    "taken as straight.",
     "The readings are made by the real Psi with the sensor's noise on the grid of the "
     "reconstruction; where mask, lens or shots are at fault, the methods are given the design's.",
     "Turning and scaling a mask moves its rim most: the larger the picture, the sooner it breaks.",
@@ -153,7 +161,7 @@ def _sections(found: Sequence[Curve], drawn: Path) -> list[Section]:
             if some:
                 name = f"{slug}-{kind.lower().replace(' ', '-')}.svg"
                 svg = draw_curves(some, colours, drawn / name)
-                charts.append(curves_section(scene, kind, svg))
+                charts.append(curves_section(scene, kind, svg, answers(some)))
     return [*tables, *charts]
 
 
@@ -219,7 +227,7 @@ def _known(levels: Levels) -> tuple[list[int], list[float]]:
 
 
 def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
-    """End the axis a little below the copied view, where lower values add nothing; return where."""
+    """End the axis a little below the baseline, where lower values add nothing; return where."""
     views = [view for curve in curves for view in curve.views if view is not None]
     levels = [level for curve in curves for level in curve.levels if level is not None]
     if not levels:
@@ -246,7 +254,7 @@ def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) ->
     lines.append(Line2D([], [], color=INK, linestyle="", marker="x"))
     names.append(f"{LOST_DB:g} dB below its best")
     lines.append(Line2D([], [], color=FAINT, linestyle=":"))
-    names.append("copied true centre view")
+    names.append("baseline: true centre view in all places")
     legend_below(figure, lines, names, 5)
 
 
@@ -269,13 +277,41 @@ def _head(curves: Sequence[Curve]) -> Head:
         return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
     (best, least), *others = reversed(broken.most_common())
     return Head(
-        best,
-        f"falls {LOST_DB:g} dB below its best under {least} of {faults} faults, the fewest",
+        f"{best} holds out best" if others else best,
+        f"it falls {LOST_DB:g} dB below its best under {least} of {faults} faults"
+        + (", the fewest" if others else ""),
         [
             "keep your bench below the strengths of the breaking points",
             *(f"compare {name}: under {count} of {faults} faults" for name, count in others),
         ],
     )
+
+
+def answers(curves: Sequence[Curve]) -> list[str]:
+    """Return for each fault of some curves a sentence: which method breaks first, which last."""
+    sentences = []
+    for fault in dict.fromkeys(curve.fault for curve in curves):
+        some = [(curve.below_best(), curve) for curve in curves if curve.fault is fault]
+        never = [curve.method for place, curve in some if place is None]
+        breaking = sorted(
+            ((place, curve) for place, curve in some if place is not None), key=lambda one: one[0]
+        )
+        if not breaking:
+            sentences.append(f"{fault.title}: no method loses {LOST_DB:g} dB in this sweep.")
+            continue
+        first, last = breaking[0], breaking[-1]
+        words = f"{fault.title}: {_broken(*first)}"
+        if never:
+            words += f"; {', '.join(never)} nowhere in this sweep"
+        elif last is not first:
+            words += f"; {_broken(*last)}, the last"
+        sentences.append(words + ".")
+    return sentences
+
+
+def _broken(place: float, curve: Curve) -> str:
+    at = f"{place_words(place, curve.strengths)} {curve.fault.unit}"
+    return f"{curve.method} has lost {LOST_DB:g} dB at {at}"
 
 
 def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
@@ -285,8 +321,8 @@ def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
     return Section("breaking-" + scene.replace(" ", "-"), f"Breaking points, {scene}", body)
 
 
-def curves_section(scene: str, kind: str, svg: Path) -> Section:
-    """Return the small multiples of one kind of fault."""
+def curves_section(scene: str, kind: str, svg: Path, answers: Sequence[str]) -> Section:
+    """Return the small multiples of one kind of fault, below what they say."""
     title = f"{kind}, {scene}"
-    body = fragment("drawing.html", drawing=embedded(svg), title=title)
+    body = fragment("drawing.html", drawing=embedded(svg), title=title, answers=answers)
     return Section(title.lower().replace(", ", "-").replace(" ", "-"), title, body)
