@@ -185,7 +185,7 @@ class SessionPage(EventWatcher):
         number = 1 if self._pictures is None else self._pictures.number + 1
         self._pictures = Pictures(number, export_of(result.light_field, result.maps))
         stated = stated_words(result.stated)
-        words = f", states a PSNR of {stated}" if stated else ""
+        words = f", estimated accuracy {stated}" if stated else ""
         self._show_field(f"{result.method}: {result.status}{words}", shots)
 
     def _publish(self, **parts: Any) -> None:

@@ -35,7 +35,15 @@ from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, machine, provenance
-from emmc_rig.study.stability.curves import LOST_DB, Curve, Levels, break_row, breaking_rows, curves
+from emmc_rig.study.stability.curves import (
+    LOST_DB,
+    Curve,
+    Levels,
+    break_row,
+    breaking_rows,
+    curves,
+    place_words,
+)
 from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.stability_study import StabilitySettings, StabilityStudy, planned
 from reconstruction.methods import METHODS
@@ -54,15 +62,16 @@ BREAK_COLUMNS = (
 """`..._to`: the strength from which on it is broken; empty: not within the sweep. Then in words."""
 PANEL_INCHES, COLUMNS = (3.9, 2.75), 3
 FLOOR_DB = 6.0
-"""Below the least of the copied centre view: further down, a curve says nothing more."""
+"""Below the least of the baseline: further down, a curve says nothing more."""
 CAVEATS = (
     "A method breaks where it falls 3 dB below its best on that curve, and where it falls below "
-    "the true centre view copied to every view. Between measured strengths the curve is taken as "
-    "straight.",
-    "The readings are made by the real Psi with the sensor's noise on the grid of the "
-    "reconstruction; where mask, lens or shots are at fault, the methods are given the design's.",
-    "Turning and scaling a mask moves its rim most: the larger the picture, the sooner it breaks.",
-    "Contrast: the PSNR is that of the picture stretched back to full contrast.",
+    "the baseline: the true centre view in all places. Between measured strengths curves are "
+    "interpolated linearly.",
+    "Frames are simulated with the faulty Psi and the sensor's noise, on the grid of the "
+    "reconstruction; the methods are given the Psi of the design.",
+    "Turning or scaling a mask moves its rim most: the larger the picture, the smaller the error "
+    "that breaks a method.",
+    "Contrast: PSNR is measured after stretching the picture back to full contrast.",
 )
 
 
@@ -153,7 +162,7 @@ def _sections(found: Sequence[Curve], drawn: Path) -> list[Section]:
             if some:
                 name = f"{slug}-{kind.lower().replace(' ', '-')}.svg"
                 svg = draw_curves(some, colours, drawn / name)
-                charts.append(curves_section(scene, kind, svg))
+                charts.append(curves_section(scene, kind, svg, answers(some)))
     return [*tables, *charts]
 
 
@@ -171,12 +180,12 @@ def _row(point: Point, result: dict) -> dict[str, object]:
 
 def _about(study: StabilityStudy, left_out: Sequence[str]) -> list[str]:
     settings = study.settings
-    size = "all of it" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
+    size = "whole views" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     lines = [
         f"{len(study.results)} points on {', '.join(Path(s).stem for s in settings.scenes)}, "
         f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
     ]
-    return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]
+    return [*lines, *([f"Excluded: {'; '.join(left_out)}."] if left_out else [])]
 
 
 def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) -> Path:
@@ -219,7 +228,7 @@ def _known(levels: Levels) -> tuple[list[int], list[float]]:
 
 
 def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
-    """End the axis a little below the copied view, where lower values add nothing; return where."""
+    """End the axis a little below the baseline, where lower values add nothing; return where."""
     views = [view for curve in curves for view in curve.views if view is not None]
     levels = [level for curve in curves for level in curve.levels if level is not None]
     if not levels:
@@ -246,7 +255,7 @@ def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) ->
     lines.append(Line2D([], [], color=INK, linestyle="", marker="x"))
     names.append(f"{LOST_DB:g} dB below its best")
     lines.append(Line2D([], [], color=FAINT, linestyle=":"))
-    names.append("copied true centre view")
+    names.append("baseline: true centre view in all places")
     legend_below(figure, lines, names, 5)
 
 
@@ -265,17 +274,48 @@ def _head(curves: Sequence[Curve]) -> Head:
     broken = Counter({curve.method: 0 for curve in first})
     broken.update(curve.method for curve in first if curve.below_best() is not None)
     if not broken:
-        why = "no method ran under any of the faults"
-        return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
+        why = "none of the methods could be measured"
+        return Head("nothing measured", why, ["list the faults: `emmc-rig stability --list`"])
     (best, least), *others = reversed(broken.most_common())
     return Head(
-        best,
-        f"falls {LOST_DB:g} dB below its best under {least} of {faults} faults, the fewest",
+        f"{best} holds out best" if others else best,
+        f"it falls {LOST_DB:g} dB below its best under {least} of {faults} faults"
+        + (", the fewest" if others else ""),
         [
-            "keep your bench below the strengths of the breaking points",
-            *(f"compare {name}: under {count} of {faults} faults" for name, count in others),
+            "keep the errors of your bench below the breaking points",
+            *(
+                f"for comparison, {name}: under {count} of {faults} faults"
+                for name, count in others
+            ),
         ],
     )
+
+
+def answers(curves: Sequence[Curve]) -> list[str]:
+    """Return for each fault of some curves a sentence: which method breaks first, which last."""
+    sentences = []
+    for fault in dict.fromkeys(curve.fault for curve in curves):
+        some = [(curve.below_best(), curve) for curve in curves if curve.fault is fault]
+        never = [curve.method for place, curve in some if place is None]
+        breaking = sorted(
+            ((place, curve) for place, curve in some if place is not None), key=lambda one: one[0]
+        )
+        if not breaking:
+            sentences.append(f"{fault.title}: no method loses {LOST_DB:g} dB in this sweep.")
+            continue
+        first, last = breaking[0], breaking[-1]
+        words = f"{fault.title}: {_broken(*first)}"
+        if never:
+            words += f"; {', '.join(never)} nowhere in this sweep"
+        elif last is not first:
+            words += f"; {_broken(*last)}, the last"
+        sentences.append(words + ".")
+    return sentences
+
+
+def _broken(place: float, curve: Curve) -> str:
+    at = f"{place_words(place, curve.strengths)} {curve.fault.unit}"
+    return f"{curve.method} has lost {LOST_DB:g} dB at {at}"
 
 
 def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
@@ -285,8 +325,8 @@ def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
     return Section("breaking-" + scene.replace(" ", "-"), f"Breaking points, {scene}", body)
 
 
-def curves_section(scene: str, kind: str, svg: Path) -> Section:
-    """Return the small multiples of one kind of fault."""
+def curves_section(scene: str, kind: str, svg: Path, answers: Sequence[str]) -> Section:
+    """Return the small multiples of one kind of fault, below what they say."""
     title = f"{kind}, {scene}"
-    body = fragment("drawing.html", drawing=embedded(svg), title=title)
+    body = fragment("drawing.html", drawing=embedded(svg), title=title, answers=answers)
     return Section(title.lower().replace(", ", "-").replace(" ", "-"), title, body)
