@@ -23,16 +23,29 @@ KINDS = {
     ".svg": "image/svg+xml",
 }
 TEMPLATES = PackageLoader("emmc_rig.pages")
+AGREE = "the frames, Psi and the noise agree with it"
+VERDICTS = {
+    "trust": ("You can trust this light field", "good"),
+    "cannot tell": ("We cannot tell whether this light field is right", "watch"),
+    "doubt": ("There is reason to doubt this light field", "watch"),
+    "do not use": ("Do not use this light field", "bad"),
+}
+"""A verdict's level as a sentence, and the tone of a page with it."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """key: its anchor. title: its heading. body: HTML. short: in the navigation, if not title."""
+    """key: its anchor. title: its heading. body: HTML. short: in the navigation, if not title.
+
+    about: one sentence on what it shows; with it the section is folded, and this stands beside the
+    title.
+    """
 
     key: str
     title: str
     body: str
     short: str = ""
+    about: str = ""
 
 
 @dataclass(frozen=True)
@@ -71,25 +84,25 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
     verdict = metrics.get("verdict")
     if not isinstance(verdict, dict):
         why = "this light field was not reconstructed from frames, or they were not checked"
-        return Head("no verdict", why, _uses(metrics, source, viewer))
+        return Head("No verdict", why, _uses(metrics, source, viewer))
     level, reasons = verdict["level"], verdict["reasons"]
-    why = [reason["what"] for reason in reasons]
-    agree = "frames, Psi and light field agree"
-    lost_db = _below_copied_db(metrics)
-    if lost_db > 0:
+    why = [reason["what"] for reason in reasons] or [AGREE]
+    if lost_db := below_baseline_db(metrics):
         why.append(
-            f"{'' if why else agree + ', '}but the truth, which frames do not show, is missed by "
-            f"{lost_db:.1f} dB more than by the copied {middle_name(axes_of(metrics))}"
+            f"against the truth it is {lost_db:.1f} dB worse than the baseline "
+            f"({middle_name(axes_of(metrics))} in all places)"
         )
     if stated := stated_words(metrics):
-        why = [*(why or [agree]), f"stated PSNR {stated}"]
+        why.append(f"estimated accuracy {stated}")
     remedies = [*(reason["remedy"] for reason in reasons), str(metrics.get("advice") or "")]
-    tone = {"trust": "good", "cannot tell": "watch", "doubt": "watch"}.get(level, "bad")
+    words, tone = VERDICTS[level]
+    if lost_db and tone == "good":
+        words, tone = "Look at this light field with care", "watch"
     return Head(
-        level,
-        "; ".join(why) or agree,
+        words,
+        "; ".join(why),
         [one for one in remedies if one] or _uses(metrics, source, viewer),
-        "watch" if tone == "good" and lost_db > 0 else tone,
+        tone,
     )
 
 
@@ -103,21 +116,24 @@ def estimated(metrics: Mapping[str, object]) -> list[str]:
     return sentences
 
 
-def _below_copied_db(metrics: Mapping[str, object]) -> float:
-    """Return by how much a result with a truth falls short of the copied view; 0: it does not."""
-    found, copied = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")
-    if isinstance(found, int | float) and isinstance(copied, int | float):
-        return max(float(copied - found), 0.0)
+def below_baseline_db(metrics: Mapping[str, object]) -> float:
+    """Return by how much a result with a truth falls short of the baseline; 0: it does not.
+
+    The baseline is the true centre view in all places, which shows no parallax.
+    """
+    found, baseline = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")
+    if isinstance(found, int | float) and isinstance(baseline, int | float):
+        return max(float(baseline - found), 0.0)
     return 0.0
 
 
 def _uses(metrics: Mapping[str, object], source: str, viewer: bool) -> list[str]:
     """Return what a light field can be used for."""
-    look = "drag the picture to turn it, click to focus, turn the wheel to open the aperture"
+    look = "drag the picture to turn it, click to focus, scroll to open the aperture"
     axes = axes_of(metrics)
     if not shows_parallax(axes):
         named = picture_name(axes)
-        look = f"drag the picture from {named} to {named}, turn the wheel for a mean of several"
+        look = f"drag the picture from {named} to {named}, scroll for a mean of several"
     if not source:
         return [look]
     named = shlex.quote(source)
@@ -194,7 +210,7 @@ def framed(
 def provenance_section(provenance: Mapping[str, object]) -> Section:
     """Return where everything came from."""
     body = fragment("provenance.html", rows=provenance)
-    return Section("provenance", "Provenance", body)
+    return Section("provenance", "Provenance", body, about="Versions, command and settings.")
 
 
 def data_address(data: bytes, kind: str) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.files.formats import Export
+from emmc_rig.files.results import stated_words
 from emmc_rig.model.files import write_text
 from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
 from emmc_rig.pages.display import (
@@ -25,8 +26,11 @@ from emmc_rig.pages.display import (
 )
 from emmc_rig.pages.page import Card, fragment, light_field_head
 from emmc_rig.pages.viewer import poster, viewer_data
+from reconstruction.verdict.rules import NOISE, UNEXPLAINED
 
 Array = NDArray[np.floating]
+EXPLAINED = 1 - UNEXPLAINED.doubt
+"""Share of the detail of validation readings below which the verdict is doubt."""
 FRAME_PIXELS = 1_500_000
 """Of all frames together, and of the error map; larger ones are shown smaller."""
 
@@ -70,7 +74,7 @@ def render(content: ReportContent) -> str:
     """Return the page as text."""
     rows, columns, height, width, _ = content.estimate.shape
     disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
-    axes = axes_of(content.metrics)
+    axes, listed = axes_of(content.metrics), _figures(content.metrics)
     export = Export(
         content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
         view_axes=axes,
@@ -93,8 +97,11 @@ def render(content: ReportContent) -> str:
         picture=picture_name(axes),
         views={"rows": rows, "columns": columns, "height": height, "width": width},
         error=None if content.truth is None else _error(content.estimate, content.truth),
+        shots="1 shot" if len(content.frames) == 1 else f"{len(content.frames)} shots",
         timings=_timings(content.stage_s),
-        figures=_figures(content.metrics),
+        total_s=sum(content.stage_s.values()),
+        figures=[row for row in listed if not row["of_method"]],
+        of_method=[row for row in listed if row["of_method"]],
         provenance=_provenance(content),
         data={"viewer-data": viewer_data(export, most_pixels=PART_PIXELS)},
         poster=poster(export, PART_PIXELS),
@@ -136,16 +143,18 @@ class Figure(NamedTuple):
     meaning: str = ""
 
 
+ESTIMATES = "logarithm; the accuracy is estimated from it"
 FIGURES = {
     "psnr_db": Figure("PSNR", ".2f", "dB", "peak 1, over all {picture}s, pixels and colours"),
-    "stated_db": Figure("Stated PSNR", ".2f", "dB", "by the method, without the truth"),
-    "stated_interval_db": Figure("Interval of the stated PSNR", ".1f", "",
-        "dB, from and to; it holds the true one in 9 of 10 captures"),
+    "stated_db": Figure("Estimated accuracy", ".2f", "dB",
+        "PSNR, by the method, without the truth"),
+    "stated_interval_db": Figure("Its interval", ".1f", "dB",
+        "from and to; it holds the true PSNR in 9 of 10 captures"),
     "ssim": Figure("SSIM", ".4f", "",
         "structural similarity, averaged over {picture}s; 1 is identical"),
-    "replicate_psnr_db": Figure("PSNR of the copied {middle}", ".2f", "dB",
-        "the true {middle} copied to all {picture}s: below it, {lost}"),
-    "psi_relative_error": Figure("Relative error of Psi", ".2e", "",
+    "replicate_psnr_db": Figure("PSNR of the baseline", ".2f", "dB",
+        "the true {middle} in all places: below it, {lost}"),
+    "psi_relative_error": Figure("Calibration error", ".2%", "",
         "|measured - exact| / |exact|, Euclidean norms"),
     "exact_psi_psnr_db": Figure("PSNR with the exact Psi", ".2f", "dB",
         "same frames, reconstructed without calibration"),
@@ -156,8 +165,8 @@ FIGURES = {
     "psi_mean_deviation": Figure("Mean standard deviation of Psi", ".2e", "",
         "of one coefficient, as calibration states it"),
     "noise_sigma": Figure("Noise of the readings", ".2e", "",
-        "their standard deviation, as the reconstruction took it"),
-    "saturated_share": Figure("Saturated readings", ".2%", "", "share left out as clipped"),
+        "their standard deviation, as the reconstruction assumed it; 1 is white"),
+    "saturated_share": Figure("Saturated readings", ".2%", "", "share excluded as clipped"),
     "whiteboard_frames": Figure("Whiteboard frames", meaning="exposures taken to measure Psi"),
     "status": Figure("Status", meaning="how the solver stopped"),
     "advice": Figure("Advice", meaning="what the solver suggests"),
@@ -167,6 +176,36 @@ FIGURES = {
     "scene_provenance": Figure("Origin of the scene"),
     "finer": Figure("Finer scene",
         meaning="{picture}s and pixels of the simulated scene for each here"),
+    "parameters.noise_sigma": Figure("Noise", ".2e", "",
+        "standard deviation of a reading, as the method assumed it; 1 is white"),
+    "parameters.lowest_px": Figure("Lowest disparity", ".2f", "px per view", "of the centre view"),
+    "parameters.highest_px": Figure("Highest disparity", ".2f", "px per view",
+        "of the centre view"),
+    "parameters.disparities": Figure("Disparities searched", meaning="how many were tried"),
+    "parameters.search_seconds": Figure("Search of disparities", ".2f", "s"),
+    "parameters.held_readings": Figure("Validation readings",
+        meaning="kept from the fit, to test it on"),
+    "parameters.at_end": Figure("Patches at the end of the range", ".1%", "",
+        "whose best disparity is the lowest or highest searched; good: at most 1 %"),
+    "parameters.misfit": Figure("Unexplained residual", ".2f", "x noise",
+        "root mean square residual of the readings over their noise; good: about 1"),
+    "parameters.misfit_row": Figure("Row of the largest residual", ".0f", "px"),
+    "parameters.misfit_column": Figure("Column of the largest residual", ".0f", "px"),
+    "parameters.decided": Figure("Textured patches with a depth", ".0%", "",
+        "whose readings prefer one disparity; good: more than 25 %"),
+    "parameters.over_plain": Figure("Residual against total variation", ".2f", "",
+        "mean square residual of the validation readings beyond their noise, over that of total "
+        "variation; good: below 1"),
+    "parameters.stated_apart": Figure("Difference of two estimates", ".2f", "", ESTIMATES),
+    "parameters.stated_disparity": Figure("Uncertainty of disparity", ".2f", "", ESTIMATES),
+    "parameters.stated_spread": Figure("Spread between models", ".2f", "", ESTIMATES),
+    "parameters.stated_contrast": Figure("Contrast of the scene", ".2f", "", ESTIMATES),
+    "parameters.stated_tails_db": Figure("Subtracted for few large errors", ".2f", "dB",
+        "from the estimated accuracy"),
+    "parameters.stated_scale_db": Figure("Scale of the deviation", ".2f", "dB",
+        "against what the validation readings show"),
+    "parameters.stated_within_db": Figure("Half of the interval", ".2f", "dB",
+        "of the estimated accuracy, which holds the true PSNR in 9 of 10 captures"),
 }  # fmt: skip
 """By the name in metrics.json; a figure without a row here is listed under its own name. In braces:
 what pictures are called, the one in the middle, what it is to fall short of it."""
@@ -198,44 +237,37 @@ def _written(value: object, spec: str = "", unit: str = "") -> str:
 
 
 def _cards(content: ReportContent) -> list[Card]:
-    metrics, stage_s = content.metrics, content.stage_s
-    no_truth = "no true light field to compare with" if content.truth is None else ""
-    psnr, replicate = _number(metrics.get("psnr_db")), _number(metrics.get("replicate_psnr_db"))
+    """Return the three figures that tell most, each with what is good; none is green in doubt."""
+    metrics = content.metrics
     axes = axes_of(metrics)
-    middle, picture = middle_name(axes), picture_name(axes)
-    versus = Card(f"Over {middle}", "not measured", no_truth)
-    if psnr is not None and replicate is not None:
-        note = f"copying the true {middle} gives {replicate:.2f} dB"
-        tone = "good" if psnr > replicate else "bad"
-        versus = Card(f"Over {middle}", f"{psnr - replicate:+.2f} dB", note, tone)
-    psi_error = _number(metrics.get("psi_relative_error"))
-    known_psi = "not measured" if psi_error is None else f"{100 * psi_error:.2f} %"
-    status = str(metrics.get("status") or "not measured")
-    cards = [
-        Card(
-            "PSNR",
-            _named(metrics, "psnr_db"),
-            no_truth or f"peak 1, all {picture}s, pixels, colours",
-        ),
-        versus,
-        Card("SSIM", _named(metrics, "ssim"), "1 is identical"),
-        Card("Error of Psi", known_psi, "|measured - exact| / |exact|"),
-    ]
-    if metrics.get("exact_psi_psnr_db") is not None:
-        note = f"with the exact Psi: {_named(metrics, 'exact_psi_psnr_db')}"
-        cards.append(Card("Calibration costs", _named(metrics, "calibration_cost_db"), note))
-    if stage_s:
-        longest = max(stage_s, key=lambda name: stage_s[name])
-        note = f"of which {longest} {stage_s[longest]:.1f} s"
-        cards.append(Card("Time", f"{sum(stage_s.values()):.1f} s", note))
-    note = str(metrics.get("advice") or metrics.get("method") or "")
-    tone = "good" if status.startswith("converged") else "watch"
-    return [*cards, Card("Solver", status, note, tone)]
-
-
-def _named(metrics: Mapping[str, object], key: str) -> str:
-    """Return a metric as its row of FIGURES writes it."""
-    return _written(metrics.get(key), FIGURES[key].format, FIGURES[key].unit)
+    fine = "good" if light_field_head(metrics).tone == "good" else ""
+    cards = []
+    psnr, baseline = _number(metrics.get("psnr_db")), _number(metrics.get("replicate_psnr_db"))
+    if psnr is not None:
+        note = f"root mean square error {10 ** (-psnr / 20):.1%} of white; the higher the better"
+        cards.append(Card("Accuracy (PSNR)", f"{psnr:.1f} dB", note))
+    if psnr is not None and baseline is not None:
+        note = f"the true {middle_name(axes)} in all places has {baseline:.1f} dB; good: above 0"
+        tone = fine if psnr > baseline else "bad"
+        cards.append(Card("Over the baseline", f"{psnr - baseline:+.1f} dB", note, tone))
+    stated = _number(metrics.get("stated_db"))
+    if stated is not None and psnr is None:
+        note = f"{stated_words(metrics)}, by the method itself; the higher the better"
+        cards.append(Card("Estimated accuracy", f"{stated:.1f} dB", note))
+    verdict = metrics.get("verdict")
+    evidence = verdict.get("features") or {} if isinstance(verdict, Mapping) else {}
+    explained, noise = _number(evidence.get("explained")), _number(evidence.get("noise"))
+    if explained is not None:
+        note = f"of the detail in validation readings is predicted; good: above {EXPLAINED:.0%}"
+        tone = fine if explained > EXPLAINED else "bad"
+        cards.append(Card("Explained", f"{max(explained, 0):.0%}", note, tone))
+    if noise is not None:
+        note = f"of the mean reading; good: below {NOISE.doubt:.0%}"
+        tone = fine if noise < NOISE.doubt else "watch"
+        cards.append(Card("Noise", f"{noise:.1%}", note, tone))
+    if content.stage_s:
+        cards.append(Card("Time", f"{sum(content.stage_s.values()):.1f} s", "from scene to page"))
+    return cards[:3]
 
 
 def _warnings(content: ReportContent) -> list[str]:
@@ -265,22 +297,22 @@ def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, ob
     return rows
 
 
-def _figures(metrics: Mapping[str, object]) -> list[dict[str, str]]:
+def _figures(metrics: Mapping[str, object]) -> list[dict[str, Any]]:
     """Return the rows of the table of metrics."""
     rows, axes = [], axes_of(metrics)
     lost = "no parallax has been recovered" if shows_parallax(axes) else "they are not told apart"
     words = {"picture": picture_name(axes), "middle": middle_name(axes), "lost": lost}
     for key, value in _flat(metrics):
         name = key.removeprefix("parameters.")
-        unknown = Figure(
-            name.replace("_", " ").capitalize(), meaning="" if name == key else "of the method"
-        )
-        figure = FIGURES.get(key, unknown)
+        figure = FIGURES.get(key, Figure(name.replace("_", " ").capitalize()))
         written = _written(value, figure.format, figure.unit)
         label, meaning = figure.label, figure.meaning
         if key in FIGURES:
             label, meaning = label.format(**words), meaning.format(**words)
-        rows.append({"key": key, "label": label, "value": written, "meaning": meaning})
+        rows.append({
+            "key": key, "label": label, "value": written, "meaning": meaning,
+            "of_method": name != key,
+        })  # fmt: skip
     return rows
 
 

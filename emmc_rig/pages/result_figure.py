@@ -1,7 +1,8 @@
 """Figure of results for a paper: views, close-ups, epipolar images and maps, side by side.
 
 Every picture is embedded at its own pixels; text and lines stay vectors. Results are columns, maps
-rows under each other's scale; of a single result the maps stand to the right of the view.
+rows under each other's scale; of a single result the maps stand to the right of the view, and its
+epipolar image under them.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError, WrongUsageError
@@ -32,7 +34,8 @@ from emmc_rig.version import __version__
 Array = NDArray[np.floating]
 WIDTH_IN = 7.16
 """Of a figure across both columns of an IEEE page."""
-EDGE_IN, GAP_IN, LABEL_IN, BAR_IN, STRIP_IN = 0.01, 0.06, 0.2, 0.45, 0.3
+EDGE_IN, GAP_IN, LABEL_IN, BAR_IN, STRIP_IN = 0.01, 0.06, 0.28, 0.45, 0.4
+BAR_WIDE_IN = 0.08
 TICK_IN = 0.05
 """Half a figure at the lower end of a scale, which stands at the edge."""
 TEXT_PT, LINE_IN = 7.5, 0.13
@@ -42,7 +45,9 @@ FRAMES = ("#ffb000", "#00beff", "#ff5d8f", "#7ed957")
 """Colours of the close-ups' frames, in order."""
 CLOSE_UP_SHARE = 0.16
 LEAST_RANGE_PX = 0.1
-"""Of a scale of disparities, where a result is one plane."""
+"""Of disparities: a map with less is one colour, and its value stands in the caption instead."""
+SCALE_SHARE = 0.25
+"""Of the picture's width, which the scale bar does not exceed."""
 
 
 @dataclass(frozen=True)
@@ -120,32 +125,39 @@ def draw_results(
         for name, one in zip(names[1:], results, strict=True)
     }  # fmt: skip
     titles = [
-        f"{name}\n{measured[name]['psnr_db']:.2f} dB, SSIM {measured[name]['ssim']:.3f}"
+        f"{name}\n{measured[name]['psnr_db']:.2f} dB, SSIM\u00a0{measured[name]['ssim']:.3f}"
         if name in measured
         else name
         for name in names
     ]
     line, _ = epipolar_lines(reference)
-    maps = _maps(results, view, truth)
+    maps, flat_px = _maps(results, view, truth)
     beside = maps if len(columns) == 1 else []
     titles += [one.label for one in beside]
-    rows, bars = (0, len(maps)) if beside else (len(maps), min(len(maps), 1))
+    rows, bars = (0, len(maps)) if beside else (len(maps), 1 if maps and truth is None else 0)
     sheet = _Sheet(
-        figure or Figure(), settings.width_in, titles, len(pieces), rows, bars, reference.shape
-    )
+        figure or Figure(), settings.width_in, titles, len(pieces), rows, bars, reference.shape,
+        bool(beside),
+    )  # fmt: skip
     for at, one in enumerate(columns):
         codes, strip = (
             three_colours(curve.encode(picture))
             for picture in (one.light_field[view], epi_horizontal(one.light_field, view[0], line))
         )
-        sheet.picture(at, codes, pieces, strip, line)
+        sheet.picture(at, codes, pieces, line)
+        sheet.strip(at, strip, line, parallax)
+    sheet.scale_bar(reference.shape[3])
     for at, one in enumerate(beside, 1):
-        sheet.map(at, 0, one.values[0], one, bar=True)
+        sheet.map(at, 0, one.values[0], one)
+        sheet.bar(at, 0, one)
     for row, one in enumerate(maps if not beside else [], 1):
-        sheet.label(row, one.label)
-        first = len(columns) - len(results)
-        for at, values in enumerate(one.values, first):
-            sheet.map(at, row, values, one, bar=at == len(columns) - 1)
+        for at, values in enumerate(one.values, len(columns) - len(results)):
+            sheet.map(at, row, values, one)
+        if truth is None:
+            sheet.label(row, one.label)
+            sheet.bar(len(columns) - 1, row, one)
+        else:
+            sheet.key(row, one)
     sources = [
         f"{name}: {_source(one)}."
         for name, one in zip(names, columns, strict=True)
@@ -155,8 +167,11 @@ def draw_results(
     caption = " ".join([
         f"{name[0].upper()}{name[1:]} of {rows_of_views}x{columns_of_views}, "
         f"{reference.shape[2]}x{reference.shape[3]} pixels.",
-        f"Epipolar plane image of row {line} (dotted), all views of a row downwards." if parallax
+        f"Epipolar image of row {line} (dotted): that row of every view (v, u) of v = {view[0]}, u "
+        "downwards; its slopes are disparities." if parallax
         else f"Row {line} (dotted) of every {picture}, downwards.",
+        *([] if flat_px is None else
+          [f"Disparity is {flat_px:.2f} px per view everywhere, to {LEAST_RANGE_PX} px."]),
         *([f"Error: root mean square over colours, of this {picture}. PSNR and SSIM are of all "
            f"{picture}s, peak 1."] if measured else []),
         f"Close-ups of {pieces[0].side}x{pieces[0].side} pixels around (y, x) = "
@@ -171,8 +186,9 @@ def draw_results(
 class _Sheet:
     """Axes in columns of one width, placed by the inch from the top left.
 
-    titles: of all columns. close_ups: below each picture. rows: of maps below; 0: they stand beside
-    the picture. bars: columns with a scale to their right, the last ones. shape: of light fields.
+    titles: of all columns. close_ups: below each picture. rows: of maps below. bars: columns with a
+    scale to their right, the last ones. shape: of light fields. beside: maps stand to the right of
+    the only picture, over its epipolar image.
     """
 
     def __init__(
@@ -184,9 +200,10 @@ class _Sheet:
         rows: int,
         bars: int,
         shape: Sequence[int],
+        beside: bool,
     ) -> None:
-        self.left = LABEL_IN if rows else EDGE_IN
-        self.bars = bars
+        self.left = EDGE_IN if beside else LABEL_IN
+        self.bars, self.beside = bars, beside
         gaps_in = (len(titles) - 1) * GAP_IN + bars * BAR_IN
         self.wide = (width_in - EDGE_IN - self.left - gaps_in) / len(titles)
         self.tall = self.wide * shape[2] / shape[3]
@@ -197,19 +214,18 @@ class _Sheet:
             for title in titles
         ]
         self.top = GAP_IN + LINE_IN * (1 + max(title.count("\n") for title in wrapped))
-        self.below = self.tall + self.side + STRIP_IN + 4 * GAP_IN
+        strip = 0 if beside else STRIP_IN + GAP_IN
+        self.below = self.tall + self.side + strip + 3 * GAP_IN
         height = self.top + self.below + rows * (self.tall + 2 * GAP_IN) + EDGE_IN
-        self.width, self.height = width_in, height + (TICK_IN if bars else 0)
+        self.width, self.height = width_in, height + TICK_IN
         self.figure = figure
         figure.set_size_inches(self.width, self.height)
         for at, title in enumerate(wrapped):
             x = self._x(at) + self.wide / 2
             self._text(x, self.top - GAP_IN / 2, title, va="bottom")
 
-    def picture(
-        self, at: int, codes: NDArray, pieces: Sequence[Piece], strip: NDArray, line: int
-    ) -> None:
-        """Draw screen codes (y, x, 3) into a column; below, pieces and the strip of a line."""
+    def picture(self, at: int, codes: NDArray, pieces: Sequence[Piece], line: int) -> None:
+        """Draw screen codes (y, x, 3) into a column, with its pieces below."""
         x, y = self._x(at), self.top
         axes = self._axes(x, y, self.wide, self.tall)
         axes.imshow(codes, interpolation="none", aspect="auto")
@@ -226,27 +242,78 @@ class _Sheet:
             close.imshow(piece.of(codes), interpolation="none")
             close.spines[:].set(visible=True, color=colour, linewidth=1.2)
         axes.axhline(line, color="white", linewidth=0.8, linestyle=":")
-        drawn = self._axes(x, y + self.side + GAP_IN, self.wide, STRIP_IN)
-        drawn.imshow(strip, interpolation="none", aspect="auto")
 
-    def map(self, at: int, row: int, values: Array | None, of: _Maps, bar: bool) -> None:
-        """Draw a map into a column; row: below the pictures, 0 beside them. bar: its scale too."""
+    def strip(self, at: int, codes: NDArray, line: int, parallax: bool) -> None:
+        """Draw the row of each view, (view, x, 3), with its name, once."""
+        name = "view u" if parallax else "view"
+        x, y, wide, tall = self._x(at), self.top + self.tall + GAP_IN, self.wide, STRIP_IN
+        if self.beside:
+            x = self._x(1)
+            wide, tall = self.width - EDGE_IN - x, self.side - LINE_IN - GAP_IN
+            words = "epipolar image" if parallax else "views"
+            self._text(x + wide / 2, y + LINE_IN / 2, f"{words} of row {line}, {name} downwards")
+            y += LINE_IN + GAP_IN
+        else:
+            y += self.side + GAP_IN
+            if at == 0:
+                self._text(LABEL_IN / 2, y + tall / 2, name, rotation=90)
+        axes = self._axes(x, y, wide, tall)
+        axes.imshow(codes, interpolation="none", aspect="auto")
+
+    def scale_bar(self, width_px: int) -> None:
+        """Draw a length of so many pixels into the first picture."""
+        fits = [
+            n * 10**k for k in range(5) for n in (1, 2, 5) if n * 10**k <= SCALE_SHARE * width_px
+        ]
+        length = max(fits, default=1)
+        axes = self.figure.axes[0]
+        outline = [withStroke(linewidth=1.5, foreground="black")]
+        start, y = 0.04 * width_px, 0.06
+        across = axes.get_xaxis_transform()
+        axes.plot(
+            [start, start + length], [y, y], color="white", linewidth=1.5, transform=across,
+            path_effects=[withStroke(linewidth=2.5, foreground="black")], solid_capstyle="butt",
+        )  # fmt: skip
+        axes.text(
+            start + length / 2, y + 0.02, f"{length} px", color="white", fontsize=6, ha="center",
+            va="bottom", transform=across, path_effects=outline,
+        )  # fmt: skip
+
+    def map(self, at: int, row: int, values: Array | None, of: _Maps) -> None:
+        """Draw a map into a column; row: below the pictures, 0 beside them."""
         x, y = self._x(at), self._y(row)
         if values is None:
             self._text(x + self.wide / 2, y + self.tall / 2, "none", color=FAINT)
-        else:
-            look: dict[str, Any] = {"cmap": of.colours, "vmin": of.low, "vmax": of.high}
-            axes = self._axes(x, y, self.wide, self.tall)
-            axes.imshow(values, interpolation="none", aspect="auto", **look)
-        if bar:
-            axes = self._axes(x + self.wide + GAP_IN, y, 0.08, self.tall)
-            colours = ScalarMappable(Normalize(of.low, of.high), of.colours)
-            self.figure.colorbar(colours, cax=axes).outline.set_linewidth(0.4)
-            axes.tick_params(labelsize=6, width=0.4, length=2, pad=1)
+            return
+        axes = self._axes(x, y, self.wide, self.tall)
+        axes.imshow(
+            values, cmap=of.colours, vmin=of.low, vmax=of.high, interpolation="none", aspect="auto"
+        )
+
+    def bar(self, at: int, row: int, of: _Maps) -> None:
+        """Draw the scale of a map to the right of a column."""
+        self._bar(self._x(at) + self.wide + GAP_IN, row, of)
+
+    def key(self, row: int, of: _Maps) -> None:
+        """Write what a row of maps shows into its first column, and draw the scale there."""
+        right = self._x(0) + self.wide - BAR_WIDE_IN
+        self._bar(right, row, of).yaxis.set_ticks_position("left")
+        wide = right - BAR_IN + BAR_WIDE_IN
+        letters = max(8, int(wide * 72 / LETTER_PT))
+        words = textwrap.fill(of.label, letters, break_long_words=False)
+        self._text(wide / 2, self._y(row) + self.tall / 2, words)
 
     def label(self, row: int, text: str) -> None:
         """Write what a row of maps shows to its left."""
-        self._text(LABEL_IN / 2, self._y(row) + self.tall / 2, text, rotation=90)
+        words = textwrap.fill(text, max(8, int(self.tall * 72 / LETTER_PT)))
+        self._text(LABEL_IN / 2, self._y(row) + self.tall / 2, words, rotation=90)
+
+    def _bar(self, x: float, row: int, of: _Maps) -> Axes:
+        axes = self._axes(x, self._y(row), BAR_WIDE_IN, self.tall)
+        colours = ScalarMappable(Normalize(of.low, of.high), of.colours)
+        self.figure.colorbar(colours, cax=axes).outline.set_linewidth(0.4)
+        axes.tick_params(labelsize=6, width=0.4, length=2, pad=1)
+        return axes
 
     def _x(self, at: int) -> float:
         bars_before = max(at - 1, 0) if self.bars > 1 else 0
@@ -294,8 +361,13 @@ def _pieces(picture: Array, settings: FigureSettings) -> list[Piece]:
     return [Piece(y, x, side) for y, x in corners] or detailed_pieces(picture, side, 2)
 
 
-def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None) -> list[_Maps]:
-    """Return every map that any result has; error and deviation share one scale."""
+def _maps(
+    results: Sequence[Export], view: tuple[int, int], truth: Array | None
+) -> tuple[list[_Maps], float | None]:
+    """Return every map that half of the results have; error and deviation share one scale.
+
+    The second is the disparity, px per view, where it is the same everywhere: no map shows that.
+    """
     errors = [
         None if truth is None
         else np.sqrt(np.mean((finite(one.light_field[view]) - truth[view]) ** 2, axis=-1))
@@ -305,14 +377,18 @@ def _maps(results: Sequence[Export], view: tuple[int, int], truth: Array | None)
     disparities = [one.disparity if shows_parallax(one.view_axes) else None for one in results]
     top = round_up(ends([*errors, *deviations])[1])
     low, high = ends(disparities)
-    if high - low < LEAST_RANGE_PX:
-        low, high = low - LEAST_RANGE_PX / 2, high + LEAST_RANGE_PX / 2
     every = [
         _Maps("error", errors, 0, top, "magma"),
-        _Maps("stated standard deviation", deviations, 0, top, "magma"),
+        _Maps("estimated deviation", deviations, 0, top, "magma"),
         _Maps("disparity, px per view", disparities, low, high, "viridis"),
     ]
-    return [one for one in every if any(values is not None for values in one.values)]
+    known = [
+        one for one in every
+        if 2 * sum(values is not None for values in one.values) >= len(results)
+    ]  # fmt: skip
+    if known and known[-1].values is disparities and high - low < LEAST_RANGE_PX:
+        return known[:-1], (low + high) / 2
+    return known, None
 
 
 def _names(columns: Sequence[Export]) -> list[str]:

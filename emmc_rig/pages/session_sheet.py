@@ -30,32 +30,31 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.exposure import GOOD_LEVEL, exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import DecidedEntry, FrameEntry, RetryEntry, ended, of_kind
 from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
-from emmc_rig.session.verify import counts
 
 LONGEST_PX, JPEG_QUALITY = 176, 80
 MOST_PICTURES, FIRST_PICTURES = 200, 12
-"""On the page, and of each kind without unfolding the rest."""
+"""On the page, and of the shots without unfolding the rest."""
 QUICK_BYTES = 1 << 30
 PICTURE_PIXELS = 1 << 17
 TONES = {"trust": "good", "doubt": "watch", "do not use": "bad"}
 BOARDS = ("reference", "open")
 """Kinds of frames that show a whiteboard through the whole aperture."""
 HEADINGS = {
-    "dark": "Darks",
-    "metering": "Metering",
+    "dark": "Darks: the lamp is off",
+    "metering": "Metering: the exposures are set by these",
     "reference": "References: whiteboard, open aperture, no masks",
     "whiteboard": "Whiteboards: the pinhole before each view",
     "open": "Open whiteboards: masks in, whole aperture",
-    "held-out": "Held out: open whiteboards that judge the calibration",
+    "held-out": "Validation: open whiteboards that test the calibration",
     "check": "Checks: whiteboards seen again, for lamp and response",
-    "turned": "The white board turned by 90 degrees",
-    "shot": "Shots of the scene",
+    "turned": "Turned board: the white board turned by 90 degrees and more",
+    "shot": "Shots: the scene",
 }
 
 
@@ -80,10 +79,16 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     if taken:
         last = ended(session.journal.entries)
         body = fragment("session_shots.html", decisions=taken, spared=last and last.spared)
-        title = "Shots: what they gave, and which was next"
-        sections.append(Section("decisions", title, body, "Shots"))
-    body = fragment("session_events.html", events=events(session))
-    sections += [Section("events", "Events", body), *_frames(session, pictures)]
+        about = f"The accuracy estimated after each of {len(taken)} shots, and which came next."
+        sections.append(Section("decisions", "Choice of shots", body, about=about))
+    happened = list(events(session))
+    body = fragment("session_events.html", events=happened)
+    sections += [
+        *_frames(session, pictures),
+        Section(
+            "events", "Events", body, about=f"{len(happened)}: runs, retries, what was changed."
+        ),
+    ]
     sources = {
         "command": session.header["command"],
         **session.header["versions"],
@@ -108,7 +113,9 @@ def _head(session: Session) -> Head:
     name = typed(session.folder)
     if missing := len(session.missing()):
         why = f"{missing} of {len(session.needed)} frames are missing"
-        return Head("not complete", why, [f"go on with: `emmc-rig capture {name}`"], "watch")
+        return Head(
+            "This session is not complete", why, [f"go on with: `emmc-rig capture {name}`"], "watch"
+        )
     reasons = exposure_reasons(shot_exposures(session))
     commands = [f"get the light field: `emmc-rig reconstruct {name}`"]
     if reconstructed(session.folder)[0]:
@@ -116,7 +123,7 @@ def _head(session: Session) -> Head:
     elif any(frame.kind in BOARDS for frame in session.needed):
         commands.insert(0, f"measure Psi from the whiteboards: `emmc-rig calibrate {name}`")
     return Head(
-        "complete",
+        "This session is complete" + (", but" if reasons else ""),
         "; ".join(reason.what for reason in reasons) or "every frame is stored and verified",
         [*(reason.remedy for reason in reasons), *commands],
         "watch" if reasons else "good",
@@ -135,25 +142,16 @@ def _cards(session: Session) -> list[Card]:
     stored, planned = len(session.stored), len(session.needed)
     size = sum(entry.bytes for entry in session.stored.values())
     retries = len(of_kind(session.journal.entries, RetryEntry))
-    state = Card("State", "not complete", "resume it", "watch")
-    if session.is_complete:
-        state = Card("State", "complete", "every frame verified", "good")
-    kinds = ", ".join(f"{done} {kind}" for kind, (done, _) in counts(session).items())
+    note = f"{shown_bytes(size)}; good: all" + (f"; {retries} taken again" if retries else "")
+    tone = "good" if session.is_complete else "watch"
     cards = [
-        state,
-        Card("Frames", f"{stored} of {planned}", kinds),
-        Card("Size", shown_bytes(size), "the camera's own bytes"),
+        Card("Frames", f"{stored} of {planned}", note, tone),
         *_exposure_cards(session),
         *_light_field_cards(session),
-        Card("Retries", str(retries), f"in {session.runs} run(s)", "watch" if retries else ""),
     ]
-    runs = run_times(session)
-    if runs:
+    if runs := run_times(session):
         last = runs[-1]
-        note = (
-            f"in the last run: {last['moving_s']:.1f} s moving, {last['exposing_s']:.1f} s "
-            f"exposing, {last['writing_s']:.1f} s writing meanwhile"
-        )
+        note = f"the last run; {last['moving_s']:.1f} s moving, {last['exposing_s']:.1f} s exposing"
         cards.append(Card("Time", f"{last['seconds']:.1f} s", note))
     return cards
 
@@ -202,27 +200,26 @@ def session_metrics(session: Session) -> dict[str, object]:
 
 
 def _exposure_cards(session: Session) -> list[Card]:
-    """Return what the brightest readings of the shots reach, with what speaks against it."""
+    """Return what the brightest readings of the shots reach."""
     shots = shot_exposures(session)
     if not shots:
         return []
     levels = [one.level for one in shots]
     reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
-    reasons = exposure_reasons(shots)
-    note = "; ".join(f"{one.level}: {one.what}; {one.remedy}" for one in reasons)
-    note = note or "of white, the brightest readings of each shot"
-    return [Card("Exposure", reached, note, "watch" if reasons else "good")]
+    note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVEL:.0%}"
+    tone = "watch" if exposure_reasons(shots) else "good"
+    return [Card("Exposure", reached, note, tone)]
 
 
 def _light_field_cards(session: Session) -> list[Card]:
     """Return the verdict of the light field, once the session is reconstructed."""
     verdict, stated_db = reconstructed(session.folder)
-    stated = "" if stated_db is None else f"{stated_db:.1f} dB stated"
+    stated = "" if stated_db is None else f"estimated accuracy {stated_db:.1f} dB"
     return [Card("Light field", verdict, stated, TONES.get(verdict, ""))] if verdict else []
 
 
 def _frames(session: Session, pictures: int) -> Iterator[Section]:
-    """Yield a section for each kind of frame; shots of the scene get the most room."""
+    """Yield a section for each kind of frame; all but the shots of the scene are folded."""
     left, balance = pictures, _balance(session)
     for kind in reversed(KINDS):
         frames = sorted((f for f in session.needed if f.kind == kind), key=_place_in_plan)
@@ -233,11 +230,19 @@ def _frames(session: Session, pictures: int) -> Iterator[Section]:
         body = fragment(
             "session_frames.html",
             pictures=[_picture(session, frame, balance) for frame in shown],
-            first=FIRST_PICTURES,
+            first=FIRST_PICTURES if kind == "shot" else len(shown),
             total=len(frames),
         )
-        title = HEADINGS[kind]
-        yield Section(kind, title, body, title.partition(":")[0])
+        title, _, words = HEADINGS[kind].partition(": ")
+        about = "" if kind == "shot" else f"{_count(session, frames)}, {words}."
+        yield Section(kind, title, body, about=about)
+
+
+def _count(session: Session, frames: Sequence[PlannedFrame]) -> str:
+    """Return how many frames there are, and how many of them are missing."""
+    missing = sum(frame.id not in session.stored for frame in frames)
+    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+    return f"{count}, {missing} of them missing" if missing else count
 
 
 def _place_in_plan(frame: PlannedFrame) -> tuple:

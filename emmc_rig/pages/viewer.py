@@ -2,7 +2,7 @@
 
     views and truth   JPEG atlases of all views, as screen codes
     disparity         one PNG atlas of what every view sees, 256 levels
-    overlays          one PNG each, of the centre view: disparity, how sure, doubt
+    overlays          one PNG each, of the centre view: disparity, deviation, residual
 
 `viewer.js` draws with WebGL2, by the formulas of `emmc_rig.model.novel_view`; without it, the
 views themselves by canvas. A pixel between four views takes 12 texture reads where disparity is
@@ -156,9 +156,7 @@ def overlays_of(content: Export) -> list[Overlay]:
         high = round_up(ends([values])[1])
         found.append(Overlay("sigma", "standard deviation", "", values, 0, high))
     if content.misfit is not None:
-        found.append(
-            Overlay("doubt", "readings missed", "times their noise", content.misfit, 1.0, 5.0)
-        )
+        found.append(Overlay("doubt", "unexplained residual", "x noise", content.misfit, 1.0, 5.0))
     return found
 
 

@@ -1,6 +1,7 @@
 """Figures for papers: what stands where, on which scale, and where it came from."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,9 +66,44 @@ def test_psnr_stands_over_its_method_and_the_caption_names_every_source(results)
         assert drawn.measured[one.title]["psnr_db"] == psnr
         assert one.metrics["command"] in drawn.caption
     # The second method has no deviation, which stands in its place.
-    assert "stated standard deviation" in texts
+    assert "estimated deviation" in texts
     assert texts.count("none") == 1
     assert "true" in texts
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+@pytest.mark.parametrize("with_truth", [True, False])
+def test_the_figure_is_labelled_and_filled_for_one_to_six_methods(results, count, with_truth):
+    of_methods = [
+        replace(results[i % 2], title=f"method {i}", truth=None if i or not with_truth else truth)
+        for i, truth in enumerate([results[0].truth] * count)
+    ]
+    figure = draw_results(of_methods).figure
+    figure.draw_without_rendering()
+    texts = [text.get_text().replace("\n", " ") for text in figure.texts]
+    assert any("view u" in text for text in texts)
+    assert any("disparity, px per view" in text for text in texts)
+    (bar,) = figure.axes[0].texts
+    assert bar.get_text() == "10 px"  # 48 px wide
+    (line,) = [one for one in figure.axes[0].lines if len(set(one.get_xdata())) == 2][-1:]
+    assert np.ptp(np.asarray(line.get_xdata())) == 10
+    drawn = sum(
+        axes.get_position().width * axes.get_position().height
+        for axes in figure.axes
+        if axes.images
+    )
+    assert drawn > 0.5
+    for axes in figure.axes:
+        x0, y0, x1, y1 = axes.get_position().extents
+        assert min(x0, y0) >= -1e-9
+        assert max(x1, y1) <= 1 + 1e-9
+
+
+def test_a_flat_disparity_is_a_figure_of_the_caption_and_not_a_map_of_one_colour(results):
+    flat = replace(results[0], disparity=np.full(SIZE, 0.25, np.float32), sigma=None, truth=None)
+    drawn = draw_results([flat])
+    assert "Disparity is 0.25 px per view everywhere" in drawn.caption
+    assert maps_of(drawn.figure) == []
 
 
 def test_a_close_up_shows_the_pixels_around_its_point_of_the_view_asked_for(results):

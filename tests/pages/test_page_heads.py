@@ -11,6 +11,7 @@ from emmc_rig.pages.viewer import render_viewer
 from emmc_rig.study.chart.charting import chart_page
 from emmc_rig.study.stability.stability_run import stability_page
 from emmc_rig.study.tables.tables_page import tables_page
+from reconstruction.verdict.rules import LEVELS
 
 NOT_ASKED: Any = None
 """The study, where nothing was measured."""
@@ -41,7 +42,7 @@ def test_a_page_with_nothing_measured_still_says_what_to_do_next(page):
 
 def test_a_viewer_of_a_scene_has_the_head_too(light_field):
     head = head_of(render_viewer(Export("a", "", light_field, source="my views")))
-    assert "no verdict" in head
+    assert "No verdict" in head
     assert "<code>emmc-rig figure &#39;my views&#39;</code>" in head
 
 
@@ -52,30 +53,38 @@ def test_a_result_in_memory_is_offered_no_command_without_a_path():
 
 
 @pytest.mark.parametrize(("found_db", "tone"), [(20.0, "watch"), (22.0, "good")])
-def test_a_trusted_result_below_its_copied_view_is_not_shown_as_good(found_db, tone):
+def test_a_trusted_result_below_the_baseline_is_not_shown_as_good(found_db, tone):
     verdict = {"level": "trust", "reasons": []}
     head = light_field_head({"verdict": verdict, "psnr_db": found_db, "replicate_psnr_db": 21.5})
     assert head.tone == tone
-    assert ("1.5 dB more than by the copied centre view" in head.why) == (tone == "watch")
-    assert "frames, Psi and light field agree" in head.why
+    below = "1.5 dB worse than the baseline (centre view in all places)" in head.why
+    assert below == (tone == "watch") == ("trust" not in head.level)
+    assert "the frames, Psi and the noise agree" in head.why
+
+
+def test_every_level_of_a_verdict_is_a_sentence_of_a_head():
+    for level in LEVELS:
+        head = light_field_head({"verdict": {"level": level, "reasons": []}})
+        assert level in head.level.lower()
+        assert (head.tone == "good") == (level == "trust")
 
 
 @pytest.mark.parametrize(
     ("stated", "words"),
     [
-        ({}, "agree"),
-        ({"stated_db": None, "stated_interval_db": None}, "agree"),
-        ({"stated_db": 31.24}, "agree; stated PSNR 31.2 dB"),
+        ({}, "agree with it"),
+        ({"stated_db": None, "stated_interval_db": None}, "agree with it"),
+        ({"stated_db": 31.24}, "agree with it; estimated accuracy 31.2 dB"),
         (
             {"stated_db": 31.24, "stated_interval_db": [29.81, 33.02]},
-            "agree; stated PSNR 31.2 dB (29.8 to 33.0 in 9 of 10 captures)",
+            "agree with it; estimated accuracy 31.2 dB (29.8 to 33.0 in 9 of 10 captures)",
         ),
     ],
     ids=["none by an earlier version", "no method's", "no interval", "interval"],
 )
 def test_the_head_says_the_stated_psnr_with_its_interval(stated, words):
     head = light_field_head({"verdict": {"level": "trust", "reasons": []}, **stated})
-    assert head.why == f"frames, Psi and light field {words}"
+    assert head.why == f"the frames, Psi and the noise {words}"
 
 
 def test_a_path_is_typed_short_below_this_folder_and_quoted(tmp_path, monkeypatch):

@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 from browsers import MARKS
+from capture_rigs import begun, still_rig
 
+from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.files.formats import Export
 from emmc_rig.pages.page import Head, Section, framed
+from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.viewer import render_viewer
+from emmc_rig.session.storage import SYSTEM_DISK
 
 pytestmark = MARKS
 WIDTHS_PX = 1600, 800, 390
@@ -53,3 +57,25 @@ def test_a_wide_screen_leaves_no_gap_beside_the_viewers_picture(
         "return side('.viewer-panel').left - side('.viewer-stage').right"
     )
     assert 0 <= gap <= 20
+
+
+MANY_FRAMES = """
+title: many frames
+camera: rgbw-bayer-1shot
+shots:
+{shots}
+whiteboards: {{repeats: 4, references: 4}}
+darks: {{repeats: 8}}
+"""
+
+
+def test_the_sheet_of_a_session_of_150_frames_is_short_on_a_phone(browser, tmp_path):
+    rig = still_rig()
+    text = MANY_FRAMES.format(shots="  - {exposure_s: 0.01, repeats: 40}")
+    session, plan = begun(tmp_path, SYSTEM_DISK, rig, text)
+    Sequencer(session, plan, rig).run()
+    assert len(session.stored) >= 150
+    path = tmp_path / "sheet.html"
+    path.write_text(sheet(session), encoding="utf-8")
+    of_width(browser, path, 390)
+    assert browser.execute_script("return document.documentElement.scrollHeight") <= 3000

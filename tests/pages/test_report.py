@@ -156,7 +156,7 @@ def test_without_a_truth_there_is_no_comparison(content):
     )
     assert page_data(page)["truth"] is None
     assert "Where it is wrong" not in page
-    assert "no true light field to compare with" in page
+    assert "Over the baseline" not in page
 
 
 @pytest.mark.parametrize(
@@ -170,11 +170,67 @@ def test_a_figure_that_is_not_finite_is_said_in_words(content, value, shown):
     assert not re.search(r">\s*-?(nan|inf)\b", page)
 
 
-def test_headline_figures_are_written_with_their_units(content):
-    page = render(content)
-    values = re.findall(r'<p class="value">(.*?)</p>', page)
-    figures = ["20.00 dB", "+2.50 dB", "0.9312", "2.13 %", "0.40 dB", "4.0 s"]
-    assert values == [*figures, "converged"]
+EVIDENCE = {"explained": 0.9, "noise": 0.02, "parallax": 0.1}
+TRUSTED = {"level": "trust", "reasons": [], "features": EVIDENCE}
+FLAT = {
+    "level": "cannot tell",
+    "reasons": [{"level": "cannot tell", "what": "no parallax", "remedy": "focus nearer"}],
+    "features": {**EVIDENCE, "parallax": 0.001},
+}
+
+
+def cards_of(page: str) -> dict[str, tuple[str, str]]:
+    """Return value and tone of every tile, by its label."""
+    found = re.findall(r'<div class="card (.*?)">\s*<h3>(.*?)</h3><p class="value">(.*?)</p>', page)
+    return {
+        label: (value, tone.split()[-1] if tone.split() else "") for tone, label, value in found
+    }
+
+
+def test_three_figures_come_first_with_their_units_and_what_is_good(content):
+    page = render(replace(content, metrics={**content.metrics, "verdict": TRUSTED}))
+    assert cards_of(page) == {
+        "Accuracy (PSNR)": ("20.0 dB", ""),
+        "Over the baseline": ("+2.5 dB", "good"),
+        "Explained": ("90%", "good"),
+    }
+    notes = re.findall(r'<p class="note">(.*?)</p>', page)
+    assert "10.0% of white" in notes[0]  # -20 dB
+    assert "17.5 dB; good: above 0" in notes[1]
+
+
+def test_without_a_truth_the_figures_are_the_methods_own(content):
+    metrics = {"stated_db": 31.2, "stated_interval_db": [29.0, 33.0], "verdict": TRUSTED}
+    page = render(replace(content, truth=None, metrics=metrics))
+    assert list(cards_of(page)) == ["Estimated accuracy", "Explained", "Noise"]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"replicate_psnr_db": 21.0, "verdict": TRUSTED}, {"verdict": FLAT}],
+    ids=["below", "flat"],
+)
+def test_nothing_is_green_beside_a_result_that_is_flat_or_below_the_baseline(content, more):
+    page = render(replace(content, metrics={**content.metrics, **more}))
+    tones = [tone for _, tone in cards_of(page).values()]
+    assert tones
+    assert "good" not in tones
+    assert 'class="verdict good"' not in page
+
+
+def test_all_but_verdict_figures_and_picture_is_folded_with_the_method_last(content):
+    metrics = {**content.metrics, "parameters": {"misfit": 0.597, "at_end": 0.0}}
+    page = render(replace(content, metrics=metrics))
+    main = page[page.index("<main>") : page.index("</main>")]
+    folded = re.findall(r'<details class="folded"><summary><h2>(.*?)</h2> <span>(.*?)</span>', main)
+    assert all(about for _, about in folded)
+    assert [title for title, _ in folded][-1] == "Inside the method"
+    assert main.count("<section") == 1  # the viewer
+    shown = re.sub(r'<details class="folded">.*', "", main, flags=re.S)
+    assert "<table" not in shown
+    assert "misfit" not in shown
+    row = main[main.index("Unexplained residual") :]
+    assert "0.60 x noise" in row[:200]
 
 
 def test_the_verdict_comes_first_with_what_to_do_next(content):
@@ -183,7 +239,7 @@ def test_the_verdict_comes_first_with_what_to_do_next(content):
     page = render(replace(content, metrics={**content.metrics, "verdict": verdict}))
     places = [
         page.index(words)
-        for words in ('aria-label="Verdict"', "shots differ", "capture shot 2 again", "20.00 dB")
+        for words in ('aria-label="Verdict"', "shots differ", "capture shot 2 again", "20.0 dB")
     ]
     assert places == sorted(places)
 

@@ -107,3 +107,23 @@ def test_nothing_sticks_out_sideways(page, width):
     assert page.execute_script(
         "return document.documentElement.scrollWidth <= document.documentElement.clientWidth"
     )
+
+
+@pytest.mark.parametrize(("width", "most_px"), [(1600, 4000), (390, 4000)])
+def test_the_folded_report_is_short_and_shows_the_picture_at_once(page, width, most_px):
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    settled(page)
+    height, top = page.execute_script(
+        "return [document.documentElement.scrollHeight,"
+        "document.getElementById('viewer-picture').getBoundingClientRect().top + scrollY]"
+    )
+    page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert height <= most_px
+    assert top < 700
+
+
+def test_a_link_to_a_folded_part_opens_it(page, report):
+    page.get(report.as_uri() + "#figures")
+    settled(page)
+    assert page.find_element(By.ID, "figures").is_displayed()

@@ -76,13 +76,18 @@ def test_a_contact_sheet_of_few_pictures_says_so(captured):
     assert "of 4 are shown" in page
 
 
-def test_events_come_first_and_most_pictures_of_a_kind_are_folded(captured, monkeypatch):
+def test_the_shots_come_first_and_every_other_kind_of_frame_is_folded(captured, monkeypatch):
     monkeypatch.setattr("emmc_rig.pages.session_sheet.FIRST_PICTURES", 1)
     page = sheet(captured)
-    assert page.index('id="events"') < page.index("<img ")
-    folded = [int(count) for count in re.findall(r"<summary>(\d+) more</summary>", page)]
     kinds = Counter(frame.kind for frame in captured.needed)
-    assert sorted(folded) == sorted(count - 1 for count in kinds.values() if count > 1)
+    assert [int(count) for count in re.findall(r"<summary>(\d+) more<", page)] == [
+        kinds["shot"] - 1
+    ]
+    folded = re.findall(r'<details class="folded">.*?<span>(\d+) frames?,', page)
+    assert sorted(map(int, folded)) == sorted(n for kind, n in kinds.items() if kind != "shot")
+    assert (
+        page.index('id="shot"') < page.index('<details class="folded">') < page.index('id="events"')
+    )
     assert page.count("<img ") == len(captured.needed)
 
 
@@ -92,7 +97,7 @@ def test_the_report_of_a_reconstructed_session_has_its_verdict(captured):
     reported = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
     (captured.folder / "reconstruction/metrics.json").write_text(json.dumps(reported))
     page = sheet(captured)
-    assert page.index("doubt") < page.index("27.5 dB stated") < page.index("<img ")
+    assert page.index("doubt") < page.index("estimated accuracy 27.5 dB") < page.index("<img ")
 
 
 def test_a_page_shows_names_as_text(captured):

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import pytest
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.processing.memory import peak_memory_mib
 from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point, charted_points
-from emmc_rig.study.chart.front import POOLED, Mark, charts, pareto_front
+from emmc_rig.study.chart.charting import answer
+from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts, pareto_front
 from emmc_rig.study.scores import angular_snr_db, scored, swept_disparity
 from emmc_rig.study.trial import Capture
 from reconstruction.methods import installed_methods
@@ -36,6 +38,16 @@ def test_the_front_is_what_nothing_beats():
     a, b, c = mark("a", 1, 20), mark("b", 2, 25), mark("c", 4, 26)
     beaten = [mark("d", 2, 24), mark("e", 3, 25), mark("f", 9, 26)]
     assert pareto_front([c, *beaten, b, a]) == [a, b, c]
+
+
+def test_a_chart_is_answered_in_words():
+    chart = Chart("dark", "cam", (mark("tv", 1, 20), mark("adaptive", 4, 26)), 18.0)
+    assert answer(chart) == (
+        "adaptive is the most accurate: 26.00 dB in 4 s, +8.00 dB against the baseline (centre "
+        "view in all places). The quickest, tv, takes 1 s and loses 6.00 dB."
+    )
+    alone = replace(chart, marks=chart.marks[:1])
+    assert answer(alone).endswith("Nothing is quicker.")
 
 
 def test_pooled_are_the_configurations_of_every_scene():

@@ -136,9 +136,17 @@ def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
         for strength, level in zip((0, 1, 4), row, strict=True)
     }
     head = stability_run._head(curves(results))
-    assert head.level == "tv"
+    assert head.level == "tv holds out best"
     assert "under 1 of 2 faults" in head.why
     assert any("compare dict-omp: under 2 of 2" in line for line in head.next)
+    # tv falls from 29 dB to 10 dB between 1 and 4 px, and never by flicker; dict-omp at 0.3.
+    shift, flicker = stability_run.answers(curves(results))
+    assert shift == (
+        "Mask shift: dict-omp has lost 3 dB at 0.3 px; tv has lost 3 dB at 1.2 px, the last."
+    )
+    assert flicker == (
+        "Lamp flicker between shots: dict-omp has lost 3 dB at 0.3 %; tv nowhere in this sweep."
+    )
 
 
 def test_a_full_sweep_is_of_all_faults():

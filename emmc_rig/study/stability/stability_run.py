@@ -35,7 +35,15 @@ from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, machine, provenance
-from emmc_rig.study.stability.curves import LOST_DB, Curve, Levels, break_row, breaking_rows, curves
+from emmc_rig.study.stability.curves import (
+    LOST_DB,
+    Curve,
+    Levels,
+    break_row,
+    breaking_rows,
+    curves,
+    place_words,
+)
 from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.stability_study import StabilitySettings, StabilityStudy, planned
 from reconstruction.methods import METHODS
@@ -154,7 +162,7 @@ def _sections(found: Sequence[Curve], drawn: Path) -> list[Section]:
             if some:
                 name = f"{slug}-{kind.lower().replace(' ', '-')}.svg"
                 svg = draw_curves(some, colours, drawn / name)
-                charts.append(curves_section(scene, kind, svg))
+                charts.append(curves_section(scene, kind, svg, answers(some)))
     return [*tables, *charts]
 
 
@@ -247,7 +255,7 @@ def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) ->
     lines.append(Line2D([], [], color=INK, linestyle="", marker="x"))
     names.append(f"{LOST_DB:g} dB below its best")
     lines.append(Line2D([], [], color=FAINT, linestyle=":"))
-    names.append("baseline: centre view in all places")
+    names.append("baseline: true centre view in all places")
     legend_below(figure, lines, names, 5)
 
 
@@ -270,8 +278,9 @@ def _head(curves: Sequence[Curve]) -> Head:
         return Head("nothing measured", why, ["list the faults: `emmc-rig stability --list`"])
     (best, least), *others = reversed(broken.most_common())
     return Head(
-        best,
-        f"falls {LOST_DB:g} dB below its best under {least} of {faults} faults, the fewest",
+        f"{best} holds out best" if others else best,
+        f"it falls {LOST_DB:g} dB below its best under {least} of {faults} faults"
+        + (", the fewest" if others else ""),
         [
             "keep the errors of your bench below the breaking points",
             *(
@@ -282,6 +291,33 @@ def _head(curves: Sequence[Curve]) -> Head:
     )
 
 
+def answers(curves: Sequence[Curve]) -> list[str]:
+    """Return for each fault of some curves a sentence: which method breaks first, which last."""
+    sentences = []
+    for fault in dict.fromkeys(curve.fault for curve in curves):
+        some = [(curve.below_best(), curve) for curve in curves if curve.fault is fault]
+        never = [curve.method for place, curve in some if place is None]
+        breaking = sorted(
+            ((place, curve) for place, curve in some if place is not None), key=lambda one: one[0]
+        )
+        if not breaking:
+            sentences.append(f"{fault.title}: no method loses {LOST_DB:g} dB in this sweep.")
+            continue
+        first, last = breaking[0], breaking[-1]
+        words = f"{fault.title}: {_broken(*first)}"
+        if never:
+            words += f"; {', '.join(never)} nowhere in this sweep"
+        elif last is not first:
+            words += f"; {_broken(*last)}, the last"
+        sentences.append(words + ".")
+    return sentences
+
+
+def _broken(place: float, curve: Curve) -> str:
+    at = f"{place_words(place, curve.strengths)} {curve.fault.unit}"
+    return f"{curve.method} has lost {LOST_DB:g} dB at {at}"
+
+
 def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
     """Return the table of one scene, or of all: method x fault -> breaking point."""
     rows, methods = breaking_rows(curves, scene)
@@ -289,8 +325,8 @@ def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
     return Section("breaking-" + scene.replace(" ", "-"), f"Breaking points, {scene}", body)
 
 
-def curves_section(scene: str, kind: str, svg: Path) -> Section:
-    """Return the small multiples of one kind of fault."""
+def curves_section(scene: str, kind: str, svg: Path, answers: Sequence[str]) -> Section:
+    """Return the small multiples of one kind of fault, below what they say."""
     title = f"{kind}, {scene}"
-    body = fragment("drawing.html", drawing=embedded(svg), title=title)
+    body = fragment("drawing.html", drawing=embedded(svg), title=title, answers=answers)
     return Section(title.lower().replace(", ", "-").replace(" ", "-"), title, body)
