@@ -131,7 +131,7 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
 
 def test_its_page_shows_what_was_decided_and_when(every):
     page = sheet(Session(every))
-    assert "Shots: what they gave" in page
+    assert "Choice of shots" in page
     assert "dB stated, " in page
     metrics = json.loads((every / "metrics.json").read_text())
     assert metrics["decided"][0]["shots"] == [0]
