@@ -348,13 +348,13 @@ def check_drift(size: Size, seed: int) -> Iterator[Row]:
 
 
 def check_streamed(size: Size, seed: int) -> Iterator[Row]:
-    """`calibrate SESSION --route free` of one shot, measured in a process of its own."""
+    """`calibrate SESSION --method free` of one shot, measured in a process of its own."""
     settings = settings_for(size, seed)
     channels = channels_of(psi_layout(settings.camera, settings.size))
     with tempfile.TemporaryDirectory() as name:
         folder, out = Path(name) / "session", Path(name) / "out"
         shadow = draw_session(folder, settings, channels)
-        command = ["calibrate", str(folder), "--route", "free", "--out", str(out)]
+        command = ["calibrate", str(folder), "--method", "free", "--out", str(out)]
         done = subprocess.run(
             [sys.executable, "-c", PROGRAM, *command], capture_output=True, text=True, check=False
         )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import datetime
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -12,6 +14,7 @@ import joblib
 import matplotlib
 import pandas as pd
 
+import emmc_rig
 from emmc_rig.study.trial import Capture
 
 matplotlib.use("Agg")
@@ -22,6 +25,8 @@ GROUP_B = (
 )  # fmt: skip
 """Real light fields in the folder EMMC_LIGHTFIELDS: tune on A, report on B."""
 SMALLEST = (32, 40)
+RUNS = "runs.csv"
+"""Of every CSV beside it: when its rows were measured, by which version and command."""
 
 
 def arguments(
@@ -70,7 +75,7 @@ def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, ar
     """Return a row for each point: the point's values and what `measure(**point)` returns.
 
     Rows are kept in NAME.csv as they are done; those that it holds are not measured again. Delete
-    the file after a change of the program.
+    the file after a change of the program. The run's command and date go into RUNS.
     """
     points = list(points)
     path = args.out / f"{name}.csv"
@@ -87,9 +92,31 @@ def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, ar
         kept = pd.concat([kept, pd.DataFrame([{k: _text(v) for k, v in row.items()}])])
         kept.to_csv(path, index=False)
         print(f"{done}/{len(missing)}", row, file=sys.stderr)
+    if missing:
+        note_run(args.out, name)
     wanted = {tuple(map(_text, point.values())) for point in points}
     chosen = kept[[key in wanted for key in kept[keys].fillna("").itertuples(False, None)]]
     return chosen.reset_index(drop=True).apply(_numbers)
+
+
+def note_run(folder: Path, name: str) -> None:
+    """Write into RUNS when, and by which command, NAME.csv of the folder was measured."""
+    path = folder / RUNS
+    known: dict[str, dict[str, str]] = {}
+    if path.is_file():
+        with path.open(newline="", encoding="utf-8") as opened:
+            known = {row["file"]: row for row in csv.DictReader(opened)}
+    words = [_text(word) for word in sys.argv[1:]]
+    known[f"{name}.csv"] = {
+        "file": f"{name}.csv",
+        "date": datetime.date.today().isoformat(),
+        "version": emmc_rig.__version__,
+        "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words]),
+    }
+    with path.open("w", newline="", encoding="utf-8") as opened:
+        writer = csv.DictWriter(opened, ["file", "date", "version", "command"], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(known[file] for file in sorted(known))
 
 
 def _row(measure: Callable[..., dict], point: dict) -> dict:

@@ -1,5 +1,6 @@
 """Every script of the lab that has a smallest size runs at it, in a folder of its own."""
 
+import csv
 import os
 import subprocess
 import sys
@@ -36,3 +37,8 @@ def test_a_script_runs_at_its_smallest_size(script, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert any(tmp_path.iterdir()), "wrote nothing"
+    if "lab.measured(" in script.read_text("utf-8"):
+        with (tmp_path / "runs.csv").open(newline="", encoding="utf-8") as opened:
+            runs = {row["file"]: row["command"] for row in csv.DictReader(opened)}
+        assert all((tmp_path / file).is_file() for file in runs)
+        assert set(runs.values()) == {f"python benchmarks/{script.name} --smallest --out ."}

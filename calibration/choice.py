@@ -146,21 +146,22 @@ def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
     Raises CalibrationError with none to choose from.
     """
     if not judged:
-        raise CalibrationError("no description of Psi to choose from")
+        raise CalibrationError("no calibration method gave a Psi: capture whiteboards")
     known = sorted(judged, key=lambda one: ROUTES.index(one.route))
     for one in known:
         if one.chi2 <= LARGEST_CHI2:
-            return one, (
-                f"{one.route}: every kind of whiteboard lies at the noise (the worst, "
-                f"{_worst_name(one)}, has {one.chi2:.2f} of it, limit {LARGEST_CHI2:g})"
-            )
+            return one, f"calibration good: {_residual(one)}"
     best = min(known, key=lambda one: one.chi2)
     return best, (
-        f"{best.route}: none reaches the noise on every kind of whiteboard; this one comes nearest "
-        f"({_worst_name(best)} has {best.chi2:.2f} of it, limit {LARGEST_CHI2:g}), and its "
-        "deviations count what is missed"
+        f"calibration doubtful: {_residual(best)}; the deviation of Psi includes the residual"
     )
 
 
-def _worst_name(one: HeldOut) -> str:
-    return max(one.groups, key=lambda name: one.groups[name]) if one.groups else "held out"
+def _residual(one: HeldOut) -> str:
+    """Return the square residual over the noise's variance, of the worst whiteboard, in words."""
+    kind = max(one.groups, key=lambda name: one.groups[name], default="")
+    worst = f", largest of: {kind}" if len(one.groups) > 1 else ""
+    return (
+        f"residual {one.chi2:.2f} x noise variance (limit {LARGEST_CHI2:g}{worst}), "
+        f"calibration method {one.route}"
+    )

@@ -134,14 +134,14 @@ class Drift:
         """The result in one line, for the user."""
         if self.recognised < LEAST_SURE:
             return (
-                f"the mask's shadow is not recognised in these captures ({self.searched}): it has "
-                "moved farther, is another, or the scene shows too little; take one whiteboard "
-                "and calibrate again"
+                f"the mask's shadow is not recognised in these captures ({self.searched}): the "
+                "mask has moved farther, is another one, or the scene shows too little of it; "
+                "capture one whiteboard and calibrate again"
             )
         if self.beyond_search:
             return (
                 f"the mask has moved by about {self.displacement_px:.1f} pixels, farther than "
-                f"searched ({self.searched}): Psi is not repaired; take one whiteboard and "
+                f"searched ({self.searched}): Psi is not corrected; capture one whiteboard and "
                 "calibrate again"
             )
         if not self.drifted:
@@ -149,8 +149,8 @@ class Drift:
         largest = max(self.by_kind_px, key=lambda kind: self.by_kind_px[kind])
         return (
             f"Psi no longer fits: the shadow has moved by {self.displacement_px:.2f} pixels, most "
-            f"of it {WORDS[largest]} ({self.by_kind_px[largest]:.2f} pixels); use the repaired Psi "
-            f"or take one whiteboard ({self.searched})"
+            f"of it {WORDS[largest]} ({self.by_kind_px[largest]:.2f} pixels); use the corrected "
+            f"Psi, or calibrate again ({self.searched})"
         )
 
 

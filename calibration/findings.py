@@ -31,7 +31,10 @@ NOTEWORTHY = {
         "clear cells of the mask let {at:.0%} of the light through: if they should pass more, the "
         "references had more light than the other whiteboards",
     ),
-    "distance_share": (0.02, "the mask's distance differs from the design by {percent:+.1f} %"),
+    "distance_share": (
+        0.02,
+        "the mask's distance differs from the design by {percent:+.1f} %; Psi follows it",
+    ),
 }
 USUAL = Placement()
 
@@ -65,44 +68,47 @@ def level_findings(levels: Levels | None) -> list[str]:
     if levels.drifting:
         found.append(
             f"the lamp drifted by {levels.drift:.2%} (its colours apart by "
-            f"{levels.colour_drift:.2%}): taken out; let it warm up"
+            f"{levels.colour_drift:.2%}): corrected for; let it warm up"
         )
     if levels.bent:
         loss = levels.bend_per_dn * levels.brightest_dn
         found.append(
-            f"the sensor's response loses {loss:.2%} at {levels.brightest_dn:.0f} DN: straightened"
+            f"the sensor's response loses {loss:.2%} at {levels.brightest_dn:.0f} DN: corrected for"
         )
     return found
 
 
 UNWATCHED = {
-    "lamp": (
-        "whether the lamp drifted: plan lamp_checks",
-        "0.6 % of Psi for every 1 % of drift",
-    ),
+    "lamp": ("drift of the lamp", "1 % of drift makes Psi 0.6 % wrong", "lamp_checks: 6"),
     "response": (
-        "whether the sensor's response bends: plan response",
-        "0.2 % of Psi for every 1 % of loss at full well",
+        "nonlinearity of the sensor",
+        "1 % of loss at full well makes Psi 0.2 % wrong",
+        "response: [0.25, 0.5, 0.75]",
     ),
     "colours": (
-        "what the colour filters let through of other colours: plan colours, with a lamp that has "
-        "them",
-        "1.4 % of Psi for every 1 % of crosstalk",
+        "crosstalk of the colour filters",
+        "1 % of crosstalk makes Psi 1.4 % wrong",
+        "colours: 2",
     ),
     "turned": (
-        "whether the white board is even over angle: plan turned",
-        "0.25 % of Psi for every 1 % of unevenness over the aperture",
+        "unevenness of the white board over angle",
+        "1 % over the aperture makes Psi 0.25 % wrong",
+        "turned: 2",
     ),
 }
-"""What no whiteboard shows, and what that costs: with lamp, response, colours and the turned board
-left out of the plan (48x64, 1024 rays) the effects of these names in `simulators.effects` make Psi
-1.27, 0.36, 6.76 and 2.54 % wrong at 2, 1, 5 and 10 %; an ordinary bench has 0.32 %."""
+"""What no whiteboard shows, what that costs, and the line of a plan after which one shows it: with
+lamp, response, colours and the turned board left out of the plan (48x64, 1024 rays) the effects of
+these names in `simulators.effects` make Psi 1.27, 0.36, 6.76 and 2.54 % wrong at 2, 1, 5 and 10 %;
+an ordinary bench has 0.32 %."""
 
 
 def unwatched(missing: Sequence[str]) -> list[str]:
     """Return what these whiteboards were not there to tell, and how much that may cost."""
     lacking = (UNWATCHED[name] for name in missing)
-    return [f"not measured: {what}; it costs {cost}" for what, cost in lacking]
+    return [
+        f"not measured: {what} ({cost}); add `{line}` under whiteboards in the plan"
+        for what, cost, line in lacking
+    ]
 
 
 def angle_findings(board: BoardAngle) -> list[str]:
@@ -117,22 +123,23 @@ def angle_findings(board: BoardAngle) -> list[str]:
         turn_deg, moved_um, deviation = min(moved)
         found.append(
             f"the mask moved by {moved_um:.2f} +- {deviation:.2f} um before the board turned by "
-            f"{turn_deg:g} degrees: taken out of what is said of the board; let the mount settle, "
-            "and capture the turned boards next to the others"
+            f"{turn_deg:g} degrees: the board's unevenness is corrected for it; let the mount "
+            "settle, and capture the turned boards right after the others"
         )
     if not board.uneven:
         return found
     words = (
         f"the white board is uneven by {np.ptp(board.radiance):.1%} over the directions into the "
-        "aperture: taken out; what is alike in every direction from its middle cannot be measured"
+        "aperture: corrected for, except for what is symmetric about its normal, which cannot be "
+        "measured"
     )
     if board.sense == 0:
         words += (
-            "; which way it was turned is not known, and both are counted: turn it by 180 degrees "
-            "as well"
+            "; whether it was turned clockwise is not known, and both are allowed for: turn it by "
+            "180 degrees as well"
         )
     elif board.sense < 0:
-        words += "; it was turned the other way than the rows and columns of the sensor run"
+        words += "; it was turned counterclockwise in the camera's picture"
     return [*found, words]
 
 
@@ -142,18 +149,18 @@ def leaning_findings(leans: Leaning, turned: bool) -> list[str]:
     turned: the board was turned, and does not send it.
     """
     found = []
-    moved = "take the whiteboards again with the lamp moved: what stays is the camera's"
+    moved = "capture the whiteboards again with the lamp moved: what stays is the camera's"
     if leans.lopsided.any():
         found.append(
             f"the views' light differs by {np.ptp(leans.lopsided):.1%} from one side of the "
-            f"aperture to the other, which lenses do not make: it may be "
-            f"{'the lamp' if turned else 'lamp or board'}, and counts in Psi's deviation; {moved}"
+            "aperture to the other, as lenses alone do not do: it may be "
+            f"{'the lamp' if turned else 'lamp or board'}, and Psi's deviation includes it; {moved}"
         )
     if leans.falling:
         found.append(
-            f"the outermost views have {leans.falling:.1%} less light than the middle one, alike "
-            "on every side: taken for the lens's vignetting, and not counted; a lobe of gloss or a "
-            f"board that does not fill the aperture looks alike: if the lens has less, {moved}"
+            f"the outermost views have {leans.falling:.1%} less light than the middle one, the "
+            "same on every side: taken for the lens's vignetting; a glossy board, or one that does "
+            f"not fill the aperture, looks the same: if the lens has less vignetting, {moved}"
         )
     return found
 
@@ -162,17 +169,16 @@ def views_assumed(worth: PinholeWorth) -> str:
     """Return in words what whiteboards of the whole aperture leave to be assumed."""
     v, u = worth.view
     return (
-        "not measured: single views; their shares of the light are taken as designed but for what "
-        f"sums of all show, to {worth.weights:.1%} of each, which Psi's deviation counts; Psi is "
-        f"expected {worth.now:.2%} wrong, with one whiteboard through the pinhole before view "
-        f"({v}, {u}) {worth.one:.2%}, with one before every view {worth.every:.2%}"
+        "not measured: each view alone; the views' shares of the light are those of the design, "
+        f"uncertain by {worth.weights:.1%} each, which Psi's deviation includes; expected error of "
+        f"Psi {worth.now:.2%}, with one whiteboard through the pinhole before view ({v}, {u}) "
+        f"{worth.one:.2%}, with one before every view {worth.every:.2%}"
     )
 
 
 def dust_finding(dusty: NDArray[np.bool_]) -> str:
     """Return in words that pixels, (pixel_y, pixel_x), lie under dust that moved."""
     return (
-        f"{int(dusty.sum())} pixels ({dusty.mean():.1%}) read another share of the light in every "
-        "whiteboard than in the references: dust moved on the sensor in between; they do not "
-        "count; clean the sensor, and capture all again"
+        f"dust moved on the sensor between references and whiteboards: {int(dusty.sum())} pixels "
+        f"({dusty.mean():.1%}) are excluded; clean the sensor, and capture all again"
     )

@@ -551,7 +551,7 @@ def fit_placement(
         raise CalibrationError(
             f"the fit does not explain the whiteboards: their correlation with the shadow of the "
             f"design is {correlation:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
-            "needed; check the mask and the camera's description, or use the free route"
+            "needed; check the mask and the camera's description, or use calibration method free"
         )
     shares = shares_of_prior(placement, covariance, tolerances)
     undecided = tuple(

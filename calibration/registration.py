@@ -68,7 +68,7 @@ def register(board: Board, mask: ShadowMask, start: Placement) -> Registration:
     raise CalibrationError(
         f"{board.name}: the mask in the bench is not the mask of the design: their best "
         f"correlation is {best.correlation:.2f}, at least {LEAST_CORRELATION} is needed; check the "
-        "mask, its pattern's seed and the camera's description, or use the free route"
+        "mask, its pattern's seed and the camera's description, or use calibration method free"
     )
 
 

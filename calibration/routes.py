@@ -1,4 +1,4 @@
-"""From a set of whiteboards to Psi: every route asked for, judged on whiteboards held out."""
+"""From a set of whiteboards to Psi: every calibration method asked for, judged by validation."""
 
 from __future__ import annotations
 
@@ -158,7 +158,9 @@ def calibrate(
     seen_colours = crosstalk(held_out, channels, good)
     judges = as_readings(held_out, layout, good)
     if not judges:
-        raise CalibrationError("no held-out whiteboard: keep one, with the aperture open")
+        raise CalibrationError(
+            "no validation whiteboard: capture one more with the aperture open, to judge Psi by"
+        )
     for board in judges:
         refuse_without_mask(board)
     stage_um = shot_stages(camera)[0]
@@ -178,7 +180,7 @@ def calibrate(
     seen: list[Board] = []
     if modelled:
         if few is None:
-            raise CalibrationError("the parametric route was given no whiteboards")
+            raise CalibrationError("the calibration method parametric was given no whiteboards")
         on_stage("parametric fit")
         seen = as_readings(few, layout, good)
         for board in seen:
@@ -212,7 +214,7 @@ def calibrate(
         findings += [mask.repeats.words] if mask.repeats.words else []
     if {"free", "combined"} & set(routes):
         if pinholes is None:
-            raise CalibrationError("the free route was given no whiteboards")
+            raise CalibrationError("the calibration method free was given no whiteboards")
         on_stage("Psi, free")
         free = replace(measure_psi(pinholes, design, empty, on_plane), good=good)
         if (best := mixed or parametric) is not None:
@@ -221,8 +223,8 @@ def calibrate(
         still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
         if not still:
             raise CalibrationError(
-                "the free route is judged by an open whiteboard where the mask stands in the "
-                "first shot: hold one out there"
+                "the calibration method free is judged by an open whiteboard with the mask where "
+                "the first shot has it: capture a validation whiteboard there"
             )
         judged["free"] = _judged_measured("free", free, still[0], layout.binning)
         frames["free"] = pinholes.exposures
@@ -243,19 +245,19 @@ def calibrate(
         missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
         _make_less_sure(calibrations[chosen.route], missed)
         advice.append(
-            f"a whiteboard differs from the chosen Psi by {chosen.relative_error:.2%} of its "
-            f"level, {chosen.chi2:.1f} times the noise's variance; what is worst: "
-            f"{_worst_groups(chosen)}; look at its residual map"
+            f"the validation whiteboards differ from Psi by {chosen.relative_error:.2%} of their "
+            f"level: residual {chosen.chi2:.1f} x noise variance, largest of "
+            f"{_worst_groups(chosen)}; look at the residual map in the report"
         )
     if seen_colours is not None:
         findings.append(
-            f"the colour filters let {seen_colours.largest:.1%} of their neighbours' "
-            "light through: Psi has three colours for every pixel"
+            f"the colour filters pass up to {seen_colours.largest:.1%} of the other colours: Psi "
+            "has three colours for every pixel"
         )
         if plain is None:
             raise CalibrationError(
-                "the colour filters let other colours through, and the free route under a white "
-                "lamp does not show which: add open whiteboards, for the parametric route"
+                "the colour filters pass other colours, and the calibration method free does not "
+                "show which: add open whiteboards, for the method parametric"
             )
         by = mixed or parametric
         assert by is not None
@@ -542,7 +544,7 @@ def _hands_finding(fit: Fit, seen: Sequence[Board], mask: ShadowMask) -> list[st
     ]
     if not loose:
         return []
-    return [f"hands put pinholes up to {max(loose):.0f} um off their holes: taken out of Psi"]
+    return [f"hands put pinholes up to {max(loose):.0f} um off their holes: corrected for"]
 
 
 def _count_moves(known: Calibration, one: Parametric, layout: PsiLayout, stages: Stages) -> None:
@@ -632,22 +634,26 @@ def fit_advice(fit: Fit) -> list[str]:
     ]
     if flickering:
         worst_of = max(flickering, key=lambda one: abs(one.brightness - 1))
-        others = f" ({len(flickering)} of {len(fit.boards)} do)" if len(flickering) > 1 else ""
+        others = (
+            f" ({len(flickering)} of {len(fit.boards)} whiteboards differ)"
+            if len(flickering) > 1
+            else ""
+        )
         found.append(
-            f"{worst_of.name}: {worst_of.brightness - 1:+.1%} in brightness against the others"
-            f"{others}; the lamp is not steady, let it warm up and capture it again"
+            f"{worst_of.name}: {worst_of.brightness - 1:+.1%} in brightness against the other "
+            f"whiteboards{others}; the lamp is not steady: let it warm up, and capture it again"
         )
     found += _moves(fit)
     if fit.undecided:
         shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
         more = (
-            "capture some through the pinhole"
+            "capture some through a pinhole"
             if fit.more_boards >= MOST_MORE_BOARDS
-            else f"{fit.more_boards} more of the same kinds, or fewer through the pinhole"
+            else f"capture {fit.more_boards} more of the same kinds, or a few through a pinhole"
         )
         found.append(
-            f"too few whiteboards for {len(fit.undecided)} parameter(s) ({shown}), which stay at "
-            f"the design: {more}; `emmc-rig calibrate --plan` says which"
+            f"too few whiteboards to measure {len(fit.undecided)} parameter(s) ({shown}), which "
+            f"keep the design's values: {more}; `emmc-rig calibrate --plan` writes a plan"
         )
     return found
 
@@ -663,9 +669,9 @@ def _moves(fit: Fit) -> list[str]:
         return []
     worst = max(moved, key=lambda one: float(np.hypot(*one.moved_um)))
     words = (
-        f"the mask stands elsewhere than the stage says in {len(moved)} of {len(fit.boards)} "
-        f"whiteboards, farthest by ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
-        f"{worst.name}, which Psi's deviation counts: "
+        f"the mask is not where the stage reports it in {len(moved)} of {len(fit.boards)} "
+        f"whiteboards, by up to ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
+        f"{worst.name}; Psi's deviation includes it: "
     )
     times_s = np.array([one.taken_s for one in fit.boards])
     places_um = np.array([one.moved_um for one in fit.boards])

@@ -87,8 +87,8 @@ def shadow_mask(camera: Camera, size: tuple[int, int]) -> ShadowMask:
     near = [name for name, mask in camera.masks.items() if mask.distance_mm < lens.distance_mm]
     if used != {tuple(camera.masks)} or len(near) != 1 or len(camera.masks) != 1:
         raise CalibrationError(
-            "the parametric route fits a camera with one mask between lens and sensor, in every "
-            f"shot; this one has {len(camera.masks)}: use the free route"
+            "calibration method parametric needs one mask between lens and sensor, the same in "
+            f"every shot; this camera has {len(camera.masks)} masks: use method free"
         )
     (name,) = near
     mask = camera.masks[name]

@@ -23,8 +23,9 @@ extensions = [
 ]
 html_theme = "furo"
 html_title = f"emmc-rig {release}"
+html_static_path = ["static"]
+html_css_files = ["gallery.css"]
 exclude_patterns = ["_build", "examples", "gallery/index.md"]
-myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 suppress_warnings = ["config.cache"]  # the gallery's settings hold classes
 
@@ -40,17 +41,18 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "remove_config_comments": True,
+    "thumbnail_size": (480, 270),
 }
 
 
-def write_commands(_: object) -> None:
-    """Write commands.md: every command with its options, from the command line itself."""
+def write_command_line(_: object) -> None:
+    """Write command-line.md: every command with its options, from the command line itself."""
     command = typer.main.get_command(command_line)
     context = typer.Context(command, info_name="emmc-rig")
-    text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Commands")
-    Path(__file__).with_name("commands.md").write_text(text, encoding="utf-8")
+    text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Every option")
+    Path(__file__).with_name("command-line.md").write_text(text, encoding="utf-8")
 
 
 def setup(app: object) -> None:
     """Register what happens before pages are read."""
-    app.connect("builder-inited", write_commands)  # type: ignore[attr-defined]
+    app.connect("builder-inited", write_command_line)  # type: ignore[attr-defined]

@@ -9,11 +9,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class CameraProtocol:
-    """One kind of camera, and the module that drives it, imported when it is used.
+    """One driver's cameras, and its module, imported when it is used.
 
     module: has `open_camera(address, clock, backend)`, whose backend is pyusb's; where it also has
     a dataclass OPTIONS, that is a fourth argument, and its fields are settings of a camera's YAML
-    file. address: what follows the kind and a colon. interface: class, subclass and protocol on
+    file. address: what follows the driver and a colon. interface: class, subclass and protocol on
     USB, by which such cameras are listed. frame_prefix: first bytes of its frames where
     `drivers.raw` does not know them; `decode_frame(data, black_level_dn, white_level_dn)` of the
     module reads these.
@@ -36,5 +36,5 @@ CAMERAS = {
     "mm": CameraProtocol("drivers.micromanager", "CONFIG.cfg"),
     "folder": CameraProtocol("drivers.folder", "DIR"),
 }
-CAMERA_HELP = ", ".join(f"{kind}:{one.address}" for kind, one in CAMERAS.items())
+CAMERA_HELP = ", ".join(f"{name}:{one.address}" for name, one in CAMERAS.items())
 """What `--camera` takes, for help texts and refusals."""

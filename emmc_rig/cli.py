@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any, NoReturn, cast
 
@@ -44,16 +44,21 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for name, group in (("devices", devices), ("session", session)):
-    for member in group.registered_commands:
-        member.cls = ModalCommand
-    app.add_typer(group, name=name)
-for command in (
-    capture, live, calibrate, demo, cameras, simulate, reconstruct, export, figure, chart,
-    tables, stability, design, mask,
-):  # fmt: skip
-    app.command(cls=ModalCommand)(command)
-app.command("import", cls=ModalCommand)(import_)
+GROUPS: dict[str, tuple[typer.Typer | Callable[..., None], ...]] = {
+    "Bench": (devices, live, capture, session, calibrate, mask, import_),
+    "Results": (demo, reconstruct, export, figure, simulate, cameras),
+    "Studies": (chart, stability, tables, design),
+}
+"""Commands by the panel of the help that lists them."""
+for panel, commands in GROUPS.items():
+    for command in commands:
+        if isinstance(command, typer.Typer):
+            for member in command.registered_commands:
+                member.cls = ModalCommand
+            app.add_typer(command, rich_help_panel=panel)
+        else:
+            name = command.__name__.rstrip("_")  # `import` is a word of Python's
+            app.command(name, cls=ModalCommand, rich_help_panel=panel)(command)
 
 
 @app.callback(invoke_without_command=True)

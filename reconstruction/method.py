@@ -73,7 +73,7 @@ class Sensitivity:
 class Method:
     """One way to reconstruct, as a module of `reconstruction.methods` offers it.
 
-    assumes, cost, when: for people; `cost` in the letters of COSTS. solve: from what is given and
+    assumes, cost, when: for people, cost in seconds. solve: from what is given and
     the settings of all methods. part, settings: the name and type of its own part of the settings.
     package: what it needs beyond the core installation; it is then learned, for some views only.
     """
@@ -96,7 +96,10 @@ class Method:
         return self.package is None or find_spec(self.package) is not None
 
 
-COSTS = (
-    "N values of the light field, s shots; p patches of q values and m readings, n atoms: "
-    "building Psi D takes 2/3 p n q operations where pixels see one colour, 2 p n q else"
-)
+def cost_words(one_shot_s: float, three_shots_s: float) -> str:
+    """Return what a method costs, in words, by its seconds on 5x5 views of 64x80 pixels.
+
+    The shipped methods state the medians over seven real scenes and one core in
+    docs/results/chart-group-a-64x80.csv, which `emmc-rig chart --size 64x80` measures.
+    """
+    return f"about {one_shot_s:g} s for 64x80 pixels from one shot, {three_shots_s:g} s from three"

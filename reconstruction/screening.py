@@ -1,4 +1,4 @@
-"""Screening of frames before any method: bad shots and pixels are left out, flicker is evened.
+"""Clean-up of frames before any method: bad shots and pixels are excluded, flicker is evened.
 
 Only Psi and the frames are needed. A smooth picture that explains their local means predicts every
 reading except for the scene's fine texture, which is alike in all shots and in neighbouring pixels.
@@ -95,23 +95,23 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     double = double_shots(flat, frames, usable)
     usable = _without(usable, double)
     if dark:
-        notes.append(f"left out {_shots(dark)}: dark, while the others are not")
+        notes.append(f"excluded {_shots(dark)}: dark, while the others are not")
     if double:
         notes.append(
-            f"left out {_shots(double)}: the same as another, although by Psi the masks moved; "
-            "look at the stage, or measure Psi again"
+            f"excluded {_shots(double)}: the same as another, although in Psi the masks moved; "
+            "check the stage, or calibrate again"
         )
     gains = shot_gains(flat, frames, usable)
     if (gains != 1).any():
         frames = (frames / gains[:, None, None]).astype(frames.dtype)
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
-        notes.append(f"evened the brightness of the shots, which differed by {spread:.1%}")
+        notes.append(f"scaled the shots to equal brightness: they differed by {spread:.1%}")
     rows, columns = dead_lines(flat, frames, usable)
     lines = rows[:, None] | columns
     if lines.any():
         usable = usable & ~lines
         notes.append(
-            "left out whole lines, whose readings hardly vary while those beside do: "
+            "excluded dead lines, whose readings hardly vary while their neighbours' do: "
             + " and ".join(
                 f"{name} {', '.join(map(str, np.flatnonzero(dead)))}"
                 for name, dead in (("rows", rows), ("columns", columns))
@@ -122,7 +122,7 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
     if bad.any():
         usable = usable & ~bad
         notes.append(
-            f"left out {int(bad.sum())} pixels ({bad.mean():.2%}) that differ from their neighbours"
+            f"excluded {int(bad.sum())} bad pixels ({bad.mean():.2%}), unlike their neighbours"
         )
     return Screened(frames, usable, tuple(notes), dark, double, gains, bad, lines)
 
@@ -253,7 +253,7 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
     most = np.empty((keep, columns), values.dtype)
     small = np.empty(columns, values.dtype)
     large = np.empty(columns, values.dtype)
-    count = np.empty(columns, np.int32)
+    count, same = np.empty(columns, np.int32), np.empty(columns, np.uint8)
     endless = np.float32(np.inf)
     for y in range(begin, end):
         least[:] = endless
@@ -264,27 +264,35 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
                 if j == y and across == 0:
                     continue
                 first, last = max(0, -across), columns - max(0, across)
+                # Their rows as arrays of their own: an index that may be negative takes time.
+                beside = values[j, first + across : last + across]
+                colours_beside = colours[j, first + across : last + across]
+                good_beside = good[j, first + across : last + across]
+                own, counted = colours[y, first:last], count[first:last]
+                alike = same[first:last]
                 found = 0
-                for x in range(first, last):
-                    alike = good[j, x + across] & (colours[j, x + across] == colours[y, x])
-                    value = values[j, x + across]
-                    small[x] = value if alike else endless
-                    large[x] = value if alike else -endless
-                    count[x] += alike
-                    found += alike
+                for n in range(beside.size):
+                    alike[n] = good_beside[n] & (colours_beside[n] == own[n])
+                    found += alike[n]
                 if found == 0:
                     continue
+                low_side, high_side = small[first:last], large[first:last]
+                for n in range(beside.size):
+                    low_side[n] = beside[n] if alike[n] else endless
+                    high_side[n] = beside[n] if alike[n] else -endless
+                for n in range(beside.size):
+                    counted[n] += alike[n]
                 for place in range(keep):
-                    kept = least[place]
-                    for x in range(first, last):
-                        one, other = kept[x], small[x]
-                        kept[x] = one if one < other else other
-                        small[x] = other if one < other else one
-                    kept = most[place]
-                    for x in range(first, last):
-                        one, other = kept[x], large[x]
-                        kept[x] = other if one < other else one
-                        large[x] = one if one < other else other
+                    kept = least[place, first:last]
+                    for n in range(kept.size):
+                        one, other = kept[n], low_side[n]
+                        kept[n] = one if one < other else other
+                        low_side[n] = other if one < other else one
+                    kept = most[place, first:last]
+                    for n in range(kept.size):
+                        one, other = kept[n], high_side[n]
+                        kept[n] = other if one < other else one
+                        high_side[n] = one if one < other else other
         for x in range(columns):
             if count[x] < fewest:
                 low[y, x], high[y, x] = -np.inf, np.inf

@@ -9,6 +9,9 @@ real ones' bytes, Psi is measured from its whiteboards, and the light field is r
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import matplotlib.pyplot as plt
+import numpy as np
+
 import emmc_rig as emmc
 
 PLAN = """
@@ -29,7 +32,7 @@ darks:
 work = TemporaryDirectory()
 plan = Path(work.name, "plan.yaml")
 plan.write_text(PLAN)
-rig = emmc.rig("simulated", scene="near-planar", size=(24, 32), rays=256)
+rig = emmc.rig("simulated", scene="near-planar", size=(48, 64), rays=256)
 session = emmc.capture(plan, rig)
 session
 
@@ -40,7 +43,7 @@ session
 print(emmc.capture(plan, rig).is_complete)
 
 # %%
-# Psi is measured; the whiteboard held out says how well:
+# Psi is measured; the whiteboard kept for validation says how well:
 
 calibration = emmc.calibrate(session)
 calibration
@@ -51,7 +54,16 @@ calibration
 psi, frames = emmc.open_frames(session.folder)
 result = emmc.reconstruct(psi, frames, "adaptive-fast")
 print(result.verdict.words)
-figure = result.show()
+
+figure, axes = plt.subplots(1, 3, figsize=(9, 2.8), layout="constrained")
+axes[0].imshow(psi.weights[0, 0, 0, :, 0], cmap="gray")
+axes[0].set_title("Psi measured: view (0, 0)")
+axes[1].imshow(frames.readings[0], cmap="gray")
+axes[1].set_title("the shot")
+axes[2].imshow(np.clip(result.light_field[2, 2], 0, 1) ** (1 / 2.2))
+axes[2].set_title("recovered centre view")
+for axis in axes:
+    axis.set(xticks=[], yticks=[])
 
 # %%
 work.cleanup()

@@ -9,6 +9,8 @@ with an axis of its own, so that every shot shows the object from another side.
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import matplotlib.pyplot as plt
+
 import emmc_rig as emmc
 
 # %%
@@ -59,6 +61,11 @@ session = emmc.capture(folder / "plan.yaml", rig)
 
 for name, notes in session.notes.items():
     print(name or "the end", notes)
+
+turned = {name: notes["degrees"] for name, notes in session.notes.items() if "degrees" in notes}
+figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
+axes.step(list(turned), list(turned.values()), where="mid", marker="o")
+axes.set(xlabel="frame", ylabel="turned by, degrees")
 
 # %%
 work.cleanup()

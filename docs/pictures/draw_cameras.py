@@ -169,13 +169,13 @@ def drawn(name: str) -> str:
     return framed(PICTURES[name]())
 
 
-def framed(parts: Parts) -> str:
+def framed(parts: Parts, wide: int = WIDTH, high: int = HEIGHT) -> str:
     """Return a picture as SVG, on white."""
     head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" viewBox="0 0 {wide} {high}" '
         f'font-family="sans-serif" font-size="14" fill="{INK}">'
     )
-    return "\n".join([head, box(0, 0, WIDTH, HEIGHT, "#fff", "none"), *parts, "</svg>"]) + "\n"
+    return "\n".join([head, box(0, 0, wide, high, "#fff", "none"), *parts, "</svg>"]) + "\n"
 
 
 if __name__ == "__main__":

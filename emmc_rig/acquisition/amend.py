@@ -109,8 +109,8 @@ def _refuse_other_camera(session: Session, plan: Plan, camera: Camera, earlier: 
     )
     if taken and patterned and counts[0] != counts[1]:
         raise AppError(
-            f"shots: a mask shows another pattern in every shot, so that there stay {counts[0]} of "
-            f"them in session {session.folder.name}: {REMEDY}"
+            "shots: a mask has another pattern in every shot, so that session "
+            f"{session.folder.name} must keep {counts[0]} of them: {REMEDY}"
         )
     for shot in sorted(taken):
         if shot >= len(camera.shots) or _seen(now, shot) != _seen(then, shot):

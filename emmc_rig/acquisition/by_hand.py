@@ -82,13 +82,13 @@ def with_hands(rig: RigType, frames: Iterable[PlannedFrame]) -> RigType:
         pinholes = {*moved} <= {*APERTURE}
         without = (
             "write `views: []` and `open:` boards under whiteboards in the plan, which need no "
-            "pinhole (emmc-rig calibrate --plan --leave-out aperture)"
+            "pinhole (emmc-rig calibrate --plan --skip aperture)"
             if pinholes
             else "plan shots at one place of the mask"
         )
         raise AppError(
-            f"the plan moves {' and '.join(moved)}, the rig has the axes {known} and, by "
-            f"by_hand: false, nobody who moves others: write by_hand: true, or {without}"
+            f"the plan moves {' and '.join(moved)}, the rig has the axes {known}, and nothing is "
+            f"moved by hand (by_hand: false): write by_hand: true, or {without}"
         )
     return replace(rig, hands=frozenset(moved), left=frozenset(lacking) - frozenset(moved))
 
@@ -208,7 +208,7 @@ class HandPlaces:
             raise WrongMaskPlaceError(
                 planned.id,
                 f"shows the mask {x:+.3f} mm in x and {y:+.3f} mm in y off its place",
-                "set it again, and look which way its micrometer counts",
+                "set it again, and check in which direction its micrometer counts",
             )
         wanted = planned.bench.offsets_um
         places = {axis: wanted[axis] + float(off) for axis, off in zip(MASK, off_um, strict=True)}

@@ -90,8 +90,8 @@ def check(
     if before is not None and _same(frame.mosaic, before):
         raise FrameRefusedError(
             planned.id,
-            "is the frame before it once more, bit by bit",
-            "the camera repeats itself; switch it off and on if it goes on",
+            "is identical to the frame before it",
+            "the camera sent its last frame again; if this repeats, switch it off and on",
         )
     if planned.kind == "dark":
         if found.mean_dn > checks.largest_dark * span:

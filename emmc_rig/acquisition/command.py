@@ -32,7 +32,7 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.bench.hardware import FOCUS, Rig
-from emmc_rig.bench.rig_config import Ask, RigChoice, opened_rig
+from emmc_rig.bench.rig_config import AnyRig, Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
@@ -145,7 +145,8 @@ def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session 
     """
     if is_session(request.out):
         session = Session(request.out, disk)
-        if session.stored and json.loads(json.dumps(dict(request.rig))) != session.rig:
+        asked = json.loads(json.dumps(dict(request.rig)))
+        if session.stored and asked != AnyRig.under_new_names(session.rig):
             raise AppError(
                 f"session {session.folder.name} was begun with another rig: "
                 f"{json.dumps(session.rig)}; leave --rig out, or name another --out"
@@ -248,7 +249,7 @@ def disk_faults_named(session: Session) -> Iterator[None]:
             errno.EDQUOT: "the disk quota is spent; make room",
             errno.EROFS: "the disk is read-only; make it writable",
             errno.EACCES: "this user may not write there; change that",
-        }.get(fault.errno or 0, f"{fault.strerror or fault}; mend that")
+        }.get(fault.errno or 0, f"{fault.strerror or fault}; correct that")
         raise AppError(
             f"{session.folder}: {why}, then run the same command to go on; "
             f"{len(session.stored)} of {len(session.needed)} frames are safe"
@@ -270,14 +271,14 @@ def way_on_named(request: CaptureRequest, session: Session) -> Iterator[None]:
         if not isinstance(fault, GaveUpError):
             raise
         if not is_session(session.folder):
-            way = "nothing was captured; mend it, then run the same command"
+            way = "nothing was captured; correct it, then run the same command"
         elif is_session(request.plan_path):
             way = (
-                f"{kept} frames are kept: mend it, then run the same command, or with a copy of "
+                f"{kept} frames are kept: correct it, then run the same command, or with a copy of "
                 f"the plan that you edited: emmc-rig capture COPY.yaml --out {request.out}"
             )
         else:
-            way = f"{kept} frames are kept: mend it, then run the same command"
+            way = f"{kept} frames are kept: correct it, then run the same command"
         raise AppError(f"{fault}; {way}") from fault
 
 

@@ -80,15 +80,15 @@ class Devices:
         self.sent = Sent()
         self.homings = 0
         self._warmth_s, self._warmth_c = -TEMPERATURES_EVERY_S, dict[str, float]()
-        self._stands_um = dict(rig.stands_um)
+        self._fixed_um = dict(rig.fixed_positions_um)
 
     def home(self) -> None:
         """Home the stage, and bring the axes that no plan moves to their places."""
         self.homings += 1
         if self._rig.stage.axes:
             self._rig.stage.home()
-        if self._stands_um:
-            self._rig.stage.move_to_um(self._stands_um)
+        if self._fixed_um:
+            self._rig.stage.move_to_um(self._fixed_um)
         self.sent = Sent()
 
     def mend(self, what: Mending) -> None:
@@ -228,7 +228,7 @@ class Devices:
             self._rig.stage, FOCUS, span_um, lambda: sharpness(snapped(), snapped()), stopped
         )
         if found is not None:
-            self._stands_um[FOCUS] = found.place_um
+            self._fixed_um[FOCUS] = found.place_um
         return found
 
     def make_safe(self) -> None:

@@ -15,6 +15,7 @@ from drivers.stage import needs_approach
 from emmc_rig.acquisition.metering import metered_exposure_s
 from emmc_rig.acquisition.order import APPROACH_UM
 from emmc_rig.acquisition.plan import METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.session.journal import FrameEntry, MeteredEntry
 from emmc_rig.session.planned import PlannedFrame
@@ -35,8 +36,8 @@ ANY_LIMITS = (0.0, float("inf"))
 class Estimate:
     """Seconds by what they are spent on, and bytes on the disk.
 
-    by_hand: how often somebody must change something at the bench; his time is not reckoned with.
-    guessed: frames whose exposure nobody knows yet.
+    by_hand: how often a person is asked to change something at the bench, which takes time of its
+    own. guessed: frames whose exposure is not metered yet.
     """
 
     frames: int
@@ -57,7 +58,7 @@ class Pace:
     """What frames cost in time, learnt from those that were taken.
 
     waits: whether moves and exposures take their time; those of most simulated rigs do not. hands:
-    axes that somebody moves.
+    axes that a hand moves. asks: whether a person is that hand.
     """
 
     def __init__(
@@ -67,9 +68,10 @@ class Pace:
         frame_bytes: int,
         waits: bool = True,
         hands: Collection[str] = (),
+        asks: bool = True,
     ) -> None:
         self._speeds_um_s, self._settle_s, self._waits = speeds_um_s, settle_s, waits
-        self._hands = hands
+        self._hands, self._asks = hands, asks
         self._bytes = frame_bytes + FILE_OVERHEAD_BYTES
         self._usual_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
         self._learnt_s: deque[float] = deque(maxlen=LEARNT_FROM)
@@ -105,7 +107,7 @@ class Pace:
             here_um |= frame.bench.offsets_um
             if frame.bench.lamp != "off":
                 wanted = frame.bench.set_by_hand(self._hands)
-                by_hand += stood is not None and stood != wanted
+                by_hand += self._asks and stood not in (None, wanted)
                 stood = wanted
             known_s = exposure_s(frame)
             guessed += known_s is None
@@ -121,7 +123,8 @@ def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
     """Return what frames cost on a rig before any is taken."""
     rows, columns = rig.camera.shape
     speeds_um_s = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
-    return Pace(speeds_um_s, plan.settle_s, 2 * rows * columns, waits, rig.hands)
+    asks = isinstance(rig.attendant, AskingAttendant)
+    return Pace(speeds_um_s, plan.settle_s, 2 * rows * columns, waits, rig.hands, asks)
 
 
 def known_exposures(

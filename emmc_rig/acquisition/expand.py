@@ -19,7 +19,7 @@ from emmc_rig.acquisition.plan import AUTO, METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
-from emmc_rig.session.planned import SHOT_DARK, Bench, Kind, PlannedFrame
+from emmc_rig.session.planned import SHOT_DARK, VALIDATION, Bench, Kind, PlannedFrame
 
 OPEN_LAMP = "white"
 FIRST_TURN_DEG = 90.0
@@ -222,7 +222,7 @@ def _open_boards(
             if own_um
         }
         bench = Bench("whiteboard", OPEN_LAMP, 0, 0, True, moved | window)
-        kind = "held-out" if board.held_out else "open"
+        kind = VALIDATION if board.validation else "open"
         exposed = _white(boards, float(np.prod(camera.views)) / opened)
         yield from _repeated(
             f"{kind}-{place}", kind, bench, board.repeats, window=board.window, **exposed

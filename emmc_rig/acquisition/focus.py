@@ -166,7 +166,9 @@ def focused(
             if 0 < best < COARSE - 1:
                 break
         else:
-            raise AppError("no sharpest place within reach: begin nearer to it, or widen the span")
+            raise AppError(
+                "no sharpest position within the span: start nearer to it, or widen the span"
+            )
         step_um = float(places_um[1] - places_um[0])
         places_um = np.linspace(middle_um - step_um, middle_um + step_um, FINE)
         values, errors = seen(places_um)
@@ -197,7 +199,7 @@ def peak(places: np.ndarray, values: np.ndarray, errors: np.ndarray) -> tuple[fl
     left = values[good] / errors[good] - rows @ found
     spread = max(1.0, float(left @ left) / max(1, len(x) - 3))
     if found[2] >= 0 or abs(found[1] / (2 * found[2])) > 1:
-        raise AppError("no sharpest place is seen: begin nearer to it, or expose longer")
+        raise AppError("no sharpest position is seen: start nearer to it, or expose longer")
     slope = np.array([0.0, -1 / (2 * found[2]), found[1] / (2 * found[2] ** 2)])
     deviation = float(np.sqrt(spread * slope @ inverse @ slope))
     return middle + scale * float(-found[1] / (2 * found[2])), scale * deviation

@@ -50,7 +50,9 @@ def metered_exposure_s(metered: FrameEntry, level: float, light: float, limits_s
     `CameraSettingError` where the board was dark.
     """
     if metered.figures.bright_dn < 1:
-        raise CameraSettingError("exposure", "cannot be metered, the board is dark: light the lamp")
+        raise CameraSettingError(
+            "exposure", "cannot be metered, the board is dark: switch the lamp on"
+        )
     low_s, high_s = limits_s
     return min(max(metered.exposure_s * level / metered.level * light, low_s), high_s)
 

@@ -75,8 +75,10 @@ class PlannedShot(Settings):
 class OpenBoard(Settings):
     """A whiteboard through the masks with the aperture open: what a fit of the mask needs.
 
-    mask_um: x, y beyond the first shot's own place. held_out: no fit sees it, it judges them.
+    mask_um: x, y beyond the first shot's own place. validation: no fit uses it, it judges them.
     """
+
+    renamed: ClassVar = {"held_out": "validation"}
 
     mask_um: tuple[float, float] = (0.0, 0.0)
     window: tuple[int, int] = Field(
@@ -85,7 +87,7 @@ class OpenBoard(Settings):
         "of the aperture is open",
     )
     repeats: Repeats = 2
-    held_out: bool = False
+    validation: bool = False
 
 
 class Boards(Settings):
@@ -95,7 +97,7 @@ class Boards(Settings):
         default="all", description="all, or a list of [v, u]; [] for none"
     )
     open: tuple[OpenBoard, ...] = Field(
-        default=(), description="masks in, whole aperture: for the parametric route of `calibrate`"
+        default=(), description="masks in, whole aperture: for the calibration method parametric"
     )
     shots: Literal["all"] | tuple[Annotated[int, Field(ge=0)], ...] = Field(
         default="all", description="for which shots the pinhole is stepped: all, or a list"
@@ -124,10 +126,10 @@ class Boards(Settings):
     turns_deg: tuple[Annotated[float, Field(gt=0, lt=360)], ...] = Field(
         default=(90.0,),
         min_length=1,
-        description="by how much it is turned in its plane; 90, 180 and 270 show the sense as "
-        "well, and what does not turn with the board",
+        description="by how much it is turned in its plane; 90, 180 and 270 also show which way, "
+        "and what does not turn with the board",
     )
-    level: float = Field(default=0.7, gt=0, lt=1, description="of white, where metering aims")
+    level: float = Field(default=0.7, gt=0, lt=1, description="brightness to meter for, 1 at white")
     exposure_s: Positive | None = Field(
         default=None, description="of the references; default: metered"
     )
@@ -144,7 +146,7 @@ class Metering(Settings):
     """Of shots with `exposure_s: auto`: where their exposure is aimed at."""
 
     level: float = Field(
-        default=0.7, gt=0, lt=1, description="of white, where the brightest readings come"
+        default=0.7, gt=0, lt=1, description="of the brightest readings, 1 at white"
     )
     bracket: bool = Field(
         default=True, description="longer exposures too, where most of a scene is far darker"
@@ -283,8 +285,8 @@ def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
     for place, shot in enumerate(plan.shots):
         if changing and shot.camera_shot not in (None, place):
             raise AppError(
-                f"shots.{place}.camera_shot: mask '{changing[0]}' shows another pattern in every "
-                f"shot, so shot {place} is always its own: leave camera_shot out"
+                f"shots.{place}.camera_shot: mask '{changing[0]}' has another pattern in every "
+                "shot, so that camera_shot has no effect: leave it out"
             )
     shots = tuple(_camera_shot(camera, place, shot) for place, shot in enumerate(plan.shots))
     return camera.model_copy(update={"shots": shots})
@@ -344,7 +346,7 @@ def new_plan(name: str, camera: Camera) -> str:
     rows, columns = camera.views
     shots = "\n".join(_shot(camera, place) for place in range(len(camera.shots)))
     return f"""\
-# A capture for `emmc-rig capture`. What stands behind a # is the default, or an example.
+# A capture for `emmc-rig capture`. Comments show defaults and examples.
 
 title: {name}
 camera: {name}              # a shipped camera (`emmc-rig cameras`), or a YAML file beside this one
@@ -362,15 +364,15 @@ shots:
 whiteboards:
   views: all                # or a list: [[0, 0], [2, 2]]
   open:                     # masks in, whole aperture
-    - {{held_out: true}}      # by which `emmc-rig calibrate` judges the Psi that it measures
-    # - {{mask_um: [0, 0]}}   # for the parametric route: few frames, see `calibrate --plan`
+    - {{validation: true}}    # not used for Psi: `emmc-rig calibrate` judges Psi by it
+    # - {{mask_um: [0, 0]}}   # to fit the mask from few frames, see `calibrate --plan`
   # lamps: [white]          # default: what the sensor needs
   repeats: 2
   references: 4
-  level: 0.7                # of white, where metering aims; or exposure_s: of the references
+  level: 0.7                # their brightness, 1 at white; or exposure_s: of the references
 
 metering:                   # of shots with exposure_s: auto
-  level: 0.7                # of white, where the brightest readings come
+  level: 0.7                # of the brightest readings, 1 at white
   bracket: true             # longer exposures too, where most of the scene is far darker
   alike: true               # the same for all shots of one lamp and gain
   longest_s: 30

@@ -61,8 +61,8 @@ def replaying(rig: Rig, frames: Sequence[PlannedFrame]) -> tuple[Rig, Mapping[st
     found = matched(frames, files)
     if not found:
         raise AppError(
-            f"{camera.folder}: which of its {len(files)} files are the plan's {len(frames)} "
-            "frames cannot be said from number and exposures; name them by their frames, such as "
+            f"{camera.folder}: its {len(files)} files cannot be matched to the plan's "
+            f"{len(frames)} frames by number and exposures; name them after the frames, as "
             f"{frames[0].id}.dng"
         )
 

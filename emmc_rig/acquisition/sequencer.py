@@ -205,12 +205,12 @@ class Sequencer:
         if good:
             return
         what = (
-            f"lies {shift.length_px:.2f} px ({shift.x_px:+.2f}, {shift.y_px:+.2f}) off"
+            f"is shifted by {shift.length_px:.2f} px ({shift.x_px:+.2f}, {shift.y_px:+.2f})"
             if shift.likeness >= LEAST_LIKENESS
-            else f"looks different (likeness {shift.likeness:.2f})"
+            else f"looks different (correlation {shift.likeness:.2f})"
         )
         raise AppError(
-            f"the bench is no longer as it was: frame {planned.id}, taken again, {what}; put "
+            f"the bench has changed: frame {planned.id}, captured again, {what}; put "
             "the masks back and check lamp and board, or begin another session with --out"
         )
 

@@ -35,20 +35,20 @@ def refuse_unless_shots_can_be_spared(plan: Plan, camera: Camera) -> None:
     """
     if len(plan.shots) < 2:
         raise AppError(
-            "--until: the plan has one shot, so that there is none to spare; list the others that "
+            "--until: the plan has one shot, so that no shot can be saved; list the others that "
             "may be taken, each with its mask_um"
         )
     boards = plan.whiteboards
     if boards is None or plan.darks is None:
         wanting = "darks" if boards is not None else "whiteboards"
         raise AppError(
-            f"--until: the plan has no {wanting}, so that Psi of its shots stays unknown; "
+            f"--until: the plan has no {wanting}, so that the Psi of its shots cannot be measured; "
             f"{PLANNED_BY}"
         )
-    if any(not board.held_out for board in boards.open):
-        if not any(board.held_out for board in boards.open):
+    if any(not board.validation for board in boards.open):
+        if not any(board.validation for board in boards.open):
             raise AppError(
-                "--until: no open whiteboard of the plan is held out to judge the fit by; "
+                "--until: no open whiteboard of the plan has `validation: true`, to judge Psi by; "
                 f"{PLANNED_BY}"
             )
         shadow_mask(camera, SMALLEST)
@@ -61,7 +61,7 @@ def refuse_unless_shots_can_be_spared(plan: Plan, camera: Camera) -> None:
     ):
         raise AppError(
             "--until: the plan has neither open whiteboards nor the pinhole before every view of "
-            f"every shot, so that Psi of its shots stays unknown; {PLANNED_BY}"
+            f"every shot, so that the Psi of its shots cannot be measured; {PLANNED_BY}"
         )
 
 
@@ -147,7 +147,7 @@ def stated_psnr_db(result: Reconstruction) -> float:
     """Return the PSNR that a result's own deviation stands for; raises AppError without one."""
     stated_db = result.stated["stated_db"]
     if stated_db is None:
-        raise AppError(f"{result.method} states no deviation of its light field: use {METHOD}")
+        raise AppError(f"{result.method} estimates no accuracy: use {METHOD}")
     return stated_db
 
 

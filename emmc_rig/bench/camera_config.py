@@ -1,4 +1,4 @@
-"""The configuration of a camera: a short `KIND:ADDRESS`, or a YAML file with more settings."""
+"""The configuration of a camera: a short `DRIVER:ADDRESS`, or a YAML file with more settings."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings
 
+DRIVER_KEYS = ("driver", "kind")
+"""Of a camera's YAML file: the name of its driver, now and in earlier versions."""
+
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """A kind of camera, which one of its kind, and its other settings; `source` for messages."""
+    """A driver, which of its cameras, and its other settings; `source` for messages."""
 
-    kind: str
+    driver: str
     address: str = ""
     options: dict[str, Any] = field(default_factory=dict)
     source: str = ""
@@ -40,18 +43,18 @@ def settings_of(kind: type[Any]) -> type[Settings]:
 
 
 def parse_camera(spec: str) -> CameraChoice:
-    """Return the camera that `KIND:ADDRESS` or the name of a YAML file describes.
+    """Return the camera that `DRIVER:ADDRESS` or the name of a YAML file describes.
 
-    The file holds `kind`, `address` and what that kind takes. Raises AppError with one line.
+    The file holds `driver` (in earlier versions `kind`), `address` and what that driver takes.
+    Raises AppError with one line.
     """
     if not spec.endswith((".yaml", ".yml")) or ":" in spec:
-        kind, _, address = spec.partition(":")
-        return CameraChoice(kind, address, source=f"--camera {shown_path(spec)}")
+        driver, _, address = spec.partition(":")
+        return CameraChoice(driver, address, source=f"--camera {shown_path(spec)}")
     read = read_yaml(Path(spec), AppError)
-    if not isinstance(read, dict) or not isinstance(read.get("kind"), str):
-        raise AppError(
-            f"{shown_path(spec)}: expected settings of a camera with its kind, such as kind: mm"
-        )
-    options = {str(key): value for key, value in read.items()}
-    kind, address = options.pop("kind"), str(options.pop("address", ""))
-    return CameraChoice(kind, address, options, shown_path(spec))
+    options = {str(key): value for key, value in read.items()} if isinstance(read, dict) else {}
+    named = next((key for key in DRIVER_KEYS if isinstance(options.get(key), str)), None)
+    if named is None:
+        raise AppError(f"{shown_path(spec)}: name the camera's driver, such as driver: mm")
+    driver, address = options.pop(named), str(options.pop("address", ""))
+    return CameraChoice(driver, address, options, shown_path(spec))

@@ -128,11 +128,11 @@ class Rig:
     window_um: aperture_x, from its zero, that brings the plate's open window onto the axis.
     clock: the devices' own. reopen_camera: opens the camera again after it went away.
     about_to_expose: called with a frame's name before its exposure. window_side_um: side of that
-    square window, to put its edges between views; None: not known. stands_um: where axes that no
-    plan moves stand in a capture, as the focus. recorded_s: of a recording that is replayed, the
-    exposure of each frame by its name. hands: axes that the stage has not, which the attendant
-    moves; left: such that stay where they are, as every frame wants them at one place. sources:
-    what is read beside every frame.
+    square window, to put its edges between views; None: not known. fixed_positions_um: where
+    axes are in a capture that no plan moves, as the focus. recorded_s: of a recording that is
+    replayed, the exposure of each frame by its name. hands: axes that the stage has not, which the
+    attendant moves; left: such that stay where they are, as every frame wants them at one place.
+    sources: what is read beside every frame.
     """
 
     stage: Stage
@@ -144,7 +144,7 @@ class Rig:
     reopen_camera: Callable[[], CameraDevice] | None = None
     about_to_expose: Callable[[str], None] = _unheard
     window_side_um: float | None = None
-    stands_um: Mapping[str, float] = field(default_factory=dict)
+    fixed_positions_um: Mapping[str, float] = field(default_factory=dict)
     recorded_s: Mapping[str, float] = field(default_factory=dict)
     hands: frozenset[str] = frozenset()
     left: frozenset[str] = frozenset()
@@ -231,7 +231,7 @@ def simulated_rig(
     rays_per_view: int = RAYS_PER_VIEW,
     flaws: Flaws = NO_FLAWS,
     focus_um: float | None = None,
-    stands_um: Mapping[str, float] | None = None,
+    fixed_positions_um: Mapping[str, float] | None = None,
     fitted: Fitted = ALL_FITTED,
 ) -> tuple[SimulatedRig, Bench]:
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
@@ -240,9 +240,9 @@ def simulated_rig(
     real one lets moves and exposures take their time; by default they take none. A frame that is
     announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
     pixel; few are quick, and grainy beside a good sensor's noise. flaws: what is wrong with
-    it. focus_um: where a fifth axis, `focus`, has the scene sharp; None: there is none. stands_um:
-    see `Rig`. fitted: with which axes and camera. Raises AppError for a size that the camera's RAW
-    files cannot hold.
+    it. focus_um: where a fifth axis, `focus`, has the scene sharp; None: there is none.
+    fixed_positions_um: see `Rig`. fitted: with which axes and camera. Raises AppError for a size
+    that the camera's RAW files cannot hold.
     """
     k = camera.sensor.binning
     if min(size) // k < SMALLEST_SIDE_PX:
@@ -343,7 +343,7 @@ def simulated_rig(
         opened,
         announced,
         window_side_um(camera.views, camera.lens.aperture_cell_um),
-        stands_um or {},
+        fixed_positions_um or {},
         chain=chain,
         still=simulator,
     )
@@ -531,27 +531,27 @@ def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]
 
 
 def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
-    """Open the camera that `spec` names: a kind, a colon and its address.
+    """Open the camera that `spec` names: a driver, a colon and its address.
 
     One of `drivers.cameras`, `simulated`, that of a plug-in, or a YAML file
     (`emmc_rig.bench.camera_config`). `backend`: of pyusb, for a simulated bus.
-    Raises AppError for any other kind, or an error of the driver.
+    Raises AppError for any other driver, or the driver's error.
     """
     choice = parse_camera(spec)
-    if choice.kind == SIMULATED:
+    if choice.driver == SIMULATED:
         return open_ptp("", clock, simulated_bus(clock), from_card=True)
-    if choice.kind in CAMERAS:
-        driver = CAMERAS[choice.kind].load()
+    if choice.driver in CAMERAS:
+        driver = CAMERAS[choice.driver].load()
         return driver.open_camera(choice.address, clock, backend, *_options(choice, driver))
     others = plug_ins(plugins.CAMERAS)
-    if choice.kind not in others:
-        kinds = ", ".join((CAMERA_HELP, SIMULATED, *(f"{name}:" for name in sorted(others))))
-        raise AppError(f"{choice.source}: no such kind of camera; use {kinds}")
-    return open_plug_in(plugins.CAMERAS, choice.kind, choice.address, clock, **choice.options)
+    if choice.driver not in others:
+        known = ", ".join((CAMERA_HELP, SIMULATED, *(f"{name}:" for name in sorted(others))))
+        raise AppError(f"{choice.source}: no such camera driver; use {known}")
+    return open_plug_in(plugins.CAMERAS, choice.driver, choice.address, clock, **choice.options)
 
 
-def camera_kinds() -> set[str]:
-    """Return every kind of camera that `--camera` takes; a plug-in replaces none of ours."""
+def camera_drivers() -> set[str]:
+    """Return every driver that `--camera` takes; a plug-in replaces none of ours."""
     return {*CAMERAS, SIMULATED, *plug_ins(plugins.CAMERAS)}
 
 
@@ -566,7 +566,7 @@ def _options(choice: CameraChoice, driver: Any) -> tuple[Any, ...]:
         return (kind(**{name: getattr(given, name) for name in type(given).model_fields}),)
     if choice.options:
         extra = ", ".join(choice.options)
-        raise AppError(f"{choice.source}: {choice.kind} takes only an address, not {extra}")
+        raise AppError(f"{choice.source}: {choice.driver} takes only an address, not {extra}")
     return ()
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -40,7 +40,7 @@ IMPORTED = "imported"
 """What a session has for a rig whose frames are files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
 LATER = (
-    "focus_um", "stands_um", "mask", "environment", "axes", "second_stage", "hands_um",
+    "focus_um", "fixed_positions_um", "mask", "environment", "axes", "second_stage", "hands_um",
     "usb_camera",
 )  # fmt: skip
 StageSpec = str | dict[str, Any]
@@ -60,11 +60,12 @@ class Mounting(Settings):
 class AnyRig(Settings):
     """What a rig's file may say of every rig.
 
-    stands_um: by axis, where those stand that no plan moves, as `focus`. mask: how it was found to
-    sit, which sessions keep. environment: what is read beside every frame.
+    fixed_positions_um: by axis that no plan moves, as `focus`, where it is. mask: how it was found
+    to sit, which sessions keep. environment: what is read beside every frame.
     """
 
-    stands_um: dict[str, float] = Field(default_factory=dict)
+    renamed: ClassVar = {"stands_um": "fixed_positions_um"}
+    fixed_positions_um: dict[str, float] = Field(default_factory=dict)
     mask: Mounting | None = None
     environment: tuple[SourceConfig, ...] = ()
 
@@ -77,13 +78,13 @@ class AnyRig(Settings):
                 raise ValueError(f"two sources are named {name}: give one another name")
         return sources
 
-    @field_validator("stands_um")
+    @field_validator("fixed_positions_um")
     @classmethod
-    def _not_the_plans(cls, stands_um: dict[str, float]) -> dict[str, float]:
-        for axis in stands_um:
+    def _not_the_plans(cls, fixed_positions_um: dict[str, float]) -> dict[str, float]:
+        for axis in fixed_positions_um:
             if axis in STAGE_AXES:
                 raise ValueError(f"{axis} is moved by plans: give its zero_um instead")
-        return stands_um
+        return fixed_positions_um
 
 
 class RealRig(AnyRig):
@@ -290,7 +291,7 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
             imaged.rays,
             flawed(NO_FLAWS, imaged.flaws),
             imaged.focus_um,
-            imaged.stands_um,
+            imaged.fixed_positions_um,
             Fitted(imaged.axes, imaged.second_stage, imaged.hands_um, imaged.usb_camera),
         )
         _check_axes(imaged, rig)
@@ -300,7 +301,9 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
     zero_um = dict(real.zero_um)
     if real.stage == SIMULATED and real.camera.startswith(RECORDING):
         # Nothing moves any more, wherever the stage of the recording was sent.
-        still: Stage = StillStage((*STAGE_AXES, *real.stands_um), SYSTEM_CLOCK, 0.0, ANYWHERE_UM)
+        still: Stage = StillStage(
+            (*STAGE_AXES, *real.fixed_positions_um), SYSTEM_CLOCK, 0.0, ANYWHERE_UM
+        )
         zero_um = dict.fromkeys(STAGE_AXES, 0.0) | zero_um
     else:
         still = open_stages(_several(real.stage))
@@ -315,7 +318,7 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
             real.window_um,
             reopen_camera=lambda: open_camera(real.camera),
             window_side_um=real.window_side_um,
-            stands_um=real.stands_um,
+            fixed_positions_um=real.fixed_positions_um,
         )
         _check_axes(real, rig)
         yield rig
@@ -323,7 +326,7 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
 
 def _check_axes(config: AnyRig, rig: Rig) -> None:
     """Raise AppError for an axis that the stage has not."""
-    for axis in config.stands_um:
+    for axis in config.fixed_positions_um:
         if axis not in rig.stage.axes:
             known = ", ".join(rig.stage.axes) or "none"
-            raise AppError(f"stands_um.{axis}: the stage has no such axis, only {known}")
+            raise AppError(f"fixed_positions_um.{axis}: the stage has no such axis, only {known}")

@@ -17,66 +17,75 @@ DEFAULT_CAMERA = "rgbw-bayer-1shot"
 def calibrate(
     session: Annotated[
         Path | None,
-        typer.Argument(help="a session of `capture`"),
+        typer.Argument(help="a session with whiteboards, as `capture` writes it"),
     ] = None,
     camera: Annotated[
-        str, typer.Option("--camera", help="a shipped camera or a YAML file")
+        str, typer.Option("--camera", help="with --plan: a shipped camera or a YAML file")
     ] = DEFAULT_CAMERA,
     size: Annotated[
-        str, typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of samples")
+        str,
+        typer.Option(
+            "--size", envvar=SIZE_VARIABLE, help="with --plan: ROWSxCOLUMNS of the light field"
+        ),
     ] = "192x256",
-    route: Annotated[
-        str, typer.Option("--route", help="auto (the surest), parametric, mixed or free")
+    method: Annotated[
+        str,
+        typer.Option("--method", help="auto (the best by validation), parametric, mixed or free"),
     ] = "auto",
     plan: Annotated[
-        bool, typer.Option("--plan", help="write how many whiteboards, of which kind, it takes")
+        bool, typer.Option("--plan", help="plan the whiteboards: writes plan.yaml for `capture`")
     ] = False,
     drift: Annotated[
         Path | None,
         typer.Option(
             "--drift",
-            help="a folder of frames.h5: does the Psi of --known still fit? Writes one that does",
+            help="a folder with frames.h5: check the Psi of --known by it, and correct its drift",
         ),
     ] = None,
     known: Annotated[
-        Path | None, typer.Option("--known", help="with --drift: a folder that `calibrate` wrote")
+        Path | None, typer.Option("--known", help="with --drift: the folder of a calibration")
     ] = None,
     target: Annotated[
-        float, typer.Option("--target", help="relative error of Psi to plan for")
+        float, typer.Option("--target", help="with --plan: relative error of Psi to reach")
     ] = 0.005,
     frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="with --plan: at most so many")
+        int | None, typer.Option("--frames", min=1, help="with --plan: most frames")
     ] = None,
     few: Annotated[
         bool,
         typer.Option(
             "--few",
-            help="about ten whiteboards of parts of the aperture in place of those of every view, "
-            "for masks that are as designed; references, darks and checks stay",
+            help="with --plan: about ten whiteboards in place of one of every view, for a mask as "
+            "designed",
         ),
     ] = False,
-    leave_out: Annotated[
+    skip: Annotated[
         str | None,
         typer.Option(
-            "--leave-out",
-            help="with --plan: what the rig cannot take, some of lamp, response, colours, turned, "
-            "aperture, mask; commas between",
+            "--skip",
+            help="with --plan: whiteboards that the rig cannot take: lamp, response, colours, "
+            "turned, aperture, mask; commas between",
         ),
     ] = None,
     sensor: Annotated[
         bool,
-        typer.Option("--sensor", help="of a session: the sensor's EMVA 1288 figures, sensor.json"),
+        typer.Option(
+            "--sensor", help="characterise the sensor too (EMVA 1288): writes sensor.json"
+        ),
     ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help="folder to write (default: in the session; emmc-calibration with --plan, "
-            "emmc-drift with --drift)",
+            help="folder to write (default: in the session; with --plan emmc-calibration, with "
+            "--drift emmc-drift)",
         ),
     ] = None,
 ) -> None:
-    """Measure Psi from a session's whiteboards, and say how sure it is; or plan them."""
+    """Measure Psi from a session's whiteboards.
+
+    Or plan these by --plan, or correct Psi for drift by --drift.
+    """
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
@@ -88,41 +97,41 @@ def calibrate(
         _judge_drift(known, drift, out or Path("emmc-drift"))
         return
     if session is not None:
-        _calibrate_session(session, route, out, sensor)
+        _calibrate_session(session, method, out, sensor)
         return
     if not plan:
-        raise typer.BadParameter("name a session, or --plan its whiteboards")
+        raise typer.BadParameter("name a session, or plan its whiteboards by --plan")
     if not 0 < target < 1:
         raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
     shape = parse_size(size)
     assert shape is not None
     settings = PlanSettings(
         camera, find_camera(camera), shape, target, frames,
-        frozenset(leave_out.split(",") if leave_out else ()), few,
+        frozenset(skip.split(",") if skip else ()), few,
     )  # fmt: skip
     out = out or Path("emmc-calibration")
     with result_folder(out, "calibrate --plan") as folder, shown_progress("plan"):
         metrics = write_plan(settings, folder)
     tell(
-        f"{metrics['frames']} frames for a relative error of Psi of "
-        f"{metrics['expected_relative_error']:.2%}, the model's own included"
+        f"{metrics['frames']} frames; expected calibration error "
+        f"{metrics['expected_relative_error']:.2%}"
     )
     if wanted := metrics["few_would_take_frames"]:
-        tell(f"every view is opened: few whiteboards would take {wanted} frames")
-    tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig ...")
+        tell(f"planned one whiteboard of every view: with --few it would be {wanted} frames")
+    tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig RIG.yaml")
     give_result(out)
 
 
 def _tell_findings(metrics: dict) -> None:
     for line in metrics["findings"]:
-        tell(f"found: {line}")
+        tell(f"finding: {line}")
     for line in metrics["unwatched"]:
         tell(line)
     for line in metrics["advice"]:
-        tell(f"measure again: {line}")
+        tell(f"advice: {line}")
 
 
-def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -> None:
+def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) -> None:
     from emmc_rig.files.folders import result_folder
     from emmc_rig.processing.session_calibration import calibrate_into
     from emmc_rig.session.session import CALIBRATION, Session
@@ -130,13 +139,13 @@ def _calibrate_session(path: Path, route: str, out: Path | None, sensor: bool) -
     captured, place = Session(path), path / CALIBRATION
     out = out or place
     with result_folder(out, "calibrate", belongs_to=place) as folder, shown_progress() as bars:
-        calibration = calibrate_into(folder, captured, route, sensor, bars)
+        calibration = calibrate_into(folder, captured, method, sensor, bars)
     metrics = calibration.metrics
     chosen = metrics["chosen"]
     judged = metrics["held_out"][chosen]
     tell(
-        f"{metrics['why']}; {metrics['frames'][chosen]} frames, the whiteboard held out is "
-        f"predicted to {judged['relative_error']:.2%}, {judged['chi2']:.2f} of the noise's variance"
+        f"{metrics['why']}, {metrics['frames'][chosen]} frames; validation whiteboard predicted "
+        f"to {judged['relative_error']:.2%}"
     )
     _tell_findings(metrics)
     sheet = calibration.sensor

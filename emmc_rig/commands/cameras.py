@@ -17,13 +17,13 @@ def _shown(value: object) -> str:
 
 def cameras(
     name: Annotated[
-        str | None, typer.Argument(help="a shipped camera or a YAML file; none: list all")
+        str | None, typer.Argument(help="a shipped camera or a YAML file (default: list all)")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="folder for the drawing and its metrics")
+        Path | None, typer.Option("--out", help="folder for the drawing (default: camera-NAME)")
     ] = None,
 ) -> None:
-    """List the cameras known, or draw one: masks, weights, sampling."""
+    """List the shipped cameras, or draw the masks of one."""
     import emmc_rig as emmc
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import write_metrics

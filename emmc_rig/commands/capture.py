@@ -13,7 +13,14 @@ import typer
 from rich.console import Console
 
 from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
-from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
+from emmc_rig.commands.options import (
+    SIMULATED as SIMULATED_PANEL,
+)
+from emmc_rig.commands.options import (
+    RigOption,
+    RigSceneOption,
+    RigSizeOption,
+)
 from emmc_rig.commands.output import emit, give_result, json_wanted, say, tell
 from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import ERRORS, AppError
@@ -29,61 +36,80 @@ OptionalPath = Path | None
 def capture(
     context: typer.Context,
     plan: Annotated[
-        OptionalPath, typer.Argument(help="a plan (YAML); or a session, to go on with it")
+        OptionalPath, typer.Argument(help="a plan (YAML), or a session to go on with")
     ] = None,
     new: Annotated[
-        str | None, typer.Option("--new", help="write a commented plan for this camera, and end")
+        str | None, typer.Option("--new", help="write a commented plan for this camera, and exit")
     ] = None,
     rig: RigOption = None,
     scene: RigSceneOption = "deep-occlusions",
     size: RigSizeOption = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="of the simulated rig")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            "--seed", min=0, help="of the random scene and noise", rich_help_panel=SIMULATED_PANEL
+        ),
+    ] = 0,
     rays: Annotated[
-        int | None, typer.Option("--rays", min=16, help="per view and pixel of the simulated rig")
+        int | None,
+        typer.Option("--rays", min=16, help="per view and pixel", rich_help_panel=SIMULATED_PANEL),
     ] = None,
     flaws: Annotated[
         str | None,
         typer.Option(
-            "--flaws", help="what is wrong with the simulated rig, as tilt,lamp,crosstalk; together"
+            "--flaws",
+            help="what is wrong with it, for instance tilt,lamp,crosstalk; or together",
+            rich_help_panel=SIMULATED_PANEL,
         ),
     ] = None,
     real_time: Annotated[
-        bool, typer.Option("--real-time", help="simulated moves and exposures take their time")
+        bool,
+        typer.Option(
+            "--real-time",
+            help="moves and exposures take as long as on a bench",
+            rich_help_panel=SIMULATED_PANEL,
+        ),
     ] = False,
     until: Annotated[
         str | None,
         typer.Option(
             "--until",
-            help="PSNR, as 30dB: shot after shot of the plan, stop when no more are needed",
+            help="as 30dB: skip the plan's further shots once this accuracy is estimated",
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="only check the plan, and say what it will take")
+        bool,
+        typer.Option("--dry-run", help="check the plan and estimate its time, without capturing"),
     ] = False,
-    page: Annotated[
-        bool, typer.Option("--page", help="show the running capture on a local page")
-    ] = False,
+    page: Annotated[bool, typer.Option("--page", help="show the capture on a local page")] = False,
     steer: Annotated[
         bool,
-        typer.Option("--steer", help="and let the page pause and take frames again; it ends there"),
+        typer.Option(
+            "--steer", help="as --page, which can also pause, capture frames again, and finish"
+        ),
     ] = False,
     other_devices: Annotated[
         bool,
-        typer.Option("--other-devices", help="go on with a camera or stage of another serial"),
+        typer.Option(
+            "--other-devices", help="go on with a camera or stage of another serial number"
+        ),
     ] = False,
     host: Annotated[
-        str, typer.Option("--host", help="address to serve the page at, for a phone at the bench")
+        str, typer.Option("--host", help="address to serve the page at, for instance for a phone")
     ] = "127.0.0.1",
     out: Annotated[
         OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
     ] = None,
 ) -> None:
-    """Run a plan on the rig; run it again to go on where it stopped. Ctrl-C: after this frame."""
+    """Capture a plan's frames on a rig.
+
+    Ctrl-C stops after the current frame; the same command goes on where it stopped.
+    """
     if new is not None:
         _write_plan(new, out or Path("plan.yaml"))
         return
     if plan is None:
-        raise typer.BadParameter("name a plan, or write one with --new CAMERA")
+        raise typer.BadParameter("name a plan, or write one by --new CAMERA")
     from emmc_rig.bench.rig_config import SIMULATED, ImagedRig, rig_description
     from emmc_rig.files.results import parse_psnr, parse_size
     from emmc_rig.model.settings import validated
@@ -160,9 +186,9 @@ def _run(
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
             most = "" if until_db is None else "at most "
-            hands = f", {expected.by_hand} change(s) by hand" if expected.by_hand else ""
+            hands = f", {expected.by_hand} changes by hand" if expected.by_hand else ""
             yet = (
-                f"; the exposures of {expected.guessed} are not metered yet and come on top"
+                f"; time excludes {expected.guessed} exposures that are metered first"
                 if expected.guessed
                 else ""
             )

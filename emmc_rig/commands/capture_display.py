@@ -1,6 +1,6 @@
 """What a capture shows: bar, time left and the brightest readings on a terminal; words elsewhere.
 
-On a terminal p pauses and resumes, and q stops after the present frame.
+On a terminal p pauses and resumes, and q stops after the current frame.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class CaptureDisplay(CaptureWatcher):
         if self._task is not None:
             self._progress.update(self._task, description="frames", total=planned, completed=done)
         if done:
-            self.tell(f"{done} of {planned} frames are there already")
+            self.tell(f"{done} of {planned} frames are captured already")
 
     def more(self, planned: int) -> None:
         """Lengthen the bar."""
@@ -89,7 +89,7 @@ class CaptureDisplay(CaptureWatcher):
     def step(self, name: str, frame: PlannedFrame) -> None:
         """Say what is under way."""
         if name != "write":
-            paused = "paused, p goes on: " if self._control.paused else ""
+            paused = "paused (p: go on): " if self._control.paused else ""
             self._doing = f"{paused}{frame.id}: {name}"
             self._update()
 
@@ -110,7 +110,7 @@ class CaptureDisplay(CaptureWatcher):
 
     def left(self, seconds: float, guessed: int) -> None:
         """Show how long the rest will take."""
-        unknown = f", and the exposures of {guessed} not metered yet" if guessed else ""
+        unknown = f" (excludes {guessed} exposures not metered yet)" if guessed else ""
         self._left = f"about {shown_seconds(seconds)} left{unknown}"
         self._update()
 
@@ -142,7 +142,7 @@ class CaptureDisplay(CaptureWatcher):
                     self._control.resume()
                 else:
                     self._control.pause()
-                    self.tell("pausing after this frame; p goes on")
+                    self.tell("pausing after this frame; press p to go on")
             elif key == STOP_KEY:
                 self._control.stop()
                 self.tell("stopping after this frame")

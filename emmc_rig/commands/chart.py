@@ -24,20 +24,23 @@ def chart(
         typer.Option("--camera", help="a shipped camera or a YAML file; may repeat"),
     ] = None,
     fast: Annotated[
-        bool, typer.Option("--fast", help="small crops, few points: minutes, not hours")
+        bool, typer.Option("--fast", help="small crops, few points: minutes instead of hours")
     ] = False,
     method: MethodsOption = None,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     repeats: Annotated[
-        int | None, typer.Option("--repeats", min=1, help="timed calls of each, at most")
+        int | None, typer.Option("--repeats", min=1, help="timed runs of each method")
     ] = None,
     seed: SeedOption = 0,
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write (default: emmc-chart)")
     ] = None,
 ) -> None:
-    """Chart speed against accuracy of every method; run it again to go on where it stopped."""
+    """Chart the speed and accuracy of every method.
+
+    The same command goes on where it stopped.
+    """
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.chart.chart_points import chart_settings
     from emmc_rig.study.chart.charting import run_chart
@@ -53,8 +56,8 @@ def chart(
         rows = [
             (m.configuration.label, f"{m.seconds:.3g}", f"{m.psnr_db:.2f}") for m in one.front()
         ]
-        show_table(("the front", "s", "dB"), rows, one.title)
+        show_table(("method", "s", "dB"), rows, one.title)
     for line in outcome.left_out:
-        say("left out", line)
+        say("excluded", line)
     tell(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")
     give_result(place)

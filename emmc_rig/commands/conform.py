@@ -19,17 +19,17 @@ SUITES = {"stage": "stages.py", "camera": "cameras.py"}
 
 def conform(
     device: Annotated[
-        str, typer.Argument(metavar="NAME", help="as --stage or --camera take it; or simulated")
+        str, typer.Argument(metavar="NAME", help="as --stage or --camera takes it; or simulated")
     ],
     only: Annotated[
-        str | None, typer.Option("--as", help="stage or camera, where the name is of both")
+        str | None, typer.Option("--as", help="stage or camera, where NAME can be either")
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="move the stage without asking")] = False,
 ) -> None:
-    """Check that a stage or camera does what every one must do; exit code 1 unless it does.
+    """Test that a stage or camera behaves as the program needs.
 
-    A stage is homed again and again, and moved through the middle of its travel, after a question;
-    a camera is exposed some twenty times. Needs the extra `test`.
+    Exit code 1 if not. A stage is homed several times, and moved through the middle of its travel,
+    after a question; a camera is exposed some twenty times. Needs the extra `test`.
     """
     if find_spec("pytest") is None:
         raise AppError('conform needs pytest: pip install "emmc-rig[test]"')
@@ -66,31 +66,33 @@ def conform(
         )
     give_result(device=device, conforms=code == pytest.ExitCode.OK)
     if code != pytest.ExitCode.OK:
-        raise AppError(f"{device} does not do what every {' and '.join(suites)} must do: see above")
+        raise AppError(
+            f"{device} failed the conformance tests of a {' and a '.join(suites)}: see above"
+        )
 
 
 def _suites(device: str) -> list[str]:
     """Return which suites a name asks for; raises AppError for one that names nothing."""
-    from emmc_rig.bench.hardware import camera_kinds
+    from emmc_rig.bench.camera_config import DRIVER_KEYS
+    from emmc_rig.bench.hardware import camera_drivers
     from emmc_rig.bench.stage_config import stage_protocols
     from emmc_rig.model.reading import read_yaml
 
     if device.endswith((".yaml", ".yml")):
         read = read_yaml(Path(device), AppError)
         settings = read if isinstance(read, dict) else {}
-        found = [
-            suite for suite, key in (("stage", "protocol"), ("camera", "kind")) if key in settings
-        ]
+        named = {"stage": ("protocol",), "camera": DRIVER_KEYS}
+        found = [suite for suite, keys in named.items() if settings.keys() & set(keys)]
     else:
         name = device.partition(":")[0]
         stages = {*stage_protocols(), "simulated"}
-        known = {"stage": stages, "camera": camera_kinds()}
+        known = {"stage": stages, "camera": camera_drivers()}
         found = [suite for suite, names in known.items() if name in names]
         if device.startswith("simulated:"):
             found = ["stage"]
     if not found:
         raise AppError(
             f"{device}: name a stage or a camera as --stage and --camera take it, such as "
-            "zaber:/dev/ttyUSB0, or a YAML file with its protocol or kind"
+            "zaber:/dev/ttyUSB0, or a YAML file with its protocol or driver"
         )
     return found

@@ -14,7 +14,9 @@ from emmc_rig.commands.output import give_result, say, show_table, shown_progres
 def design(
     bench: Annotated[
         Path | None,
-        typer.Argument(help="a YAML file of what the bench has (default: see docs/design.md)"),
+        typer.Argument(
+            help="a YAML file that describes the bench (default: one of docs/design.md)"
+        ),
     ] = None,
     scene: ScenesOption = None,
     size: SizeOption = None,
@@ -24,7 +26,7 @@ def design(
         typer.Option("--out", help="folder to write (default: emmc-design)"),
     ] = None,
 ) -> None:
-    """Choose the mask to order: by theory, confirmed by simulation; a camera and a mask file."""
+    """Design the mask to order, by theory and simulation."""
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.design.bench import load_bench
     from emmc_rig.study.design.designing import run_design, simulated_table
@@ -39,11 +41,11 @@ def design(
     tell(designed.found.winner.label)
     tell(
         f"expected {best.psnr_db:.2f} dB, {best.light:.0%} of the light, Fresnel number "
-        f"{best.fresnel:.2g}: diffraction costs {loss_db:.2f} dB"
+        f"{best.fresnel:.2g}: diffraction loses {loss_db:.2f} dB"
     )
     show_table(*simulated_table(designed.simulated))
     tell(designed.verdict)
     for line in designed.left_out:
-        say("left out", line)
+        say("note", line)
     tell(f"open {designed.page}")
     give_result(place)

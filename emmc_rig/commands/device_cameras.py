@@ -26,11 +26,11 @@ CameraSpec = Annotated[
     typer.Option("--camera", help=f"{CAMERA_HELP}, simulated or a YAML file"),
 ]
 RigOption = Annotated[
-    str | None, typer.Option("--rig", help="simulated: the same as --camera simulated")
+    str | None, typer.Option("--rig", help="simulated: as --camera simulated", hidden=True)
 ]
 ExposureOption = Annotated[
     str | None,
-    typer.Option("--exposure", help="in seconds, or as 20ms (default: as the camera is set)"),
+    typer.Option("--exposure", help="as 0.02 or 20ms (default: as the camera is set)"),
 ]
 GainOption = Annotated[
     float | None, typer.Option("--gain", help="1: the lowest ISO (default: as the camera is set)")
@@ -52,7 +52,7 @@ def register(app: typer.Typer) -> None:
 
 
 def camera_info(camera: CameraSpec = "ptp:", rig: RigOption = None) -> None:
-    """Show what a camera is, and what it can be set to."""
+    """Show a camera's model and settings."""
     camera = _chosen(camera, rig)
     with closing(open_camera(camera)) as device:
         rows = list(camera_rows(device))
@@ -68,7 +68,7 @@ def snap(
     count: Annotated[int, typer.Option("--count", min=1, help="number of frames")] = 1,
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
-    """Take frames: the camera's own bytes, a PNG preview and the facts, each file whole or none."""
+    """Take frames and save them as the camera's own files, with a PNG preview of each."""
     from emmc_rig.files.results import parse_seconds
     from emmc_rig.pages.frame_view import frame_figures
 
@@ -108,7 +108,7 @@ def camera_rows(device: Camera) -> Iterator[tuple[str, str]]:
     """Yield name and value of what a camera says of itself, without exposing a frame."""
     identity = device.identity
     for name in ("maker", "model", "serial", "firmware"):
-        yield name, getattr(identity, name) or "not stated"
+        yield name, getattr(identity, name) or "unknown"
     low_s, high_s = device.exposure_limits_s
     yield "exposure", f"{device.exposure_s:g} s, from {low_s:g} to {high_s:g} s"
     low, high = device.gain_limits

@@ -23,18 +23,22 @@ from emmc_rig.errors import AppError
 if TYPE_CHECKING:
     from drivers.stage import Stage
 
-app = typer.Typer(no_args_is_help=True, help="What is connected; probe, home and jog it by hand.")
+app = typer.Typer(
+    name="devices",
+    no_args_is_help=True,
+    help="List, test and move stages and cameras.",
+)
 
 StageOption = Annotated[
     str | None,
     typer.Option(
         "--stage",
-        help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file that wires names",
+        help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file",
     ),
 ]
 RigOption = Annotated[
     str | None,
-    typer.Option("--rig", help="simulated: of Zaber devices; or simulated:grbl, simulated:apt"),
+    typer.Option("--rig", help="simulated, simulated:grbl or simulated:apt, instead of --stage"),
 ]
 AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (default: all)")]
 
@@ -45,7 +49,7 @@ app.command()(conform)
 
 @app.command("list")
 def list_devices(rig: RigOption = None) -> None:
-    """List serial ports (adapter, what usually answers there, who holds them) and USB cameras."""
+    """List the serial ports and USB cameras of this computer."""
     from drivers.clock import SYSTEM_CLOCK
     from drivers.ports import guess_of, holder_of, list_serial_ports
 
@@ -102,11 +106,12 @@ def _list_cameras(backend: Any = None) -> None:
 @app.command()
 def probe(
     ports: Annotated[
-        list[str] | None, typer.Argument(help="ports to ask (default: those of a known adapter)")
+        list[str] | None,
+        typer.Argument(help="ports to ask (default: those with a known USB adapter)"),
     ] = None,
     rig: RigOption = None,
 ) -> None:
-    """Ask ports what answers there; nothing moves."""
+    """Ask serial ports which stage answers; nothing moves."""
     from drivers.ports import guess_of, list_serial_ports
     from emmc_rig.bench.hardware import probe_port, probe_simulated
 
@@ -130,10 +135,13 @@ def probe(
 def check(
     rig: Annotated[str, typer.Argument(help="simulated, or the YAML file of a rig")],
     camera: Annotated[
-        str, typer.Option("--camera", help="only this one, in every way: shipped, or a YAML file")
+        str,
+        typer.Option(
+            "--camera", help="only this camera, with every calibration: shipped, or a YAML file"
+        ),
     ] = "",
 ) -> None:
-    """Open a rig, and say what it can do: cameras, shots, calibration, what one part would buy."""
+    """List which cameras and calibrations a rig can do."""
     from emmc_rig.bench.hands import NoAttendant
     from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
     from emmc_rig.files.cameras import find_camera
@@ -168,7 +176,7 @@ def check(
         one = found[0]
         tell(f"{camera}: {one.shots} of {one.of_shots} shots, {one.by_hand} mask moves by hand")
         show_table(
-            ("calibration", "axes", "by hand", "error of Psi"),
+            ("calibration", "axes", "by hand", "calibration error"),
             [
                 (
                     way.name,
@@ -181,7 +189,14 @@ def check(
         )
     else:
         show_table(
-            ("camera", "shots", "calibration", "by hand", "error of Psi", "one more part"),
+            (
+                "camera",
+                "shots",
+                "calibration",
+                "by hand",
+                "calibration error",
+                "with one more axis",
+            ),
             [
                 (
                     one.camera,
@@ -211,14 +226,14 @@ def check(
 
 @app.command()
 def info(stage: StageOption = None, rig: RigOption = None) -> None:
-    """Show every axis of a stage: homed, position, limits, speed."""
+    """Show a stage's axes: homed, position, limits, speed."""
     with _opened(stage, rig) as opened:
         _show(opened)
 
 
 @app.command()
 def home(axes: AxesArgument = None, stage: StageOption = None, rig: RigOption = None) -> None:
-    """Find the reference of the axes, and show where they are."""
+    """Home the axes of a stage, and show where they are."""
     with _opened(stage, rig) as opened:
         with shown_progress("home"):
             opened.home(axes or None)
@@ -228,14 +243,16 @@ def home(axes: AxesArgument = None, stage: StageOption = None, rig: RigOption = 
 @app.command()
 def jog(
     axis: Annotated[str, typer.Argument(help="name of the axis")],
-    distance_um: Annotated[float, typer.Argument(help="distance in um, or a place with --to")],
-    to: Annotated[bool, typer.Option("--to", help="move to this place, not by it")] = False,
+    distance_um: Annotated[float, typer.Argument(help="distance in um; with --to the position")],
+    to: Annotated[
+        bool, typer.Option("--to", help="move to this position instead of by this distance")
+    ] = False,
     home_first: Annotated[bool, typer.Option("--home", help="home the axis first")] = False,
     speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
     stage: StageOption = None,
     rig: RigOption = None,
 ) -> None:
-    """Move one axis by a distance (write `-- -5` for a negative one), or to a place."""
+    """Move an axis by a distance (`-- -5`: back), or to a position."""
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
             opened.set_speed_um_s(axis, speed_um_s)
@@ -251,7 +268,7 @@ def jog(
 
 @app.command("udev-rule")
 def udev_rule() -> None:
-    """Print the udev rule that lets a user open the devices (Linux)."""
+    """Print the udev rule that lets users open the devices (Linux)."""
     from drivers.ports import udev_rule_path
 
     tell(udev_rule_path().read_text(encoding="utf-8").removesuffix("\n"))
@@ -264,7 +281,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     from emmc_rig.bench.hardware import open_stage
 
     if (stage is None) == (rig is None):
-        raise typer.BadParameter("say which stage: either --stage or --rig simulated")
+        raise typer.BadParameter("name a stage by --stage, or --rig simulated")
     if rig is not None:
         simulated_protocol(rig)
     logging.basicConfig(format="emmc-rig: %(message)s", level=logging.WARNING)

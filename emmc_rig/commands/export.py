@@ -15,32 +15,35 @@ def export(
     result: Annotated[
         str | None,
         typer.Argument(
-            help="a folder of `reconstruct` or `demo`, a session, or a scene's name; or `psi`"
+            help="a folder of `reconstruct` or `demo`, a session, a scene, or the word psi"
         ),
     ] = None,
     of: Annotated[
         Path | None,
         typer.Argument(
-            help="after `psi`: its file, or a session, or a folder of `simulate`, `demo` or "
-            "`calibrate`; frames there are exported, too"
+            help="after psi: its file, or a session or folder that holds it; frames there are "
+            "exported, too"
         ),
     ] = None,
     form: Annotated[
         str | None,
-        typer.Option("--format", help="see --list (default: viewer); of psi: npz (default), mat"),
+        typer.Option(
+            "--format", help="see --list (default: viewer); for psi: npz (default) or mat"
+        ),
     ] = None,
     list_formats: Annotated[
-        bool, typer.Option("--list", help="the formats: what each is, and keeps")
+        bool, typer.Option("--list", help="list the formats: what each is, and keeps")
     ] = False,
     truth: Annotated[
-        str | None, typer.Option("--truth", help="the scene that was captured, for the viewer")
+        str | None,
+        typer.Option("--truth", help="the scene that was captured, to compare with in the viewer"),
     ] = None,
     size: ExportSizeOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write (default: emmc-FORMAT)")
     ] = None,
 ) -> None:
-    """Write a light field, or Psi, in a format that others read, or a viewer: one HTML file."""
+    """Export a light field or Psi to other programs, or as a viewer."""
     from emmc_rig.files.exports import LIGHT_FIELD, open_export
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats import FORMATS
@@ -48,7 +51,7 @@ def export(
     from emmc_rig.pages.viewer import VIEWER
 
     if of is not None and result != "psi":
-        raise typer.BadParameter(f"one light field at a time; '{of}' goes with `psi` alone")
+        raise typer.BadParameter(f"'{of}': export one light field at a time")
     if result == "psi" and (of is not None or not Path("psi", LIGHT_FIELD).is_file()):
         _export_psi(of or Path("psi" if Path("psi").exists() else "."), form or "npz", out)
         return
@@ -63,7 +66,7 @@ def export(
     if form not in known:
         raise typer.BadParameter(f"no format {form!r}; there are {', '.join(known)}")
     if result is None:
-        raise typer.BadParameter("name a result or a scene, or --list the formats")
+        raise typer.BadParameter("name a result or a scene, or list the formats by --list")
     out = out or Path(f"emmc-{form}")
     with result_folder(out, f"export --format {form}") as folder, shown_progress("read") as bars:
         opened = open_export(result, truth, parse_size(size))

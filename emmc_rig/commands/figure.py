@@ -19,22 +19,27 @@ def figure(
         str | None, typer.Option("--truth", help="the scene that was captured: adds errors, PSNR")
     ] = None,
     view: Annotated[
-        str | None, typer.Option("--view", metavar="V,U", help="its row and column")
+        str | None,
+        typer.Option(
+            "--view", metavar="V,U", help="row and column of the view shown (default: the middle)"
+        ),
     ] = None,
     at: Annotated[
         list[str] | None,
-        typer.Option("--at", metavar="Y,X", help="centre of a close-up, pixels; may repeat"),
+        typer.Option(
+            "--at", metavar="Y,X", help="row and column of a close-up's centre; may repeat"
+        ),
     ] = None,
     side: Annotated[
-        int | None, typer.Option("--side", min=4, help="pixels of a close-up's side")
+        int | None, typer.Option("--side", min=4, help="a close-up's side, pixels")
     ] = None,
     width: Annotated[
-        float, typer.Option("--width", min=2, max=40, help="of the figure, inches")
+        float, typer.Option("--width", min=2, max=40, help="of the figure, in inches")
     ] = 7.16,
     size: ExportSizeOption = None,
     out: OutOption = Path("emmc-figure"),
 ) -> None:
-    """Draw results of one capture side by side: PDF, SVG, PNG and a caption with their sources."""
+    """Draw results of one capture side by side, for a paper."""
     from emmc_rig.files.exports import open_export
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size, write_metrics

@@ -13,33 +13,39 @@ from emmc_rig.commands.output import give_result, say, shown_progress, tell
 def import_(
     table: Annotated[
         Path | None,
-        typer.Argument(help="CSV: a row a file, columns file, kind and what else is known"),
+        typer.Argument(
+            help="CSV with a row for each file: file, kind, exposure_s and more, see docs"
+        ),
     ] = None,
-    camera: Annotated[
-        str, typer.Option("--camera", help="a shipped camera, or the YAML file of your own")
-    ] = "",
+    camera: Annotated[str, typer.Option("--camera", help="a shipped camera, or a YAML file")] = "",
     out: Annotated[Path, typer.Option("--out", help="folder of the session to write")] = Path(
         "emmc-session"
     ),
     shots: Annotated[
         list[str] | None,
-        typer.Option("--shots", help="without a table: a glob, such as 'shot*.tif'; may repeat"),
+        typer.Option(
+            "--shots", help="without a table: shots, for instance 'shot*.tif'; may repeat"
+        ),
     ] = None,
-    darks: Annotated[list[str] | None, typer.Option("--darks", help="a glob of darks")] = None,
+    darks: Annotated[
+        list[str] | None, typer.Option("--darks", help="without a table: darks")
+    ] = None,
     whites: Annotated[
         list[str] | None,
-        typer.Option("--whites", help="a glob of whiteboards through the masks, aperture open"),
+        typer.Option(
+            "--whites", help="without a table: whiteboards through the masks, aperture open"
+        ),
     ] = None,
     references: Annotated[
         list[str] | None,
-        typer.Option("--references", help="a glob of whiteboards without the masks"),
+        typer.Option("--references", help="without a table: whiteboards without the masks"),
     ] = None,
     planes: Annotated[
         bool,
-        typer.Option("--planes", help="red, green, blue of a file: three monochrome shots"),
+        typer.Option("--planes", help="read a colour picture as three monochrome shots"),
     ] = False,
 ) -> None:
-    """Make a session of files that another program wrote."""
+    """Make a session from frames of another program."""
     from emmc_rig.importing.session import import_session
     from emmc_rig.importing.table import ImportedKind, read_table, rows_of_globs
 

@@ -12,7 +12,7 @@ import typer
 
 from drivers.cameras import CAMERA_HELP
 from emmc_rig.commands.modes import given_names, refuse
-from emmc_rig.commands.options import RigOption, RigSceneOption, RigSizeOption
+from emmc_rig.commands.options import SIMULATED, RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.commands.output import say, shown_progress, tell
 from emmc_rig.errors import AppError
 
@@ -35,7 +35,12 @@ def live(
         str | None, typer.Option("--stage", help="zaber:PORT, grbl:PORT, apt:PORT or a YAML file")
     ] = None,
     design: Annotated[
-        str, typer.Option("--design", help="the masks in a simulated rig: see `emmc-rig cameras`")
+        str,
+        typer.Option(
+            "--design",
+            help="the camera whose masks are in it, see `emmc-rig cameras`",
+            rich_help_panel=SIMULATED,
+        ),
     ] = "rgbw-bayer-1shot",
     scene: RigSceneOption = "deep-occlusions",
     size: RigSizeOption = None,
@@ -43,25 +48,31 @@ def live(
         str | None,
         typer.Option(
             "--psi",
-            help="show the light field too: a session, a calibration's folder, psi.h5, or `design` "
-            "(what the simulated rig has by default)",
+            help="show the light field too, by a session, a calibration's folder, psi.h5, or "
+            "`design`",
         ),
     ] = None,
     method: Annotated[
-        str | None, typer.Option("--method", help="of the light field when nothing moves")
+        str | None,
+        typer.Option("--method", help="reconstructs the light field while nothing moves"),
     ] = None,
     plan: Annotated[
         Path | None,
-        typer.Option("--plan", help="a plan that the page may write what it found into; --rig too"),
+        typer.Option(
+            "--plan", help="a plan into which the page may write; into the file of --rig, too"
+        ),
     ] = None,
-    host: Annotated[str, typer.Option("--host", help="address to serve at")] = "127.0.0.1",
+    host: Annotated[str, typer.Option("--host", help="address to serve the page at")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
     read_only: Annotated[
-        bool, typer.Option("--read-only", help="the page shows, and moves and sets nothing")
+        bool, typer.Option("--read-only", help="the page moves and sets nothing")
     ] = False,
     browser: Annotated[bool, typer.Option("--open", help="open the page in a browser")] = False,
 ) -> None:
-    """Show the camera on a local page: levels, focus, mask, jog, light field. Ctrl-C ends."""
+    """Set up the bench on a local page: exposure, focus, masks.
+
+    It shows the light field too, where Psi is known. Ctrl-C ends.
+    """
     from emmc_rig.live.server import (
         LOCAL_HOSTS,
         Server,
@@ -82,7 +93,7 @@ def live(
     if rig == "simulated":
         psi = psi or DESIGN
     if method is not None and psi is None:
-        raise typer.BadParameter("--method needs --psi: a light field needs a Psi")
+        raise typer.BadParameter("--method needs --psi")
     listening = listening_socket(host, port)
     with closing(listening), ExitStack() as opened:
         with shown_progress("open the devices"):
@@ -107,7 +118,7 @@ def live(
             page = SetupPage(watch, following)
             Server(application(page, token, read_only, hosts)).run(sockets=[listening])
         except KeyboardInterrupt:
-            tell("ended; the stage stands")
+            tell("ended; the stage does not move")
 
 
 @contextmanager

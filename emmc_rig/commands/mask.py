@@ -16,34 +16,34 @@ def mask(
     photo: Annotated[Path, typer.Argument(help="a picture of 8 or 16 bits, or a RAW file")],
     cells: Annotated[str, typer.Option("--cells", help="ROWSxCOLUMNS of the mask")],
     cell_um: Annotated[
-        float, typer.Option("--cell-um", min=1e-3, help="side of a cell, um: for the camera's file")
+        float, typer.Option("--cell-um", min=1e-3, help="side of a cell, um")
     ],
-    out: Annotated[Path, typer.Option("--out", help="the mask's picture to write, .png")],
+    out: Annotated[Path, typer.Option("--out", help="picture of the mask to write, .png")],
     corners: Annotated[
         str | None,
         typer.Option(
             "--corners",
             metavar="'X,Y X,Y X,Y X,Y'",
             help="outer corners of the cells in the photograph, px, clockwise from the mask's top "
-            "left (default: found from its outline)",
+            "left (default: found)",
         ),
     ] = None,
     ordered: Annotated[
         Path | None,
         typer.Option(
-            "--ordered", help="the mask as it should be, a picture of one pixel a cell: a turned "
-            "or mirrored photograph and cells that are otherwise show"
+            "--ordered",
+            help="the mask as ordered, a picture of one pixel a cell, to compare with",
         ),
     ] = None,
     linear: Annotated[
         bool | None,
         typer.Option(
-            "--linear/--srgb", help="a picture's codes are light, or sRGB (default: by 16 or 8 "
-            "bits)"
+            "--linear/--srgb",
+            help="the picture's coding (default: linear of 16 bits, sRGB of 8)",
         ),
     ] = None,
 ) -> None:  # fmt: skip
-    """Read a mask's cells from its photograph: a picture of one pixel a cell, for cameras."""
+    """Measure a mask's cells in a photograph of it."""
     from calibration.mask_photo import read_mask
     from emmc_rig.errors import WrongUsageError
     from emmc_rig.files.photograph import read_photograph

@@ -5,7 +5,7 @@ An option that would be ignored is refused: wrong usage, in one line.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -18,8 +18,8 @@ from emmc_rig.errors import ERRORS
 MODES: dict[str, dict[str, set[str]]] = {
     "calibrate": {
         "drift": {"known", "out"},
-        "session": {"route", "sensor", "out"},
-        "plan": {"camera", "size", "target", "leave_out", "few", "frames", "out"},
+        "session": {"method", "sensor", "out"},
+        "plan": {"camera", "size", "target", "skip", "few", "frames", "out"},
     },
     "capture": {"new": {"out"}},
     "export": {"list_formats": set()},
@@ -33,6 +33,8 @@ NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
     "export": {"truth": "result"},
 }
 """By command, an option and the one, or those, without which it does nothing."""
+RENAMED = {"calibrate": {"--route": "--method", "--leave-out": "--skip"}}
+"""By command, options of earlier versions that scripts use, and what they are called now."""
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")
 
 
@@ -41,6 +43,11 @@ class ModalCommand(TyperCommand):
 
     def __init__(self, *args: Any, params: list | None = None, **more: Any) -> None:
         super().__init__(*args, params=[*(params or ()), _json_option()], **more)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line; options of earlier versions are taken under their new names."""
+        renamed = RENAMED.get(self.name or "", {})
+        return super().parse_args(ctx, [_under_new_name(one, renamed) for one in args])
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; raises BadParameter."""
@@ -66,6 +73,12 @@ class ModalCommand(TyperCommand):
                 where = " or ".join(option_of(ctx, mode) for mode in modes)
                 refuse(ctx, (name,), f"without {where}")
         return super().invoke(ctx)
+
+
+def _under_new_name(word: str, renamed: Mapping[str, str]) -> str:
+    """Return a word of the command line, `--old` or `--old=value` under its new name."""
+    option, equals, value = word.partition("=")
+    return renamed.get(option, option) + equals + value
 
 
 def _json_option() -> Any:

@@ -11,17 +11,18 @@ DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
 SIZE_VARIABLE = "EMMC_SIZE"
 """Environment variable: the --size where none is given, so that everything can be tried small."""
+SIMULATED, PARALLEL = "Simulated rig", "Large light fields"
+"""Panels of the help for options that few commands' users need."""
 
 SceneOption = Annotated[
     str,
     typer.Option(
         "--scene",
-        help="a folder of view_ROW_COL.png or an HDF5 file (NAME@by-parallax: its views in the "
-        "order that parallax shows), or a built-in name",
+        help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in scene's name",
     ),
 ]
 CameraOption = Annotated[
-    str, typer.Option("--camera", help="a shipped camera (see `emmc-rig cameras`) or a YAML file")
+    str, typer.Option("--camera", help="a name that `emmc-rig cameras` lists, or a YAML file")
 ]
 ShotsOption = Annotated[
     int | None, typer.Option("--shots", min=1, help="number of shots (default: the camera's own)")
@@ -29,45 +30,59 @@ ShotsOption = Annotated[
 SizeOption = Annotated[
     str | None,
     typer.Option(
-        "--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS: the middle of a scene, or its size"
+        "--size",
+        envvar=SIZE_VARIABLE,
+        help="ROWSxCOLUMNS: the middle of a scene; a built-in scene is drawn in that size",
     ),
 ]
 ExportSizeOption = Annotated[
     str | None,
-    typer.Option(
-        "--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of a scene; a result keeps its own"
-    ),
+    typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS, of a scene only"),
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of scene and noise")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="of the random scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
 ClusterOption = Annotated[
     str | None,
-    typer.Option("--cluster", help="tcp://HOST:PORT of a Dask scheduler, in place of --workers"),
+    typer.Option(
+        "--cluster",
+        help="tcp://HOST:PORT of a Dask scheduler, instead of --workers",
+        rich_help_panel=PARALLEL,
+    ),
 ]
 DictionaryOption = Annotated[
     str | None,
-    typer.Option("--dictionary", help="a dictionary's file, or: lambertian, dct"),
+    typer.Option("--dictionary", help="of methods that need one: lambertian, dct, or a file"),
 ]
 ScenesOption = Annotated[
     list[str] | None,
-    typer.Option("--scene", help="a folder of views, an HDF5 file or a built-in name; may repeat"),
+    typer.Option(
+        "--scene", help="a folder of views, an HDF5 file or a built-in scene's name; may repeat"
+    ),
 ]
 MethodsOption = Annotated[
-    list[str] | None, typer.Option("--method", help="only this one; may repeat")
+    list[str] | None, typer.Option("--method", help="only this method; may repeat")
 ]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")
 ]
 RigSceneOption = Annotated[
-    str, typer.Option("--scene", help="what the simulated rig looks at, see `demo`")
+    str,
+    typer.Option(
+        "--scene", help="what its camera looks at, as in `demo`", rich_help_panel=SIMULATED
+    ),
 ]
 RigSizeOption = Annotated[
     str | None,
-    typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS of the simulated light field"),
+    typer.Option(
+        "--size",
+        envvar=SIZE_VARIABLE,
+        help="ROWSxCOLUMNS of the light field",
+        rich_help_panel=SIMULATED,
+    ),
 ]
 
 
 def check_workers(workers: int | None, cluster: str | None) -> None:
     """Raise BadParameter where both are given."""
     if workers is not None and cluster is not None:
-        raise typer.BadParameter("--workers are of this machine, --cluster has its own: give one")
+        raise typer.BadParameter("--workers and --cluster exclude each other: give one")

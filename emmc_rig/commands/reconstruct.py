@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import ClusterOption, DictionaryOption, check_workers
+from emmc_rig.commands.options import PARALLEL, ClusterOption, DictionaryOption, check_workers
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
 
@@ -15,59 +15,75 @@ from emmc_rig.commands.verdict import show_verdict
 def reconstruct(
     frames: Annotated[
         list[Path] | None,
-        typer.Argument(
-            help="a session of `capture`, or a folder that `demo` or `simulate` wrote; or several"
-        ),
+        typer.Argument(help="sessions, or folders that `demo` or `simulate` wrote"),
     ] = None,
     method: Annotated[
         str | None, typer.Option("--method", help="see --list (default: adaptive)")
     ] = None,
     list_methods: Annotated[
-        bool, typer.Option("--list", help="the methods: what each assumes, costs, is for")
+        bool,
+        typer.Option("--list", help="list the methods: what each assumes and how long it takes"),
     ] = False,
     psi: Annotated[
         Path | None,
-        typer.Option("--psi", help="imaging matrix (default: psi.h5 beside the frames)"),
+        typer.Option("--psi", help="the imaging matrix (default: beside the frames)"),
     ] = None,
     dictionary: DictionaryOption = None,
     settings: Annotated[
-        Path | None, typer.Option("--settings", help="YAML of method settings: tv, sparse")
+        Path | None,
+        typer.Option(
+            "--settings", help="YAML of settings of methods: tv, sparse, adaptive, blocks"
+        ),
     ] = None,
     truth: Annotated[
         str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
     ] = None,
     without_shots: Annotated[
         list[int] | None,
-        typer.Option("--without-shots", help="leave out a shot, such as 2; may repeat"),
+        typer.Option("--without-shots", help="exclude a shot, counted from 1; may repeat"),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option("--workers", min=1, help="processes that share blocks and captures"),
+        typer.Option(
+            "--workers",
+            min=1,
+            help="processes that share blocks and captures",
+            rich_help_panel=PARALLEL,
+        ),
     ] = None,
     cluster: ClusterOption = None,
     as_zarr: Annotated[
-        bool, typer.Option("--zarr", help="light field and maps as result.zarr, by all workers")
+        bool,
+        typer.Option(
+            "--zarr",
+            help="write result.zarr instead of one HDF5 file",
+            rich_help_panel=PARALLEL,
+        ),
     ] = False,
     memory: Annotated[
         str | None,
-        typer.Option("--memory", help="of all processes together, as 2GiB: fewer at a time"),
+        typer.Option(
+            "--memory",
+            help="most memory of all processes together, as 2GiB",
+            rich_help_panel=PARALLEL,
+        ),
     ] = None,
     budget: Annotated[
-        str | None, typer.Option("--budget", help="choose the best method for a time, as 30s")
+        str | None,
+        typer.Option("--budget", help="choose the most accurate method within a time, as 30s"),
     ] = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="exit with 1 when the verdict is: do not use")
+        bool, typer.Option("--strict", help="exit code 1 where the verdict is: do not use")
     ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help="folder to write (default: emmc-reconstruction; of a session, in the session); "
-            "of several captures, a folder in it each",
+            help="folder to write (default: in a session, else emmc-reconstruction)",
         ),
     ] = None,
 ) -> None:
-    """Reconstruct the light field of a folder of frames, by any method."""
+    """Reconstruct light fields from frames, with a verdict."""
     from emmc_rig.processing.memory import parse_memory
     from emmc_rig.processing.reconstructing import load_settings, reconstruct_captures
     from reconstruction.methods import DEFAULT_METHOD, find_method
@@ -76,14 +92,18 @@ def reconstruct(
         _list_methods()
         return
     if not frames:
-        raise typer.BadParameter("name a folder of frames, or --list the methods")
+        raise typer.BadParameter(
+            "name a session or a folder of frames, or list the methods by --list"
+        )
     check_workers(workers, cluster)
     if memory is not None and cluster is not None:
-        raise typer.BadParameter("--memory is of this machine; a cluster's workers have their own")
+        raise typer.BadParameter("--memory is for this machine only: leave it out with --cluster")
     chosen, why = load_settings(settings), None
     if budget is not None:
         if method is not None or settings is not None:
-            raise typer.BadParameter("--budget chooses the method and its settings")
+            raise typer.BadParameter(
+                "--budget chooses method and settings: leave --method and --settings out"
+            )
         from emmc_rig.processing.budget import method_within
         from emmc_rig.processing.reconstructing import open_frames
 
@@ -133,7 +153,7 @@ def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice and not (out is None and all(map(is_session, frames))):
         raise typer.BadParameter(
-            f"several captures are called {twice[0]}, and each needs a folder of its name in --out"
+            f"several captures are named {twice[0]}, and --out has a folder a name: rename one"
         )
     return [
         (folder, folder / SESSION_RECONSTRUCTION)
@@ -150,16 +170,16 @@ def _say_result(metrics: dict, out: Path) -> None:
     if "assumed" in metrics:
         say("note", metrics["assumed"])
     for line in metrics["screening"]:
-        say("screening", line)
+        say("clean-up", line)
     compared = ""
     if "psnr_db" in metrics:
         gain = metrics["psnr_db"] - metrics["replicate_psnr_db"]
         compared = (
-            f"; {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB against the copied "
-            f"{middle_name(axes_of(metrics))}, SSIM {metrics['ssim']:.3f}"
+            f"; PSNR {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB over the baseline "
+            f"({middle_name(axes_of(metrics))} in all places), SSIM {metrics['ssim']:.3f}"
         )
     if stated := stated_words(metrics):
-        compared += f"; stated PSNR {stated}"
+        compared += f"; estimated accuracy {stated}"
     if "blocks" in metrics:
         rows, columns = metrics["blocks"]
         compared += f"; {rows}x{columns} blocks, at most {metrics['peak_gib']:.2f} GiB a worker"
@@ -173,13 +193,11 @@ def _say_result(metrics: dict, out: Path) -> None:
 
 
 def _list_methods() -> None:
-    from reconstruction.method import COSTS
     from reconstruction.methods import METHODS
 
     for known in METHODS.values():
         tell(f"{known.name}: {known.title}")
         tell(f"    assumes  {known.assumes}")
-        tell(f"    use it   {known.when}")
-        tell(f"    costs    {known.cost}")
-    tell(COSTS)
+        tell(f"    use for  {known.when}")
+        tell(f"    takes    {known.cost}")
     give_result(methods=list(METHODS))

@@ -12,7 +12,11 @@ import typer
 
 from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 
-app = typer.Typer(no_args_is_help=True, help="Sessions of `emmc-rig capture`: look, check, export.")
+app = typer.Typer(
+    name="session",
+    no_args_is_help=True,
+    help="List, show, verify and export sessions of `capture`.",
+)
 
 Folder = Annotated[Path, typer.Argument(help="a session folder")]
 
@@ -21,7 +25,7 @@ Folder = Annotated[Path, typer.Argument(help="a session folder")]
 def list_sessions(
     folder: Annotated[Path, typer.Argument(help="the folder that holds sessions")] = Path(),
 ) -> None:
-    """List the sessions in a folder and below it: state, frames, camera, verdict, PSNR stated."""
+    """List the sessions in and below a folder."""
     from rich.markup import escape
     from rich.table import Column
 
@@ -49,17 +53,18 @@ def list_sessions(
              one.created[:10], one.verdict, stated)
         )  # fmt: skip
     heads = (Column(head, no_wrap=True) for head in ("state", "frames", "size", "begun", "verdict"))
-    show_table((Column("session", overflow="fold"), *heads, "dB"), rows)
+    show_table((Column("session", overflow="fold"), *heads, "accuracy, dB"), rows)
     give_result(sessions=[{**asdict(one), "folder": str(one.folder)} for one in found])
 
 
 @app.command()
 def show(session: Folder) -> None:
-    """Show what a session holds, without reading its frames."""
+    """Show a session's frames, plan and events, without reading the frames."""
     from emmc_rig.files.results import shown_bytes
     from emmc_rig.pages.session_sheet import events
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.listing import summary
+    from emmc_rig.session.planned import kind_name
     from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
 
@@ -71,7 +76,7 @@ def show(session: Folder) -> None:
     tell(f"  {'size':<12} {shown_bytes(listed.bytes)}")
     tell(f"  {'frames':<12} {listed.stored} of {listed.planned}")
     for kind, (done, planned) in counts(opened).items():
-        tell(f"  {kind:<12} {done} of {planned}")
+        tell(f"  {kind_name(kind):<12} {done} of {planned}")
     if opened.amendments:
         plans = Counter(entry.plan for entry in opened.stored.values())
         for number in range(opened.amendments + 1):
@@ -82,7 +87,7 @@ def show(session: Folder) -> None:
         names = ", ".join(leftovers)
         tell(f"  {len(leftovers)} leftover(s) of a crash, which do not count: {names}")
     for name in foreign:
-        tell(f"  {name}: not of this session")
+        tell(f"  {name}: not part of this session")
     for reason in exposure_reasons(shot_exposures(opened)):
         tell(f"  {reason.level:<12} {reason.what}; {reason.remedy}")
     for kind, line in events(opened):
@@ -92,7 +97,7 @@ def show(session: Folder) -> None:
 
 @app.command()
 def verify(session: Folder) -> None:
-    """Hash every frame and compare with the journal; exit code 1 unless complete and good."""
+    """Check every frame's SHA-256; exit code 1 unless all are there and good."""
     from emmc_rig.errors import AppError
     from emmc_rig.session.session import Session
     from emmc_rig.session.verify import verify as verified
@@ -116,18 +121,16 @@ def verify(session: Folder) -> None:
 @app.command()
 def export(
     session: Folder,
-    out: Annotated[
-        Path, typer.Option("--out", help="the file to write, FILE.h5; with --dng, a folder")
-    ],
+    out: Annotated[Path, typer.Option("--out", help="file to write, FILE.h5; with --dng a folder")],
     compress: Annotated[
-        bool, typer.Option("--compress", help="gzip: smaller, and slower by far")
+        bool, typer.Option("--compress", help="compress by gzip: much slower")
     ] = False,
     dng: Annotated[
         bool,
-        typer.Option("--dng", help="a DNG a frame, with exposure, ISO, time, serial, session"),
+        typer.Option("--dng", help="write each frame as DNG"),
     ] = False,
 ) -> None:
-    """Write a complete session as one HDF5 file with NeXus names, or frames as DNG files."""
+    """Export a session as one HDF5 file (NeXus), or its frames as DNG."""
     from emmc_rig.files.results import shown_bytes
     from emmc_rig.session.export import export_dng, export_hdf5
     from emmc_rig.session.session import Session
@@ -135,7 +138,7 @@ def export(
     opened = Session(session)
     if dng:
         if compress:
-            raise typer.BadParameter("--compress is of the HDF5 file: leave it out with --dng")
+            raise typer.BadParameter("--compress: no effect with --dng; leave it out")
         with shown_progress() as progress:
             progress.begin("export", len(opened.stored))
             export_dng(opened, out, progress.step)
@@ -155,9 +158,11 @@ def sheet(
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write (default: the session)")
     ] = None,
-    pictures: Annotated[int, typer.Option("--pictures", min=0, help="most to show")] = 200,
+    pictures: Annotated[
+        int, typer.Option("--pictures", min=0, help="most pictures on the page")
+    ] = 200,
 ) -> None:
-    """Write the contact sheet: frames, events, times, as one HTML page."""
+    """Write the contact sheet of a session: frames, events and times in one HTML page."""
     from emmc_rig.pages.session_sheet import write_sheet
     from emmc_rig.session.session import REPORT, Session
 

@@ -31,10 +31,10 @@ def simulate(
     size: SizeOption = None,
     out: OutOption = Path("emmc-frames"),
     as_zarr: Annotated[
-        bool, typer.Option("--zarr", help="frames and Psi as Zarr groups of shards")
+        bool, typer.Option("--zarr", help="write frames and Psi as Zarr, for large ones")
     ] = False,
 ) -> None:
-    """Make frames of a light field through any camera, without a rig."""
+    """Simulate the frames that a camera takes of a light field."""
     import emmc_rig as emmc
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size

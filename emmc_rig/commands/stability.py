@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import (
+    PARALLEL,
     ClusterOption,
     DictionaryOption,
     ScenesOption,
@@ -27,21 +28,27 @@ def stability(
         ),
     ] = None,
     fault: Annotated[
-        list[str] | None, typer.Option("--fault", help="only this one; may repeat")
+        list[str] | None, typer.Option("--fault", help="only this fault; may repeat")
     ] = None,
     method: Annotated[
         list[str] | None,
-        typer.Option("--method", help="only this one, or all; may repeat"),
+        typer.Option("--method", help="only this method, or `all`; may repeat"),
     ] = None,
     fast: Annotated[
-        bool, typer.Option("--fast", help="one small crop, few points: minutes, not hours")
+        bool, typer.Option("--fast", help="one small crop, few points: minutes instead of hours")
     ] = False,
-    faults: Annotated[bool, typer.Option("--list", help="the faults, and leave")] = False,
+    faults: Annotated[bool, typer.Option("--list", help="list the faults, and exit")] = False,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="processes that share the trials")
+        int | None,
+        typer.Option(
+            "--workers",
+            min=1,
+            help="processes that share the trials",
+            rich_help_panel=PARALLEL,
+        ),
     ] = None,
     cluster: ClusterOption = None,
     out: Annotated[
@@ -49,7 +56,10 @@ def stability(
         typer.Option("--out", help="folder to write (default: emmc-stability)"),
     ] = None,
 ) -> None:
-    """Find where methods fail: sweeps of faults; run it again to go on where it stopped."""
+    """Find the strength of faults at which methods fail.
+
+    The same command goes on where it stopped.
+    """
     from emmc_rig.files.results import parse_size
     from emmc_rig.study.stability.curves import breaking_rows
     from emmc_rig.study.stability.stability_run import run_stability
@@ -67,11 +77,11 @@ def stability(
     with shown_progress() as bars:
         outcome = run_stability(settings, out, bars, workers=workers, cluster=cluster)
     rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
-    title = f"{outcome.curves[0].scene}: 3 dB below its best / below the copied centre view"
+    title = f"{outcome.curves[0].scene}: falls 3 dB below its best / below the baseline at"
     shown = [(f"{fault.title}, {fault.unit}", *cells) for fault, cells in rows]
     show_table(("fault", *methods), shown, title)
     for line in outcome.left_out:
-        say("left out", line)
+        say("excluded", line)
     tell(f"open {outcome.page}")
     give_result(out)
 

@@ -13,17 +13,23 @@ from emmc_rig.commands.output import give_result, show_table, shown_progress, te
 
 def tables(
     scenes: Annotated[
-        Path | None, typer.Option("--scenes", help="a folder of scenes (default: the built-in)")
+        Path | None,
+        typer.Option("--scenes", help="a folder of scenes (default: the built-in ones)"),
     ] = None,
     only: Annotated[
-        str | None, typer.Option("--only", help="table2, table3, table4; commas between")
+        str | None, typer.Option("--only", help="some of table2, table3, table4; commas between")
     ] = None,
-    fast: Annotated[bool, typer.Option("--fast", help="crops: minutes, not days")] = False,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="small crops: minutes instead of days")
+    ] = False,
     dictionary: DictionaryOption = None,
     seed: SeedOption = 0,
     out: OutOption = Path("emmc-tables"),
 ) -> None:
-    """Reproduce the paper's tables; run it again to go on where it stopped."""
+    """Reproduce the paper's tables.
+
+    The same command goes on where it stopped.
+    """
     from emmc_rig.study.tables.tables_page import run_tables
     from emmc_rig.study.tables.tables_study import FAST, TablesSettings
 
@@ -36,6 +42,6 @@ def tables(
         # Ours above the paper's: side by side the widest table does not fit a terminal.
         rows = [[cell.replace(" | ", "\n") for cell in row] for row in grid.rows]
         show_table(grid.heads, rows, grid.title)
-    tell("PSNR in dB: ours, below it the paper's; compare within one run only")
+    tell("PSNR in dB, the paper's below; compare figures within one run only")
     tell(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
     give_result(out)

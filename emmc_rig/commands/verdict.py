@@ -16,6 +16,6 @@ def show_verdict(verdict: dict) -> None:
     """Print a verdict, a line for each reason."""
     colour = VERDICT_COLOURS[verdict["level"]]
     if not verdict["reasons"]:
-        tell("trust: frames, Psi and light field agree", colour)
+        tell("trust: the light field agrees with frames, Psi and noise", colour)
     for reason in verdict["reasons"]:
         show_reason(**reason)

@@ -22,8 +22,8 @@ from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
 PSI_ASSUMED = (
-    "Psi is the camera as described, which no whiteboard measured: what it is off by is in no "
-    "deviation, and masks that stand elsewhere are doubted only where the frames show it"
+    "Psi is computed from the camera's description, not calibrated: its error is in no estimated "
+    "accuracy, and misplaced masks are noticed only where the frames show them"
 )
 _SECONDS = {"us": 1e-6, "ms": 1e-3, "": 1, "s": 1, "min": 60, "m": 60, "h": 3600}
 VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")

@@ -112,4 +112,4 @@ def replace_text(path: Path, before: str, after: str) -> None:
             partial.write_text(after.replace("\r\n", "\n"), encoding="utf-8", newline=end)
             shutil.copymode(real, partial)
     except OSError as fault:
-        raise AppError(f"{path}: cannot be written ({fault.strerror}); mend that") from fault
+        raise AppError(f"{path}: cannot be written ({fault.strerror}); correct that") from fault

@@ -39,12 +39,12 @@ from emmc_rig.model.settings import validated
 from emmc_rig.session.frame_file import frame_entry, frame_file
 from emmc_rig.session.journal import CompleteEntry, ImportedEntry, RunEntry
 from emmc_rig.session.lock import held
-from emmc_rig.session.planned import SHOT_DARK, Bench, PlannedFrame
+from emmc_rig.session.planned import SHOT_DARK, VALIDATION, Bench, PlannedFrame
 from emmc_rig.session.session import Frozen, Session, wall_time
 from emmc_rig.session.storage import part_of
 from emmc_rig.session.verify import verify_frames
 
-KIND_ORDER = ("dark", "reference", "whiteboard", "open", "check", "turned", "held-out", "shot")
+KIND_ORDER = ("dark", "reference", "whiteboard", "open", "check", "turned", VALIDATION, "shot")
 TOP_DN = 65_535
 BRIGHTEST = 0.9
 """What the brightest part of a scene is taken for where nothing states how bright white is."""
@@ -229,7 +229,7 @@ def _check_values(frames: NDArray, name: str, white_dn: int) -> None:
     """Raise AppError for what no sensor reads out."""
     if frames.dtype.kind == "f" and not np.isfinite(frames).all():
         bad = int(np.count_nonzero(~np.isfinite(frames)))
-        raise AppError(f"{name}: {bad} pixel(s) are no numbers (NaN or infinite); mend the file")
+        raise AppError(f"{name}: {bad} pixel(s) are no numbers (NaN or infinite); correct the file")
     low, high = frames.min(), frames.max()
     if low < 0:
         raise AppError(
@@ -389,7 +389,7 @@ class _Import:
         if row.kind not in ("shot", "dark"):
             raise AppError(f"{where}: its exposure is not known; write exposure_s into the table")
         exposure_s = float(own_s[shot] if row.kind == "shot" else max(own_s))
-        self._note(f"exposures that nothing states are the camera's: {exposure_s:g} s")
+        self._note(f"exposures that no file states are taken from the camera: {exposure_s:g} s")
         return exposure_s
 
     def _compare_exposures(self, said_s: float, other_s: float, start: str, who: str) -> None:
@@ -442,14 +442,15 @@ class _Import:
 
     def _frames(self) -> list[tuple[PlannedFrame, _Item]]:
         """Return every frame as a plan would name it, with where it comes from."""
-        held_out = self._held_out()
+        validating = self._validating()
         named: list[tuple[int, PlannedFrame, _Item]] = []
         counts: Counter[str] = Counter()
         groups: dict[str, dict[object, int]] = defaultdict(dict)
         fitted = fittings(self._camera)
         for (item, shot), exposure_s in zip(self._items, self._exposures_s, strict=True):
             row, where = item.listed.row, item.listed.where
-            kind = "held-out" if item is held_out else row.kind
+            validates = item is validating or row.kind == "validation"
+            kind = VALIDATION if validates else row.kind
             lamp = "off" if kind == "dark" else row.lamp or "white"
             at_um = mask_offsets_um(self._camera, shot)
             if _placed(row) and kind != "shot":
@@ -467,8 +468,8 @@ class _Import:
             if row.turn_deg is not None:
                 kind = "turned"
             kind = "check" if kind == "reference-check" else kind
-            if kind in ("open", "held-out", "check", "turned") and shot:
-                raise AppError(f"{where}: whiteboards of the whole aperture are of shot 0 alone")
+            if kind in ("open", VALIDATION, "check", "turned") and shot:
+                raise AppError(f"{where}: whiteboards of the whole aperture must be of shot 0")
 
             def group(name: str, key: object) -> str:
                 return f"{name}-{groups[name].setdefault(key, len(groups[name]))}"
@@ -502,7 +503,7 @@ class _Import:
         )
         return [(frame, item) for _, frame, item in named]
 
-    def _held_out(self) -> _Item | None:
+    def _validating(self) -> _Item | None:
         """Return the whiteboard of the whole aperture that is kept to judge by, if none is said."""
         rows = [(item, item.listed.row) for item, _ in self._items]
         whole = [
@@ -511,9 +512,9 @@ class _Import:
             if (row.kind == "open" and row.turn_deg is None)
             or (row.kind == "whiteboard" and row.aperture_x_um is row.aperture_y_um is None)
         ]
-        if len(whole) < FEWEST_TO_HOLD_OUT or any(row.kind == "held-out" for _, row in rows):
+        if len(whole) < FEWEST_TO_HOLD_OUT or any(row.kind == "validation" for _, row in rows):
             return None
-        self._note(f"{shown_path(whole[-1].listed.path)} is held out, to judge the calibration by")
+        self._note(f"{shown_path(whole[-1].listed.path)} validates the calibration: no fit uses it")
         return whole[-1]
 
     def _view(self, place_um: tuple[float, float], where: str) -> tuple[int, int]:
@@ -709,8 +710,8 @@ class _Import:
                 )
             return
         self._note(
-            "how bright white is nobody states: electrons_per_s is taken as "
-            f"{electrons_per_s:.3g}, so that the brightest of the scene is {BRIGHTEST:g}"
+            f"the camera's electrons_per_s is not known: taken as {electrons_per_s:.3g}, for which "
+            f"the brightest readings of the shots are {BRIGHTEST:g}"
         )
         noise = noise.model_copy(update={"electrons_per_s": electrons_per_s})
         sensor = self._camera.sensor.model_copy(update={"noise": noise})

@@ -21,7 +21,7 @@ from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.settings import Settings, validated
 
 ImportedKind = Literal[
-    "shot", "dark", "reference", "whiteboard", "open", "held-out", "check", "reference-check"
+    "shot", "dark", "reference", "whiteboard", "open", "validation", "check", "reference-check"
 ]
 LONGEST_S = 3600.0
 MOST_TABLE_BYTES = 16_000_000
@@ -36,11 +36,16 @@ def _seconds(value: object) -> object:
     return value
 
 
+def _present_kind(value: object) -> object:
+    """Return a kind of file as it is called now."""
+    return "validation" if value == "held-out" else value
+
+
 class Row(Settings):
     """One file; a column that is left empty is not known."""
 
     file: str = Field(description="from the table's folder; FILE@ARRAY where it holds several")
-    kind: ImportedKind
+    kind: Annotated[ImportedKind, BeforeValidator(_present_kind)]
     shot: int | None = Field(default=None, ge=0, description="from 0, as in plans")
     exposure_s: float | None = Field(default=None, gt=0, le=LONGEST_S)
     gain: float = Field(default=1.0, ge=1, le=100, description="a factor, 1 at the lowest ISO")

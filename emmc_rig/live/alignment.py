@@ -187,7 +187,7 @@ class MaskGauge:
         turn, stretch = np.degrees(deviations[2]), deviations[3]
         if turn > WANTED_DEG or stretch > WANTED_SHARE:
             raise CalibrationError(
-                f"the picture decides the mask's rotation to {turn:.2g} degrees and its scale to "
+                f"the mask's rotation is known to {turn:.2g} degrees and its scale to "
                 f"{100 * stretch:.2g} % only: look at a white board, expose longer"
             )
         repeats = self._mask.repeats
@@ -264,7 +264,9 @@ def _sample(board: Board, half_px: float, rng: np.random.Generator) -> _Sample:
     inside = (np.abs(y) <= half_px)[:, None] & (np.abs(x) <= half_px)
     chosen = np.flatnonzero(board.usable & inside)
     if len(chosen) < 16 * len(np.unique(board.channels)):
-        raise CalibrationError("hardly a pixel is lit and below white: expose otherwise")
+        raise CalibrationError(
+            "hardly any pixel is lit without being saturated: change the exposure"
+        )
     if len(chosen) > SAMPLED_PIXELS:
         chosen = np.sort(rng.choice(chosen, SAMPLED_PIXELS, replace=False))
     pixels = np.stack(np.unravel_index(chosen, board.reading.shape), axis=1)

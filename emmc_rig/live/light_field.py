@@ -132,7 +132,7 @@ class LiveLightField:
                 f"{frame.mosaic.shape[0]}x{frame.mosaic.shape[1]}"
             )
         if shot is None:
-            return self._report("the mask stands at no shot of this Psi")
+            return self._report("the mask is at the place of no shot of this Psi")
         if shot not in self._held or self._changed(shot, frame):
             if shot in self._held:
                 self._held.clear()

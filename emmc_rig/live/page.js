@@ -61,8 +61,8 @@ function draw() {
     : focus.share >= 1 ? "the sharpest of the last minute"
     : `${percent(focus.share, focus.deviation)} of the sharpest of the last minute`);
   const shift = figures.shift;
-  write("shift", shift ? `x ${shift.x_px.toFixed(2)}, y ${shift.y_px.toFixed(2)} px, likeness ${Math.round(100 * shift.likeness)} %`
-    : state.reference ? "the frame is not like the reference" : "no reference");
+  write("shift", shift ? `x ${shift.x_px.toFixed(2)}, y ${shift.y_px.toFixed(2)} px, correlation ${Math.round(100 * shift.likeness)} %`
+    : state.reference ? "the frame does not match the reference" : "no reference");
   write("take", state.reference ? "forget the reference" : "measure shifts from here");
 }
 
@@ -107,7 +107,7 @@ function drawWhy() {
   const level = figures ? Math.max(...Object.values(figures.brightest)) : 0;
   const what = !figures ? "" : figures.dark ? "Black" : level < DIM && !view.bright ? "Almost black" : "";
   const reason = hint?.text || "Looking for the reason.";
-  write("why", gone ? `${state.frame ? "Not live, this is the last frame" : "No picture"}: ${gone}. It is tried again every second.`
+  write("why", gone ? `${state.frame ? "Not live, this is the last frame" : "No picture"}: ${gone}. Trying again every second.`
     : !state.frame ? (state.exposing ? "The first exposure is under way." : "Waiting for the first frame.")
     : !what ? "" : state.busy ? `${what} while the stage is ${state.busy}.` : figures.dark && hint ? reason : `${what}. ${reason}`);
 }

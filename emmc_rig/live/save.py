@@ -78,10 +78,13 @@ class Files:
 
     def _edit(self, path: Path, values: Mapping[Key, float]) -> None:
         before = path.read_text(encoding="utf-8")
-        after = with_values(before, values, str(path))
-        read = parse_yaml(after, str(path), AppError)
+        read = parse_yaml(before, str(path), AppError)
         simulated = SimulatedFile if _kind(read) == SIMULATED else RealRig
-        validated(Plan if path == self._plan else simulated, read, str(path), AppError)
+        settings = Plan if path == self._plan else simulated
+        earlier = {new: old for old, new in settings.renamed.items() if old in (read or {})}
+        named = {(earlier.get(key[0], key[0]), *key[1:]): value for key, value in values.items()}
+        after = with_values(before, named, str(path))
+        validated(settings, parse_yaml(after, str(path), AppError), str(path), AppError)
         if after != before:
             self._previewed[path] = before, after
 
@@ -99,5 +102,5 @@ def _rig_values(found: Found, what: Sequence[str]) -> dict[Key, float]:
         names = "rotation_deg", "rotation_deviation_deg", "scale", "scale_deviation"
         values |= {("mask", name): getattr(place, name) for name in names}
     if "focus" in what and found.focus is not None:
-        values["stands_um", found.focus.axis] = found.focus.place_um
+        values["fixed_positions_um", found.focus.axis] = found.focus.place_um
     return values

@@ -10,7 +10,7 @@ function draw(before) {
   $("bar").value = state.done;
   write("count", state.planned ? `${state.done} of ${state.planned} frames` : "no frame yet");
   write("left", state.left && !state.ended && state.done < state.planned ? `about ${duration(state.left.seconds)} left`
-    + (state.left.guessed ? `, and the exposures of ${state.left.guessed} not metered yet` : "") : "");
+    + (state.left.guessed ? ` (excludes ${state.left.guessed} exposures not metered yet)` : "") : "");
   write("step", state.step);
   // Whoever may press "go on" reads of a pause beside it: nothing moves under the hand.
   const here = state.paused && state.held && !state.read_only;

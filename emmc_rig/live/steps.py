@@ -137,10 +137,10 @@ def _centre(
         text = (
             f"not homed yet: {', '.join(unknown)}"
             if unknown
-            else f"away from it: {', '.join(away)}"
+            else f"not there yet: {', '.join(away)}"
         )
     if by_hand:
-        text += f"; no axis moves the {by_hand[0]}: a hand does"
+        text += f"; the {by_hand[0]} is moved by hand"
     action = "centre" if away else ""
     return {"name": "centre the mask", "done": not away, "text": text, "action": action}
 

@@ -432,7 +432,10 @@ class Watch:
                 "action": "centre",
             }
         if figures["dark"]:
-            return {"text": "The picture is dark: light the lamp, open the aperture.", "action": ""}
+            return {
+                "text": "The picture is dark: switch the lamp on, open the aperture.",
+                "action": "",
+            }
         if figures["saturated"] > 0.001:
             return {"text": "Part of the picture is saturated.", "action": "autoexpose"}
         if level < WANTED_LEVELS[0] / 4:
@@ -604,7 +607,7 @@ class Watch:
         chosen_s = min(max(exposure_s * factor, shortest_s), longest_s, self._longest_s)
         if abs(chosen_s / exposure_s - 1) < 0.01:
             if dark:
-                why = f"dark at {exposure_s:g} s too: light the lamp, open the aperture"
+                why = f"dark at {exposure_s:g} s too: switch the lamp on, open the aperture"
             elif chosen_s > 0.99 * self._longest_s and chosen_s < 0.99 * longest_s:
                 why = ""  # the hint says how long an exposure is needed
             else:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from typing import ClassVar, TypeGuard, TypeVar, get_args, get_origin
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeGuard, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
@@ -15,21 +16,32 @@ class Settings(BaseModel):
     """Base of every configuration object: frozen, no unknown keys, no coercion of NaN.
 
     removed: keys that files of earlier versions may hold; they are ignored, with a warning.
+    renamed: earlier names of keys, and what they are called now; both are read.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     removed: ClassVar[tuple[str, ...]] = ()
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     @model_validator(mode="before")
     @classmethod
-    def _without_removed(cls, data: object) -> object:
-        """Drop keys that earlier versions had, and say so."""
+    def _of_earlier_versions(cls, data: object) -> object:
+        """Drop keys that earlier versions had, and say so; rename others."""
         if not isinstance(data, dict):
             return data
         for name in sorted(set(cls.removed).intersection(data)):
             text = f"the setting '{name}' was removed in version 0.3 and is ignored"
             warnings.warn(text, RemovedSettingWarning, stacklevel=2)
-        return {name: value for name, value in data.items() if name not in cls.removed}
+        kept = {name: value for name, value in data.items() if name not in cls.removed}
+        for old, new in cls.renamed.items():
+            if old in kept and new in kept:
+                raise ValueError(f"{old} is an earlier name of {new}: leave {old} out")
+        return cls.under_new_names(kept)
+
+    @classmethod
+    def under_new_names(cls, data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return plain data with every key under its present name."""
+        return {cls.renamed.get(name, name): value for name, value in data.items()}
 
     @model_validator(mode="before")
     @classmethod

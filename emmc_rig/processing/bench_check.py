@@ -91,8 +91,8 @@ class Ability:
                 way = surer[0]
                 named = " and ".join(missing)
                 if way.name == best.name:
-                    return f"{named}: none of {self.hands(best)} moves by hand"
-                return f"{named}: {shown_error(way.error)} in place of {shown_error(best.error)}"
+                    return f"{named}: no moves by hand instead of {self.hands(best)}"
+                return f"{named}: {shown_error(way.error)} instead of {shown_error(best.error)}"
         return ""
 
 
@@ -103,7 +103,7 @@ def _known(way: Calibration) -> float:
 
 def shown_error(error: float | None) -> str:
     """Return a relative error for people."""
-    return "not known beforehand" if error is None else f"{error:.2%}"
+    return "known after calibration" if error is None else f"{error:.2%}"
 
 
 def ability(name: str, camera: Camera, axes: Collection[str], hands: bool) -> Ability:
@@ -125,7 +125,7 @@ def ability(name: str, camera: Camera, axes: Collection[str], hands: bool) -> Ab
 
 def _ways(camera: Camera) -> list[Calibration]:
     views = int(np.prod(camera.views))
-    design = Calibration("design alone, assumed", (), 0, None)
+    design = Calibration("design, not measured", (), 0, None)
     try:
         mask = shadow_mask(camera, SIZE)
     except (CalibrationError, CameraError):

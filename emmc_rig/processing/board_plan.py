@@ -72,7 +72,7 @@ the mask."""
 class PlanSettings:
     """What to plan whiteboards for: camera, size, and the relative error of Psi.
 
-    most_frames: of the plan, None: as many as it takes. leave_out: names of WATCHES that the rig
+    most_frames: of the plan, None: as many as it takes. skip: names of WATCHES that the rig
     cannot take. few: plan for the fitted mask alone, without the pinhole before every view.
     """
 
@@ -81,18 +81,18 @@ class PlanSettings:
     size: tuple[int, int]
     target: float = 0.005
     most_frames: int | None = None
-    leave_out: frozenset[str] = frozenset()
+    skip: frozenset[str] = frozenset()
     few: bool = False
 
     def __post_init__(self) -> None:
-        for name in sorted(self.leave_out):
+        for name in sorted(self.skip):
             if name not in WATCHES:
-                raise AppError(f"--leave-out {name}: use some of {', '.join(WATCHES)}")
+                raise AppError(f"--skip {name}: use some of {', '.join(WATCHES)}")
 
     @property
     def moves_masks(self) -> bool:
         """Whether whiteboards are planned with the mask elsewhere, too."""
-        return bool(self.camera.moving_masks) and "mask" not in self.leave_out
+        return bool(self.camera.moving_masks) and "mask" not in self.skip
 
 
 def plan_light(camera: Camera, mask: ShadowMask) -> Light:
@@ -111,7 +111,7 @@ def soft_design(camera: Camera, mask: ShadowMask) -> Placement:
 
 
 def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
-    """Return the plan of a capture: whiteboards for every route, and the camera's shots."""
+    """Return the plan of a capture: whiteboards for every method, and the camera's shots."""
     through = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
     repeats = max(through.values(), default=1)
     every = len(through) == np.prod(settings.camera.views)
@@ -121,8 +121,8 @@ def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
         if kind.pinhole is None
     ]
     judged_um = ((0.0, 0.0), VERIFY_UM) if settings.moves_masks else ((0.0, 0.0),)
-    judging = [OpenBoard(mask_um=place_um, held_out=True) for place_um in judged_um]
-    coloured = camera_colours(settings.camera) and "colours" not in settings.leave_out
+    judging = [OpenBoard(mask_um=place_um, validation=True) for place_um in judged_um]
+    coloured = camera_colours(settings.camera) and "colours" not in settings.skip
     return Plan(
         title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
         camera=settings.camera_name,
@@ -133,10 +133,10 @@ def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
             repeats=repeats,
             references=REFERENCE_FRAMES,
             open=(*fitted, *judging),
-            lamp_checks=0 if "lamp" in settings.leave_out else LAMP_CHECKS,
-            response=() if "response" in settings.leave_out else SERIES_SHARES,
+            lamp_checks=0 if "lamp" in settings.skip else LAMP_CHECKS,
+            response=() if "response" in settings.skip else SERIES_SHARES,
             colours=COLOUR_REPEATS if coloured else 0,
-            turned=0 if "turned" in settings.leave_out else TURNED_REPEATS,
+            turned=0 if "turned" in settings.skip else TURNED_REPEATS,
             turns_deg=TURNS_DEG,
         ),
         darks=Darks(
@@ -160,7 +160,7 @@ def frames_by_kind(settings: PlanSettings, planned: PlannedFrames) -> Counter[st
 
 
 def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
-    """Return the whiteboards for all routes in one: the same number of every view, and open ones.
+    """Return the whiteboards for all methods in one: the same number of every view, and open ones.
 
     Raises AppError, with the best there is, where the error asked for cannot be reached with the
     frames that the settings allow (default: MOST_FRAMES before every view).
@@ -175,7 +175,8 @@ def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> Pla
     if most < 1:
         raise AppError(
             f"--frames {most_frames}: a plan opens each of the {len(views)} views at least once, "
-            f"and takes {others} frames beside: name at least {len(views) + others}, or --leave-out"
+            f"and takes {others} frames besides: allow {len(views) + others} or more, or plan for "
+            "less by --skip"
         )
     soft = soft_design(camera, mask)
     planned = plan_combined(mask, soft, light, target, most)
@@ -190,14 +191,14 @@ def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> Pla
 
 
 def few_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedFrames:
-    """Return the fewest whiteboards for the parametric routes: open ones and parts of the aperture.
+    """Return the fewest whiteboards for parametric methods: open ones and parts of the aperture.
 
     Raises AppError, with the best there is, where the error asked for cannot be reached with the
     frames that the settings allow (default: MOST_FRAMES whiteboards).
     """
     camera, target = settings.camera, settings.target
     stages = STAGE_KINDS_UM if settings.moves_masks else STAGE_KINDS_UM[:1]
-    whole = "aperture" in settings.leave_out
+    whole = "aperture" in settings.skip
     if whole and settings.moves_masks:
         stages = STAGE_KINDS_UM + MORE_STAGES_UM
     kinds = [Kind(None, stage) for stage in stages]
@@ -214,7 +215,7 @@ def few_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedF
         raise AppError(
             f"a relative error of Psi of {target:.3%} cannot be reached by few whiteboards: the "
             f"best is {planned.expected_error:.3%}, with {others + taken} frames; raise --target "
-            f"or --frames, or {'open the aperture in parts' if whole else 'leave --few out'}"
+            f"or --frames, or plan without {'--skip aperture' if whole else '--few'}"
         )
     return planned
 
@@ -228,7 +229,7 @@ def write_plan(settings: PlanSettings, folder: Path) -> dict:
     camera = settings.camera
     mask = shadow_mask(camera, settings.size)
     light = plan_light(camera, mask)
-    whole = "aperture" in settings.leave_out
+    whole = "aperture" in settings.skip
     few, more = settings.few or whole, 0
     planned = (few_plan if few else combined_plan)(settings, mask, light)
     counts = frames_by_kind(settings, planned)
@@ -261,7 +262,7 @@ def write_plan(settings: PlanSettings, folder: Path) -> dict:
         ],
         "frames_by_kind": dict(counts),
         "frames": counts.total(),
-        "left_out": {name: WATCHES[name] for name in sorted(settings.leave_out)},
+        "left_out": {name: WATCHES[name] for name in sorted(settings.skip)},
         "expected_relative_error": planned.expected_error,
         "command": command_line(),
         "versions": versions(),

@@ -32,7 +32,7 @@ def method_within(psi: ImagingMatrix, frames: Frames, budget: str) -> tuple[str,
     unit_s = timed(psi, frames)
     within = [method for method, cost in COST.items() if cost * unit_s <= budget_s]
     method = within[0] if within else min(COST, key=COST.__getitem__)
-    why = "the most accurate within" if within else "the quickest: none keeps to"
+    why = "the most accurate within" if within else "the quickest: none is done within"
     takes_s = COST[method] * unit_s
     return method, f"{method}: {why} {budget_s:g} s; about {takes_s:.2g} s on this machine"
 

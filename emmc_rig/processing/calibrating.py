@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Annotated, Any, Literal, overload
+from typing import Annotated, Any, ClassVar, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,16 +42,18 @@ class Pose(Settings):
 
     reference: the aperture open, and no mask in the beam. mask_um: where the mask stood, (x, y)
     from where the camera's design centres it, None: as in its shot. view: the one (v, u) that a
-    pinhole opened, None: all. held_out: seen by no fit, to judge by. exposure_s: in any unit, the
+    pinhole opened, None: all. validation: used by no fit, to judge by. exposure_s: in any unit, the
     same for all. taken_s: when, which shows drift.
     """
+
+    renamed: ClassVar = {"held_out": "validation"}
 
     reference: bool = False
     mask_um: tuple[Offset, Offset] | None = None
     shot: int = Field(default=0, ge=0)
     view: tuple[View, View] | None = None
     lamp: Literal["white", "red", "green", "blue"] = "white"
-    held_out: bool = False
+    validation: bool = False
     exposure_s: Positive = 1.0
     taken_s: float = 0.0
 
@@ -59,8 +61,9 @@ class Pose(Settings):
 @overload
 def calibrate(
     session: Session | str | Path,
-    route: str = "auto",
+    method: str = "auto",
     *,
+    route: str | None = None,
     sensor: bool = False,
     watcher: Watcher | None = None,
 ) -> SessionCalibration: ...
@@ -69,7 +72,7 @@ def calibrate(
 @overload
 def calibrate(
     session: Sequence[ArrayLike] | np.ndarray,
-    route: Sequence[Mapping[str, Any]],
+    poses: Sequence[Mapping[str, Any]],
     camera: Camera,
     *,
     darks: ArrayLike | Mapping[float, ArrayLike],
@@ -78,32 +81,35 @@ def calibrate(
 
 def calibrate(
     session: Any,
-    route: Any = "auto",
+    method: Any = "auto",
     camera: Camera | None = None,
     *,
+    route: str | None = None,
     darks: ArrayLike | Mapping[float, ArrayLike] | None = None,
     sensor: bool = False,
     watcher: Watcher | None = None,
 ) -> SessionCalibration | tuple[ImagingMatrix, SessionCalibration]:
     """Return Psi as whiteboards measure it: `calibrate(session)`, or arrays with their poses.
 
-    Arrays are calibrated by the routes of a session, and judged by whiteboards held out. Of what a
+    Arrays are calibrated by the methods of a session, and judged by those for validation. Of what a
     session can hold besides, arrays have nothing: boards turned in their plane or with the lamp
     moved, which tell uneven light from the lens; pinholes of several views at once; whiteboards
     after the scene, besides what `taken_s` shows of drift. What was not watched for that, the
     report says. Lamps of three colours are poses with their `lamp`.
 
-    `calibrate(session, route)` returns a calibration, whose `psi` it is. `calibrate(whiteboards,
+    `calibrate(session, method)` returns a calibration, whose `psi` it is. `calibrate(whiteboards,
     poses, camera, darks=darks)` returns Psi and that calibration, whose `frames(dn)` are what the
     same bench reads of a scene. In both `save(folder)` writes psi.h5 with a report.
 
     Args:
         session: itself, or its folder. Or whiteboards, a list of arrays (repeat, y, x) in DN: at
-            least a reference, of two repeats, one held out, and as many as the route needs: through
-            the open aperture with the mask in a few places, or of every view through a pinhole.
-        route: parametric, mixed or free; `auto` takes every one that there are whiteboards for,
+            least a reference, of two repeats, one for validation, and as many as the method needs:
+            through the open aperture with the mask in a few places, or through a pinhole of every
+            view.
+        method: parametric, mixed or free; `auto` takes every one that there are whiteboards for,
             and chooses. Or poses, a dict for each whiteboard with the keys of `Pose`.
         camera: as designed, of arrays; its noise has the white level.
+        route: an earlier name of `method`.
         darks: of arrays, (repeat, y, x) in DN, the lamp off, at one exposure, or by exposures.
         sensor: the figures of a session's sensor too, from its darks and references.
         watcher: is shown the progress of a session's.
@@ -114,11 +120,12 @@ def calibrate(
         CalibrationError: whiteboards that are unfit: no lamp, another mask, saturated, unsteady.
         ArgumentError: an argument of another type.
     """
-    if camera is None and isinstance(route, str) and not isinstance(session, (list, np.ndarray)):
-        return calibrate_session(session, route, sensor, watcher)
+    method = method if route is None else route
+    if camera is None and isinstance(method, str) and not isinstance(session, (list, np.ndarray)):
+        return calibrate_session(session, method, sensor, watcher)
     required(camera, Camera, "camera", "the camera as designed, emmc_rig.camera(...)")
     assert camera is not None
-    return _of_arrays(session, route, camera, darks)
+    return _of_arrays(session, method, camera, darks)
 
 
 @one_blas_thread()
@@ -145,7 +152,7 @@ def _of_arrays(
     if len(sizes) != 1:
         raise AppError(f"darks: of {len(sizes)} sizes, {', '.join(map(str, sorted(sizes)))} pixels")
     references: dict[tuple[int, str], MeanFrame] = {}
-    sorted_in: dict[str, list[BoardFrame]] = {"open": [], "pinhole": [], "held out": []}
+    sorted_in: dict[str, list[BoardFrame]] = {"open": [], "pinhole": [], "validation": []}
     for place, (frames, pose) in enumerate(zip(whiteboards, stood, strict=True)):
         name = f"whiteboards[{place}]"
         _refuse_beyond(pose, camera, name)
@@ -159,11 +166,11 @@ def _of_arrays(
             continue
         of_shot = camera.shots[pose.shot].offset_um
         stage_um = pose.mask_um or next(iter(of_shot.values()), (0.0, 0.0))
-        kind = "held out" if pose.held_out else "pinhole" if pose.view else "open"
+        kind = "validation" if pose.validation else "pinhole" if pose.view else "open"
         sorted_in[kind].append(BoardFrame.held(mean, stage_um, pose.shot, pose.view, pose.lamp))
     if not references:
         raise AppError(
-            "poses: none is a reference, {'reference': True}: the aperture open, no mask"
+            "poses: none is {'reference': True}, a whiteboard without the mask, aperture open"
         )
     # The white lamp's first: the sensor's gain follows from it.
     white_first = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
@@ -172,12 +179,12 @@ def _of_arrays(
     boards = SessionBoards(
         *(
             every.with_frames(some) if some else None
-            for some in (fitted, sorted_in["pinhole"], sorted_in["held out"])
+            for some in (fitted, sorted_in["pinhole"], sorted_in["validation"])
         ),
         turned={},
     )
     k, (rows, columns) = camera.sensor.binning, dark[0].mean_dn.shape
-    where = "poses: there are", "take them, and give their arrays"
+    where = "poses: they have", "capture them, and give their arrays and poses"
     outcome = boards_outcome(camera, (k * rows, k * columns), boards, where)
     metrics = calibration_metrics(outcome, camera.title, "", "auto", started)
     return outcome.calibration.psi, SessionCalibration(outcome, outcome.calibration, metrics)
@@ -208,8 +215,8 @@ def _refuse_millimetres(poses: Sequence[Pose], camera: Camera) -> None:
     cell_um = min((mask.cell_um for mask in camera.masks.values()), default=0.0)
     if 0 < moved_um < LEAST_MOVED * cell_um:
         raise AppError(
-            f"poses: the mask moves by {moved_um:g} um at most, its cells are {cell_um:g} um: "
-            "mask_um takes um; were these mm?"
+            f"poses: the mask moves by {moved_um:g} um at most, and its cells are {cell_um:g} um "
+            "wide: mask_um is in um; were these mm?"
         )
 
 

@@ -141,7 +141,7 @@ def frames(
     if gamma is None:
         gamma = 1.0
         if looks := _looks_coded(taken, usable, np.asarray(dn).dtype == np.uint8):
-            estimates.append(f"gamma 1 (assumed, though {looks}: of a picture's, give gamma=2.2)")
+            estimates.append(f"gamma 1 (assumed, although {looks}: for a picture give gamma=2.2)")
 
     def linear(values: Array) -> Array:
         return (

@@ -1,4 +1,4 @@
-"""A session's whiteboards to Psi, by the route that predicts the whiteboard held out best."""
+"""A session's whiteboards to Psi, by the method that predicts the validation whiteboard best."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from emmc_rig.session.session import CALIBRATION, Session
 from reconstruction.inputs import check_frames
 
 SENSOR = "sensor.json"
-ROUTES = {
+METHODS = {
     "auto": ("parametric", "mixed", "free", "combined"),
     "parametric": ("parametric",),
     "mixed": ("parametric", "mixed"),
@@ -57,7 +57,7 @@ def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, 
 class SessionCalibration:
     """Psi as whiteboards measure it, those of a session or arrays.
 
-    outcome: all routes tried, and the choice among them. calibration: the one chosen, of the shots
+    outcome: all methods tried, and the choice among them. calibration: the one chosen, of the shots
     that the session has. metrics: what metrics.json says.
     """
 
@@ -73,7 +73,7 @@ class SessionCalibration:
 
     @property
     def held_out_error(self) -> float:
-        """Relative error at which the whiteboard held out of the fit is predicted."""
+        """Relative error at which the validation whiteboard is predicted."""
         return self.outcome.judged[self.outcome.chosen].relative_error
 
     def frames(self, dn: ArrayLike, exposures_s: float | Sequence[float] = 1.0) -> Frames:
@@ -120,56 +120,56 @@ class SessionCalibration:
 
     def __repr__(self) -> str:
         return (
-            f"SessionCalibration({self.outcome.chosen} route, whiteboard held out to "
+            f"SessionCalibration(method {self.outcome.chosen}, validation error "
             f"{self.held_out_error:.2%}, {self.psi!r})"
         )
 
 
 def calibrate_session(
-    session: Session | str | Path, route: str, sensor: bool, watcher: Watcher | None
+    session: Session | str | Path, method: str, sensor: bool, watcher: Watcher | None
 ) -> SessionCalibration:
     """Return Psi as a session's whiteboards measure it, see `calibrating.calibrate`."""
     if not isinstance(session, Session):
         takes = "a session, or its folder; or whiteboards as arrays, with poses and a camera"
         session = Session(path_of(session, "session", takes))
-    return _calibrated(session, route, sensor, watcher or Silent(), in_memory)
+    return _calibrated(session, method, sensor, watcher or Silent(), in_memory)
 
 
 def calibrate_into(
-    folder: Path, session: Session, route: str, sensor: bool, watcher: Watcher
+    folder: Path, session: Session, method: str, sensor: bool, watcher: Watcher
 ) -> SessionCalibration:
     """Calibrate and write the result into an existing folder.
 
-    The free route writes Psi and its deviations view by view, and does not hold them in memory:
+    The method free writes Psi and its deviations view by view, and does not hold them in memory:
     they are no longer there in what is returned. Raises AppError or CalibrationError.
     """
     whole = taken_shots(session) == tuple(range(len(camera_of(session).shots)))
     with arrays_in(folder) as on_disk:
-        empty = on_disk if route == "free" and whole else in_memory
-        calibration = _calibrated(session, route, sensor, watcher, empty)
+        empty = on_disk if method == "free" and whole else in_memory
+        calibration = _calibrated(session, method, sensor, watcher, empty)
         calibration.write(folder)
     return calibration
 
 
 @one_blas_thread()
 def _calibrated(
-    session: Session, route: str, sensor: bool, watcher: Watcher, empty: NewArray
+    session: Session, method: str, sensor: bool, watcher: Watcher, empty: NewArray
 ) -> SessionCalibration:
-    if route not in ROUTES:
-        raise AppError(f"--route {route}: use one of {', '.join(ROUTES)}")
+    if method not in METHODS:
+        raise AppError(f"--method {method}: use one of {', '.join(METHODS)}")
     started = time.perf_counter()
     watcher.begin("frames", None)
     whiteboards = (frame for frame in session.frames if frame.kind == "whiteboard")
     planes = len({(one.bench.shot, one.view, one.bench.lamp) for one in whiteboards})
     outcome = session_outcome(
         session,
-        None if route == "auto" else ROUTES[route],
+        None if method == "auto" else METHODS[method],
         lambda name: watcher.begin(name, planes if name == "Psi, free" else None),
         empty,
         watcher.step,
     )
     title = session.header["title"] or session.folder.name
-    metrics = calibration_metrics(outcome, title, str(session.folder), route, started)
+    metrics = calibration_metrics(outcome, title, str(session.folder), method, started)
     shots = taken_shots(session)
     chosen = outcome.calibration
     if len(shots) < chosen.psi.shots:
@@ -184,14 +184,14 @@ def _calibrated(
 
 
 def calibration_metrics(
-    outcome: Outcome, title: str, session: str, route: str, started: float
+    outcome: Outcome, title: str, session: str, method: str, started: float
 ) -> dict[str, Any]:
     """Return what metrics.json says; title: of the camera, started: by `time.perf_counter`."""
     return {
         "camera": title,
         "session": session,
         "size": list(outcome.calibration.psi.size),
-        "route": route,
+        "route": method,  # the key that scripts read
         **outcome_figures(outcome),
         "calibration_seconds": time.perf_counter() - started,
         "command": command_line(),

@@ -1,4 +1,4 @@
-"""A session's whiteboards by what takes them: fits, the free route, judges and sensor."""
+"""A session's whiteboards by what takes them: fits, the method free, validation and sensor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from emmc_rig.session.frame_means import (
     session_darks,
     stage_um_of,
 )
-from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.planned import VALIDATION, PlannedFrame
 from emmc_rig.session.session import Session
 
 
@@ -32,8 +32,8 @@ from emmc_rig.session.session import Session
 class SessionBoards:
     """A session's whiteboards by what takes them; None where the plan has no such frames.
 
-    fit: for the parametric routes, those of the open aperture, and those through the pinhole as
-    well. pinholes: for the free route. held_out: seen by no fit. turned: by the degrees that the
+    fit: for the parametric methods, those of the open aperture, and those through the pinhole as
+    well. pinholes: for the method free. held_out: used by no fit. turned: by the degrees that the
     board was turned.
     """
 
@@ -46,7 +46,7 @@ class SessionBoards:
 def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
     """Return a session's whiteboards; channels: (y, x), the colour each pixel sees (3: all)."""
     every = _without_boards(session)
-    found = {kind: _board_frames(session, kind) for kind in ("open", "whiteboard", "held-out")}
+    found = {kind: _board_frames(session, kind) for kind in ("open", "whiteboard", VALIDATION)}
     turned: dict[float, dict[bool, list[PlannedFrame]]] = defaultdict(lambda: defaultdict(list))
     for frame in session.frames:
         if frame.kind == "turned":
@@ -57,7 +57,7 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
     few = [*found["open"], *(found["whiteboard"] if found["open"] else ())]
     fit, free, held_out = (
         replace(every, frames=tuple(frames), checks=checks) if frames else None
-        for frames in (few, found["whiteboard"], found["held-out"])
+        for frames in (few, found["whiteboard"], found[VALIDATION])
     )
     own_um = next((one.stage_um for one in found["open"]), (0.0, 0.0))
     boards = {
@@ -134,7 +134,7 @@ def sensor_pairs(session: Session) -> tuple[list[Pair], Iterator[Pair]]:
         raise AppError(
             f"{session.folder}: --sensor takes two darks at each of two exposures at least, and "
             f"two references at each of four (it has {len(darks)} and {len(flats)}): "
-            "`emmc-rig calibrate --plan` writes a plan that has, unless response is left out"
+            "`emmc-rig calibrate --plan` writes a plan that has them, without --skip response"
         )
 
     def pairs(groups: Mapping[float, list[PlannedFrame]]) -> Iterator[Pair]:

@@ -87,7 +87,7 @@ def exposure_reasons(shots: Sequence[ShotExposure]) -> list[Reason]:
         found.append(
             Reason(
                 f"the brightest reading of {_shots(worst, dark)} is {worst.level:.1%} of white: "
-                f"{quieter_db:.1f} dB or more of the readings' noise",
+                f"{quieter_db:.1f} dB or more of signal-to-noise ratio are lost",
                 worst.level,
                 f"expose {worst.factor:.2g} times as long, or write exposure_s: auto",
                 "doubt",
@@ -110,11 +110,11 @@ def exposure_reasons(shots: Sequence[ShotExposure]) -> list[Reason]:
         worst = max(unknown, key=lambda one: one.dark_share)
         found.append(
             Reason(
-                f"no dark frame is exposed as long as {_shots(worst, unknown)}: a dark current of "
-                f"{DARK_ELECTRONS_PER_S:g} electrons/s, which would not be seen, is "
+                f"no dark frame is exposed as long as {_shots(worst, unknown)}: an unseen dark "
+                f"current of {DARK_ELECTRONS_PER_S:g} electrons/s would be "
                 f"{worst.dark_share:.1%} of the brightest reading",
                 worst.dark_share,
-                "take darks of the shots too (`darks: {of_shots: 4}`)",
+                "capture darks of the same exposure: `darks: {of_shots: 4}` in the plan",
                 "doubt",
             )
         )
@@ -122,5 +122,5 @@ def exposure_reasons(shots: Sequence[ShotExposure]) -> list[Reason]:
 
 
 def _shots(worst: ShotExposure, alike: Sequence[ShotExposure]) -> str:
-    others = "" if len(alike) == 1 else f" (the worst of {len(alike)} such)"
-    return f"shot {worst.shot}{others}"
+    others = "" if len(alike) == 1 else f" (the worst of {len(alike)} shots)"
+    return f"shot {worst.shot + 1}{others}"

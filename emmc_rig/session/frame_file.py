@@ -25,7 +25,7 @@ from emmc_rig.session.journal import Figures, FrameEntry
 STREAMED = ".bin"
 """Frames that the drivers of `drivers.cameras` decode by themselves."""
 NO_FIGURES = Figures(0.0, 0.0, 0.0)
-UNSTORABLE = "the camera's frame cannot be stored so that it is read back: mend its driver"
+UNSTORABLE = "the camera's frame cannot be stored without loss: correct its driver"
 
 
 @dataclass(frozen=True)

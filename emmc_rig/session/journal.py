@@ -184,13 +184,13 @@ class MeteredEntry(Entry):
     def __str__(self) -> str:
         by_exposure: dict[float, list[str]] = {}
         for shot, exposure_s in self.exposures_s.items():
-            by_exposure.setdefault(exposure_s, []).append(str(shot))
+            by_exposure.setdefault(exposure_s, []).append(str(shot + 1))
         exposures = ", ".join(
-            f"shots {', '.join(shots)} by {exposure_s:.3g} s"
+            f"shot{'s' * (len(shots) > 1)} {', '.join(shots)} exposure {exposure_s:.3g} s"
             for exposure_s, shots in by_exposure.items()
         )
-        longer = f"; {len(self.asked)} longer frames, for the dark parts" if self.asked else ""
-        return f"metered: {exposures}{longer}"
+        longer = f"; {len(self.asked)} longer frames for the dark parts" if self.asked else ""
+        return f"{exposures}{longer}"
 
 
 class UntilEntry(Entry):
@@ -201,7 +201,7 @@ class UntilEntry(Entry):
     wall: str = ""
 
     def __str__(self) -> str:
-        return f"{self.wall}: shots are taken until {self.target_db:g} dB are stated"
+        return f"{self.wall}: shots are taken until the estimated accuracy is {self.target_db:g} dB"
 
 
 class DecidedEntry(Entry):
@@ -223,12 +223,15 @@ class DecidedEntry(Entry):
     wall: str = ""
 
     def __str__(self) -> str:
-        taken = ", ".join(map(str, self.shots))
-        stated = f"shots {taken}: {self.stated_db:.2f} dB stated, {self.target_db:g} wanted"
+        taken = ", ".join(str(shot + 1) for shot in self.shots)
+        stated = (
+            f"shot{'s' * (len(self.shots) > 1)} {taken}: estimated accuracy {self.stated_db:.2f} "
+            f"dB, target {self.target_db:g} dB"
+        )
         if self.next is None:
-            spared = f", {len(self.spared)} shots spared" if self.spared else ""
-            return f"{stated}; no more, {self.why}{spared}"
-        return f"{stated}; next shot {self.next}{f', {self.why}' if self.why else ''}"
+            spared = f", {len(self.spared)} shots not needed" if self.spared else ""
+            return f"{stated}; done, {self.why}{spared}"
+        return f"{stated}; next shot {self.next + 1}{f', {self.why}' if self.why else ''}"
 
 
 class HaltEntry(Entry):
@@ -263,7 +266,7 @@ class RetryEntry(Entry):
     at_s: float = 0.0
 
     def __str__(self) -> str:
-        return f"{self.id}, try {self.attempt}: {self.fault}"
+        return f"{self.id}, attempt {self.attempt}: {self.fault}"
 
 
 class ComparedEntry(Entry):
@@ -278,8 +281,8 @@ class ComparedEntry(Entry):
 
     def __str__(self) -> str:
         return (
-            f"{self.id} taken again: shifted by ({self.x_px:+.3f}, {self.y_px:+.3f}) px, "
-            f"likeness {self.likeness:.3f}"
+            f"{self.id} captured again: shifted by ({self.x_px:+.3f}, {self.y_px:+.3f}) px, "
+            f"correlation {self.likeness:.3f}"
         )
 
 

@@ -43,7 +43,7 @@ class Scale:
 def session_calibration(session: Session) -> Calibration:
     """Return Psi measured from the session's whiteboards; raises AppError or CalibrationError.
 
-    Whiteboards of the open aperture are fitted, and tested on those held out; where there are
+    Whiteboards of the open aperture are fitted, and tested on those for validation; where there are
     none, every coefficient is measured through the pinhole.
     """
     if any(frame.kind == "open" for frame in session.frames):
@@ -59,12 +59,12 @@ def session_outcome(
     empty: NewArray = in_memory,
     on_plane: Callable[[str], None] = lambda what: None,
 ) -> Outcome:
-    """Return Psi by the routes named, with the choice among them.
+    """Return Psi by the calibration methods named, with the choice among them.
 
-    By default by every route that the session has the whiteboards for. empty, on_plane: of the
-    free route, see `measure_psi`.
+    By default by every method that the session has the whiteboards for. empty, on_plane: of the
+    method free, see `measure_psi`.
 
-    Raises AppError where the session has not what a route needs, or CalibrationError.
+    Raises AppError where the session has not what a method needs, or CalibrationError.
     """
     camera, k = camera_of(session), camera_of(session).sensor.binning
     rows, columns = frame_shape(session)
@@ -87,7 +87,7 @@ def boards_outcome(
     """Return Psi of whiteboards, see `session_outcome`.
 
     size: rows and columns of the light field. where: the beginning of an error's line, what has not
-    the whiteboards that a route needs, and its end, what to do.
+    the whiteboards that a method needs, and its end, what to do.
     """
     # Only where a pixel has several samples does the design say more than its layout.
     whole = camera.sensor.binning > 1
@@ -102,13 +102,14 @@ def boards_outcome(
         for needed, there, what in (
             ({"parametric", "mixed"} & set(routes), few, "open whiteboards"),
             ("free" in routes, pinholes, "whiteboards through the pinhole"),
-            (True, held_out, "whiteboards held out (`held_out: true`)"),
+            (True, held_out, "validation whiteboard (`validation: true`)"),
         )
         if needed and there is None
     ]
     if wanting:
         raise AppError(
-            f"{where[0]} no {' and no '.join(wanting)}, which this route needs; {where[1]}"
+            f"{where[0]} no {' and no '.join(wanting)}, which this calibration method needs; "
+            f"{where[1]}"
         )
     assert held_out is not None
     return calibrate(
@@ -126,7 +127,7 @@ def boards_outcome(
 
 
 def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:
-    """Return whether whiteboards show every view of every shot, as the free route takes them."""
+    """Return whether whiteboards show every view of every shot, as the method free takes them."""
     if pinholes is None:
         return False
     opened = {(one.shot, one.pinhole) for one in pinholes.frames}

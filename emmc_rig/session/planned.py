@@ -10,6 +10,14 @@ Kind = Literal[
     "dark", "metering", "reference", "whiteboard", "open", "held-out", "check", "turned", "shot"
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+VALIDATION: Kind = "held-out"
+"""What sessions call the open whiteboards that no fit uses, since version 0.2."""
+
+
+def kind_name(kind: str) -> str:
+    """Return what a kind of frame is called before users."""
+    return "validation" if kind == VALIDATION else kind
+
 
 SHOT_DARK = "dark-shot"
 """How ids of darks begin that are exposed as the shots are."""

@@ -123,7 +123,7 @@ class Session:
             refuse_missing(Path(folder), LISTED)
             raise AppError(f"{folder}: no session, it holds no {JOURNAL}; {LISTED}") from fault
         except OSError as fault:
-            raise AppError(f"{folder}: cannot be read ({fault.strerror}); mend that") from fault
+            raise AppError(f"{folder}: cannot be read ({fault.strerror}); correct that") from fault
 
     def __repr__(self) -> str:
         taken, needed = len(self.stored), len(self.needed)
@@ -150,7 +150,7 @@ class Session:
             )
         except OSError as fault:
             raise AppError(
-                f"{folder}: cannot be made ({fault.strerror}); mend that, or name another folder"
+                f"{folder}: cannot be made ({fault.strerror}); correct that, or name another folder"
             ) from fault
         return cls(folder, disk)
 

@@ -54,14 +54,14 @@ class Verdict:
             shown = ", ".join(self.missing[:5]) + (", ..." if len(self.missing) > 5 else "")
             yield f"{len(self.missing)} of {self.planned} frames not captured yet: {shown}"
         if self.spared:
-            yield f"{self.spared} more frame(s) planned, which the scene did not need"
+            yield f"{self.spared} more frame(s) planned, which were not needed (--until)"
         if self.unreadable:
             yield f"{self.unreadable} journal line(s) torn or damaged; their frames do not count"
         if self.leftovers:
             count, shown = len(self.leftovers), ", ".join(self.leftovers)
             yield f"{count} leftover(s) of a crash, which do not count: {shown}"
         for name in self.foreign:
-            yield f"{name}: not of this session, left alone"
+            yield f"{name}: not part of this session"
 
 
 def verify_frames(

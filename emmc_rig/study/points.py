@@ -256,7 +256,7 @@ class Study(Generic[P]):
     def _leave_out(self, points: Iterable[P], why: str, watcher: Watcher) -> None:
         for point in points:
             self.left_out[point] = why
-            watcher.step(f"left out: {self.label(point)}")
+            watcher.step(f"excluded: {self.label(point)}")
 
 
 def _group_measured(task: tuple[Study, Sequence]) -> tuple[list[dict], str | None]:

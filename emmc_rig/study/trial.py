@@ -84,7 +84,9 @@ class Capture:
     def need_built_in(self) -> None:
         """Raise NotApplicableError for a measured scene."""
         if not self.is_built_in:
-            raise NotApplicableError("built-in scenes only: what was measured cannot be changed so")
+            raise NotApplicableError(
+                "needs a built-in scene: a measured one cannot be changed in this way"
+            )
 
     def scene_seen(
         self, views: tuple[int, int] | None = None, change: Callable[[World], World] | None = None

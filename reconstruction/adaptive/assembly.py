@@ -60,27 +60,31 @@ class Cells(NamedTuple):
 @njit(forceinline=True, fastmath=True)
 def _place(disparity, y, margin, size, taps, fractions):
     """Set taps and fractions (2, ray, x) of row y's rays, along y and x, see `first_tap`."""
-    views_v, views_u, _, columns = disparity.shape
+    views_v, views_u, _, _ = disparity.shape
+    ahead, none, one = np.float32(margin - 1), np.float32(0), np.float32(1)
     last_y, last_x = np.float32(size[0] - TAPS), np.float32(size[1] - TAPS)
-    ahead = np.float32(margin - 1)
-    none, full = np.float32(0), np.float32(1)
     for v in range(views_v):
         for u in range(views_u):
-            ray = v * views_u + u
-            row = disparity[v, u, y]
+            ray, row = v * views_u + u, disparity[v, u, y]
             dv, du = np.float32(v - views_v // 2), np.float32(u - views_u // 2)
-            tap_y, tap_x = taps[0, ray], taps[1, ray]
-            part_y, part_x = fractions[0, ray], fractions[1, ray]
-            for x in range(columns):
-                at_y, at_x = np.float32(y) - row[x] * dv, np.float32(x) - row[x] * du
-                whole_y, whole_x = np.floor(at_y), np.floor(at_x)
-                first_y, first_x = whole_y + ahead, whole_x + ahead
-                fy = none if first_y < none else at_y - whole_y
-                fx = none if first_x < none else at_x - whole_x
-                part_y[x] = full if first_y > last_y else fy
-                part_x[x] = full if first_x > last_x else fx
-                tap_y[x] = np.int32(min(max(first_y, none), last_y))
-                tap_x[x] = np.int32(min(max(first_x, none), last_x))
+            _along(row, np.float32(y), none, dv, ahead, last_y, taps[0, ray], fractions[0, ray])
+            _along(row, none, one, du, ahead, last_x, taps[1, ray], fractions[1, ray])
+
+
+@njit(forceinline=True, fastmath=True)
+def _along(row, start, step, by, ahead, last, taps, parts):
+    """Set taps and fractions of a row of rays along one axis.
+
+    An axis at a time: a compiler vectorises no loop that sets many arrays, which might overlap.
+    """
+    none, full = np.float32(0), np.float32(1)
+    for x in range(row.size):
+        at = start + step * np.float32(np.int32(x)) - row[x] * by
+        whole = np.floor(at)
+        first = whole + ahead
+        part = none if first < none else at - whole
+        parts[x] = full if first > last else part
+        taps[x] = np.int32(min(max(first, none), last))
 
 
 @njit(forceinline=True)
@@ -89,21 +93,26 @@ def _bound(weights, y, taps, reach):
 
     weights: (v, u, y, stored, x) of one shot.
     """
-    views_v, views_u, _, stored, columns = weights.shape
-    top, bottom, left, right, entries = reach[0], reach[1], reach[2], reach[3], reach[4]
+    views_v, views_u, _, stored, _ = weights.shape
     for v in range(views_v):
         for u in range(views_u):
             ray = v * views_u + u
-            tap_y, tap_x = taps[0, ray], taps[1, ray]
             for k in range(stored):
                 row = weights[v, u, y, k]
-                for x in range(columns):
-                    seen = row[x] != 0
-                    top[x] = min(top[x], tap_y[x] if seen else top[x])
-                    bottom[x] = max(bottom[x], tap_y[x] if seen else bottom[x])
-                    left[x] = min(left[x], tap_x[x] if seen else left[x])
-                    right[x] = max(right[x], tap_x[x] if seen else right[x])
-                    entries[x] += 1 if seen else 0
+                _widen(row, taps[0, ray], reach[0], reach[1])
+                _widen(row, taps[1, ray], reach[2], reach[3])
+                entries = reach[4]
+                for x in range(row.size):
+                    entries[x] += np.int32(1) if row[x] != 0 else np.int32(0)
+
+
+@njit(forceinline=True)
+def _widen(row, taps, first, last):
+    """Let first and last include the taps of rays that are not dark."""
+    for x in range(row.size):
+        seen = row[x] != 0
+        first[x] = min(first[x], taps[x] if seen else first[x])
+        last[x] = max(last[x], taps[x] if seen else last[x])
 
 
 @njit(cache=True, nogil=True)
@@ -123,15 +132,21 @@ def _measure(weights, disparity, margin, binning, size, first_row, last_row, box
                 _bound(weights[s], pixel_y * binning + sub_y, taps[sub_y], reach)
             for pixel_x in range(pixels_x):
                 reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
-                mine = reach[:, pixel_x * binning : (pixel_x + 1) * binning]
-                entries = mine[4].sum()
+                begin = pixel_x * binning
+                top, bottom, left, right, entries = (
+                    reach[0, begin], reach[1, begin], reach[2, begin], reach[3, begin],
+                    reach[4, begin],
+                )  # fmt: skip
+                for x in range(begin + 1, begin + binning):
+                    top, bottom = min(top, reach[0, x]), max(bottom, reach[1, x])
+                    left, right = min(left, reach[2, x]), max(right, reach[3, x])
+                    entries += reach[4, x]
                 boxes[reading] = 0
                 counts[reading] = entries
                 if entries == 0:
                     continue
-                top, left = mine[0].min(), mine[2].min()
-                height = mine[1].max() - top + TAPS
-                vectors = -(-(mine[3].max() - left + TAPS) // LANES)
+                height = bottom - top + TAPS
+                vectors = -(-(right - left + TAPS) // LANES)
                 rows = height * vectors * stored
                 if rows <= BOX_ROWS * entries and vectors * LANES <= size[1]:
                     boxes[reading, 0] = top

@@ -117,18 +117,6 @@ def add_box(context, texture, at, wide, cells, start, height, vectors, value):
 
 
 @intrinsic
-def copy_box(context, texture, at, wide, cells, start, height, vectors):
-    """Set a box of float32 cells to what lies below on a texture, see `read_box`."""
-
-    def write(code, texture, at, wide, cells, *box):
-        with code.box(at, wide, *box) as (here, there):
-            code.store(code.load(texture, here, LANES), cells, there)
-
-    kinds = texture, at, wide, cells, start, height, vectors
-    return function(types.void, kinds, write, _Code)
-
-
-@intrinsic
 def read_taps(context, texture, at, wide, fraction_y, fraction_x):
     """Return a flat float32 texture between its values, from the first of four rows of taps on."""
 

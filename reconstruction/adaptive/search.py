@@ -8,7 +8,7 @@ best of a patch that decides.
 
 Where patches lie is arbitrary, and changes the disparities they agree on: shifted by 3 pixels, they
 make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). So what two grids of
-patches believe, one between the other, is averaged: +0.2 dB (docs/adaptive.md).
+patches believe, one between the other, is averaged: +0.2 dB (benchmarks/tried.md).
 
 Neighbouring patches agree by belief propagation: their disparities differ as d - d' is Laplace
 distributed, or, with a small probability, are not related (another object). Messages are passed
@@ -65,8 +65,9 @@ SMOOTH_PX = 0.25
 """Disparities at most this much apart are evaluated; between, evidence is interpolated unless it
 decides: the log-likelihood of fine textures waves with a period of 0.75 px."""
 KEPT = 4
-"""Kinds of texture that patches of the fine search compare further after their first probe. The
-coarse search compares all: its disparities, far apart, would lose the right one."""
+"""Kinds of texture that patches of the fine search compare further after their first probe, where
+textures of several lengths are compared: `adaptive-fast`, with one, loses 0.04 dB by it. The coarse
+search compares all: its disparities, far apart, would lose the right one."""
 CONTENDING = 4.0
 """Log-likelihood below a patch's best within which it is evaluated at all disparities: interpolated
 there instead, it made buttercup's crops 0.3 to 0.5 dB worse."""
@@ -307,7 +308,7 @@ def fine(
     """
     side = reading_side(data.psi.shots)
     patches = EvidencePatches(side, min(stride, side))
-    prior = replace(prior, kept=KEPT)
+    prior = replace(prior, kept=KEPT if prior.finer_px else None)
     low, high = rough.disparities[[0, -1]]
     every = max(1, int(SMOOTH_PX / step_px + 1e-9))
     ends = np.floor(low / step_px / every) * every, np.ceil(high / step_px / every) * every

@@ -50,7 +50,7 @@ def _spread_px(survey: Survey) -> NDArray[np.float64]:
 
 def searched_again(survey: Survey, settings: AdaptiveSettings) -> search.Volume | None:
     """Return the beliefs of a second search; None where disparities are not wide."""
-    if np.mean(_spread_px(survey) > WIDE_PX) < WIDE_SHARE:
+    if not settings.second or np.mean(_spread_px(survey) > WIDE_PX) < WIDE_SHARE:
         return None
     looser = survey.bright.variance(LOOSER * settings.misfit)
     return search.fine(

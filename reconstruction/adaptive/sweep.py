@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import floor
+from typing import Any
 
 import cv2
 import numpy as np
@@ -142,12 +143,14 @@ def plane_frames(psi: ImagingMatrix, texture: Array, disparity: float, margin: i
     return frames
 
 
-def _likelihood(residual: Array, variance: Array, used: Array, guide: Array) -> Array:
-    """Return the log-likelihood of every pixel (y, x) of residuals (shot, y, x), averaged."""
+def _likelihood(residual: Array, variance: Array, used: Array, alike: Any) -> Array:
+    """Return the log-likelihood of every pixel (y, x) of residuals (shot, y, x), averaged.
+
+    alike: the guided filter of the picture.
+    """
     surprise = np.log1p(np.square(residual) / (FREEDOM * variance)) * used
     each = (-(FREEDOM + 1) / 2 * surprise.sum(axis=0)).astype(np.float32)
-    mean = cv2.ximgproc.guidedFilter(guide, each, RADIUS_PX, EDGE)
-    return np.asarray(mean, dtype=np.float32) * (2 * RADIUS_PX + 1) ** 2
+    return np.asarray(alike.filter(each), dtype=np.float32) * (2 * RADIUS_PX + 1) ** 2
 
 
 def _smooth(values: Array, used: Array) -> Array:
@@ -192,11 +195,17 @@ def swept(
     within &= np.abs(volume.disparities) * half + TAPS <= margin
     labels = volume.disparities[within]
     evidence = np.empty((len(rows), len(columns), len(labels)), dtype=np.float32)
-    for label, known in enumerate(np.flatnonzero(within)):
-        of_plane = frames - plane_frames(psi, texture, labels[label], margin)
-        likelihood = _likelihood(of_plane, variance, weight, guide)[::STRIDE, ::STRIDE]
-        believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
-        evidence[..., label] = likelihood + np.log(believed + LEAST_BELIEF)
+    all_known = np.flatnonzero(within)
+
+    def work(_: int, first: int, last: int) -> None:
+        alike = cv2.ximgproc.createGuidedFilter(guide, RADIUS_PX, EDGE)
+        for label, known in enumerate(all_known[first:last], first):
+            of_plane = frames - plane_frames(psi, texture, labels[label], margin)
+            likelihood = _likelihood(of_plane, variance, weight, alike)[::STRIDE, ::STRIDE]
+            believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
+            evidence[..., label] = likelihood + np.log(believed + LEAST_BELIEF)
+
+    in_bands(work, len(labels))
     chances = posteriors(evidence, compatibility(labels, slope_px * STRIDE, jump))
     return replace(
         volume,

@@ -88,23 +88,34 @@ def _fill(out, y, x, nearer, mark):
 
 @njit(forceinline=True, fastmath=True)
 def _settle(centre, margin, dv, du, out, mark):
-    """Set the disparity of rays on slanted surfaces to that of the points they meet there."""
-    last_y, last_x = centre.shape[0] - 2, centre.shape[1] - 2
+    """Set the disparity of rays on slanted surfaces to that of the points they meet there.
+
+    Places first, then what lies there: a loop that does both is not vectorised.
+    """
+    flat, wide = centre.reshape(-1), np.int32(centre.shape[1])
+    last_y, last_x = np.int32(centre.shape[0] - 2), np.int32(centre.shape[1] - 2)
     low, high_y, high_x = np.float32(0), np.float32(last_y + 1), np.float32(last_x + 1)
-    near = np.float32(SAME_SURFACE)
+    near, columns = np.float32(SAME_SURFACE), out.shape[1]
+    right, under = np.uint32(1), np.uint32(wide)
+    # Unsigned: an index that may be negative is counted from the end, which takes time.
+    place, parts = np.empty(columns, np.uint32), np.empty((2, columns), np.float32)
+    down, along = parts[0], parts[1]
     for y in range(out.shape[0]):
         line, hidden = out[y], mark[y]
         for _ in range(SETTLING):
-            for x in range(line.size):
-                d = line[x]
-                py = min(max(np.float32(y + margin) - d * dv, low), high_y)
-                px = min(max(np.float32(x + margin) - d * du, low), high_x)
+            for x in range(columns):
+                py = min(max(np.float32(y + margin) - line[x] * dv, low), high_y)
+                px = min(max(np.float32(np.int32(x) + margin) - line[x] * du, low), high_x)
                 iy, ix = min(np.int32(py), last_y), min(np.int32(px), last_x)
-                fy, fx = py - np.float32(iy), px - np.float32(ix)
-                above = centre[iy, ix] + fx * (centre[iy, ix + 1] - centre[iy, ix])
-                below = centre[iy + 1, ix] + fx * (centre[iy + 1, ix + 1] - centre[iy + 1, ix])
-                met = above + fy * (below - above)
-                same = abs(met - d) <= near and hidden[x] == 0
+                down[x], along[x] = py - np.float32(iy), px - np.float32(ix)
+                place[x] = np.uint32(iy * wide + ix)
+            for x in range(columns):
+                d, at, fx = line[x], place[x], along[x]
+                above = flat[at] + fx * (flat[at + right] - flat[at])
+                below = flat[at + under]
+                below += fx * (flat[at + under + right] - below)
+                met = above + down[x] * (below - above)
+                same = (abs(met - d) <= near) & (hidden[x] == 0)
                 line[x] = met if same else d
 
 

@@ -6,14 +6,12 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from reconstruction import bpdn
-from reconstruction.method import Given, Method
+from reconstruction.method import Given, Method, cost_words
 from reconstruction.result import Reconstruction
 from reconstruction.sparse import SparseSettings, reconstruct_sparse
 
 if TYPE_CHECKING:
     from reconstruction.methods import MethodSettings
-
-_BUILDING = "Psi D, then "
 
 
 def _solve(solver: bpdn.Method, given: Given, settings: MethodSettings) -> Reconstruction:
@@ -30,8 +28,7 @@ def _solve(solver: bpdn.Method, given: Given, settings: MethodSettings) -> Recon
     )
 
 
-def _method(solver: bpdn.Method, title: str, assumes: str, operations: str, when: str) -> Method:
-    cost = f"{_BUILDING}{operations}"
+def _method(solver: bpdn.Method, title: str, assumes: str, cost: str, when: str) -> Method:
     solve = partial(_solve, solver)
     return Method(
         f"dict-{solver}", title, assumes, cost, when, solve, "sparse", SparseSettings, True
@@ -42,8 +39,8 @@ METHODS = (
     _method(
         "admm",
         "sparse patches by ADMM with working sets (the paper's Dict-ADMM)",
-        "patches are a few atoms of the dictionary",
-        "p (n m^2 + 4 n m x 30-100 passes) operations",
+        "every patch is a sum of a few atoms of the dictionary",
+        cost_words(1.4, 4.3),
         "one shot with a dictionary of similar scenes",
     ),
     _method(
@@ -51,34 +48,34 @@ METHODS = (
         "sparse patches by the Lasso path (LARS)",
         "as dict-admm, and the same minimiser to rounding",
         "p 2 n m operations a step, 1-3 steps an atom used",
-        "exact minimiser wanted, or few atoms per patch",
+        "the exact minimiser, or few atoms per patch",
     ),
     _method(
         "omp",
         "sparse patches by orthogonal matching pursuit",
-        "patches are at most `atoms` atoms",
-        "p 2 n m operations an atom",
-        "quickest; coarse previews",
+        "every patch is a sum of at most `atoms` atoms",
+        cost_words(0.83, 1.6),
+        "coarse previews",
     ),
     _method(
         "ista",
         "sparse patches by proximal gradient",
         "as dict-admm",
         "p (n m^2 + 4 n m x thousands of steps) operations",
-        "only to compare",
+        "to compare solvers",
     ),
     _method(
         "fista",
         "sparse patches by accelerated proximal gradient with restart",
         "as dict-admm",
         "p (n m^2 + 4 n m x 500-5,000 steps) operations",
-        "only to compare",
+        "to compare solvers",
     ),
     _method(
         "sl0",
         "sparse patches by smoothed l0 (as [18])",
-        "patches are the fewest atoms that explain the frames",
-        "p (n m^2 + 4 n m x 50 passes) operations",
+        "every patch is a sum of the fewest atoms that explain the frames",
+        cost_words(2.4, 4.4),
         "little noise; to compare with [18]",
     ),
 )

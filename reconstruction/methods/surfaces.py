@@ -14,7 +14,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
-from reconstruction.method import Given, Method, Sensitivity
+from reconstruction.method import Given, Method, Sensitivity, cost_words
 from reconstruction.methods.variational import solve_tv_dict
 from reconstruction.result import Reconstruction
 from reconstruction.sparse import SparseSettings
@@ -79,13 +79,12 @@ def _solve(
 METHODS = (
     Method(
         "adaptive",
-        "surfaces whose disparity the evidence of patches chooses, and their texture; averaged "
-        "with sparse patches from two shots on",
-        "what is seen lies on surfaces, alike from all views but where one hides another; from two "
-        "shots on that or what `tv-dict` assumes, each where it holds",
-        "p patches 81 m^2/2 (2 + l d) + l (d + 28) m^3/6 for d disparities, l texture lengths; "
-        "2 x 8 x 12 x 32 N/6; 13 steps of tv; from two shots on that of tv-dict",
-        "any number of shots; nothing to train; disparity and standard deviation wanted",
+        "surfaces: disparity by comparing patches, then texture; averaged with TV + dictionary "
+        "from two shots on",
+        "the scene consists of opaque surfaces that look the same from all views; from two shots "
+        "on, that or what `tv-dict` assumes, each where it holds",
+        cost_words(1.4, 6.8),
+        "the default; gives disparity and standard deviation, needs no training",
         partial(_solve, "adaptive", lambda settings: settings),
         "adaptive",
         AdaptiveSettings,
@@ -93,10 +92,10 @@ METHODS = (
     ),
     Method(
         "adaptive-fast",
-        "as adaptive: fewer patches and disparities, fewer steps",
+        "as adaptive, with fewer patches, disparities and steps",
         "as adaptive",
-        "about a quarter of adaptive",
-        "previews; still ahead of tv from one shot",
+        cost_words(0.63, 1.3),
+        "previews; from one shot still more accurate than tv",
         partial(_solve, "adaptive-fast", fast),
         "adaptive",
         AdaptiveSettings,

@@ -131,7 +131,7 @@ def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:
         reason = worst.verdict.reasons[0]
         reasons.append(
             Reason(
-                f"{len(bad)} of {len(blocks)} blocks alone are worse, such as that from row "
+                f"{len(bad)} of {len(blocks)} blocks are worse than the whole, as that from row "
                 f"{worst.row}, column {worst.column}: {reason.what}",
                 share,
                 reason.remedy,

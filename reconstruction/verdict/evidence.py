@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
@@ -148,9 +149,12 @@ def gathered(
     frames, usable = np.where(read.usable, read.frames, 0), read.usable
     found = relief(psi, frames, noise_sigma, usable) if found is None else found
     masks = shadow(found)
-    off = displaced(psi, found)
-    shots = compared(found)
     residual = frames - psi.forward(result.light_field)
+    with ThreadPoolExecutor(1) as beside:  # the two that take long
+        given = psi, frames, residual, noise_sigma, usable, read.kept
+        baselines = beside.submit(over_baselines, *given)
+        off = displaced(psi, found)
+    shots = compared(found)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     step = quantised(frames, usable)
     return Evidence(
@@ -176,7 +180,7 @@ def gathered(
         short=read.short,
         gains=read.gains,
         parallax=_parallax(result.light_field, psi.view_axes),
-        **over_baselines(psi, frames, residual, noise_sigma, usable, read.kept),
+        **baselines.result(),
         blockiness=blockiness(frames, usable),
         steps=None if step is None else step / np.sqrt(12) / max(noise_sigma, 1e-12),
         stated=_stated(result),

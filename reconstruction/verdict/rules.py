@@ -58,7 +58,7 @@ OFF = Limits(0.0215, 0.05)
 """Share of readings that differ from all their neighbours. In clean frames of fine soil and leaves
 it is up to 2 %."""
 BAD = Limits(0.02, 0.1)
-"""Share of pixels that screening calls bad: where it is large, screening overlooks others."""
+"""Share of pixels that the clean-up calls bad: where it is large, others are overlooked."""
 SATURATED = Limits(0.14, 0.35)
 SHORT = Limits(0.02, 0.35)
 """Share of the readings."""
@@ -121,7 +121,7 @@ LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
 """For methods that lose little with one shot."""
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
-DRIFT = "run `emmc-rig calibrate --drift`, or take one whiteboard"
+DRIFT = "run `emmc-rig calibrate --drift`, or calibrate again"
 ANOTHERS = 0.5
 """Strength of another shot's masks above which, and of its own below which, shots are confused."""
 LEAST_STRENGTH = 0.25
@@ -155,7 +155,7 @@ class Verdict:
     def words(self) -> str:
         """The verdict in one line."""
         if not self.reasons:
-            return "trust: readings, masks and noise agree with the light field"
+            return "trust: the light field agrees with frames, Psi and noise"
         return f"{self.level}: " + "; ".join(f"{r.what}: {r.remedy}" for r in self.reasons)
 
     def __str__(self) -> str:
@@ -196,10 +196,10 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         limits = LEFT_OUT_OF_ONE if _sensitivity(e).one_shot else LEFT_OUT
         shots = ", ".join(str(shot + 1) for shot in e.left_out)
         yield Reason(
-            f"{len(e.left_out)} of {len(e.brightness)} shots were left out, dark or the same as "
-            f"another: {shots}",
+            f"{len(e.left_out)} of {len(e.brightness)} shots are excluded, as dark or as the same "
+            f"as another: {shots}",
             share,
-            "look at lamp and stage, and take them again",
+            "check lamp and stage, and capture them again",
             limits.level(share),
         )
     kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
@@ -207,9 +207,11 @@ def _shots(e: Evidence) -> Iterator[Reason]:
     dark = [shot for shot, brightness in enumerate(bright, 1) if brightness < DARK]
     if dark:
         yield Reason(
-            f"shot {dark[0]} is dark", bright[dark[0] - 1], "take it again, or leave it out",
+            f"shot {dark[0]} is dark",
+            bright[dark[0] - 1],
+            f"capture it again, or `emmc-rig reconstruct --without-shots {dark[0]}`",
             "do not use",
-        )  # fmt: skip
+        )
         return
     for shot in kept if len(kept) > 1 else []:
         row = e.other_strengths[shot]
@@ -219,7 +221,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             yield Reason(
                 f"shot {shot + 1} shows the masks of shot {t + 1}",
                 other,
-                "the stage did not move, or frames are out of order: take it again",
+                "the stage did not move, or frames are out of order: capture it again",
                 "do not use",
             )
             return
@@ -229,7 +231,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
     yield Reason(
         f"shot {worst + 1} differs in brightness by {apart[worst]:.1%}",
         apart[worst],
-        "steady the lamp, or normalise the frames by a reference",
+        "let the lamp warm up, or divide the frames by a reference",
         FLICKER.level(apart[worst]),
     )
     if e.motion is not None and e.motion > MOTION.doubt and e.moved_at and e.moved_px:
@@ -238,9 +240,9 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         if shot is not None:
             what = f"shot {shot + 1} saw another scene than the others"
             remedy += f", or `emmc-rig reconstruct --without-shots {shot + 1}`"
-        left_out = ", and is left out there" if shot is not None and e.moved else ""
+        excluded = ", and is excluded there" if shot is not None and e.moved else ""
         yield Reason(
-            f"{what} in {e.moved_px[0]}x{e.moved_px[1]} pixels about row {y}, column {x}{left_out}",
+            f"{what} in {e.moved_px[0]}x{e.moved_px[1]} pixels about row {y}, column {x}{excluded}",
             e.motion,
             remedy,
             MOTION.level(e.motion) if shot is None else "doubt",
@@ -255,14 +257,14 @@ def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
     worst = max(gains, key=lambda shot: abs(np.log(max(gains[shot], 1e-6))))
     apart = abs(gains[worst] - 1)
     darker = f"{apart:.1%} {'darker' if gains[worst] < 1 else 'brighter'}"
-    words = f"shot {worst + 1} is {darker} than the others, and was evened to them"
+    words = f"shot {worst + 1} is {darker} than the others, and was scaled to them"
     if len(gains) == 2:
         words = f"the two shots differ in brightness by {np.ptp(list(gains.values())):.1%}: which "
-        words += "is right is not known, and the light field has their mean"
+        words += "is right is not known, and the light field has their mean brightness"
     yield Reason(
         words,
         apart,
-        "steady the lamp, or normalise the frames by a reference",
+        "let the lamp warm up, or divide the frames by a reference",
         "doubt" if apart > FLICKER.doubt else "trust",
     )
 
@@ -283,12 +285,12 @@ def _coding(e: Evidence) -> Iterator[Reason]:
     A loss of strength counts beyond two deviations, and is measured to within two more: where these
     four exceed the limit of doubt, twice that limit may pass unnoticed.
     """
-    remedy = "measure Psi with whiteboards beside this capture, or use masks that show in a shot"
+    remedy = "calibrate beside this capture, or use masks that modulate a shot more"
     weakest = _strength(e)
     if weakest is None:
         yield Reason(
-            f"the masks change neighbouring readings by {e.relief:.1%}: whether Psi is the "
-            "camera's cannot be tested",
+            f"the masks change neighbouring readings by {e.relief:.1%} only: the frames cannot "
+            "show whether Psi is right",
             e.relief,
             remedy,
             "cannot tell",
@@ -297,7 +299,7 @@ def _coding(e: Evidence) -> Iterator[Reason]:
     deviation = max(error for error in e.strength_errors if error is not None)
     if 4 * deviation > STRENGTH_LOST.doubt * _patience(e, 0.85):
         yield Reason(
-            f"the masks' strength is known to {deviation:.1%} only: a Psi that is wrong may pass",
+            f"the masks' contrast is known to {deviation:.1%} only: a wrong Psi may go unnoticed",
             deviation,
             remedy,
             "cannot tell",
@@ -307,10 +309,10 @@ def _coding(e: Evidence) -> Iterator[Reason]:
 def _colour(e: Evidence) -> Iterator[Reason]:
     if e.colour_error is not None and e.colour_error > COLOUR_ERROR:
         yield Reason(
-            f"no pixel has a colour filter, and the masks show colours to {e.colour_error:.0%} of "
-            "the brightness only: others would explain the readings as well",
+            f"colours are uncertain by {e.colour_error:.0%} of the brightness: no pixel has a "
+            "colour filter, and the masks hardly tell colours apart",
             e.colour_error,
-            "take more shots, or a sensor with colour filters",
+            "capture more shots, or use a sensor with colour filters",
             "cannot tell",
         )
 
@@ -337,7 +339,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     patience = _patience(e, 0.0 if cause == "offset" else 0.85)
     weak = STRENGTH_LOST.times(patience).level(lost)
     displaced = DISPLACED_PX.times(_patience(e, 0.85)).level(moved)
-    shift = f"the masks' shadow lies about {moved:.2f} pixels from where Psi says"
+    shift = f"the masks' shadow is about {moved:.2f} pixels from its place in Psi"
     sure = abs(value) - 2 * deviation
     what, remedy = _named(cause, value, weakest[0])
     if displaced != "trust" and weakest[0] > LEAST_STRENGTH:
@@ -401,33 +403,33 @@ def _likeliest(causes: dict[str, tuple[float, float, float]]) -> tuple[str, floa
 
 def _named(cause: str, value: float, strength: float) -> tuple[str, str]:
     """Return a cause in words, with its size, and what to do about it."""
-    weak = f"the masks show at {strength:.0%} of the strength that Psi says"
+    weak = f"the masks' contrast is {strength:.0%} of that in Psi"
     size, more = abs(value), value > 0
     if strength < LEAST_STRENGTH:
-        return weak + ", as if they were others", DRIFT
+        return weak + ", as with other masks", DRIFT
     return {
         "offset": (
             f"the black level seems {size:.1%} of the mean reading too {'low' if more else 'high'}",
-            "take darks; where these agree, look for stray light",
+            "capture darks; where these agree, look for stray light",
         ),
         "gamma": (
             f"the readings follow the light to the power of {1 + value:.2f}",
-            "store frames without gamma or tone curve, or make them linear",
+            "store frames without gamma or tone curve, or linearise them",
         ),
         "blur": (
             f"{weak}, as if their shadow were {'blurred' if more else 'sharper'} by "
             f"{size**0.5:.1f} pixels{' more' if more else ''}",
-            "measure Psi with whiteboards as it is now, or blur its weights so",
+            "calibrate the bench as it is now",
         ),
         "distance": (
-            f"{weak}, as if they stood {size:.0%} {'further from' if more else 'nearer to'} the "
+            f"{weak}, as with masks {size:.0%} {'further from' if more else 'nearer to'} the "
             "sensor",
             DRIFT,
         ),
         "vignetting": (
             f"the outermost rays seem to lose {min(size, 1):.0%} {'more' if more else 'less'} than "
-            "Psi says",
-            "measure Psi with whiteboards at this aperture, or close the aperture",
+            "in Psi",
+            "calibrate at this aperture, or close the aperture",
         ),
     }.get(cause, (weak, DRIFT))
 
@@ -443,7 +445,7 @@ def _compression(e: Evidence) -> Iterator[Reason]:
     steps, share = e.steps or 0.0, e.noise_share or 0.0
     if steps > STEPS and steps * share**0.5 > STEPS_SHARE:
         yield Reason(
-            f"the readings come in steps, which add {steps:.1f} times the noise stated",
+            f"the readings are quantised: steps add {steps:.1f} times the sensor's noise",
             steps,
             "store more bits, or raise the gain",
             "doubt",
@@ -455,56 +457,56 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
     weakest = _strength(e)
     if weakest is None or weakest[0] > 1 - STRENGTH_LOST.doubt / 2 or e.off > OFF.refuse:
         yield Reason(
-            f"{e.off:.1%} of the readings are far off all around them",
+            f"{e.off:.1%} of the readings differ from all their neighbours",
             e.off,
-            "list dead and hot pixels (a dark and a reference frame show them), or expose less",
+            "mask dead and hot pixels (a dark and a reference frame show them), or expose less",
             OFF.level(e.off),
         )
     shots = len(e.strengths)
     bad = BAD.times(shots**0.75 * _sensitivity(e).bad_pixels)
     yield Reason(
-        f"{e.bad:.1%} of the pixels are bad and not listed",
+        f"{e.bad:.1%} of the pixels are bad, and not known as such",
         e.bad,
-        "list dead and hot pixels: a dark and a reference frame show them",
+        "mask dead and hot pixels: a dark and a reference frame show them",
         bad.level(e.bad),
     )
     yield Reason(
         f"{e.saturated:.0%} of the readings are saturated",
         e.saturated,
-        "expose less, or bracket",
+        "expose less, or bracket the exposure",
         SATURATED.level(e.saturated / shots**0.25),
     )
     yield Reason(
-        f"{e.short:.1%} of the readings are saturated where nothing else shows how bright it was",
+        f"{e.short:.1%} of the readings are saturated where no other shot or exposure is not",
         e.short,
-        "expose less, or bracket",
+        "expose less, or bracket the exposure",
         SHORT.level(e.short),
     )
     listed = e.unusable - e.saturated
     yield Reason(
         f"{listed:.0%} of the readings are of pixels that cannot be used",
         listed,
-        "take more shots, or have the sensor seen to",
+        "capture more shots, or replace the sensor",
         UNUSABLE.level(listed / shots**0.25),
     )
     yield Reason(
-        f"{e.blind:.0%} of the picture lies in holes that no shot sees, the largest "
-        f"{2 * e.hole_px:.0f} pixels wide at row {e.hole_at[0]}, column {e.hole_at[1]}",
+        f"{e.blind:.0%} of the picture has no usable reading in any shot; the largest hole is "
+        f"{2 * e.hole_px:.0f} pixels wide, at row {e.hole_at[0]}, column {e.hole_at[1]}",
         e.blind,
-        "expose less, bracket, or replace the sensor's dead area by another shot",
+        "expose less, bracket the exposure, or add a shot with the camera moved",
         BLIND.level(e.blind),
     )
 
 
 def _noise(e: Evidence) -> Iterator[Reason]:
-    light = "more light, longer exposure or more shots"
+    light = "add light, expose longer or capture more shots"
     if NOISE.level(e.noise) != "trust":
         yield Reason(
             f"noise is {e.noise:.0%} of the mean reading", e.noise, light, NOISE.level(e.noise)
         )
     elif e.noise_share is not None and e.noise > LEAST_NOISE:
         yield Reason(
-            f"noise is {e.noise_share:.0%} of the residual of the held-out readings",
+            f"noise is {e.noise_share:.0%} of the residual of the validation readings",
             e.noise_share,
             light,
             NOISE_SHARE.level(e.noise_share),
@@ -516,23 +518,25 @@ def _search(e: Evidence) -> Iterator[Reason]:
     decided, at_end = e.parameters.get("decided"), e.parameters.get("at_end", 0.0)
     picture, parallax = picture_name(e.view_axes), shows_parallax(e.view_axes)
     searched = "disparities" if parallax else f"shifts from {picture} to {picture}"
+    depth = "depth" if parallax else f"the shift from {picture} to {picture}"
     if decided is not None:
         yield Reason(
-            f"{1 - decided:.0%} of the textured patches fit all {searched} alike",
+            f"{depth} cannot be determined in {1 - decided:.0%} of the textured patches: all "
+            f"{searched} fit alike",
             decided,
-            f"use a mask that differs from {picture} to {picture}, or more shots",
+            f"use a mask that differs from {picture} to {picture}, or capture more shots",
             UNDECIDED.level(1 - decided),
         )
         if e.noise > NOISY and UNDECIDED.doubt > 1 - decided > LEFT_OPEN:
             yield Reason(
-                f"noise is {e.noise:.0%} of the mean reading, and {1 - decided:.0%} of the "
-                f"textured patches fit several {searched}",
+                f"noise is {e.noise:.0%} of the mean reading, and in {1 - decided:.0%} of the "
+                f"textured patches several {searched} fit",
                 e.noise,
-                "more light, longer exposure or more shots",
+                "add light, expose longer or capture more shots",
                 "doubt",
             )
     yield Reason(
-        f"{at_end:.0%} of the patches fit best at the end of the range of {searched} searched",
+        f"{at_end:.0%} of the patches fit best at the limit of the {searched} searched",
         at_end,
         "raise furthest_px" + (", or focus nearer to the scene" if parallax else ""),
         AT_END.level(at_end),
@@ -543,10 +547,10 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
     times = e.parameters.get("misfit", 0.0)
     row, column = (e.parameters.get(f"misfit_{axis}", 0.0) for axis in ("row", "column"))
     yield Reason(
-        f"the residual of the readings is {times:.1f} times their noise, largest near row "
-        f"{row:.0f}, column {column:.0f}",
+        f"unexplained residual of {times:.1f} sigma, largest near row {row:.0f}, column "
+        f"{column:.0f}",
         times,
-        "take more shots, or check the noise model and Psi",
+        "check Psi and the noise model, or capture more shots",
         MISFIT.level(times),
     )
 
@@ -554,28 +558,28 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
 def _fit(e: Evidence) -> Iterator[Reason]:
     if e.parallax is not None and e.parallax < LEAST_PARALLAX:
         yield Reason(
-            "the frames show no parallax: the light field is one picture for all views",
+            "scene treated as flat: the frames show no parallax, and all views are alike",
             e.parallax,
-            "focus nearer or farther, or take more shots, if the scene has depth",
+            "if the scene has depth, focus nearer or farther, or capture more shots",
             "cannot tell",
         )
     if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
         yield Reason(
-            f"the light field explains {max(e.explained, 0):.0%} of the detail that held-out "
-            "readings show beyond a smooth picture",
+            f"the light field explains {max(e.explained, 0):.0%} of the detail in the validation "
+            "readings, beyond a smooth picture",
             e.explained,
-            "take another method, or more shots",
+            "use another method, or capture more shots",
             UNEXPLAINED.level(1 - e.explained),
         )
     for over, what in (
         (e.over_flat, f"one picture for all {picture_name(e.view_axes)}s"),
-        (e.over_neighbours, "the mean of the readings beside"),
+        (e.over_neighbours, "the mean of neighbouring readings"),
     ):
         if over is not None and over > 1:
             yield Reason(
-                f"{what} foretells the readings kept from the fit better than the light field",
+                f"{what} predicts the validation readings better than the light field does",
                 over,
-                "check Psi and the noise, or take another method or more shots",
+                "check Psi and the noise, use another method, or capture more shots",
                 "doubt",
             )
 

@@ -72,7 +72,7 @@ def reconstruct_judged(
         read = dataclasses.replace(read, short=float(short.mean()))
         notes = (
             *notes,
-            f"{read.short:.1%} of the readings are saturated and count as what they read at least",
+            f"{read.short:.1%} of the readings are saturated, and taken as lower bounds",
         )
     shown = np.where(read.usable, read.frames, 0)
     seen = relief(psi, shown, typical, read.usable)
@@ -86,7 +86,7 @@ def reconstruct_judged(
         read = dataclasses.replace(read, kept=read.kept & ~found.moved)
         notes = (
             *notes,
-            f"left out {found.moved.mean():.1%} of the readings, where one shot saw another scene "
+            f"excluded {found.moved.mean():.1%} of the readings, where one shot saw another scene "
             "than the others",
         )
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))

@@ -27,7 +27,7 @@ PLAN = {
     "shots": [{"exposure_s": 0.02}],
     "whiteboards": {
         "views": [[0, 0], [1, 1], [2, 2], [4, 3]],
-        "open": [{"held_out": True, "repeats": 1}],
+        "open": [{"validation": True, "repeats": 1}],
         "repeats": 1,
         "references": 2,
         "exposure_s": 0.002,
@@ -75,7 +75,7 @@ def test_what_the_stage_lacks_is_asked_of_a_person_or_left_where_it_is():
 def test_nobody_there_to_move_an_axis_is_told_what_works_without_it():
     rig, _, camera, _ = bench_of(["mask_x", "mask_y"])
     frames = expand(Plan.model_validate(PLAN), camera, rig.window_um)
-    with pytest.raises(AppError, match=r"moves aperture_x and aperture_y.*--leave-out aperture"):
+    with pytest.raises(AppError, match=r"moves aperture_x and aperture_y.*--skip aperture"):
         with_hands(replace(rig, attendant=NoAttendant()), frames)
 
 

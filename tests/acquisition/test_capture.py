@@ -189,7 +189,7 @@ def test_a_resume_refuses_a_bench_whose_mask_has_slipped():
     rig, _ = bench_rig()
     slipped = replace(rig, zero_um={**rig.zero_um, "mask_x": rig.zero_um["mask_x"] + 72.0})
     again = Session(session.folder, session.disk)
-    with pytest.raises(AppError, match="no longer as it was"):
+    with pytest.raises(AppError, match="the bench has changed"):
         Sequencer(again, plan, slipped).run()
     assert len(again.stored) == 10
     assert any(entry.kind == "refused" for entry in again.journal.entries)
@@ -447,7 +447,7 @@ def test_a_frame_that_cannot_be_right_is_refused(kind, level, line):
 def test_a_frame_that_comes_twice_is_refused_and_another_one_is_not():
     one, other = frame_at(900), frame_at(900, seed=1)
     check(planned("shot"), other, figures(other), one.mosaic, Checks())
-    with pytest.raises(DriverError, match="once more, bit by bit"):
+    with pytest.raises(DriverError, match="is identical to the frame before it"):
         check(planned("shot"), one, figures(one), one.mosaic.copy(), Checks())
 
 
@@ -472,7 +472,7 @@ def test_a_camera_that_repeats_itself_once_costs_a_try():
     assert Sequencer(session, plan, rig).run().complete
     faults = [e.fault for e in of_kind(session.journal.entries, RetryEntry)]
     assert len(faults) == 1
-    assert "bit by bit" in faults[0]
+    assert "is identical to the frame before it" in faults[0]
     assert len(set(contents(session).values())) == 3
 
 
@@ -581,6 +581,16 @@ def test_frames_of_another_rig_are_refused(tmp_path):
     Sequencer(session, request.plan, rig).run()
     with pytest.raises(AppError, match="another rig"):
         begun_session(other)
+
+
+def test_a_session_goes_on_whose_rig_was_described_by_keys_of_an_earlier_version(tmp_path):
+    rig = still_rig()
+    earlier = replace(request_for(tmp_path, text=ONE_SHOT), rig={"stands_um": {"focus": 9.0}})
+    session = new_session(earlier, planned_frames(earlier, rig))
+    Sequencer(session, earlier.plan, rig).run()
+    assert begun_session(replace(earlier, rig={"fixed_positions_um": {"focus": 9.0}})) is not None
+    with pytest.raises(AppError, match="another rig"):
+        begun_session(replace(earlier, rig={"fixed_positions_um": {"focus": 8.0}}))
 
 
 def resident_bytes():

@@ -58,7 +58,7 @@ GUARDS = (
     "cannot be metered, the board is dark",  # such a frame is refused as black before
     "was not captured yet; resume it",  # only frames are read that were hashed just before
     "is damaged, its SHA-256 is not the journal's",
-    "states no deviation of its light field",  # its method does
+    "estimates no accuracy",  # its method does
     "); resume it",
     "no session, it holds no",  # a folder that is none is a plan, or the place for one
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
@@ -79,8 +79,8 @@ GUARDS = (
     "note() takes numbers, texts, lists and mappings",
     ", now it is on ",
     "no edge above the noise: light the scene",
-    "no sharpest place ",
-    "nobody who moves others: write by_hand: true",  # refused before a session is made
+    "no sharpest position ",
+    "moved by hand (by_hand: false): write by_hand: true",  # refused before a session is made
     "shows the shadow through ",  # walked in test_by_hand.py
     "shows the mask ",
     "an imported session takes no further frames",  # it is complete; its remedy is another import
@@ -253,7 +253,7 @@ PLANS = {
         {"camera": "camera.yaml", "shots": [ONE]},
         {"camera": "camera.yaml", "shots": [{**ONE, "mask_um": [24, 0]}]},
     ),
-    "is always its own: leave camera_shot out": (
+    "so that camera_shot has no effect: leave it out": (
         {**CHANGING, "shots": [{**ONE, "camera_shot": 1}]}, {**CHANGING, "shots": [ONE]},
     ),
 }  # fmt: skip
@@ -300,7 +300,7 @@ def a_target_without_boards(bench):
     calibration_plan(bench)
 
 
-@walk("--until: no open whiteboard of the plan is held out")
+@walk("--until: no open whiteboard of the plan has `validation: true`")
 def a_target_without_a_judge(bench):
     bench.small_camera(whiteboards={**PLAN["whiteboards"], "open": [{"repeats": 1}]})
     yield bench.refused(*CAPTURE, "--until", "30dB")
@@ -401,7 +401,7 @@ def a_lamp_left_on(bench):
     bench.light.factor = {}
 
 
-@walk("is the frame before it once more, bit by bit")
+@walk("is identical to the frame before it")
 def a_camera_that_repeats_itself(bench):
     bench.light.repeats = True
     yield bench.refused()
@@ -441,7 +441,7 @@ def faults_that_go_on(bench):
     bench.light.faults.clear()
 
 
-@walk("the bench is no longer as it was: frame ")
+@walk("the bench has changed: frame ")
 def a_board_that_was_moved(bench):
     bench.begun()
     bench.light.swapped = {"board-s1-v2-u2-white-r0": "elsewhere"}
@@ -464,7 +464,7 @@ def memory_that_loses_bits(bench):
 # What lies in the folder.
 
 
-@walk("name a plan, or write one with --new CAMERA")
+@walk("name a plan, or write one by --new CAMERA")
 def no_argument(bench):
     code, _, err = bench.run("capture")
     assert code == 2
@@ -537,7 +537,7 @@ def raises(code):
     return refuse
 
 
-@walk("); mend that")
+@walk("); correct that")
 def a_journal_that_cannot_be_read(bench):
     bench.begun()
     with pytest.MonkeyPatch.context() as patch:
@@ -546,7 +546,7 @@ def a_journal_that_cannot_be_read(bench):
     yield line
 
 
-@walk("); mend that, or name another folder")
+@walk("); correct that, or name another folder")
 def a_folder_that_cannot_be_made(bench):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Disk, "make_folder", raises(errno.EROFS))
@@ -637,7 +637,7 @@ EDITS = {
 WALKS |= {text: partial(edit_that_is_taken_back, edit=edit) for text, edit in EDITS.items()}
 
 
-@walk("shots: a mask shows another pattern in every shot")
+@walk("shots: a mask has another pattern in every shot")
 def more_shots_of_changing_patterns(bench):
     camera = "coded-aperture-sequential-random"
     bench.plan(camera=camera)
@@ -695,7 +695,7 @@ def work_by_hand_without_a_terminal(bench):
     bench.patch.setattr("sys.stdin", terminal)
 
 
-@walk(" cannot be said from number and exposures; name them by their frames")
+@walk(" frames by number and exposures; name them after the frames")
 def a_recording_of_two_files_for_each_frame(bench):
     assert bench.run(*CAPTURE)[0] == 0
     recorded = bench.folder / "recorded"
@@ -765,7 +765,7 @@ def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
         bench.light.faults[AGAIN] = fault
         line = bench.refused()
         assert str(fault) in line
-        assert "9 frames are kept: mend it, then run the same command" in line
+        assert "9 frames are kept: correct it, then run the same command" in line
         retries = of_kind(Session(bench.session).journal.entries, RetryEntry)
         assert retries[-1].attempt == (1 if isinstance(fault, HOPELESS) else 2)
     bench.light.faults.clear()

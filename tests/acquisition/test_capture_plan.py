@@ -24,6 +24,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.results import shown_bytes, shown_seconds
 from emmc_rig.model.camera import shipped_cameras
+from emmc_rig.model.settings import validated
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 WINDOW_UM = 40_000.0
@@ -195,7 +196,7 @@ def test_a_bad_plan_gives_one_line_that_names_what_is_wrong(tmp_path, changes, l
         ({"camera": "conventional", "shots": [{"mask_um": [1, 1]}]}, "no mask to move"),
         (
             {"camera": "programmable-aperture", "shots": [{"camera_shot": 3}, {}]},
-            "leave camera_shot out",
+            "camera_shot has no effect",
         ),
     ],
 )
@@ -245,7 +246,7 @@ def test_a_new_plan_for_every_camera_says_what_the_camera_says(tmp_path, name):
     path.write_text(new_plan(name, camera), encoding="utf-8")
     plan = load_plan(path)
     assert planned_camera(plan).shots == camera.shots
-    boards = Boards(open=(OpenBoard(held_out=True),))
+    boards = Boards(open=(OpenBoard(validation=True),))
     # Older plans, which do not name them, are expanded as before.
     darks = Darks(of_shots=4)
     assert Plan(camera=name, shots=plan.shots, title=name, whiteboards=boards, darks=darks) == plan
@@ -257,3 +258,9 @@ def test_what_differs_between_two_plans_is_named():
     assert differences(one, one) == []
     assert differences(other, one) == ["settle_s is 0.5, not 0.0"]
     assert differences(one, plan_of(shots=[{}]))[0] == "shots has 3 entries, not 1"
+
+
+def test_a_key_of_earlier_versions_is_read_under_its_new_name_and_not_beside_it():
+    assert validated(OpenBoard, {"held_out": True}, "plan", AppError) == OpenBoard(validation=True)
+    with pytest.raises(AppError, match="held_out is an earlier name of validation"):
+        validated(OpenBoard, {"held_out": True, "validation": True}, "plan", AppError)

@@ -24,7 +24,9 @@ darks: {repeats: 2}
 """
 
 
-def captured(tmp_path, focus, rig=f"focus_um: {FOCUS_UM}\nstands_um: {{focus: 8800}}", **more):
+def captured(
+    tmp_path, focus, rig=f"focus_um: {FOCUS_UM}\nfixed_positions_um: {{focus: 8800}}", **more
+):
     """Return the session of a plan that focuses so, on a simulated rig of that file."""
     (tmp_path / "plan.yaml").write_text(f"{PLAN}focus: {focus}\n")
     (tmp_path / "rig.yaml").write_text(f"kind: simulated\n{rig}\n")
@@ -71,7 +73,7 @@ def test_a_plan_that_says_nothing_of_the_kind_is_refused(tmp_path, focus):
 
 def test_where_no_peak_is_seen_the_axis_is_left_where_it_stood_and_the_capture_goes_on(tmp_path):
     told = []
-    rig = f"focus_um: {FOCUS_UM}\nstands_um: {{focus: 2000}}"
+    rig = f"focus_um: {FOCUS_UM}\nfixed_positions_um: {{focus: 2000}}"
     session = captured(
         tmp_path, "{span_um: 20}", rig=rig,
         on_event=lambda event: told.append(event.facts.get("text", "")),
@@ -115,7 +117,7 @@ def test_a_fault_is_met_by_focusing_from_where_it_began_or_by_going_back_there(l
     camera = plan_and_camera(text)[1]
     fine = fine_scene("deep-occlusions", 2, 2, size=size, views=camera.views)
     rig, _ = simulated_rig(
-        camera, fine.samples, size, 0, focus_um=FOCUS_UM, stands_um={"focus": 8800.0}
+        camera, fine.samples, size, 0, focus_um=FOCUS_UM, fixed_positions_um={"focus": 8800.0}
     )
     rig = replace(rig, camera=Faltering(rig.camera, lost, fault))
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig, text)

@@ -40,7 +40,11 @@ CAMERA = {
 PLAN = {
     "camera": "camera.yaml",
     "shots": [{"exposure_s": 0.05}] * 3,
-    "whiteboards": {"views": [[1, 1]], "shots": [0], "open": [{"repeats": 2}, {"held_out": True}]},
+    "whiteboards": {
+        "views": [[1, 1]],
+        "shots": [0],
+        "open": [{"repeats": 2}, {"validation": True}],
+    },
     "darks": {"repeats": 2},
 }
 
@@ -92,7 +96,7 @@ def session_until(folder, target, reason):
 def enough(tmp_path_factory):
     """A session that needed one shot of three."""
     folder = tmp_path_factory.mktemp("enough")
-    return session_until(folder, "12dB", "the target is reached, 2 shots spared")
+    return session_until(folder, "12dB", "the target is reached, 2 shots not needed")
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +123,7 @@ def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
 def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough):
     code, out, _ = program("session", "verify", enough)
     assert code == 0
-    assert "2 more frame(s) planned, which the scene did not need" in out
+    assert "2 more frame(s) planned, which were not needed" in out
     code, out, _ = program("session", "show", enough)
     assert "shot         1 of 1" in out
     assert "12 wanted; no more, the target is reached" in out
@@ -132,7 +136,7 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
 def test_its_page_shows_what_was_decided_and_when(every):
     page = sheet(Session(every))
     assert "Choice of shots" in page
-    assert "dB stated, " in page
+    assert "estimated accuracy " in page
     metrics = json.loads((every / "metrics.json").read_text())
     assert metrics["decided"][0]["shots"] == [0]
     assert metrics["spared"] == 0
@@ -249,7 +253,7 @@ def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_
         ({"darks": None}, "30", "no darks"),
         ({"whiteboards": {"views": [[1, 1]]}}, "30", "neither open whiteboards nor the pinhole"),
         ({"whiteboards": {"shots": [0]}}, "30", "neither open whiteboards nor the pinhole"),
-        ({"whiteboards": {"open": [{}]}}, "30", "held out"),
+        ({"whiteboards": {"open": [{}]}}, "30", "has `validation: true`"),
     ],
 )
 def test_a_capture_that_cannot_spare_shots_says_why_and_makes_nothing(
@@ -274,7 +278,7 @@ def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cos
     assert stated_psnr_db(few) == pytest.approx(18.5)
     assert few.stated["stated_interval_db"] == pytest.approx([16.5, 20.5])
     assert result_with().stated == {"stated_db": None, "stated_interval_db": None}
-    with pytest.raises(AppError, match="states no deviation"):
+    with pytest.raises(AppError, match="estimates no accuracy"):
         stated_psnr_db(result_with())
 
 

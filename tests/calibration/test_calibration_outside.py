@@ -150,7 +150,7 @@ def test_a_mask_that_moves_before_the_board_turns_makes_no_board_uneven(moved_um
 def test_boards_turned_either_way_round_show_how_uneven_they_are(sense):
     found, by_route = measured(turns=TURNS, optics={"board": 0.1, "turn_sense": sense})
     assert "uneven by 10" in said(found)
-    assert ("the other way" in said(found)) == (sense < 0)
+    assert ("counterclockwise" in said(found)) == (sense < 0)
     assert is_true(by_route["parametric"])
     assert by_route["parametric"]["true"] < 0.006
 
@@ -158,7 +158,7 @@ def test_boards_turned_either_way_round_show_how_uneven_they_are(sense):
 @pytest.mark.slow
 def test_a_board_turned_once_tells_nothing_of_its_sense_and_both_are_counted():
     found, by_route = measured(turns=(90.0,), optics={"board": 0.1, "turn_sense": -1})
-    assert "which way it was turned is not known" in said(found)
+    assert "whether it was turned clockwise is not known" in said(found)
     assert by_route["parametric"]["two"] > 0.9
 
 
@@ -189,6 +189,6 @@ def test_what_may_be_the_lens_as_well_is_named_with_its_size(flaw):
 )
 def test_masks_that_stand_elsewhere_than_the_stage_says_are_named_and_counted(course, words):
     found, by_route = measured(course=course)
-    assert "the mask stands elsewhere than the stage says" in said(found)
+    assert "the mask is not where the stage reports it" in said(found)
     assert words in said(found)
     assert by_route["parametric"]["two"] > 0.9

@@ -57,14 +57,14 @@ def test_few_whiteboards_never_take_more_frames_than_every_view(
 
 
 def test_where_the_aperture_stays_open_only_the_mask_moves(run, tmp_path):
-    asked = ("calibrate", "--plan", "--leave-out", "aperture", "--size", "96x128")
+    asked = ("calibrate", "--plan", "--skip", "aperture", "--size", "96x128")
     code, _, _ = run(*asked, "--target", "0.01", "--out", tmp_path / "plan")
     assert code == 0
     boards = yaml.safe_load((tmp_path / "plan" / "plan.yaml").read_text())["whiteboards"]
     assert boards["views"] == []
     assert not any("window" in one for one in boards["open"])
     places = {
-        tuple(one.get("mask_um", (0, 0))) for one in boards["open"] if not one.get("held_out")
+        tuple(one.get("mask_um", (0, 0))) for one in boards["open"] if not one.get("validation")
     }
     assert len(places) == 4
     metrics = json.loads((tmp_path / "plan" / "metrics.json").read_text())
@@ -72,7 +72,7 @@ def test_where_the_aperture_stays_open_only_the_mask_moves(run, tmp_path):
     assert "aperture" in metrics["left_out"]
     code, _, said = run(*asked, "--target", "0.0001", "--out", tmp_path / "none")
     assert code == 1
-    assert "open the aperture in parts" in said
+    assert "or plan without --skip aperture" in said
     assert not (tmp_path / "none" / "plan.yaml").exists()
 
 

@@ -197,7 +197,7 @@ def test_a_footprint_list_gives_the_same_reading():
     np.testing.assert_allclose(read, shadow.readings(pixels, colours, every, (4.0, 0.0)), rtol=3e-3)
 
 
-def test_a_camera_without_one_mask_before_its_sensor_is_sent_to_the_free_route():
+def test_a_camera_without_one_mask_before_its_sensor_is_sent_to_method_free():
     camera = camera_of(masks={}, shots=[{}])
-    with pytest.raises(CalibrationError, match="use the free route"):
+    with pytest.raises(CalibrationError, match="use method free"):
         shadow_mask(camera, SIZE)

@@ -1,4 +1,4 @@
-"""The free route of `calibrate SESSION`: Psi written to disk view by view is Psi in memory."""
+"""The method free of `calibrate SESSION`: Psi written to disk view by view is Psi in memory."""
 
 import json
 
@@ -30,7 +30,7 @@ def test_psi_on_disk_is_psi_in_memory(session, tmp_path, monkeypatch):
     whole.save(tmp_path / "whole")
     monkeypatch.setattr(frames, "BAND_PIXELS", 5 * SIZE[1])
     out = tmp_path / "streamed"
-    assert exit_code("calibrate", session.folder, "--route", "free", "--out", out) == 0
+    assert exit_code("calibrate", session.folder, "--method", "free", "--out", out) == 0
     psi = ImagingMatrix.load(out / "psi.h5")
     np.testing.assert_allclose(psi.weights, whole.psi.weights, rtol=1e-6, atol=1e-9)
     assert psi.camera_json == whole.psi.camera_json

@@ -39,7 +39,7 @@ PLAN = {
         "views": [[2, 2]],
         "shots": [0],
         "references": 2,
-        "open": [{"repeats": 2}, {"held_out": True}],
+        "open": [{"repeats": 2}, {"validation": True}],
     },
     "darks": {"repeats": 2},
 }
@@ -100,7 +100,7 @@ def test_a_session_goes_on_without_its_rig_and_calibrates_to_a_folder(tmp_path, 
     calibration.save("psi")
     saved = ImagingMatrix.load(tmp_path / "psi" / "psi.h5")
     np.testing.assert_array_equal(saved.weights, calibration.psi.weights)
-    assert "route, whiteboard held out" in repr(calibration)
+    assert "validation error" in repr(calibration)
     assert "32x48" in repr(calibration)
     psi, frames = emmc.open_frames(session.folder)
     assert frames.shape == psi.frames_shape == (1, 32, 48)

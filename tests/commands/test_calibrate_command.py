@@ -87,7 +87,7 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
             "calibrate", "--camera", camera_file, *SIZE, "--plan", "--target", target, "--out", out
         )
         assert code == 0
-        assert "frames for a relative error of Psi" in said
+        assert "frames; expected calibration error 0." in said
         plan = json.loads((out / "metrics.json").read_text())
         assert plan["expected_relative_error"] <= float(target)
         opened = {tuple(one["pinhole"]) for one in plan["whiteboards"] if one["pinhole"]}

@@ -434,7 +434,7 @@ def test_files_of_any_name_are_taken_in_order_where_all_exposures_agree(
     (recorded / "0.dng").unlink()
     code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml", "--out", "other")
     assert code == 1
-    assert "name them by their frames" in one_line(err)
+    assert "name them after the frames" in one_line(err)
     assert not (tmp_path / "other").exists()
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,12 +11,15 @@ import time
 import cv2
 import numpy as np
 import pytest
+import typer
 import yaml
 from programs import one_line
 
+from emmc_rig import cli
 from emmc_rig.version import __version__
 
 SMALL = ["--size", "24x32"]
+COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def views_in(folder, rows=2, columns=2, size=(24, 32)):
@@ -157,11 +161,13 @@ def test_unknown_names_and_sizes_are_one_line(run):
     assert (code, "more_shots_step_um" in one_line(err)) == (1, True)
 
 
-def test_solver_settings_that_make_no_sense_are_one_line(run):
-    for option, value in (("--mu", -1), ("--mu", "nan"), ("--chroma-weight", 0)):
-        code, _, err = run("demo", *SMALL, "--method", "tv", option, value, "--out", "r")
+def test_solver_settings_that_make_no_sense_are_one_line(run, tmp_path):
+    settings = tmp_path / "settings.yaml"
+    for name, value in (("mu", -1), ("mu", ".nan"), ("chroma_weight", 0)):
+        settings.write_text(f"tv: {{{name}: {value}}}\n")
+        code, _, err = run("reconstruct", "frames", "--settings", settings)
         assert code == 1
-        assert option.strip("-").replace("-", "_") in one_line(err)
+        assert f"tv.{name}" in one_line(err)
 
 
 def test_wrong_usage_is_exit_code_2(run):
@@ -180,7 +186,10 @@ def test_version_and_help_are_printed(run):
     assert run("--version")[:2] == (0, f"emmc-rig {__version__}\n")
     code, out, _ = run("--help")
     assert code == 0
-    assert "demo" in out
+    panels = re.findall(r"─ (\w+) ─", out)
+    assert panels == ["Options", "Bench", "Results", "Studies"]
+    listed = re.findall(r"^│ ([a-z]+) ", out, re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
 
 
 @pytest.mark.slow

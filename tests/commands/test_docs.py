@@ -1,9 +1,11 @@
 """The documentation is run: every command block, as it stands, in order, in one fresh folder.
 
 A comment before a block says why it is only parsed, not run: it needs hardware, or real files, or
-takes minutes. EMMC_SIZE, which the README names, makes the rest small.
+takes minutes. EMMC_SIZE, which docs/commands.md names, makes the rest small.
 """
 
+import csv
+import itertools
 import re
 import runpy
 import shlex
@@ -120,6 +122,40 @@ def test_every_camera_and_bench_is_drawn_as_the_script_draws_it(tmp_path):
         assert (pictures / f"bench-{name}.svg").read_text() == script["drawn"](name)
 
 
+def test_every_concept_is_drawn_as_the_script_draws_it_and_shown():
+    pictures = ROOT / "docs" / "pictures"
+    script = runpy.run_path(str(pictures / "draw_concepts.py"))
+    shown = set(
+        re.findall(r"pictures/concepts-([\w-]+)\.svg", (ROOT / "docs/concepts.md").read_text())
+    )
+    assert shown == set(script["PICTURES"])
+    for name in shown:
+        assert (pictures / f"concepts-{name}.svg").read_text() == script["drawn"](name)
+
+
+@pytest.mark.slow
+def test_every_step_of_adaptive_has_its_picture():
+    script = runpy.run_path(str(ROOT / "docs" / "pictures" / "draw_adaptive.py"))
+    page = (ROOT / "docs" / "adaptive.md").read_text()
+    for name, figure in script["figures"]((32, 40)).items():
+        assert f"pictures/adaptive-{name}.webp" in page
+        assert (ROOT / "docs" / "pictures" / f"adaptive-{name}.webp").is_file()
+        assert all(axes.has_data() for axes in figure.axes)
+
+
+def test_the_readmes_animation_turns_a_view_beside_the_frame():
+    script = runpy.run_path(str(ROOT / "docs" / "pictures" / "draw_parallax.py"))
+    light_field = np.random.default_rng(0).random((5, 5, 16, 20, 3)).astype(np.float32)
+    pictures = script["animation"](light_field[0, 0, ..., 0], light_field, np.ones((16, 20)))
+    left, right = (
+        np.stack([np.asarray(one)[:30, part] for one in pictures])
+        for part in (slice(0, 37), slice(54, None))
+    )
+    assert (left == left[0]).all()
+    assert all((one != other).any() for one, other in itertools.pairwise(right))
+    assert 1e5 < (ROOT / "docs" / "pictures" / "parallax.webp").stat().st_size < 1.5e6
+
+
 @pytest.mark.parametrize("name", ["plot_8_turntable", "plot_9_power_meter"])
 def test_the_worked_hooks_run_and_note_what_they_are_for(name):
     names = runpy.run_path(str(ROOT / "docs" / "examples" / f"{name}.py"))
@@ -175,3 +211,19 @@ def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
             lost = [path for path in before if after.get(path) != before[path]]
             grown = [path for path in lost if path.name == "journal.jsonl"]
             assert all(ours.get(path) == before[path] or path in grown for path in lost), lost
+
+
+def test_the_page_of_results_its_charts_and_the_readmes_table_are_what_the_command_makes():
+    made = runpy.run_path(str(ROOT / "benchmarks" / "results_page.py"))["made"]()
+    charts = {path for path in made if path.suffix == ".svg"}
+    assert charts == set((ROOT / "docs" / "results" / "charts").iterdir())
+    stale = [path.name for path, text in made.items() if path.read_text("utf-8") != text]
+    assert not stale, "run `python benchmarks/results_page.py`"
+
+
+def test_every_csv_of_results_says_when_and_by_which_command_it_was_measured():
+    results = ROOT / "docs" / "results"
+    with (results / "runs.csv").open(newline="", encoding="utf-8") as opened:
+        runs = {row["file"]: row for row in csv.DictReader(opened)}
+    assert set(runs) == {path.name for path in results.glob("*.csv")} - {"runs.csv"}
+    assert all(row["date"] and row["version"] and row["command"] for row in runs.values())

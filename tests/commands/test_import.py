@@ -33,7 +33,7 @@ PLAN = {
         "references": 2,
         "lamp_checks": 2,
         "turned": 2,
-        "open": [{"held_out": True}, {"mask_um": [0, 0]}, {"mask_um": [24, 0]}],
+        "open": [{"validation": True}, {"mask_um": [0, 0]}, {"mask_um": [24, 0]}],
     },
     "darks": {"repeats": 2, "of_shots": 2},
 }

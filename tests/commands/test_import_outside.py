@@ -92,7 +92,7 @@ def test_a_photograph_of_the_mask_and_four_files_become_the_light_field(tmp_path
     assert 10 * np.log10(1 / np.mean((field - truth) ** 2)) > 34
     found = verdict(tmp_path / "bench")
     assert found["level"] == "trust", found["reasons"]
-    assert "which no whiteboard measured" in metrics_of(tmp_path / "bench")["assumed"]
+    assert "not calibrated" in metrics_of(tmp_path / "bench")["assumed"]
 
 
 def gamma(bits):
@@ -192,7 +192,7 @@ def whiteboards(folder, bench, pinhole_s):
     for view in np.ndindex(bench.optics.views):
         take(4, "whiteboard", pinhole_s, view=view)
     for x, y in ((0, 0), (15, -21)):
-        take(4, "held-out", 0.15, mask_x_um=x, mask_y_um=y)
+        take(4, "validation", 0.15, mask_x_um=x, mask_y_um=y)
     take(2, "shot", 0.15, shot=0)
     with (folder / "table.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))

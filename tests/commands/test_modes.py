@@ -64,12 +64,11 @@ def test_an_option_without_the_one_that_it_needs_is_refused(command, name, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("option", ["--mu", "--chroma-weight"])
-def test_settings_of_a_method_are_refused_on_another(option, tmp_path, monkeypatch):
+def test_a_dictionary_is_refused_on_a_method_without_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, _, err = program("demo", "--method", "adaptive", option, "1")
+    code, _, err = program("demo", "--method", "adaptive", "--dictionary", "dct")
     assert code == 2
-    assert option in err
+    assert "--dictionary" in err
     assert not list(tmp_path.iterdir())
 
 
@@ -91,3 +90,15 @@ def test_options_of_the_simulated_rig_are_refused_on_another(tmp_path, monkeypat
     assert "--seed" in err
     code, _, err = program("live", "--camera", "simulated", "--scene", "near-planar")
     assert code == 2
+
+
+def test_options_of_earlier_versions_are_taken_under_their_new_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for typed in (["--leave-out", "hue"], ["--leave-out=hue"]):
+        code, _, err = program("calibrate", "--plan", *typed)
+        assert (code, "--skip hue: use some of lamp" in err) == (1, True), err
+    code, _, err = program("calibrate", "--plan", "--route", "free")
+    assert code == 2
+    assert "--method: no effect with --plan" in err.replace("\n", " ")
+    _, out, _ = program("calibrate", "--help")
+    assert "--route" not in out

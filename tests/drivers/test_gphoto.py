@@ -210,7 +210,7 @@ def test_a_short_name_and_a_file_open_it(address, tmp_path):
     with closing(open_camera(f"gphoto2:{address}")) as camera:
         assert camera.shape == (40, 48)
     file = tmp_path / "camera.yaml"
-    file.write_text(f"{{kind: gphoto2, address: '{address}', settings: {{iso: 100}}}}")
+    file.write_text(f"{{driver: gphoto2, address: '{address}', settings: {{iso: 100}}}}")
     with closing(open_camera(str(file))) as camera:
         assert camera.gain == 1.0
     file.write_text("{kind: gphoto2, setings: {iso: 100}}")

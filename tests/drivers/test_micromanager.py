@@ -257,7 +257,7 @@ def test_an_encoder_that_knows_its_place_is_confirmed_after_a_reconnect(sequence
 
 
 def test_files_and_short_names_open_both_by_name(tmp_path):
-    (tmp_path / "camera.yaml").write_text(f"{{kind: mm, address: {DEMO}, binning: 4}}")
+    (tmp_path / "camera.yaml").write_text(f"{{driver: mm, address: {DEMO}, binning: 4}}")
     (tmp_path / "stage.yaml").write_text(
         f"{{protocol: mm, port: {DEMO}, axes: {{mask_x: XY.x, mask_y: XY.y}},"
         " travel_um: {mask_x: [0, 900], mask_y: [0, 900]}}"

@@ -136,7 +136,7 @@ def test_the_file_of_a_psi_is_exported_without_frames(tmp_path, monkeypatch):
         (("export", "psi", "nowhere"), 1, "nowhere: no such file"),
         (("export", "psi", "noise.h5"), 1, "noise.h5: "),
         (("export", "psi", "noise.h5", "--format", "tiff"), 2, "there are npz, mat"),
-        (("export", "near-planar", "noise.h5"), 2, "goes with `psi` alone"),
+        (("export", "near-planar", "noise.h5"), 2, "export one light field at a time"),
     ],
 )
 def test_what_is_no_psi_is_refused_and_nothing_is_written(tmp_path, monkeypatch, words, code, said):

@@ -14,7 +14,7 @@ PLAN = {
     "shots": [{"exposure_s": 0.02}],
     "whiteboards": {
         "views": [[0, 0], [1, 1]],
-        "open": [{"held_out": True, "repeats": 1}],
+        "open": [{"validation": True, "repeats": 1}],
         "repeats": 1,
         "references": 2,
         "exposure_s": 0.002,

@@ -428,7 +428,7 @@ def test_in_the_dark_an_exposure_climbs_to_4_s_and_comes_back_and_says_what_to_d
         until(watch, lambda state: state["figures"])
         watch.auto_expose()
         dark = until(watch, lambda state: state["trouble"]["setting"])
-        assert "dark at 4 s too: light the lamp" in dark["trouble"]["setting"]
+        assert "dark at 4 s too: switch the lamp on" in dark["trouble"]["setting"]
         until(watch, lambda state: state["settings"]["exposure_s"] == 0.01)
         assert max(asked_s) == 4.0
         camera.light = 2.0
@@ -746,7 +746,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "code", "reported"),
     [
-        (("--camera", "nonsense:"), 1, "no such kind of camera"),
+        (("--camera", "nonsense:"), 1, "no such camera driver"),
         (("--rig", "nowhere.yaml"), 1, "nowhere.yaml"),
         (("--rig", "simulated", "--camera", "simulated"), 2, "either --rig"),
         (("--rig", "simulated", "--host", "203.0.113.7"), 1, "cannot serve"),

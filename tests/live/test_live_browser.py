@@ -350,7 +350,7 @@ def test_a_black_picture_says_why_and_the_next_step_stands_below_it(page, rig):
     rig.attendant.set_lamp("off")
     try:
         wait(page, lambda: text(page, "why") == text(page, "hint-text") != "")
-        assert "light the lamp" in text(page, "why")
+        assert "switch the lamp on" in text(page, "why")
         assert not page.find_element(By.ID, "next").is_displayed()
     finally:
         rig.attendant.set_lamp("white")

@@ -74,7 +74,7 @@ def test_a_peak_and_its_deviation_are_those_of_the_parabola():
     assert abs(off.mean()) < 4 * off.std() / np.sqrt(300)
     # Stated by the larger of errors and scatter, it is a little too large on average.
     assert 0.9 < np.median(stated) / off.std() < 1.5
-    with pytest.raises(AppError, match="no sharpest place"):
+    with pytest.raises(AppError, match="no sharpest position"):
         peak(places, places / 10, errors)
 
 
@@ -155,6 +155,15 @@ def test_only_what_was_chosen_and_previewed_is_written_and_nothing_when_the_file
     with pytest.raises(AppError, match="changed meanwhile"):
         files.save()
     assert rig.read_text() == RIG_YAML + "by_hand: false\n"
+
+
+def test_a_place_is_written_where_a_file_of_an_earlier_version_has_it(tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG_YAML + "stands_um: {focus: 9000}\n")
+    files = Files(rig=rig)
+    files.preview(found(), ["focus"])
+    files.save()
+    assert rig.read_text() == RIG_YAML + "stands_um: {focus: 8000.0}\n"
 
 
 def test_a_text_that_cannot_be_edited_in_place_is_left_and_the_line_to_write_is_named():

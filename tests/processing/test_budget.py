@@ -42,7 +42,7 @@ def test_a_budget_takes_the_most_accurate_within_it(monkeypatch):
         taken, why = method_within(NOT_READ, NOT_READ, text)
         assert taken == method
         assert f"about {10 * COST[method]:.2g} s" in why
-        assert ("none keeps to" in why) == (text == "0.5")
+        assert ("none is done within" in why) == (text == "0.5")
 
 
 @pytest.fixture(scope="module")

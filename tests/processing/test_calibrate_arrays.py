@@ -19,8 +19,8 @@ POSES = [
     {"mask_um": (0.0, 0.0)},
     {"mask_um": (270.0, 162.0)},
     *({"view": view} for view in ((1, 1), (0, 0), (2, 0), (0, 2), (2, 2))),
-    {"mask_um": (0.0, 0.0), "held_out": True},
-    {"mask_um": (-207.0, 118.0), "held_out": True},
+    {"mask_um": (0.0, 0.0), "validation": True},
+    {"mask_um": (-207.0, 118.0), "validation": True},
 ]
 REPEATS = 4
 NOISE = CAMERA.sensor.noise
@@ -67,7 +67,7 @@ def test_arrays_make_the_psi_of_the_bench(bench, calibrated):
     assert build_imaging_matrix(CAMERA, SIZE).relative_difference(exact) > 0.1
     assert report.psi is psi
     assert report.held_out_error < 0.02
-    assert "route, whiteboard held out to" in repr(report)
+    assert "validation error" in repr(report)
 
 
 @pytest.mark.slow
@@ -85,9 +85,9 @@ def test_arrays_make_the_same_psi_as_the_board_sets_that_a_session_makes(taken, 
         (BoardFrame.held(m, p.get("mask_um", (0.0, 0.0)), 0, p.get("view")), p)
         for m, p in list(zip(means, poses, strict=True))[1:]
     ]
-    fitted = [one for one, pose in frames if not pose.get("held_out")]
+    fitted = [one for one, pose in frames if not pose.get("validation")]
     fitted.sort(key=lambda one: one.pinhole is not None)
-    held_out = every.with_frames([one for one, pose in frames if pose.get("held_out")])
+    held_out = every.with_frames([one for one, pose in frames if pose.get("validation")])
     layout = psi_layout(CAMERA, SIZE)
     few = every.with_frames(fitted)
     outcome = calibrate(CAMERA, layout, ("parametric", "mixed"), held_out, few)
@@ -122,15 +122,15 @@ MISTAKES = {
         r"poses\[1\]: unknown key 'mask_mm': did you mean 'mask_um'",
     ),
     "no darks": ({"darks": None}, "darks: got None; it takes an array"),
-    "no reference": ({"poses": [{}, {}]}, "none is a reference"),
-    "nothing held out": ({}, "there are no whiteboards held out"),
+    "no reference": ({"poses": [{}, {}]}, "a whiteboard without the mask"),
+    "no validation": ({}, "they have no validation whiteboard"),
     "another size": ({"darks": DARK[:, :-2]}, r"whiteboards\[0\]: \(44, 60\) pixels, the darks"),
     "a hole": ({"whiteboards": [BOARD, BOARD * np.nan]}, r"whiteboards\[1\]: holds values that"),
     "a flat list": ({"whiteboards": [1, 2]}, r"whiteboards\[0\]: got 1; it takes DN"),
     "no list": ({"whiteboards": None}, "whiteboards: got None; it takes a list of arrays"),
     "poses in mm": (
         {"poses": [{"reference": True}, {"mask_um": (0.27, 0.162)}]},
-        r"moves by 0.27 um at most, its cells are [\d.]+ um: .* were these mm\?",
+        r"moves by 0.27 um at most, and its cells are [\d.]+ um wide: .* were these mm\?",
     ),
     "a place that is no number": (
         {"poses": [{"reference": True}, {"mask_um": (0, np.nan)}]},

@@ -40,12 +40,12 @@ def captured(tmp_path_factory):
 def test_the_plan_written_is_one_that_captures(captured):
     plan = load_plan(captured / "plan" / "plan.yaml")
     assert plan.whiteboards is not None
-    kinds = [board.held_out for board in plan.whiteboards.open]
+    kinds = [board.validation for board in plan.whiteboards.open]
     assert True in kinds
     assert False in kinds
     metrics = json.loads((captured / "plan" / "metrics.json").read_text())
     planned = [one["frames"] for one in metrics["whiteboards"] if not one["pinhole"]]
-    assert [b.repeats for b in plan.whiteboards.open if not b.held_out] == planned
+    assert [b.repeats for b in plan.whiteboards.open if not b.validation] == planned
     assert plan.whiteboards.views == "all"
 
 
@@ -76,9 +76,9 @@ def test_a_session_is_read_by_the_psi_that_its_open_whiteboards_give(captured):
     assert np.isfinite(found.readings[found.usable]).all()
 
 
-def test_the_free_route_takes_the_same_session(captured):
+def test_the_method_free_takes_the_same_session(captured):
     out = captured / "free"
-    assert exit_code("calibrate", captured / "session", "--route", "free", "--out", out) == 0
+    assert exit_code("calibrate", captured / "session", "--method", "free", "--out", out) == 0
     surest = json.loads((captured / "calibration" / "metrics.json").read_text())
     assert surest["chosen"] in ("combined", "free")
     free, both = (ImagingMatrix.load(one / "psi.h5") for one in (out, captured / "calibration"))
@@ -109,7 +109,7 @@ def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured,
 def test_whiteboards_for_shots_or_stages_that_are_not_there_are_refused(tmp_path, capsys):
     for wrong, line in (
         ({"shots": [3]}, "none of the 1 shots"),
-        ({"open": [{"mask_um": [0, 0], "held": True}]}, "held_out"),
+        ({"open": [{"mask_um": [0, 0], "valid": True}]}, "validation"),
     ):
         path = tmp_path / "plan.yaml"
         plan = {"camera": "rgbw-bayer-1shot", "shots": [{}], "whiteboards": wrong}
@@ -145,7 +145,7 @@ def test_a_session_corrects_what_is_wrong_with_lamp_sensor_and_board(tmp_path, c
 
 def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, capsys):
     plan, out = tmp_path / "plan", tmp_path / "session"
-    without = ("--leave-out", "lamp,response,colours,turned")
+    without = ("--skip", "lamp,response,colours,turned")
     assert exit_code("calibrate", "--plan", "--size", "32x48", *without, "--out", plan) == 0
     whiteboards = load_plan(plan / "plan.yaml").whiteboards
     assert whiteboards is not None
@@ -161,5 +161,5 @@ def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, caps
     assert "two references at each of four (it has" in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "sheet").exists()
     assert exit_code("calibrate", "--sensor", "--out", tmp_path / "sheet") == 2
-    assert exit_code("calibrate", "--plan", "--leave-out", "hue", "--out", tmp_path / "x") == 1
+    assert exit_code("calibrate", "--plan", "--skip", "hue", "--out", tmp_path / "x") == 1
     assert "colours" in capsys.readouterr().err

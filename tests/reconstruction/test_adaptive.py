@@ -333,8 +333,9 @@ def test_sigma_is_calibrated_on_the_planted_plane(planted):
 
 
 @pytest.mark.slow
-def test_intervals_hold_true_psnrs_and_deviations_most_errors():
-    """Of twelve captures nine at least: of intervals for 9 in 10, in 97 of 100 cases."""
+@pytest.mark.parametrize(("method", "at_least"), [("adaptive", 11), ("adaptive-fast", 9)])
+def test_intervals_hold_true_psnrs_and_deviations_most_errors(method, at_least):
+    """Of twelve captures: fitted on `adaptive`, all of them; of `adaptive-fast`, to 0.5 dB."""
     held = []
     for scene, camera, seed in itertools.product(
         ("deep-occlusions", "dark", "non-lambertian"),
@@ -342,13 +343,15 @@ def test_intervals_hold_true_psnrs_and_deviations_most_errors():
         (7, 8),
     ):
         given = trial_of(Capture(scene, camera, (48, 64), seed=seed, noise=0.003))
-        found = given.solved("adaptive-fast")
+        found = given.solved(method)
         low_db, high_db = found.stated["stated_interval_db"]
-        held.append(low_db < given.psnr_db(found.light_field) < high_db)
+        psnr_db = given.psnr_db(found.light_field)
+        assert low_db - 0.6 < psnr_db < high_db + 0.6
+        held.append(low_db < psnr_db < high_db)
         assert high_db - low_db == pytest.approx(2 * within_db(found.parameters["decided"]))
         error = np.abs(found.light_field - given.truth)
         assert 0.5 < np.mean(error <= found.maps["sigma"][..., None]) < 0.8
-    assert sum(held) >= 9
+    assert sum(held) >= at_least
 
 
 def test_an_interval_is_wider_where_patches_do_not_decide():

@@ -9,7 +9,6 @@ from reconstruction.adaptive.lanes import (
     TAPS,
     add_box,
     add_taps,
-    copy_box,
     read_box,
     read_taps,
 )
@@ -25,11 +24,6 @@ def reads_box(texture, cells, vectors):
 @njit
 def adds_box(texture, cells, vectors, value):
     add_box(texture, AT, WIDE, cells, START, HEIGHT, vectors, value)
-
-
-@njit
-def copies_box(texture, cells, vectors):
-    copy_box(texture, AT, WIDE, cells, START, HEIGHT, vectors)
 
 
 @njit
@@ -62,16 +56,6 @@ def test_boxes_are_read_and_added_as_sums_of_products(kind, vectors):
     below(expected, vectors)[:] += np.float32(0.3) * box
     adds_box(texture, cells, vectors, np.float32(0.3))
     np.testing.assert_allclose(texture, expected, rtol=1e-5, atol=1e-5)
-
-
-def test_a_box_is_copied_and_nothing_beside_it():
-    texture = np.arange(12 * WIDE, dtype=np.float32)
-    cells = np.full((START + HEIGHT * 2 + 2, LANES), -1, np.float32)
-    copies_box(texture, cells, 2)
-    box = cells[START : START + HEIGHT * 2].reshape(HEIGHT, -1)
-    np.testing.assert_array_equal(box, below(texture, 2))
-    assert (cells[:START] == -1).all()
-    assert (cells[START + HEIGHT * 2 :] == -1).all()
 
 
 @pytest.mark.parametrize("fractions", [(0.0, 0.0), (0.3, 0.9), (1.0, 0.5)])

@@ -76,7 +76,7 @@ def test_dark_and_double_shots_are_left_out(count):
         assert getattr(seen, kind) == last
         assert not seen.usable[list(last)].any()
         assert seen.usable[0].mean() > 0.99
-        assert seen.notes[0].startswith("left out shot")
+        assert seen.notes[0].startswith("excluded shot")
 
 
 def test_a_mask_that_is_to_stand_still_repeats_its_shots():

@@ -17,6 +17,7 @@ from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.adaptive.survey import checked, surveyed
 
 SIZE = (48, 56)
+QUICK = fast(AdaptiveSettings()).model_copy(update={"second": True})
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +48,12 @@ def test_wide_disparities_are_searched_again(survey, disparity, again):
 
 @pytest.mark.parametrize(("share", "again"), [(0.05, False), (0.2, True)])
 def test_a_few_wide_patches_are_not_worth_a_second_search(survey, share, again):
-    found = searched_again(believing(survey, 4.0, share), fast(AdaptiveSettings()))
+    found = searched_again(believing(survey, 4.0, share), QUICK)
     assert (found is not None) == again
+
+
+def test_adaptive_fast_searches_once(survey):
+    assert searched_again(believing(survey, 4.0), fast(AdaptiveSettings())) is None
 
 
 @pytest.mark.parametrize(
@@ -71,7 +76,7 @@ def test_one_shot_surfaces_fail_where_surfaces_miss_and_disparities_are_large(
 
 
 def test_the_second_search_is_less_sure(survey):
-    again = searched_again(believing(survey, 4.0), fast(AdaptiveSettings()))
+    again = searched_again(believing(survey, 4.0), QUICK)
     assert again is not None
     assert again.probability.max(axis=-1).mean() <= survey.volume.probability.max(axis=-1).mean()
 
@@ -104,10 +109,7 @@ def test_a_known_disparity_is_not_searched_again(monkeypatch, known):
     trial, asked = wide_trial(1), []
     monkeypatch.setattr(method, "searched_again", lambda *_: asked.append(1))
     disparity = np.full(trial.psi.size, 3.0, np.float32) if known else None
-    settings = fast(AdaptiveSettings())
-    reconstruct_adaptive(
-        trial.psi, trial.readings, trial.noise_sigma, settings, disparity=disparity
-    )
+    reconstruct_adaptive(trial.psi, trial.readings, trial.noise_sigma, QUICK, disparity=disparity)
     assert bool(asked) != known
 
 

@@ -341,8 +341,8 @@ def judged_trial(
 @pytest.mark.parametrize(
     ("fault", "strength", "reason"),
     [
-        ("mask-shift", 0.5, "shadow lies about"),
-        ("mask-shift", 4, "as if they were others"),
+        ("mask-shift", 0.5, "shadow is about"),
+        ("mask-shift", 4, "as with other masks"),
         ("edge-blur", 0.75, "blurred"),
         ("vignetting", 80, "outermost rays"),
         ("flicker", 20, "brightness"),
@@ -366,7 +366,7 @@ def test_a_fault_is_reported_with_its_reason_and_a_remedy(fault, strength, reaso
 def test_many_shots_that_screening_left_out_are_reported_and_few_are_not():
     verdict = judged_trial("missing-shot", 2)
     assert verdict.level == "doubt"
-    assert "2 of 3 shots were left out, dark or the same as another: 2, 3" in verdict.words
+    assert "2 of 3 shots are excluded, as dark or as the same as another: 2, 3" in verdict.words
     assert judged_trial("missing-shot", 1).level == "trust"
 
 
@@ -380,7 +380,7 @@ def test_a_shot_under_another_light_takes_the_level_of_the_others_and_is_named(t
     result, verdict = reconstruct_judged("tv", three, frames, 0.003, settings=QUICK)
     assert verdict.level == "doubt"
     assert f"shot 2 is {1 - share:.0%}"[:-1] in verdict.words
-    assert "was evened to them" in verdict.words
+    assert "was scaled to them" in verdict.words
     assert result.light_field.mean() == pytest.approx(scene.mean(), rel=0.02)
     two = dataclasses.replace(verdict.evidence, gains=(0.9, 1.1, 1.0), left_out=(2,))
     assert "which is right is not known" in verdict_from(two).words
@@ -408,9 +408,13 @@ def test_a_light_field_that_foretells_less_than_anybody_would_is_doubted(three):
 def test_what_foretells_better_is_named_and_one_picture_for_all_views_is_said_to_be_one(three):
     clean = clean_evidence(three)
     for figures, words, level in (
-        ({"over_flat": 1.2}, "one picture for all views foretells", "doubt"),
-        ({"over_neighbours": 1.2}, "the mean of the readings beside foretells", "doubt"),
-        ({"parallax": 1e-4}, "no parallax: the light field is one picture", "cannot tell"),
+        (
+            {"over_flat": 1.2},
+            "one picture for all views predicts the validation readings better",
+            "doubt",
+        ),
+        ({"over_neighbours": 1.2}, "the mean of neighbouring readings predicts", "doubt"),
+        ({"parallax": 1e-4}, "scene treated as flat: the frames show no parallax", "cannot tell"),
     ):
         verdict = verdict_from(dataclasses.replace(clean, **figures))
         assert words in verdict.words
@@ -480,7 +484,7 @@ def test_a_coded_aperture_leaves_nothing_in_one_frame_that_would_show_a_wrong_ps
     result = Reconstruction("tv", light_field, Status.CONVERGED, "", 1, (), 0.0, {})
     verdict = verdict_from(gathered(psi, read, 1e-3, result))
     assert verdict.level == "cannot tell"
-    assert "cannot be tested" in verdict.words
+    assert "cannot show whether Psi is right" in verdict.words
 
 
 MOVED = {"moved_at": (1, 5, 5), "moved_px": (9, 9)}
@@ -538,14 +542,14 @@ def test_noise_is_doubted_where_it_leaves_disparities_open(three):
 
 
 CAUSES = (
-    ("offset", 0.06, "black level seems 6.0% of the mean reading too low", "take darks"),
-    ("offset", -0.06, "black level seems 6.0% of the mean reading too high", "take darks"),
+    ("offset", 0.06, "black level seems 6.0% of the mean reading too low", "capture darks"),
+    ("offset", -0.06, "black level seems 6.0% of the mean reading too high", "capture darks"),
     ("gamma", -0.1, "to the power of 0.90", "without gamma"),
-    ("blur", 0.81, "blurred by 0.9 pixels more", "whiteboards"),
-    ("blur", -0.81, "sharper by 0.9 pixels", "whiteboards"),
+    ("blur", 0.81, "blurred by 0.9 pixels more", "calibrate"),
+    ("blur", -0.81, "sharper by 0.9 pixels", "calibrate"),
     ("distance", 0.1, "10% further from", "--drift"),
     ("vignetting", 0.2, "lose 20% more", "aperture"),
-    ("contrast", 0.03, "masks show at 95% of the strength", "--drift"),
+    ("contrast", 0.03, "masks' contrast is 95% of that in Psi", "--drift"),
 )
 
 
@@ -648,7 +652,7 @@ def test_bad_pixels_that_screening_finds_are_reported():
     verdict = judged_trial("bad-pixels", 20)
     share = verdict.evidence.bad
     assert 0.1 < share < 0.2
-    assert f"{share:.1%} of the pixels are bad and not listed" in verdict.words
+    assert f"{share:.1%} of the pixels are bad, and not known as such" in verdict.words
 
 
 def motion_in(psi, frames, sigma=1e-4, usable=None, light_field=None):
@@ -738,7 +742,7 @@ def test_a_shot_is_left_out_where_something_moved_in_it_and_the_place_is_doubted
     result, verdict = reconstruct_judged("tv", three, frames, 0.003, settings=QUICK)
     assert verdict.level == "doubt"
     assert "shot 2 saw another scene than the others in " in verdict.words
-    assert "left out there" in verdict.words
+    assert "excluded there" in verdict.words
     assert "--without-shots 2" in verdict.words
     assert verdict.evidence.moved_at is not None
     _, row, column = verdict.evidence.moved_at

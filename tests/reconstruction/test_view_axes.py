@@ -354,7 +354,7 @@ def test_a_demo_of_bands_is_grey_and_speaks_of_bands(tmp_path):
         "--method", "tv", "--out", str(tmp_path / "out"),
     )  # fmt: skip
     assert code == 0
-    assert "against the copied middle band" in output
+    assert "over the baseline (middle band in all places)" in output
     words = (tmp_path / "out/report.html").read_text().split("<script")[0]
     assert "parallax" not in words
     assert "the true middle band in all places" in words

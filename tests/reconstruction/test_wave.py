@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from emmc_rig.model import bands
+from reconstruction import wave
 from reconstruction.choices import choose_primal_step, contrast, smooth_guess
 from reconstruction.differences import norm_squared
 from reconstruction.problem import colour_metric
@@ -78,3 +79,14 @@ def test_bands_of_rows_change_no_value(random_psi, monkeypatch):
     together = few_steps(psi, frames, usable, MU, STEPS)
     monkeypatch.setattr(bands, "get_num_threads", lambda: 5)
     np.testing.assert_array_equal(few_steps(psi, frames, usable, MU, STEPS), together)
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_tiles_of_columns_change_no_value_beyond_rounding(random_psi, monkeypatch, binning):
+    psi, frames, usable = captured(random_psi, 2, 1, binning)
+    together = few_steps(psi, frames, usable, MU, 2)
+    monkeypatch.setattr(wave, "TILE_BYTES", 1)
+    monkeypatch.setattr(wave, "LEAST_TILE", 1)
+    in_tiles = few_steps(psi, frames, usable, MU, 2)
+    assert len(wave._tiles(psi, 2)) > 3
+    np.testing.assert_allclose(in_tiles, together, atol=1e-6)

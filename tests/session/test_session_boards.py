@@ -29,7 +29,7 @@ darks: {exposure_s: [0.04, 0.01], repeats: 2}
 whiteboards: """
 MANY = """
   views: [[2, 2], [0, 1]]
-  open: [{}, {mask_um: [24, -12]}, {mask_um: [48, 0], held_out: true}]
+  open: [{}, {mask_um: [24, -12]}, {mask_um: [48, 0], validation: true}]
   repeats: 2
   references: 2
   response: [0.5, 0.25, 0.125]
@@ -115,12 +115,12 @@ def test_every_whiteboard_goes_to_what_takes_it(session):
     assert turned[1].references[0, "white"].mean_dn[0, 0] == level["turned-reference-r0"]
 
 
-def test_each_route_is_given_the_whiteboards_that_it_takes(session, monkeypatch):
+def test_each_method_is_given_the_whiteboards_that_it_takes(session, monkeypatch):
     monkeypatch.setattr(measured_psi, "calibrate", lambda *given, **_: given[2:])
     assert whiteboards_of(session, None) == (("parametric", "mixed"), 1, 4, 2)
     assert whiteboards_of(session, ("free", "combined")) == (("free", "combined"), 1, 4, 2)
     assert whiteboards_of(session, ("free",)) == (("free",), 1, 0, 2)
-    with pytest.raises(AppError, match="the pinhole and no whiteboards held out"):
+    with pytest.raises(AppError, match="the pinhole and no validation whiteboard"):
         whiteboards_of(captured(TURNED), None)
 
 

@@ -248,7 +248,7 @@ def test_contrast_fades_towards_the_mean_and_the_peak_with_it(clean):
 
 @pytest.mark.parametrize("name", ["disparity-range", "occlusion", "specularity", "scene-motion"])
 def test_a_measured_scene_is_not_made_up(name, measured):
-    with pytest.raises(NotApplicableError, match="built-in scenes only"):
+    with pytest.raises(NotApplicableError, match="needs a built-in scene"):
         made(name, 2, scene=measured)
 
 

@@ -13,7 +13,7 @@ from emmc_rig.model.settings import Settings
 from emmc_rig_unrolled.weights import NetworkWeights
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs, checked_noise
-from reconstruction.method import Given, Method
+from reconstruction.method import Given, Method, cost_words
 from reconstruction.result import Reconstruction, Status
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ METHODS = (
         "unrolled",
         "a learned denoiser between exact data steps, Psi as an input",
         "scenes like the random worlds of its training, of the views that it was trained for",
-        "stages (blocks 4.5 channels^2 + 160 channels) N operations",
+        cost_words(0.34, 0.41),
         "to compare what learning buys; needs PyTorch",
         _solve,
         "unrolled",

@@ -109,12 +109,12 @@ def _name(axes: Axes, front: Sequence[Mark], colours: Mapping[str, str]) -> None
 
 
 CAVEATS = (
-    "Frames are made with the very Psi that reconstructs them; all methods have this advantage.",
-    "Angular: 0 dB is what one picture in all places scores; below, parallax is worse than none. "
-    "Disparity: mean error of one plane sweep on the estimate; in brackets on the truth.",
-    "Seconds are the median of repeats after a warm-up, one point at a time; "
-    "the dictionary is made beforehand. Memory is what a run takes beyond Psi, frames and "
-    "dictionary.",
+    "Frames are simulated by the same Psi that reconstructs them, which favours all methods alike.",
+    "Angular SNR: 0 dB is the baseline, the centre view in all places; below 0 dB parallax is "
+    "worse than none. Disparity error: mean, of a plane sweep on the estimate; in brackets, on the "
+    "truth.",
+    "Seconds: median of repeats after a warm-up, one run at a time, without making the dictionary. "
+    "Memory: what a run takes besides Psi, frames and dictionary.",
 )
 MEANS = {
     "ssim": ".3f", "angular_db": ".2f", "disparity_mae_px": ".2f", "floor_mae_px": ".2f",
@@ -139,14 +139,14 @@ def chart_page(
 def _head(chart: Chart | None) -> Head:
     """Return the most accurate configuration and the quicker ones that none beats."""
     if chart is None or not chart.marks:
-        why = "no method of these could be measured"
-        return Head("nothing charted", why, ["see what there is: `emmc-rig reconstruct --list`"])
+        why = "none of these methods could be measured"
+        return Head("nothing measured", why, ["list the methods: `emmc-rig reconstruct --list`"])
     *quicker, best = chart.front()
     return Head(
         f"{best.configuration.label} is the most accurate",
         f"{chart.title}: {_accuracy(chart, best)}",
         [
-            f"in {one.seconds:.3g} s take {one.configuration.label}: "
+            f"in {one.seconds:.3g} s: {one.configuration.label}, "
             f"{best.psnr_db - one.psnr_db:.2f} dB less"
             for one in reversed(quicker)
         ]
@@ -311,11 +311,11 @@ def _about(study: ChartStudy, load: str, left_out: Sequence[str]) -> list[str]:
     lines = [
         f"{len(done)} points on {', '.join(Path(s).stem for s in settings.scenes)}, through "
         f"{', '.join(Path(c).stem for c in settings.cameras)}.",
-        f"{machine()}; load while measuring (processes that wanted a core) {load}. "
+        f"{machine()}; load average while measuring {load}. "
         + (
-            "The machine was busy: seconds by the clock are too long, CPU seconds less so."
+            "The machine was busy: seconds are too long, CPU seconds less so."
             if busy
             else "The machine was quiet."
         ),
     ]
-    return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]
+    return [*lines, *([f"Excluded: {'; '.join(left_out)}."] if left_out else [])]

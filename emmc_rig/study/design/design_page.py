@@ -18,10 +18,10 @@ from emmc_rig.pages.page import (
 from emmc_rig.study.design.search import Search
 
 CAVEATS = (
-    "Theory knows textures on two planes half a sample of disparity apart, and noise; it knows no "
-    "occlusion. Differences of a tenth of a dB are below what it can order.",
+    "Theory assumes textures on two planes half a sample of disparity apart, and noise, without "
+    "occlusion. Differences of a tenth of a dB are below its accuracy.",
     "Frames are simulated by the Psi of the mask as printed, on the grid of the reconstruction; "
-    "a bench measures that Psi.",
+    "on a bench, calibration measures that Psi.",
 )
 SHOWN = 20
 """Masks in the table."""
@@ -45,12 +45,12 @@ def design_page(
     loss_db = found.ideal_db - best.psnr_db
     cards = (
         Card(
-            "PSNR expected",
+            "Expected PSNR",
             f"{best.psnr_db:.2f} dB",
-            f"{found.held[0].worst_db:.2f} where the maker misses most",
+            f"{found.held[0].worst_db:.2f} with the maker's worst error",
         ),
         Card("Light", f"{best.light:.0%}", "of the open camera's"),
-        Card("Fresnel number", f"{best.fresnel:.2g}", f"diffraction costs {loss_db:.2f} dB"),
+        Card("Fresnel number", f"{best.fresnel:.2g}", f"diffraction loses {loss_db:.2f} dB"),
     )
     names = list(found.held[0].psnr_db)
     body = fragment(
@@ -74,14 +74,14 @@ def design_page(
         [
             "try it on a scene of your own: "
             f"`emmc-rig simulate --camera {typed(camera)} --scene FOLDER`",
-            "if it is worth it to you, have it made: the mask's GDSII file lies beside that camera",
+            "to have it made, send the mask's GDSII file, which is beside that camera",
         ],
     )
     return framed("Which mask to order", about, CAVEATS, sections, head=head)
 
 
 def _tried(found: Search) -> Table:
-    heads = ("Mask", "PSNR expected, dB", "Light", "Fresnel number")
+    heads = ("Mask", "Expected PSNR, dB", "Light", "Fresnel number")
     rows = [
         [one.label, f"{what.psnr_db:.2f}", f"{what.light:.0%}", f"{what.fresnel:.2g}"]
         for one, what in found.tried[:SHOWN]

@@ -224,7 +224,7 @@ def _at_equal_light(camera: Camera, bench: DesignBench) -> Camera:
 def _verdict(compared: Sequence[Simulated]) -> str:
     """Return what the design gains on the best shipped camera, in words; the design is first."""
     if len(compared) == 1:
-        return "no shipped camera of this sensor takes as many shots."
+        return "no shipped camera of this sensor has as many shots to compare with."
     best = max(compared[1:], key=lambda one: one.mean_db)
     gain_db = compared[0].mean_db - best.mean_db
     worth = "order it" if gain_db >= GOAL_DB else "a mask you have may do as well"

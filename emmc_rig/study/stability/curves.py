@@ -29,9 +29,9 @@ def below_best(levels: Levels, whole: bool = False) -> float | None:
 
 
 def below_view(levels: Levels, views: Levels, whole: bool = False) -> float | None:
-    """Return the place where levels fall below those of the copied centre view; see `crossing`.
+    """Return the place where levels fall below those of the baseline; see `crossing`.
 
-    Where the copied view is exact (None or infinite) nothing exceeds it.
+    Where the baseline is exact (None or infinite) nothing exceeds it.
     """
     margins = [
         None if level is None or view is None or math.isinf(view) else level - view

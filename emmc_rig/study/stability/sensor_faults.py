@@ -182,12 +182,12 @@ FAULTS = (
         SENSOR, black_level, repairable=True,
     ),
     Fault(
-        "gamma", "Power of the light less than 1", "%",
+        "gamma", "Gamma below 1", "%",
         (0, 2, 5, 10, 20, 50), (0, 10, 50),
         SENSOR, gamma, repairable=True,
     ),
     Fault(
-        "jpeg", "Quality of JPEG", "of 100",
+        "jpeg", "JPEG quality", "of 100",
         (100, 95, 90, 85, 70, 50), (100, 85, 50),
         SENSOR, jpeg,
     ),

@@ -65,12 +65,13 @@ FLOOR_DB = 6.0
 """Below the least of the baseline: further down, a curve says nothing more."""
 CAVEATS = (
     "A method breaks where it falls 3 dB below its best on that curve, and where it falls below "
-    "the baseline, the true centre view in all places. Between measured strengths the curve is "
-    "taken as straight.",
-    "The readings are made by the real Psi with the sensor's noise on the grid of the "
-    "reconstruction; where mask, lens or shots are at fault, the methods are given the design's.",
-    "Turning and scaling a mask moves its rim most: the larger the picture, the sooner it breaks.",
-    "Contrast: the PSNR is that of the picture stretched back to full contrast.",
+    "the baseline: the true centre view in all places. Between measured strengths curves are "
+    "interpolated linearly.",
+    "Frames are simulated with the faulty Psi and the sensor's noise, on the grid of the "
+    "reconstruction; the methods are given the Psi of the design.",
+    "Turning or scaling a mask moves its rim most: the larger the picture, the smaller the error "
+    "that breaks a method.",
+    "Contrast: PSNR is measured after stretching the picture back to full contrast.",
 )
 
 
@@ -179,12 +180,12 @@ def _row(point: Point, result: dict) -> dict[str, object]:
 
 def _about(study: StabilityStudy, left_out: Sequence[str]) -> list[str]:
     settings = study.settings
-    size = "all of it" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
+    size = "whole views" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     lines = [
         f"{len(study.results)} points on {', '.join(Path(s).stem for s in settings.scenes)}, "
         f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
     ]
-    return [*lines, *([f"Left out: {'; '.join(left_out)}."] if left_out else [])]
+    return [*lines, *([f"Excluded: {'; '.join(left_out)}."] if left_out else [])]
 
 
 def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) -> Path:
@@ -273,16 +274,19 @@ def _head(curves: Sequence[Curve]) -> Head:
     broken = Counter({curve.method: 0 for curve in first})
     broken.update(curve.method for curve in first if curve.below_best() is not None)
     if not broken:
-        why = "no method ran under any of the faults"
-        return Head("nothing measured", why, ["choose among: `emmc-rig stability --list`"])
+        why = "none of the methods could be measured"
+        return Head("nothing measured", why, ["list the faults: `emmc-rig stability --list`"])
     (best, least), *others = reversed(broken.most_common())
     return Head(
         f"{best} holds out best" if others else best,
         f"it falls {LOST_DB:g} dB below its best under {least} of {faults} faults"
         + (", the fewest" if others else ""),
         [
-            "keep your bench below the strengths of the breaking points",
-            *(f"compare {name}: under {count} of {faults} faults" for name, count in others),
+            "keep the errors of your bench below the breaking points",
+            *(
+                f"for comparison, {name}: under {count} of {faults} faults"
+                for name, count in others
+            ),
         ],
     )
 

@@ -29,10 +29,9 @@ from emmc_rig.study.tables.cells import (
 from emmc_rig.study.tables.tables_study import TablesSettings, TablesStudy, scene_specs
 
 CAVEATS = (
-    "The paper's figures stand beside ours to show the order of things, not to be reached or "
-    "beaten: which aperture variant of the MIT scenes it used, and how far its mask stood from the "
-    "sensor, is unknown. Compare methods and scenarios within one run.",
-    "The paper's means are over all its own scenes of the table, given here or not.",
+    "The paper's figures are for orientation: its aperture variant of the MIT scenes and its "
+    "distance from mask to sensor are unknown. Compare methods and scenarios within one run.",
+    "The paper's means are over all of its scenes, whether they are measured here or not.",
 )
 CSV, PAGE = "tables.csv", "tables.html"
 COLUMNS = (
@@ -104,8 +103,8 @@ def _head(results: Results) -> Head:
         if result.get("psnr_db") is not None:
             by_method.setdefault(cell.method, []).append(result["psnr_db"])
     if not by_method:
-        why = "none of the cells of these tables was reconstructed"
-        return Head("nothing measured", why, ["compute all of it: `emmc-rig tables`"])
+        why = "no cell of these tables was reconstructed"
+        return Head("nothing measured", why, ["compute all tables: `emmc-rig tables`"])
     means = {METHODS[name]: float(np.mean(levels)) for name, levels in by_method.items()}
     best = max(means, key=lambda name: means[name])
     return Head(

@@ -1,0 +1,60 @@
+"""On whole frames of real light fields, one shot, `adaptive` leads the methods with a dictionary.
+
+The paper's Bayer camera with its own noise, nothing trained; the rows are the chart at the top of
+docs/results.md. Kept row by row, so that a run that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import lab
+
+from emmc_rig.model.lightfield import psnr_db, replicate_centre
+from emmc_rig.study.trial import Capture, trial_of
+
+METHODS = ("adaptive", "adaptive-fast", "tv-dict")
+WHOLE = (*lab.GROUP_A, *lab.GROUP_B[:2])
+"""The scenes whose frames are more than a crop."""
+
+
+def measure(scene: str, camera: str, size: tuple[int, int] | None, seed: int, method: str) -> dict:
+    """Return PSNR of a method and of the baseline, and what it took, of one light field."""
+    given = trial_of(Capture(scene, camera, size, seed))
+    started, cpu = time.perf_counter(), time.process_time()
+    result = given.solved(method)
+    seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu
+    return {
+        "rows": given.truth.shape[2],
+        "columns": given.truth.shape[3],
+        "psnr_db": round(given.psnr_db(result.light_field), 2),
+        "baseline_db": round(psnr_db(replicate_centre(given.truth), given.truth), 2),
+        "cpu_s": round(cpu_s, 1),
+        "seconds": round(seconds, 1),
+    }
+
+
+def main() -> None:
+    """Measure every method on every scene."""
+    parser = lab.arguments(__doc__)
+    parser.add_argument("--method", action="append", help=f"may repeat; default: {METHODS}")
+    args = lab.parsed(parser)
+    if not args.smallest and not args.scene:
+        args.scenes = [str(Path(os.environ["EMMC_LIGHTFIELDS"]) / name) for name in WHOLE]
+    points = [
+        {
+            "scene": scene, "camera": args.camera, "size": args.size if args.smallest else None,
+            "seed": args.seed, "method": method,
+        }
+        for method in (args.method or METHODS)
+        for scene in args.scenes
+    ]  # fmt: skip
+    rows = lab.measured(points, measure, "full-frames", args)
+    table = rows.pivot_table(index="scene", columns="method", values="psnr_db")
+    lab.finished(rows, table.plot.barh(), "full-frames", args)
+
+
+if __name__ == "__main__":
+    main()

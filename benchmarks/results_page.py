@@ -1,0 +1,640 @@
+"""docs/results.md, its charts and the README's table are docs/results/*.csv, by one command.
+
+    python benchmarks/results_page.py
+
+Every figure of the page is a row of a CSV, or a mean of rows; docs/results/runs.csv says when and
+by which command each was measured. The standard library is all that it needs.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, median
+
+import svg_charts
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "docs" / "results"
+GROUP_A = {"antinous", "begonia", "buttercup", "dice", "dragons", "fish", "occlusions"}
+BEGIN, END = "<!-- reached: python benchmarks/results_page.py -->", "<!-- /reached -->"
+"""Around the README's table."""
+
+Row = Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Section:
+    """One question: how it is answered, in a sentence, by charts and a table, from which files.
+
+    charts: SVG by name. how: how to read them. table: its head first. line: a row of the README's
+    table, what was measured and what it reached.
+    """
+
+    heading: str
+    answer: str
+    how: str
+    files: tuple[str, ...]
+    charts: Mapping[str, str]
+    table: Sequence[Sequence[str]] = ()
+    line: tuple[str, str] | None = None
+
+
+def rows_of(name: str) -> list[dict[str, str]]:
+    """Return the rows of a CSV of docs/results."""
+    with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as opened:
+        return list(csv.DictReader(opened))
+
+
+def number(row: Row, key: str) -> float:
+    """Return a figure of a row."""
+    return float(row[key])
+
+
+def share(rows: Sequence[Row], counts: Callable[[Row], bool]) -> str:
+    """Return how many of the rows count, as "9 of 10 (90 %)"."""
+    found = sum(map(counts, rows))
+    return f"{found} of {len(rows)} ({found / len(rows):.0%})".replace("%", " %")
+
+
+def whole_frames() -> Section:
+    """One shot of whole real light fields."""
+    rows = rows_of("full-frames")
+    of: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        of.setdefault(row["scene"], {})[row["method"]] = row
+    scenes = sorted(of, key=lambda scene: -number(of[scene]["adaptive"], "psnr_db"))
+    dots = {
+        "baseline: centre view in all places": [
+            number(of[scene]["adaptive"], "baseline_db") for scene in scenes
+        ],
+        **{
+            method: [number(of[scene][method], "psnr_db") for scene in scenes]
+            for method in ("tv-dict", "adaptive")
+        },
+    }
+    lead = mean(a - b for a, b in zip(dots["adaptive"], dots["tv-dict"], strict=True))
+    reached = f"{min(dots['adaptive']):.1f} to {max(dots['adaptive']):.1f} dB"
+    answer = f"One frame each: adaptive is {lead:.1f} dB above tv-dict"
+    methods = [one for one in ("tv-dict", "adaptive-fast", "adaptive") if one in of[scenes[0]]]
+    table = [("light field", "size", *(f"`{method}`" for method in methods), "seconds")]
+    for scene in scenes:
+        first = of[scene]["adaptive"]
+        cells = (f"{number(of[scene][method], 'psnr_db'):.2f} dB" for method in methods)
+        size = f"{first['rows']}x{first['columns']}"
+        table.append((scene, size, *cells, f"{number(first, 'seconds'):.0f}"))
+    return Section(
+        "How good is one shot?",
+        f"From one frame of the paper's Bayer camera `adaptive` reaches {reached}, {lead:.1f} dB "
+        "above `tv-dict` on average; noise on, nothing trained.",
+        "To the right is better; 6 dB are half the error. The grey bar of a light field spans from "
+        "the baseline, which has no parallax at all, to the best method. Seconds are those of "
+        "`adaptive` on two cores.",
+        ("full-frames",),
+        {"whole-frames": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
+        table,
+        (
+            f"PSNR of {len(scenes)} real light fields from one frame each",
+            f"{reached}, {lead:.1f} dB above `tv-dict`",
+        ),
+    )
+
+
+CAMERAS = {"one shot": "rgbw-bayer-1shot", "three shots": "rgbw-bayer-3shots"}
+
+
+def speed() -> Section:
+    """Accuracy and processor time of every method."""
+    rows = [row for row in rows_of("chart-group-b-64x80") if row["level"] == "default"]
+    scenes = {row["scene"] for row in rows}
+    named: dict[str, dict[str, tuple[float, float]]] = {}
+    for shots, camera in CAMERAS.items():
+        for method in sorted({row["method"] for row in rows}):
+            of = [row for row in rows if (row["camera"], row["method"]) == (camera, method)]
+            named.setdefault(shots, {})[method] = (
+                mean(number(row, "cpu_seconds") for row in of),
+                mean(number(row, "psnr_db") for row in of),
+            )
+    best = named["one shot"]["adaptive"]
+    second = max(
+        (db, method)
+        for method, (_, db) in named["one shot"].items()
+        if not method.startswith("adaptive")
+    )
+    fast = named["one shot"]["adaptive-fast"]
+    answer = f"adaptive is {best[1] - second[0]:.1f} dB above the next best method"
+    table = [("method", "one shot", "three shots")]
+    for method in sorted(named["one shot"], key=lambda one: -named["one shot"][one][1]):
+        cells = (named[shots][method] for shots in CAMERAS)
+        table.append((f"`{method}`", *(f"{db:.2f} dB, {cpu_s:.1f} s" for cpu_s, db in cells)))
+    return Section(
+        "Which method, for how much time?",
+        f"`adaptive` leads `{second[1]}` by {best[1] - second[0]:.1f} dB with one shot; "
+        f"`adaptive-fast` is {best[1] - fast[1]:.1f} dB below it in {fast[0] / best[0]:.0%} of its "
+        "time.".replace("%", " %"),
+        f"Up is better, left is faster. Each point is the mean of {len(scenes)} light fields of "
+        "group B, which no setting was tuned on, cut to 64x80; time is of one core.",
+        ("chart-group-b-64x80", "chart-group-a-64x80"),
+        {"speed": svg_charts.points(answer, ("processor seconds", "PSNR, dB"), named)},
+        table,
+        (
+            f"The same of {len(scenes)} that nothing was tuned on, cut to 64x80",
+            f"{best[1]:.1f} dB in {best[0]:.1f} s, next best `{second[1]}` {second[0]:.1f} dB",
+        ),
+    )
+
+
+def three_shots() -> Section:
+    """Three shots of a moved mask."""
+    rows = rows_of("three-shots")
+    by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in rows}
+    scenes = sorted({row["scene"] for row in rows}, key=lambda one: -by[one, "adaptive"])
+    dots = {method: [by[scene, method] for scene in scenes] for method in ("tv-dict", "adaptive")}
+    leads = [a - b for a, b in zip(dots["adaptive"], dots["tv-dict"], strict=True)]
+    answer = f"Three shots: adaptive is {mean(leads):.1f} dB above tv-dict"
+    return Section(
+        "What do three shots give?",
+        f"With the mask moved between three shots `adaptive` leads `tv-dict` by "
+        f"{min(leads):.1f} to {max(leads):.1f} dB.",
+        f"To the right is better. {len(scenes)} light fields, cut to 256x256; the last ones have "
+        "disparities wider than the search.",
+        ("three-shots",),
+        {"three-shots": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
+    )
+
+
+def noise_and_shots() -> Section:
+    """Whether a better capture is ever a worse result."""
+    rows = rows_of("noise-and-shots")
+
+    def curves(key: str, kept: Callable[[Row], bool]) -> list[list[tuple[float, float]]]:
+        by: dict[str, list[tuple[float, float]]] = {}
+        for row in filter(kept, rows):
+            by.setdefault(row["scene"], []).append((number(row, key), number(row, "psnr_db")))
+        most = max(map(len, by.values()))
+        return [sorted(line) for line in by.values() if len(line) == most]
+
+    def averaged(every: list[list[tuple[float, float]]]) -> list[tuple[float, float]]:
+        return [(column[0][0], mean(db for _, db in column)) for column in zip(*every, strict=True)]
+
+    noise = curves("noise_sigma", lambda row: row["shots"] == "1")
+    shots = curves("shots", lambda row: row["noise_sigma"] == "0.004")
+    gained, more = (abs(line[-1][1] - line[0][1]) for line in (averaged(noise), averaged(shots)))
+    falls = max(high - low for line in shots for (_, high), (_, low) in itertools.pairwise(line))
+    charts = {
+        "noise": svg_charts.lines(
+            f"A sixteenth of the noise gains {gained:.1f} dB",
+            ("standard deviation of a reading, 1 is white", "PSNR, dB"),
+            {f"mean of {len(noise)} light fields": averaged(noise)}, noise, log=True,
+        ),
+        "shots": svg_charts.lines(
+            f"Sixteen shots gain {more:.1f} dB over one",
+            ("shots", "PSNR, dB"),
+            {f"mean of {len(shots)} light fields": averaged(shots)}, shots, log=True,
+        ),
+    }  # fmt: skip
+    return Section(
+        "Do less noise and more shots help?",
+        f"Less noise gains up to {gained:.1f} dB on average, sixteen shots {more:.1f} dB. One "
+        f"scene of wide disparities falls by {falls:.1f} dB between two numbers of shots.",
+        "A line should never fall towards less noise (left) or more shots (right). Thin lines are "
+        "single light fields, 64x64.",
+        ("noise-and-shots",),
+        charts,
+    )
+
+
+def stated() -> Section:
+    """How well the accuracy that a result states holds."""
+    rows = rows_of("stated-groups")
+    table = [
+        ("captures of group", "number", "error of the stated PSNR, rms", "truth within interval")
+    ]
+    for row in rows:
+        within = (
+            f"{number(row, 'in_interval'):.0%}".replace("%", " %") if row["in_interval"] else ""
+        )
+        table.append((row["group"], row["captures"], f"{number(row, 'rms_db'):.1f} dB", within))
+    other = next(row for row in rows if row["group"] == "B")
+    held = f"{number(other, 'in_interval'):.0%}".replace("%", " %")
+    return Section(
+        "Can the estimated accuracy be believed?",
+        f"The interval that a result states for its PSNR holds the truth in {held} of the captures "
+        f"that it was not fitted to; it is wide: {number(other, 'median_width_db'):.1f} dB.",
+        "90 % should lie within. The estimate itself is off by the rms, so that it tells a good "
+        "result from a poor one, not 30 from 31 dB.",
+        ("stated-groups",),
+        {},
+        table,
+        ("The interval stated for the PSNR holds the true one", f"{held} of {other['captures']}"),
+    )
+
+
+LOST_DB = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 100.0)
+
+
+def verdicts() -> Section:
+    """Whether results that a fault broke are flagged."""
+    rows = [row for row in rows_of("verdicts-real") if row["kind"] in ("broken", "good", "between")]
+    groups = {
+        "group A, limits were set on it": [row for row in rows if row["scene"] in GROUP_A],
+        "group B": [row for row in rows if row["scene"] not in GROUP_A],
+    }
+
+    def flagged(row: Row) -> bool:
+        return row["verdict"] != "trust"
+
+    faults = len({row["fault"] for row in rows} - {"none"})
+    series = {}
+    for group, of in groups.items():
+        line = []
+        for low, high in itertools.pairwise(LOST_DB):
+            within = [row for row in of if low <= max(number(row, "lost_db"), 0) < high]
+            at = 0.25 if not low else min((low + high) / 2, 8)
+            line.append((at, 100 * mean(map(flagged, within))))
+        series[group] = line
+    table = [("", *groups)]
+    counts = {}
+    for kind, words in (
+        ("broken", "broken (3 dB lost or more), flagged"),
+        ("good", "good (1 dB at most), flagged"),
+    ):
+        counts[kind] = [
+            share([row for row in of if row["kind"] == kind], flagged) for of in groups.values()
+        ]
+        table.append((words, *counts[kind]))
+    return Section(
+        "Is a broken result flagged?",
+        f"Of results that a fault broke {counts['broken'][1]} are flagged in light fields that the "
+        f"limits were not set on, of good ones {counts['good'][1]}.",
+        f"{faults} faults in steps, one shot, `adaptive-fast`. The line should be at 0 % to the "
+        "left, where a fault costs nothing, and at 100 % from 3 dB on. Flagged is any verdict but "
+        "*trust*.",
+        ("verdicts-real",),
+        {
+            "verdicts": svg_charts.lines(
+                "The more a fault costs, the surer it is flagged",
+                ("dB lost by the fault", "flagged, %"),
+                series,
+                log=True,
+            )
+        },
+        table,
+        (
+            "Results that a fault broke are flagged; good ones, by mistake",
+            "; ".join(of[1] for of in counts.values()),
+        ),
+    )
+
+
+def wrong_psi() -> Section:
+    """What a moved mask costs, and what fitting Psi to the frames wins back."""
+    rows = [row for row in rows_of("mismatch") if row["error"] == "Mask shift 0.5 px"]
+    # It has become part of `adaptive`.
+    rows = [row for row in rows if row["method"] != "adaptive-dict"]
+    rows.sort(key=lambda row: -number(row, "oracle"))
+    dots = {
+        "Psi of before": [number(row, "mismatched") for row in rows],
+        "Psi fitted to the frames": [number(row, "blind") for row in rows],
+        "the true Psi": [number(row, "oracle") for row in rows],
+    }
+    lost = [number(row, "oracle") - number(row, "mismatched") for row in rows]
+    won = min(number(row, "recovered_of_oracle") for row in rows)
+    answer = "A mask half a pixel off costs every method; the frames alone mend Psi"
+    return Section(
+        "What if the mask has moved?",
+        f"Half a pixel costs {min(lost):.1f} to {max(lost):.1f} dB; a Psi fitted to the frames, "
+        f"blindly, wins back {won:.0%} or more of what the true one does.".replace("%", " %"),
+        "The grey bar is what is lost by a wrong Psi. One scene, 32x40: the order counts, not the "
+        "levels.",
+        ("mismatch",),
+        {"wrong-psi": svg_charts.dots(answer, "PSNR, dB", [row["method"] for row in rows], dots)},
+    )
+
+
+FAULTS = {
+    "exposure": "electrons at white, fewer than", "read-noise": "read noise, electrons",
+    "saturation": "saturated readings, %", "bad-pixels": "bad pixels, not listed, %",
+    "masked-pixels": "bad pixels, listed, %", "mask-shift": "mask shift, px",
+    "mask-rotation": "mask rotation, degrees", "mask-distance-error": "mask distance, %",
+    "mask-scale": "mask scale, %", "edge-blur": "blurred edges, px", "vignetting": "vignetting, %",
+    "camera-motion": "camera motion, px a shot",
+}  # fmt: skip
+
+
+def breaking() -> Section:
+    """From which strength a fault costs 3 dB."""
+    rows = [
+        row
+        for row in rows_of("stability-real-breaking")
+        if row["screened"] == "True" and row["scene"] != "all scenes"
+    ]
+    table = [("fault", "`adaptive-fast`, median (least, most)", "`tv`, median")]
+    for fault, words in FAULTS.items():
+        cells = []
+        for method in ("adaptive-fast", "tv"):
+            of = [
+                number(row, "below_best_to")
+                for row in rows
+                if (row["fault"], row["method"]) == (fault, method) and row["below_best_to"]
+            ]
+            cells.append(of)
+        most = f"{median(cells[0]):.2g} ({min(cells[0]):.2g}, {max(cells[0]):.2g})"
+        table.append((words, _plain(most), _plain(f"{median(cells[1]):.2g}")))
+    shifts = {
+        row["scene"]: number(row, "below_best_to")
+        for row in rows
+        if (row["fault"], row["method"]) == ("mask-shift", "adaptive-fast")
+    }
+    strict, mild = min(shifts, key=shifts.__getitem__), max(shifts, key=shifts.__getitem__)
+    points: dict[str, list[tuple[float, float]]] = {}
+    for row in rows_of("stability-real"):
+        if (row["fault"], row["method"], row["screened"]) == (
+            "mask-shift",
+            "adaptive-fast",
+            "True",
+        ):
+            at = number(row, "strength")
+            points.setdefault(row["scene"], []).append((at, number(row, "psnr_db")))
+    every = [sorted(line) for line in points.values()]
+    shared = sorted(set.intersection(*({x for x, _ in line} for line in every)))
+    middle = [(x, mean(dict(line)[x] for line in every)) for x in shared]
+    return Section(
+        "How much does a method bear?",
+        "It follows the scene: a mask that is off costs 3 dB from "
+        f"{shifts[strict]:.2g} pixels on in {strict}, and from {shifts[mild]:.2g} in {mild}.",
+        f"The table says from which strength on a fault costs 3 dB, over {len(every)} light "
+        "fields, 48x64, three shots. Frames are cleaned up before. The thin lines are single light "
+        "fields.",
+        ("stability-real-breaking", "stability-real"),
+        {
+            "mask-shift": svg_charts.lines(
+                "A mask that is off is paid for at once",
+                ("shift of the mask, px", "PSNR, dB"),
+                {f"mean of {len(every)} light fields": middle}, every,
+            )
+        },
+        table,
+    )  # fmt: skip
+
+
+def _plain(words: str) -> str:
+    """Return figures without exponents."""
+    return " ".join(
+        f"{left}{float(part.strip('(),')):g}{right}" if "e+" in part else part
+        for part in words.split(" ")
+        for left, right in [("(" if part[0] == "(" else "", part[len(part.rstrip("),")) :])]
+    )
+
+
+def calibration() -> Section:
+    """How well Psi is measured."""
+    rows = rows_of("calibration_checks")
+    by = {row["what"]: number(row, "measured") for row in rows}
+    names = [
+        row["what"].split(":")[0] for row in rows if row["what"].endswith(": true error of Psi")
+    ]
+    labels = [
+        {"few": "ten whiteboards", "session": "a whole session"}.get(one, one) for one in names
+    ]
+    dots = {
+        words: [100 * by[f"{name}: {key} error of Psi"] for name in names]
+        for words, key in (("stated", "stated"), ("true", "true"))
+    }
+    table = [("calibration method", "true error of Psi")]
+    for words, what in (
+        ("parametric: the mask's place, fitted", "Psi, parametric (dust not modelled)"),
+        ("with its defects", "Psi, mixed"),
+        ("free: every coefficient measured", "Psi, free"),
+        ("both combined", "Psi, combined"),
+    ):
+        table.append((words, f"{100 * by[what]:.2f} %"))
+    sizes = rows_of("calibration-sizes")
+    largest = max(sizes, key=lambda row: number(row, "columns"))
+    return Section(
+        "How well is Psi measured?",
+        f"To {100 * by['Psi, combined']:.1f} %, from {by['frames']:.0f} frames of a bench with "
+        "offset, turn, dust, vignetting and bad pixels, and the deviation stated is true. At "
+        f"{largest['rows']}x{largest['columns']} pixels it takes {largest['cpu_s']} s and "
+        f"{largest['peak_gib']} GiB.",
+        "The two dots of a row should lie on each other: what is stated is what is true. A row is "
+        "one more thing wrong with the bench; the truth is integrated ray by ray.",
+        ("calibration_checks", "calibration-sizes"),
+        {
+            "calibration": svg_charts.dots(
+                "The stated error of Psi is the true one", "error of Psi, %", labels, dots, 0
+            )
+        },
+        table,
+        (
+            "Psi, measured on a bench with ordinary faults",
+            f"{100 * by['Psi, combined']:.2f} % error",
+        ),
+    )  # fmt: skip
+
+
+def mask_design() -> Section:
+    """What a designed mask gains over the shipped ones."""
+    rows = rows_of("design")
+    names = [f"{row['sensor']}, {row['shots']} shot{'s' * (row['shots'] != '1')}" for row in rows]
+    dots = {
+        "best shipped camera": [number(row, "shipped_db") for row in rows],
+        "designed": [number(row, "design_db") for row in rows],
+    }
+    gains = [number(row, "design_db") - number(row, "shipped_db") for row in rows]
+    table = [("sensor", "designed mask", "best shipped", "gain")]
+    for name, row, gain in zip(names, rows, gains, strict=True):
+        table.append((name, row["design"], f"`{row['best_shipped']}`", f"{gain:+.2f} dB"))
+    return Section(
+        "Which mask to order?",
+        f"Before a monochrome sensor with three shots the designed mask gains {max(gains):.1f} dB "
+        "(shipped since as `rgbw-mono-3shots`); behind Bayer filters the mask hardly counts.",
+        "To the right is better. Mean of the light fields of group B, 96x96, diffraction included, "
+        "equal exposure.",
+        ("design",),
+        {
+            "design": svg_charts.dots(
+                "A designed mask pays with a monochrome sensor", "PSNR, dB", names, dots
+            )
+        },
+        table,
+    )  # fmt: skip
+
+
+def learning() -> Section:
+    """What a trained network gains."""
+    rows = [*rows_of("group-b-chart"), *rows_of("group-b-unrolled")]
+    kept = [row for row in rows if row["camera"] == "scenario-ii-cfa" and row["level"] == "default"]
+    by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in kept}
+    scenes = sorted({row["scene"] for row in kept}, key=lambda one: -by[one, "adaptive"])
+    dots = {
+        words: [by[scene, method] for scene in scenes]
+        for words, method in (
+            ("tv", "tv"), ("unrolled, a network", "unrolled"), ("adaptive", "adaptive"),
+        )
+    }  # fmt: skip
+    over, under = (
+        mean(a - b for a, b in zip(dots[one], dots[other], strict=True))
+        for one, other in (("unrolled, a network", "tv"), ("adaptive", "unrolled, a network"))
+    )
+    return Section(
+        "What does training buy?",
+        f"A small network, trained on random worlds, gains {over:.1f} dB over total "
+        f"variation and stays {under:.1f} dB below `adaptive`, which is trained on nothing.",
+        "To the right is better. Group B, 128x160, one shot. The network is the plug-in "
+        "`benchmarks/unrolled_plugin`.",
+        ("group-b-chart", "group-b-unrolled"),
+        {
+            "learning": svg_charts.dots(
+                "A small network gains little, the adaptive model much", "PSNR, dB", scenes, dots
+            )
+        },
+    )
+
+
+def others() -> Section:
+    """Captures of cameras that nobody here built."""
+    rows = [row for row in rows_of("real_captures") if row["mask"] == "right"]
+    by = {
+        (row["capture"], row["method"]): number(row, "rms") / number(row, "interpolation_rms")
+        for row in rows
+    }
+    level = {(row["capture"], row["method"]): row["level"] for row in rows}
+    captures = sorted({row["capture"] for row in rows})
+    cameras = len({capture.split("/")[0] for capture in captures})
+    dots = {
+        method: [round(by[capture, method], 3) for capture in captures]
+        for method in ("tv", "adaptive-fast")
+    }
+    worse = [key for key, ratio in by.items() if ratio > 1]
+    trusted = sum(level[key] == "trust" for key in worse)
+    wrong = [
+        row
+        for row in rows_of("real_captures")
+        if row["mask"] not in ("right", "0.9 px softer") and row["level"]
+    ]
+    refused = share(wrong, lambda row: row["level"] == "do not use")
+    table = [("capture", "verdict of `adaptive-fast`", "of `tv`")]
+    for capture in captures:
+        table.append((capture, level[capture, "adaptive-fast"], level[capture, "tv"]))
+    return Section(
+        "Does it work on cameras that others built?",
+        f"{len(captures)} captures of {cameras} cameras: {len(worse)} of {len(by)} results predict "
+        f"readings worse than interpolation, trusted of these: {trusted or 'none'}. A mask some "
+        f"rows off or mirrored is refused in {refused}.",
+        "Readings kept from the fit (validation), 1 is what interpolation without any camera model "
+        "misses them by; to the left is better. Of tsa the published mask is sharper than its "
+        "shadow, and the verdict says so: [cameras that others built](real-captures.md).",
+        ("real_captures",),
+        {
+            "others": svg_charts.dots(
+                "With a right Psi, readings are predicted better than by interpolation",
+                "error of validation readings, 1 = interpolation", captures, dots, 1,
+            )
+        },
+        table,
+    )  # fmt: skip
+
+
+def large() -> Section:
+    """Whole sensors."""
+    rows = rows_of("large")
+    table = [("megapixels", "method", "processor time", "for a sample", "memory of a worker")]
+    for row in rows:
+        samples = number(row, "rows") * number(row, "columns")
+        cpu_s = number(row, "cpu_s") + number(row, "survey_cpu_s")
+        table.append(
+            (
+                row["megapixels"], f"`{row['method']}`", f"{cpu_s / 60:.0f} min",
+                f"{1e3 * cpu_s / samples:.2f} ms", f"{row['worker_gib']} GiB",
+            )
+        )  # fmt: skip
+    most = max(rows, key=lambda row: number(row, "megapixels"))
+    return Section(
+        "How large may it be?",
+        f"{most['megapixels']} megapixels were reconstructed in {most['blocks']} blocks, each of "
+        f"which needs {most['worker_gib']} GiB.",
+        "Time and memory grow with the pixels and the range of disparities; "
+        "[large captures](scale.md) says how to share them out.",
+        ("large",),
+        {},
+        table,
+    )
+
+
+SECTIONS: tuple[Callable[[], Section], ...] = (
+    whole_frames, speed, three_shots, noise_and_shots, stated, verdicts, wrong_psi, breaking,
+    calibration, mask_design, learning, others, large,
+)  # fmt: skip
+
+HEAD = """\
+# Results
+
+<!-- Made by `python benchmarks/results_page.py`: change the rows in results/, or that script. -->
+
+Real light fields come in two groups: settings were tuned on **A**, and results are reported on
+**B**. Accuracy is the {term}`PSNR` of all views, pixels and colours against the true light field.
+Every chart is drawn from the rows below it, by one command; what its run was is at its foot.
+"""
+
+
+def table_text(rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table; the first row is its head."""
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
+
+
+def run_text(file: str, runs: Mapping[str, Row]) -> str:
+    """Return what a CSV is, when it was measured and by which command."""
+    run = runs[f"{file}.csv"]
+    return (
+        f"[{file}.csv](results/{file}.csv): {run['date']}, version {run['version']}, "
+        f"`{run['command']}`"
+    )
+
+
+def made() -> dict[Path, str]:
+    """Return every file that the command writes, and its text."""
+    runs = {row["file"]: row for row in rows_of("runs")}
+    files: dict[Path, str] = {}
+    page, lines = [HEAD], [("what", "reached", "measured by")]
+    shown: set[str] = set()
+    for section in (make() for make in SECTIONS):
+        page.append(f"## {section.heading}\n\n{section.answer}\n")
+        for name, chart in section.charts.items():
+            files[RESULTS / "charts" / f"{name}.svg"] = chart
+            page.append(f"![{section.heading}](results/charts/{name}.svg)\n")
+        page.append(f"**How to read this.** {section.how}\n")
+        if section.table:
+            page.append(table_text(section.table) + "\n")
+        page += [f"- {run_text(file, runs)}" for file in section.files]
+        page.append("")
+        shown |= set(section.files)
+        if section.line:
+            command = runs[f"{section.files[0]}.csv"]["command"].split(" --")[0]
+            lines.append((*section.line, f"`{command}`"))
+    page.append("## Other runs\n")
+    page += [
+        f"- {run_text(Path(file).stem, runs)}"
+        for file in sorted(runs)
+        if Path(file).stem not in shown
+    ]
+    files[ROOT / "docs" / "results.md"] = "\n".join(page) + "\n"
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    before, rest = readme.split(BEGIN)
+    files[ROOT / "README.md"] = f"{before}{BEGIN}\n{table_text(lines)}\n{END}{rest.split(END)[1]}"
+    return files
+
+
+def main() -> None:
+    """Write the page, its charts, and the README's table."""
+    for path, text in made().items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
