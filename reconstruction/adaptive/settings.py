@@ -29,9 +29,7 @@ class AdaptiveSettings(Settings):
     interleaved: bool = Field(
         default=True, description="compare a second grid of patches too, between the first"
     )
-    second: bool = Field(
-        default=True, description="search again, with a larger misfit, where disparities are wide"
-    )
+    second: bool = Field(default=True, description="search again, where disparities are wide")
     lengths_px: tuple[Length, ...] = Field(
         default=(3.0, 1.5), min_length=1, description="correlation lengths of a patch's texture"
     )

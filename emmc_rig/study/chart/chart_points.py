@@ -26,6 +26,7 @@ FAST = {"size": (64, 80), "zoom": 3, "repeats": 3, "enough_s": 1.0}
 DEFAULT = "default"
 _QUICK_PATCHES = {"stride": 9, "solver": {"rtol": 1e-2, "max_steps": 200}}
 VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
+    "adaptive": {DEFAULT: {}, "best": {"adaptive": {"patches": 1}}},
     "tv": {
         "15 steps": {"tv": {"max_steps": 15}},
         "40 steps": {"tv": {"max_steps": 40}},
