@@ -262,8 +262,12 @@ def _psi(outcome: Outcome) -> tuple[str, float]:
         top = round_up(float(np.nanpercentile(whole, 99.9)))
         label = "share of the open camera's light" if axes is not panels[-1] else "the same unit"
         drawn_map(axes, whole, (0, top), label, "gray" if axes is not panels[-1] else "magma")
-        axes.set_xticks([(u + 0.5) * (width + 2) for u in range(views[1])], range(views[1]))
-        axes.set_yticks([(v + 0.5) * (height + 2) for v in range(views[0])], range(views[0]))
+        axes.set_xticks(
+            [(u + 0.5) * (width + 2) for u in range(views[1])], map(str, range(views[1]))
+        )
+        axes.set_yticks(
+            [(v + 0.5) * (height + 2) for v in range(views[0])], map(str, range(views[0]))
+        )
         titled(axes, title, "view u")
     relative_deviation = float(np.sqrt(squares[1] / max(squares[0], 1e-30)))
     return fragment("calibration_psi.html") + _pictures({"Psi": figure}), relative_deviation
