@@ -67,7 +67,7 @@ def texts(path: Path) -> Iterator[tuple[int, str]]:
         text = path.read_text(encoding="utf-8")
         text = TEMPLATE.sub(lambda code: "\n" * code[0].count("\n"), text)
         for one in re.finditer(SAID[path.suffix], text):
-            yield text.count("\n", 0, one.start()) + 1, " ".join(one[0].split())
+            yield text.count("\n", 0, one.start()) + 1, " ".join(one[0].strip('<>`"').split())
 
 
 def docstrings(tree: ast.Module) -> set[ast.Constant]:
