@@ -80,7 +80,9 @@ def whole_frames() -> Section:
     reached = f"{min(dots['adaptive']):.1f} to {max(dots['adaptive']):.1f} dB"
     answer = f"One frame each: adaptive is {lead:.1f} dB above tv-dict"
     methods = [one for one in ("tv-dict", "adaptive-fast", "adaptive") if one in of[scenes[0]]]
-    table = [("light field", "size", *(f"`{method}`" for method in methods), "seconds")]
+    table: list[tuple[str, ...]] = [
+        ("light field", "size", *(f"`{method}`" for method in methods), "seconds")
+    ]
     for scene in scenes:
         first = of[scene]["adaptive"]
         cells = (f"{number(of[scene][method], 'psnr_db'):.2f} dB" for method in methods)
@@ -211,7 +213,12 @@ def stated() -> Section:
     """How well the accuracy that a result states holds."""
     rows = rows_of("stated-groups")
     table = [
-        ("captures of group", "number", "error of the stated PSNR, rms", "truth within interval")
+        (
+            "captures of group",
+            "number",
+            "error of the estimated accuracy, rms",
+            "truth within interval",
+        )
     ]
     for row in rows:
         within = (
@@ -222,14 +229,18 @@ def stated() -> Section:
     held = f"{number(other, 'in_interval'):.0%}".replace("%", " %")
     return Section(
         "Can the estimated accuracy be believed?",
-        f"The interval that a result states for its PSNR holds the truth in {held} of the captures "
-        f"that it was not fitted to; it is wide: {number(other, 'median_width_db'):.1f} dB.",
+        f"The interval of a result's estimated accuracy holds the true PSNR in {held} of the "
+        "captures that it was not fitted to; it is wide: "
+        f"{number(other, 'median_width_db'):.1f} dB.",
         "90 % should lie within. The estimate itself is off by the rms, so that it tells a good "
         "result from a poor one, not 30 from 31 dB.",
         ("stated-groups",),
         {},
         table,
-        ("The interval stated for the PSNR holds the true one", f"{held} of {other['captures']}"),
+        (
+            "The interval of the estimated accuracy holds the true PSNR",
+            f"{held} of {other['captures']}",
+        ),
     )
 
 

@@ -23,7 +23,7 @@ for method in ("tv", "dict-omp", "tv-dict", "adaptive-fast", "adaptive"):
     print(f"{method:14} {points[method][0]:6.2f} s  {points[method][1]:6.2f} dB")
 
 # %%
-figure, axis = plt.subplots(layout="constrained")
+figure, axis = plt.subplots(figsize=(6, 3.4), layout="constrained")
 for method, (seconds, psnr_db) in points.items():
     axis.plot(seconds, psnr_db, "o")
     axis.annotate(method, (seconds, psnr_db), xytext=(6, 4), textcoords="offset points")

@@ -41,8 +41,3 @@ for axis, (title, shown) in zip(axes, pictures.items(), strict=True):
 print(result.verdict.level)
 for reason in result.verdict.reasons:
     print(f"- {reason.what}\n  {reason.remedy}")
-
-# %%
-# What it would have shown, beside the truth and the readings that it leaves unexplained:
-
-figure = result.figure(truth=scene)

@@ -24,7 +24,7 @@ whiteboards:
   references: 2
   open:
     - repeats: 2
-    - held_out: true
+    - validation: true
 darks:
   repeats: 2
 """

@@ -79,6 +79,7 @@ def figures(size: tuple[int, int] = SIZE) -> dict[str, Figure]:
     disparity = fits.scene.centre
     mean = averaged(survey, fits, disparity_sigma)
     assert mean.sigma is not None
+    assert scene.disparity_px is not None
 
     begun, (left, right) = _pictures(
         ("the frame: one number a pixel", "the centre view, at the end")

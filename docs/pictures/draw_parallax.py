@@ -61,6 +61,7 @@ def main() -> None:
     psi = camera.psi(scene.size)
     frames = camera.expose(scene, seed=0, psi=psi)
     result = emmc.reconstruct(psi, frames)
+    assert result.disparity is not None
     first, *others = animation(frames.readings[0], result.light_field, result.disparity)
     path = Path(__file__).parent / "parallax.webp"
     first.save(

@@ -320,7 +320,6 @@ def test_a_row_of_views_is_a_light_field(views):
     [
         ((3, 3), ANGLES, 2, False),
         ((3, 3), ANGLES, 3, True),
-        ((7, 7), ANGLES, 1, True),
         ((9, 9), ANGLES, 1, False),
         ((1, 24), BANDS, 1, False),
         ((1, 28), BANDS, 1, True),
