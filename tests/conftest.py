@@ -59,6 +59,8 @@ def pytest_sessionstart(session):
     config = session.config
     if hasattr(config, "workerinput") or tests_are_named(config) or config.option.collectonly:
         return
+    if config.option.but is not None:  # the run that listed those tests has compiled
+        return
     first_run = [sys.executable, "-m", "emmc_rig.commands.first_run"]
     for together in (("search", "fit"), ("dict-admm", "dict-omp")):
         with ExitStack() as running:
