@@ -201,7 +201,7 @@ def check_few(size: Size, seed: int) -> Iterator[Row]:
     settings = settings_for(size, seed, few=True, target=0.005 if size.rays > 1000 else 0.02)
     boards = simulated_plan(settings).whiteboards
     assert boards is not None
-    yield Row("few: whiteboards", sum(one.repeats for one in boards.open if not one.held_out), 12)
+    yield Row("few: whiteboards", sum(one.repeats for one in boards.open if not one.validation), 12)
     yield from _error_rows("few", calibrate_simulated(settings).found.metrics, 0.005)
 
 

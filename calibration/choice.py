@@ -160,7 +160,7 @@ def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
 def _residual(one: HeldOut) -> str:
     """Return the square residual over the noise's variance, of the worst whiteboard, in words."""
     kind = max(one.groups, key=lambda name: one.groups[name], default="")
-    worst = f", largest of: {kind}" if len(one.groups) > 1 else ""
+    worst = f", worst: {kind}" if len(one.groups) > 1 else ""
     return (
         f"residual {one.chi2:.2f} x noise variance (limit {LARGEST_CHI2:g}{worst}), "
         f"calibration method {one.route}"

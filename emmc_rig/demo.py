@@ -54,8 +54,8 @@ from simulators.bench import Bench
 from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
-SIZE = (96, 128)
-"""Of a built-in scene: a quarter of the samples of its own 192x256, for a first run of seconds."""
+SIZE = (108, 144)
+"""Of a built-in scene: a third of the samples of its own 192x256, for a first run of seconds."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,6 @@ class DemoSettings:
     camera: Camera
     size: tuple[int, int] | None = None
     seed: int = 0
-    whiteboard_repeats: int = 2
     method: str = DEFAULT_METHOD
     dictionary: str | None = None
     solver: MethodSettings = field(default_factory=MethodSettings)
@@ -277,7 +276,7 @@ def demo_plan(settings: DemoSettings) -> Plan:
         title="demo",
         camera=settings.camera_name,
         shots=tuple(PlannedShot() for _ in settings.camera.shots),
-        whiteboards=Boards(repeats=settings.whiteboard_repeats),
+        whiteboards=Boards(repeats=1),
         darks=Darks(),
         # The scene is exposed as its camera says, whatever that saturates.
         checks=Checks(largest_saturated_share=1.0, smallest_signal=0.0),

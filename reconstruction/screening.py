@@ -253,7 +253,7 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
     most = np.empty((keep, columns), values.dtype)
     small = np.empty(columns, values.dtype)
     large = np.empty(columns, values.dtype)
-    count, same = np.empty(columns, np.int32), np.empty(columns, np.uint8)
+    count, alike = np.empty(columns, np.int32), np.empty(columns, np.uint8)
     endless = np.float32(np.inf)
     for y in range(begin, end):
         least[:] = endless
@@ -264,35 +264,31 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
                 if j == y and across == 0:
                     continue
                 first, last = max(0, -across), columns - max(0, across)
-                # Their rows as arrays of their own: an index that may be negative takes time.
-                beside = values[j, first + across : last + across]
-                colours_beside = colours[j, first + across : last + across]
-                good_beside = good[j, first + across : last + across]
-                own, counted = colours[y, first:last], count[first:last]
-                alike = same[first:last]
+                # Unsigned: an index that may be negative is counted from the end, which takes time.
+                own, there = np.uint64(first), np.uint64(first + across)
+                width = np.uint64(last - first)
                 found = 0
-                for n in range(beside.size):
-                    alike[n] = good_beside[n] & (colours_beside[n] == own[n])
+                for n in range(width):
+                    same = colours[j, n + there] == colours[y, n + own]
+                    alike[n] = good[j, n + there] & same
                     found += alike[n]
                 if found == 0:
                     continue
-                low_side, high_side = small[first:last], large[first:last]
-                for n in range(beside.size):
-                    low_side[n] = beside[n] if alike[n] else endless
-                    high_side[n] = beside[n] if alike[n] else -endless
-                for n in range(beside.size):
-                    counted[n] += alike[n]
+                for n in range(width):
+                    value = values[j, n + there]
+                    small[n] = value if alike[n] else endless
+                    large[n] = value if alike[n] else -endless
+                for n in range(width):
+                    count[n + own] += alike[n]
                 for place in range(keep):
-                    kept = least[place, first:last]
-                    for n in range(kept.size):
-                        one, other = kept[n], low_side[n]
-                        kept[n] = one if one < other else other
-                        low_side[n] = other if one < other else one
-                    kept = most[place, first:last]
-                    for n in range(kept.size):
-                        one, other = kept[n], high_side[n]
-                        kept[n] = other if one < other else one
-                        high_side[n] = one if one < other else other
+                    for n in range(width):
+                        one, other = least[place, n + own], small[n]
+                        least[place, n + own] = one if one < other else other
+                        small[n] = other if one < other else one
+                    for n in range(width):
+                        one, other = most[place, n + own], large[n]
+                        most[place, n + own] = other if one < other else one
+                        large[n] = one if one < other else other
         for x in range(columns):
             if count[x] < fewest:
                 low[y, x], high[y, x] = -np.inf, np.inf

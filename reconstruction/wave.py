@@ -104,9 +104,7 @@ def _raise(ahead, below, dual, steps, v, u, raised, size):
     first, second, third = size[:width], size[width : 2 * width], size[2 * width :]
     for x in range(width):
         ratio = bound / np.sqrt(first[x] + second[x] + third[x])
-        first[x] = relax * (ratio if ratio < one else one)
-    second[:] = first
-    third[:] = first
+        first[x] = second[x] = third[x] = relax * (ratio if ratio < one else one)
     kept = one - relax
     for index in range(indices):
         new, old = raised[index], dual[v, u, index]
@@ -203,7 +201,9 @@ def _pass(data, steps, unmix, begun, count, span, own, columns, out):
                         line[c * width + x] = mean
                 for v in range(views_v):
                     for u in range(views_u):
-                        now[y % rows, v, u] = line
+                        # Not as arrays: what checks their shapes takes two seconds to compile.
+                        for x in range(values):
+                            now[y % rows, v, u, x] = line[x]
         for step in range(max(0, front - bottom + 1), min(count, front - top + 1)):
             row = front - step
             at = row * binning % rows

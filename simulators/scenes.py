@@ -388,10 +388,43 @@ def _avenue(rng: np.random.Generator) -> World:
     )  # fmt: skip
 
 
+def _toy_table(rng: np.random.Generator) -> World:
+    jitter = rng.uniform(-0.01, 0.01, 6)
+    wall = textures.stone(rng, "#3f6f86", "#6fa3b4", "#a8cbd0", finest=6)
+
+    def block(letter: str, paint: str, disparity: float, *at: float, **more) -> Card:
+        return Card(textures.letter_block(letter, paint), disparity, _frame(*at), **more)
+
+    def ball(s: float, t: float, disparity: float, radius: float, *colours: str) -> Ball:
+        return Ball(s, t, disparity, radius, 0.5, textures.segments(rng, *colours), gloss=0.04)
+
+    return World(
+        cards=(
+            Card(wall, -2.0, _frame(0, 0, 1, 1), tiled=True),
+            Card(
+                textures.gingham(rng, "#c2413a", 3, weave=0.0), -2.4, _ground(-0.2, 0.3),
+                slope_t=9.0, tiled=True,
+            ),
+            Card(textures.postcard(rng), -1.8, _frame(-0.25 + jitter[0], -0.2, 0.36, 0.27)),
+            block("E", "#1f5fa8", -0.6, 0.06 + jitter[1], -0.06, 0.2, 0.2, 4),
+            block("M", "#d88a1e", -0.5, 0.3 + jitter[2], -0.05, 0.21, 0.21, -5, slope_s=0.8),
+            block("C", "#2f8a52", 0.1, 0.17 + jitter[3], 0.13, 0.23, 0.23, -8),
+        ),
+        balls=(
+            ball(-0.24 + jitter[4], 0.06, 0.0, 0.13, "#d0342c", "#f4ead2", "#2d6fb0", "#f0b429"),
+            ball(-0.08, 0.23, 1.5, 0.075, "#2d8a6a", "#f4ead2", "#7a3fa0"),
+            ball(0.4, 0.24 + jitter[5], 1.8, 0.085, "#f0b429", "#d0342c", "#f4ead2"),
+        ),
+        surroundings=textures.surroundings(rng, "#5a4a3a", "#a89a86", "#dcd6ca"),
+        ambient=0.55,
+    )  # fmt: skip
+
+
 SCENES: dict[str, Scene] = {
     "near-planar": Scene("papers, a leaf and marbles on a tilted desk", (-0.3, 0.3), _desk),
     "deep-occlusions": Scene("a garden behind leaves and grass", (-2.0, 2.0), _garden),
     "non-lambertian": Scene("glass, mirror, gloss and clear film", (-1.6, 1.6), _still_life),
     "dark": Scene("blossoms at night, a few saturated glints", (-0.6, 0.6), _night_blossoms),
     "wide-disparity": Scene("an avenue seen through a fence", (-6.0, 10.0), _avenue),
+    "toy-table": Scene("letter blocks and balls on a checked cloth", (-2.0, 2.0), _toy_table),
 }

@@ -93,21 +93,30 @@ def bricks(rng: np.random.Generator, rows: int, columns: int, side: int = 1024) 
     return mixed(mortar, brick, step(edge + wobble, 0.09, 0.03))
 
 
-def gingham(rng: np.random.Generator, colour: str, squares: int, side: int = 1024) -> np.ndarray:
-    """Checked cloth, `squares` pairs of stripes each way; tiled."""
+def gingham(
+    rng: np.random.Generator, colour: str, squares: int, weave: float = 0.06, side: int = 1024
+) -> np.ndarray:
+    """Checked cloth, `squares` pairs of stripes each way, its threads as dark as `weave`; tiled."""
     p, q = grid(side)
     warp, weft = np.sin(np.pi * squares * p * 2) > 0, np.sin(np.pi * squares * q * 2) > 0
-    weave = 0.06 * np.sin(2 * np.pi * 96 * p) * np.sin(2 * np.pi * 96 * q)
-    shade = 0.5 * warp + 0.42 * weft + weave + 0.04 * noise(rng, side, 2, 60)
+    threads = weave * np.sin(2 * np.pi * 96 * p) * np.sin(2 * np.pi * 96 * q)
+    shade = 0.5 * warp + 0.42 * weft + threads + 0.04 * noise(rng, side, 2, 60)
     soft = cv2.GaussianBlur(shade.astype(np.float32), (0, 0), side / 700)
     return painted(np.clip(soft, 0, 1), "#f4f0e6", colour)
 
 
 def stone(
-    rng: np.random.Generator, *colours: str, veins: float = 0.0, side: int = 512
+    rng: np.random.Generator,
+    *colours: str,
+    veins: float = 0.0,
+    finest: float = 110,
+    side: int = 512,
 ) -> np.ndarray:
-    """A cloudy mix of the colours, darkened along `veins` by that much; tiled."""
-    cloud = noise(rng, side, 1, 110, 1.0)
+    """A cloudy mix of the colours, darkened along `veins` by that much; tiled.
+
+    finest: detail, cycles per side.
+    """
+    cloud = noise(rng, side, 1, finest, 1.0)
     vein = np.exp(-((noise(rng, side, 2, 30, 1.3) / 0.06) ** 2))
     return painted(np.clip(0.5 + 0.2 * cloud - veins * vein, 0, 1), *colours)
 
@@ -200,6 +209,19 @@ def star_chart(side: int = 512) -> np.ndarray:
     shade = np.where((np.abs(q - 0.88) < 0.055) & (np.abs(p - 0.5) < 0.42), bars, shade)
     shade = cv2.GaussianBlur(shade.astype(np.float32), (0, 0), 1.2)
     return painted(shade, "#161616", "#f3f1ea", alpha=rectangle(side))
+
+
+def letter_block(letter: str, paint: str, side: int = 256) -> np.ndarray:
+    """The face of a toy block: a letter and a frame in `paint` on pale wood."""
+    ink = np.zeros((side, side), np.uint8)
+    cv2.rectangle(ink, (side // 12,) * 2, (side - side // 12,) * 2, 255, side // 11, cv2.LINE_AA)
+    font, scale, thick = cv2.FONT_HERSHEY_SIMPLEX, side / 40, side // 8
+    (wide, high), _ = cv2.getTextSize(letter, font, scale, thick)
+    cv2.putText(
+        ink, letter, ((side - wide) // 2, (side + high) // 2), font, scale, 255, thick, cv2.LINE_AA
+    )  # fmt: skip
+    shade = cv2.GaussianBlur(ink.astype(np.float32) / 255, (0, 0), side / 200)
+    return painted(shade, "#f3e2bf", paint, alpha=rectangle(side))
 
 
 def postcard(rng: np.random.Generator, side: int = 512) -> np.ndarray:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 # As many processes as cores: threads of BLAS in each would wait on each other.
@@ -58,12 +59,20 @@ def pytest_sessionstart(session):
     config = session.config
     if hasattr(config, "workerinput") or tests_are_named(config) or config.option.collectonly:
         return
+    if config.option.but is not None:  # the run that listed those tests has compiled
+        return
     first_run = [sys.executable, "-m", "emmc_rig.commands.first_run"]
-    parts = [["search"], ["fit"]], [["dict-admm"], ["dict-omp"]]
-    for together in parts:
-        processes = [subprocess.Popen([*first_run, *one, "rgbw-bayer-3shots"]) for one in together]
-        for process in processes:
-            process.wait()
+    for together in (("search", "fit"), ("dict-admm", "dict-omp")):
+        with ExitStack() as running:
+            processes = [
+                running.enter_context(
+                    # It ends when its input does: this process's own may be at its end already.
+                    subprocess.Popen([*first_run, part, "rgbw-bayer-3shots"], stdin=subprocess.PIPE)
+                )
+                for part in together
+            ]
+            if any(process.wait() for process in processes):
+                pytest.exit(f"kernels of {' or '.join(together)} do not compile or run", 1)
 
 
 NO_LIGHT_FIELDS = "EMMC_LIGHTFIELDS does not name a folder of real light fields"

@@ -186,7 +186,8 @@ def _run(
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
             most = "" if until_db is None else "at most "
-            hands = f", {expected.by_hand} changes by hand" if expected.by_hand else ""
+            count = expected.by_hand
+            hands = f", {count} change{'s' * (count > 1)} by hand" if count else ""
             yet = (
                 f"; time excludes {expected.guessed} exposures that are metered first"
                 if expected.guessed

@@ -10,7 +10,6 @@ import typer
 from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import (
     DEFAULT_CAMERA,
-    DEFAULT_SCENE,
     CameraOption,
     DictionaryOption,
     OutOption,
@@ -22,10 +21,13 @@ from emmc_rig.commands.options import (
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
 
+DEMO_SCENE = "toy-table"
+"""Large even surfaces, sharp edges and letters: what a light field of few pixels can show well."""
+
 
 def demo(
     context: typer.Context,
-    scene: SceneOption = DEFAULT_SCENE,
+    scene: SceneOption = DEMO_SCENE,
     camera: CameraOption = DEFAULT_CAMERA,
     shots: ShotsOption = None,
     seed: SeedOption = 0,

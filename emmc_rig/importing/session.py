@@ -449,8 +449,10 @@ class _Import:
         fitted = fittings(self._camera)
         for (item, shot), exposure_s in zip(self._items, self._exposures_s, strict=True):
             row, where = item.listed.row, item.listed.where
-            validates = item is validating or row.kind == "validation"
-            kind = VALIDATION if validates else row.kind
+            if item is validating or row.kind == "validation":
+                kind = VALIDATION
+            else:
+                kind = row.kind
             lamp = "off" if kind == "dark" else row.lamp or "white"
             at_um = mask_offsets_um(self._camera, shot)
             if _placed(row) and kind != "shot":

@@ -81,7 +81,10 @@ class Files:
         read = parse_yaml(before, str(path), AppError)
         simulated = SimulatedFile if _kind(read) == SIMULATED else RealRig
         settings = Plan if path == self._plan else simulated
-        earlier = {new: old for old, new in settings.renamed.items() if old in (read or {})}
+        there = read if isinstance(read, dict) else {}
+        earlier: dict[str | int, str] = {
+            n: old for old, n in settings.renamed.items() if old in there
+        }
         named = {(earlier.get(key[0], key[0]), *key[1:]): value for key, value in values.items()}
         after = with_values(before, named, str(path))
         validated(settings, parse_yaml(after, str(path), AppError), str(path), AppError)

@@ -50,10 +50,17 @@ def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None
         for band in range(count):
             one(band)
         return
-    at_work = [_pool(threads).submit(one, band) for band in range(count)]
+    ahead = iter(range(count))
+
+    def several() -> None:
+        for band in ahead:  # threads share it: who is free takes the next
+            one(band)
+
+    # A task a thread, not a band: to hand one over takes as long as a short band.
+    at_work = [_pool(threads).submit(several) for _ in range(min(threads, count))]
     wait(at_work)
-    for band in at_work:
-        band.result()
+    for thread in at_work:
+        thread.result()
 
 
 def in_views(work: Callable[[tuple[int, int]], None], views: tuple[int, ...]) -> None:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from calibration.choice import HeldOut
 from calibration.routes import Outcome
 from calibration.sensor import SensorSheet
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.display import DisplayCurve, finite, heat, montage, png_of, round_up
-from emmc_rig.pages.drawing import ACCENT, INK, sheet, svg_of, titled
+from emmc_rig.pages.display import finite, round_up
+from emmc_rig.pages.drawing import ACCENT, INK, drawn_map, sheet, svg_of, titled
 from emmc_rig.pages.page import (
     Card,
     Head,
@@ -32,28 +35,48 @@ DETAIL_PX = 40
 """Side of the piece of a slice of Psi that is shown pixel for pixel."""
 THUMBNAIL_PX = 120
 """Side of a whole slice."""
-WORDS = {
-    "offset_x_um": ("Offset x", "um"),
-    "offset_y_um": ("Offset y", "um"),
-    "rotation_rad": ("Rotation", "rad"),
-    "scale": ("Scale of the cells", ""),
-    "skew": ("Skew", ""),
-    "distance_share": ("Error of the distance d", "of d"),
-    "distortion_um": ("Distortion at the corner", "um"),
-    "blur_um": ("Edge blur", "um"),
-    "clear": ("Transmittance, open", ""),
-    "leak": ("Transmittance, closed", ""),
-    "vignetting": ("Vignetting", ""),
-    "falloff": ("Falloff over the aperture", ""),
-    "tilt_x_rad": ("Tilt, x", "rad"),
-    "tilt_y_rad": ("Tilt, y", "rad"),
-    "bow_um": ("Bow at the corner", "um"),
-    "glass_um": ("Glass between mask and sensor", "um"),
-}
-
-
+MAP_PX = 640
+"""Longest side of a residual map; larger ones are shown averaged."""
 GOOD_CHI2 = 1.5
-"""Held-out residual, in variances of the noise, above which something is not modelled."""
+"""Validation residual, in variances of the noise, above which something is not modelled."""
+GOOD_BAD_PIXELS = 0.02
+"""Share of pixels, from which on a reconstruction is doubted (`reconstruction.verdict.rules`)."""
+SURE = 2.0
+"""Deviations by which a parameter differs from the design before the page says so."""
+
+
+class _Parameter(NamedTuple):
+    """How a fitted parameter is written: in units of `unit`, each `per_unit` of the fit's.
+
+    design: its value as designed, in the fit's units; None where the mask's file has another for
+    every mask. of: whose property it is, where it differs.
+    """
+
+    words: str
+    unit: str
+    of: str
+    per_unit: float = 1.0
+    design: float | None = 0.0
+
+
+PARAMETERS = {
+    "offset_x_um": _Parameter("Mask's offset, x", "um", "the mount"),
+    "offset_y_um": _Parameter("Mask's offset, y", "um", "the mount"),
+    "rotation_rad": _Parameter("Mask's rotation", "mrad", "the mount", 1e-3),
+    "scale": _Parameter("Scale of the mask's cells", "% of design", "the mask", 0.01, 1.0),
+    "skew": _Parameter("Mask's skew", "mrad", "the mask", 1e-3),
+    "distance_share": _Parameter("Mask's distance", "% from the design's", "the mount", 0.01),
+    "distortion_um": _Parameter("Distortion at the corner", "um", "the lens"),
+    "blur_um": _Parameter("Blur of the mask's edges", "um", "the mask"),
+    "clear": _Parameter("Transmittance of open cells", "%", "the mask", 0.01, None),
+    "leak": _Parameter("Transmittance of closed cells", "%", "the mask", 0.01, None),
+    "vignetting": _Parameter("Vignetting", "%", "the lens", 0.01),
+    "falloff": _Parameter("Falloff over the aperture", "%", "the lens", 0.01),
+    "tilt_x_rad": _Parameter("Mask's tilt, x", "mrad", "the mount", 1e-3),
+    "tilt_y_rad": _Parameter("Mask's tilt, y", "mrad", "the mount", 1e-3),
+    "bow_um": _Parameter("Mask's bow at the corner", "um", "the mask"),
+    "glass_um": _Parameter("Glass between mask and sensor", "um", "the mount"),
+}
 
 
 def write_calibration_report(
@@ -67,33 +90,45 @@ def write_calibration_report(
     metrics: as `emmc_rig.calibrate` makes them.
     """
     unwatched = [one.removeprefix("not measured: ") for one in outcome.unwatched]
+    psi, relative_deviation = _psi(outcome)
+    chosen = outcome.judged[outcome.chosen]
     sections = [
-        Section("choice", "Chosen", _choice(outcome, metrics)),
         *_listed("found", "Found and taken into account", outcome.findings),
         *_listed("unwatched", "Not measured", unwatched),
-    ]
+        Section("psi", "Psi", psi),
+        Section(
+            "residuals", "Residuals", _residuals([chosen]) + _kinds(chosen),
+            about="Whiteboards kept from the fit, less what this calibration predicts of them.",
+        ),
+        Section(
+            "methods", "Calibration methods", _methods(outcome),
+            about=f"Why {outcome.chosen} was chosen, and what the others predict.",
+        ),
+    ]  # fmt: skip
     if outcome.parametric is not None:
-        sections.append(Section("fit", "Fit", _fit(metrics)))
-    body = _kinds(outcome.judged[outcome.chosen]) + _residuals(list(outcome.judged.values()))
-    sections += [Section("residuals", "Residual maps", body), Section("psi", "Psi", _psi(outcome))]
+        about = "Where it sits and how it was made, each figure with its standard deviation."
+        sections.append(Section("fit", "Mask as fitted", _fit(metrics), about=about))
     if sensor is not None:
-        sections.append(Section("sensor", "Sensor", _sensor(sensor)))
+        about = "Gain, noise and linearity after EMVA 1288."
+        sections.append(Section("sensor", "Sensor", _sensor(sensor), about=about))
     sections.append(provenance_section(_provenance(metrics)))
     title = f"Calibration of {metrics['camera']}"
-    write_text(
-        path, framed(title, (), (), sections, ["calibration.css"], head=_head(outcome, metrics))
-    )
+    text = framed(
+        title, (), (), sections, ["calibration.css"], head=_head(outcome, metrics),
+        lead=fragment("cards.html", cards=_cards(outcome, metrics, relative_deviation)),
+    )  # fmt: skip
+    write_text(path, text)
 
 
 def _head(outcome: Outcome, metrics: Mapping) -> Head:
     """Return whether the whiteboards agree with the Psi chosen, and what to measure again."""
-    good = outcome.judged[outcome.chosen].chi2 < GOOD_CHI2 and not outcome.advice
-    return Head(
-        "trust" if good else "doubt",
-        outcome.why,
-        outcome.advice or [_use(metrics)],
-        "good" if good else "watch",
-    )
+    agrees = outcome.judged[outcome.chosen].chi2 < GOOD_CHI2
+    words = "This calibration does not describe the bench"
+    if agrees:
+        words = "You can use this calibration"
+        words += ", and make it better" if outcome.advice else ""
+    good = agrees and not outcome.advice
+    return Head(words, outcome.why, outcome.advice or [_use(metrics)], "good" if good else "watch")
 
 
 def _use(metrics: Mapping) -> str:
@@ -102,30 +137,42 @@ def _use(metrics: Mapping) -> str:
     return f"get the light field with this Psi: `emmc-rig reconstruct {typed(metrics['session'])}`"
 
 
-def _choice(outcome: Outcome, metrics: Mapping) -> str:
-    judged = outcome.judged[outcome.chosen]
-    cards = [
-        Card("Route", outcome.chosen, "the surest at the noise", "good"),
-        Card(
-            "Held-out residual",
-            f"{judged.chi2:.2f}",
-            "times the noise's variance",
-            "good" if judged.chi2 < GOOD_CHI2 else "watch",
+def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> list[Card]:
+    judged, bad = outcome.judged[outcome.chosen], metrics["bad_pixels"]
+
+    def card(label: str, value: str, note: str, good: bool) -> Card:
+        return Card(label, value, note, "good" if good else "watch")
+
+    return [
+        card(
+            "Validation residual", f"{judged.chi2:.2f} x noise",
+            f"mean square, over the noise's variance; good: below {GOOD_CHI2:g}",
+            judged.chi2 < GOOD_CHI2,
         ),
-        Card("Frames", str(outcome.frames[outcome.chosen]), "for this route"),
-        Card("Bad pixels", f"{metrics['bad_pixels']:.2%}", "found and left out"),
-    ]
+        Card(
+            "Deviation of Psi", f"{relative_deviation:.2%}",
+            "standard deviation of its coefficients, over their root mean square",
+        ),
+        card(
+            "Excluded pixels", f"{bad:.2%}",
+            f"found bad; good: below {GOOD_BAD_PIXELS:.0%}", bad < GOOD_BAD_PIXELS,
+        ),
+    ]  # fmt: skip
+
+
+def _methods(outcome: Outcome) -> str:
     rows = [
         (
             name,
             outcome.frames[name],
             f"{one.chi2:.2f}",
+            "yes" if one.chi2 < GOOD_CHI2 else "no",
             f"{one.relative_error:.3%}",
         )
         for name, one in outcome.judged.items()
     ]
     chosen = list(outcome.judged).index(outcome.chosen)
-    return fragment("calibration_choice.html", cards=cards, rows=rows, chosen=chosen)
+    return fragment("calibration_choice.html", rows=rows, chosen=chosen)
 
 
 def _listed(name: str, title: str, lines: Sequence[str]) -> list[Section]:
@@ -137,68 +184,93 @@ def _kinds(judged: HeldOut) -> str:
     """Return how every kind of whiteboard is predicted, the worst first."""
     order = sorted(judged.groups.items(), key=lambda item: -item[1])
     rows = [(name, f"{value:.2f}") for name, value in order]
-    heads = ("Whiteboards, by the route chosen", "Residual / noise")
-    return fragment("figures.html", heads=heads, rows=rows, pictures={})
+    heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
+    return fragment("figures.html", heads=heads, rows=rows)
 
 
 def _fit(metrics: Mapping) -> str:
-    rows = []
-    for name, (words, unit) in WORDS.items():
-        found = metrics["parameters"][name]
-        rows.append([words, f"{found['value']:.6g}", f"{found['deviation']:.2g}", unit])
-    return fragment(
-        "calibration_fit.html",
-        fit=metrics["fit"],
-        heads=["Parameter", "Fitted", "Standard deviation", "Unit"],
-        rows=rows,
-    )
+    undecided = metrics["fit"]["undecided"]
+    rows = [
+        _fitted(parameter, metrics["parameters"][name], name in undecided)
+        for name, parameter in PARAMETERS.items()
+    ]
+    return fragment("calibration_fit.html", fit=metrics["fit"], rows=rows, good_chi2=GOOD_CHI2)
+
+
+def _fitted(one: _Parameter, found: Mapping[str, float], undecided: bool) -> tuple[str, str, str]:
+    """Return a parameter as a row: its name, value and deviation, and what that says."""
+    value, deviation = found["value"] / one.per_unit, found["deviation"] / one.per_unit
+    digits = max(0, 1 - math.floor(math.log10(deviation))) if deviation > 0 else 2
+    written = f"{value:.{digits}f} ± {deviation:.{digits}f} {one.unit}"
+    if undecided:
+        return one.words, written, "not known from these whiteboards: taken as designed"
+    if one.design is None:
+        return one.words, written, "measured; Psi has it"
+    away = abs(value - one.design / one.per_unit)
+    if away <= SURE * deviation:
+        return one.words, written, "as designed, within its deviation"
+    return one.words, written, f"{one.of}, not an error: Psi has it"
 
 
 def _residuals(judged: Sequence[HeldOut]) -> str:
-    pictures = {}
-    for one in judged:
-        grey = np.clip(one.residual / (2 * RESIDUAL_SCALE) + 0.5, 0, 1)
-        pictures[one.route] = png_of((grey * 255 + 0.5).astype(np.uint8))
-    return fragment("calibration_residuals.html", pictures=pictures, scale=RESIDUAL_SCALE)
+    """Return maps (pixel_y, pixel_x) of what predictions miss, with axes and a scale."""
+    figure, panels = sheet(len(judged), 7.0, 4.6, label="pixel y")
+    for axes, one in zip(panels, judged, strict=True):
+        height, width = one.residual.shape
+        small = _shrunk(one.residual, MAP_PX)
+        scale = (-0.5, width - 0.5, height - 0.5, -0.5)
+        drawn_map(
+            axes, small, (-RESIDUAL_SCALE, RESIDUAL_SCALE), "validation whiteboard less "
+            "prediction,\nstandard deviations of the noise", "RdBu_r", extent=scale,
+        )  # fmt: skip
+        titled(axes, one.route, "pixel x")
+    return _pictures({"Residual map": figure})
 
 
-def _psi(outcome: Outcome) -> str:
-    """Return slices of Psi and of its deviation, (v, u, y, x) of the first shot."""
+def _pictures(figures: Mapping[str, Figure]) -> str:
+    addresses = {name: data_address(svg_of(one), ".svg") for name, one in figures.items()}
+    return fragment("calibration_pictures.html", pictures=addresses)
+
+
+def _psi(outcome: Outcome) -> tuple[str, float]:
+    """Return slices of Psi and of its deviation, (v, u, y, x) of the first shot, as pictures.
+
+    The second is the root mean square deviation of that shot's coefficients over theirs.
+    """
     psi, deviation = outcome.calibration.psi, outcome.calibration.deviation
     views = psi.light_field_shape[:2]
     slices: list[list[Array]] = [[], [], []]
-    medians = []
+    squares = np.zeros(2)
     for v, u in np.ndindex(views):  # one view in memory at a time
-        weights, spread = (finite(of[0, v, u].sum(axis=1)) for of in (psi.weights, deviation))
-        for found, one in zip(
-            slices, (_thumbnail(weights), _centre(weights), _centre(spread)), strict=True
-        ):
+        planes = [finite(of[0, v, u]) for of in (psi.weights, deviation)]
+        squares += [np.square(plane, dtype=np.float64).sum() for plane in planes]
+        weights, spread = (plane.sum(axis=1) for plane in planes)
+        shown = _shrunk(weights, THUMBNAIL_PX), _centre(weights), _centre(spread)
+        for found, one in zip(slices, shown, strict=True):
             found.append(one)
-        medians.append(np.median(spread))
-    whole, piece, unsure = (
-        np.reshape(np.array(one, np.float32), (*views, *one[0].shape)) for one in slices
+    titles = (
+        "Weights, whole field",
+        f"Weights, the middle {slices[1][0].shape[1]} x {slices[1][0].shape[0]} pixels",
+        "Their standard deviation, same pixels",
     )
-    layout = f"rows are v 0 to {views[0] - 1} downwards, columns u 0 to {views[1] - 1}"
-    side = f"{piece.shape[-1]} × {piece.shape[-2]}"
-    note = f"same pixels; of the views' medians the median is {np.median(medians):.2g}"
-    panels = [
-        _panel("Whole field", f"one tile per view, averaged down; {layout}", whole, 3),
-        _panel(
-            "Centre, pixel for pixel", f"the middle {side} pixels of each view's weights", piece, 2
-        ),
-        _panel("Its standard deviation", note, unsure, 2, "heat"),
-    ]
-    return fragment("calibration_psi.html", panels=panels)
-
-
-def _panel(
-    name: str, note: str, slices: Array, gap_px: int, ramp: str = "grey"
-) -> dict[str, object]:
-    """Return a figure of slices (v, u, y, x) side by side; ramp: its scale of colours."""
-    scale = round_up(float(np.percentile(slices, 99.9)))
-    codes = DisplayCurve(1 / scale, 1.0).encode(slices)
-    picture = png_of(montage(heat(codes) if ramp == "heat" else codes, gap_px))
-    return {"name": name, "note": note, "picture": picture, "scale": scale, "ramp": ramp}
+    figure, panels = sheet(3, 4.9, 4.2, label="view v")
+    for axes, tiles, title in zip(panels, slices, titles, strict=True):
+        height, width = tiles[0].shape
+        whole = np.full((views[0] * (height + 2), views[1] * (width + 2)), np.nan, np.float32)
+        for tile, (v, u) in zip(tiles, np.ndindex(views), strict=True):
+            whole[v * (height + 2) :, u * (width + 2) :][:height, :width] = tile
+        top = round_up(float(np.nanpercentile(whole, 99.9)))
+        label = "share of the open camera's light" if axes is not panels[-1] else "the same unit"
+        drawn_map(axes, whole, (0, top), label, "gray" if axes is not panels[-1] else "magma")
+        axes.set_xticks(
+            [(u + 0.5) * (width + 2) for u in range(views[1])], map(str, range(views[1]))
+        )
+        axes.set_yticks(
+            [(v + 0.5) * (height + 2) for v in range(views[0])], map(str, range(views[0]))
+        )
+        titled(axes, title, "view u")
+    relative_deviation = float(np.sqrt(squares[1] / max(squares[0], 1e-30)))
+    return fragment("calibration_psi.html") + _pictures({"Psi": figure}), relative_deviation
 
 
 def _centre(view: Array) -> Array:
@@ -207,9 +279,10 @@ def _centre(view: Array) -> Array:
     return view[top : top + DETAIL_PX, left : left + DETAIL_PX]
 
 
-def _thumbnail(view: Array) -> Array:
+def _shrunk(view: Array, longest_px: int) -> Array:
+    """Return a picture (y, x) averaged down where a side is longer."""
     height, width = view.shape
-    shrink = min(1.0, THUMBNAIL_PX / max(height, width))
+    shrink = min(1.0, longest_px / max(height, width))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     return np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.float32)
 
@@ -229,9 +302,8 @@ def _sensor(sheet_: SensorSheet) -> str:
     linearity.axhline(0, color=INK, linewidth=0.8)
     titled(linearity, "Linearity", "exposure, s")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
-    drawn = {"Photon transfer curve": first, "Linearity": second}
-    pictures = {name: data_address(svg_of(one), ".svg") for name, one in drawn.items()}
-    return fragment("figures.html", heads=heads, rows=_figures(sheet_.rows()), pictures=pictures)
+    table = fragment("figures.html", heads=heads, rows=_figures(sheet_.rows()))
+    return table + _pictures({"Photon transfer curve": first, "Linearity": second})
 
 
 def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> list[tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Linear pictures as screen codes, and codes as pictures in a page: sprites, montages, heat."""
+"""Linear pictures as screen codes, and codes as pictures in a page: sprites, heat."""
 
 from __future__ import annotations
 
@@ -141,17 +141,6 @@ def round_up(value: float) -> float:
     decade = 10.0 ** math.floor(math.log10(value))
     end = next(step * decade for step in (1, 1.5, 2, 3, 5, 7, 10) if step * decade >= value)
     return float(f"{end:.2g}")  # 0.15, not 0.15000000000000002
-
-
-def montage(tiles: NDArray[np.uint8], gap_px: int) -> NDArray[np.uint8]:
-    """(v, u, y, x) or (v, u, y, x, c) as one picture with white gaps."""
-    around = [(0, 0)] * tiles.ndim
-    around[2] = around[3] = (0, gap_px)
-    padded = np.pad(tiles, around, constant_values=255)
-    order = (0, 2, 1, 3, *range(4, tiles.ndim))
-    rows, columns, height, width = padded.shape[:4]
-    sheet = padded.transpose(order).reshape(rows * height, columns * width, *tiles.shape[4:])
-    return np.ascontiguousarray(sheet[:-gap_px, :-gap_px])
 
 
 def heat(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:

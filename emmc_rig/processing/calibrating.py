@@ -72,7 +72,7 @@ def calibrate(
 @overload
 def calibrate(
     session: Sequence[ArrayLike] | np.ndarray,
-    poses: Sequence[Mapping[str, Any]],
+    method: Sequence[Mapping[str, Any]],
     camera: Camera,
     *,
     darks: ArrayLike | Mapping[float, ArrayLike],

@@ -66,13 +66,24 @@ def _steepen(weights, colour, disparity, hidden, slopes, margin, first, last, ou
     last_y, wide = slopes.shape[2] - TAPS, slopes.shape[3]
     flat, plane = slopes.reshape(-1), slopes.shape[2] * wide
     other = slopes.shape[1] * plane
+    lit = np.empty(columns + 1, np.int64)
     for y in range(first, last):
         for v in range(views_v):
             for u in range(views_u):
                 down, right = np.float32(views_v // 2 - v), np.float32(views_u // 2 - u)
+                if down == 0 and right == 0:
+                    continue
+                # Listed first: no processor predicts which rays are dark.
+                count = 0
                 for x in range(columns):
-                    if hidden[v, u, y, x] or (down == 0 and right == 0):
-                        continue
+                    seen = False
+                    for s in range(shots):
+                        for k in range(stored):
+                            seen |= weights[s, v, u, y, k, x] != 0
+                    lit[count] = x
+                    count += 1 if seen & (hidden[v, u, y, x] == 0) else 0
+                for n in range(count):
+                    x = lit[n]
                     d = disparity[v, u, y, x]
                     iy, fy = _first_tap(np.float32(y) + d * down, margin, last_y)
                     ix, fx = _first_tap(np.float32(x) + d * right, margin, wide - TAPS)

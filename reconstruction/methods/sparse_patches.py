@@ -47,7 +47,7 @@ METHODS = (
         "lars",
         "sparse patches by the Lasso path (LARS)",
         "as dict-admm, and the same minimiser to rounding",
-        "p 2 n m operations a step, 1-3 steps an atom used",
+        "longer than dict-admm",
         "the exact minimiser, or few atoms per patch",
     ),
     _method(
@@ -61,14 +61,14 @@ METHODS = (
         "ista",
         "sparse patches by proximal gradient",
         "as dict-admm",
-        "p (n m^2 + 4 n m x thousands of steps) operations",
+        "longer than dict-fista",
         "to compare solvers",
     ),
     _method(
         "fista",
         "sparse patches by accelerated proximal gradient with restart",
         "as dict-admm",
-        "p (n m^2 + 4 n m x 500-5,000 steps) operations",
+        "about 20 times as long as dict-admm",
         "to compare solvers",
     ),
     _method(

@@ -126,7 +126,7 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
     assert "2 more frame(s) planned, which were not needed" in out
     code, out, _ = program("session", "show", enough)
     assert "shot         1 of 1" in out
-    assert "12 wanted; no more, the target is reached" in out
+    assert "target 12 dB; done, the target is reached" in out
     reported = summary(Session(enough))
     assert (reported.state, reported.stored) == ("complete", reported.planned)
     verdict = verify(Session(enough))
@@ -135,7 +135,7 @@ def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough
 
 def test_its_page_shows_what_was_decided_and_when(every):
     page = sheet(Session(every))
-    assert "Shots: what they gave" in page
+    assert "Choice of shots" in page
     assert "estimated accuracy " in page
     metrics = json.loads((every / "metrics.json").read_text())
     assert metrics["decided"][0]["shots"] == [0]

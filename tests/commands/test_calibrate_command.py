@@ -67,7 +67,12 @@ def test_calibrate_writes_psi_its_uncertainty_and_a_page(camera_file, tmp_path):
         assert np.asarray(file["good"]).shape == (32, 40)
         assert set(SCALARS) <= set(file.attrs) or metrics["chosen"] == "free"
     page = (out / "report.html").read_text()
-    for words in ("What to do next", "Residual maps", "Photon transfer", "Edge blur"):
+    for words in (
+        "What to do next",
+        "Residual map",
+        "Photon transfer",
+        "Blur of the mask&#39;s edges",
+    ):
         assert words in page
     assert "http" not in page.split("</style>")[1].replace("http://www.w3.org", "")
 

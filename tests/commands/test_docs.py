@@ -66,10 +66,11 @@ DOCUMENTS = [document for document in ALL if any(found for _, found in blocks(do
 @pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_command_of_the_documentation_is_one_of_the_program(document):
+    whole = typer.main.get_command(cli.app)
     for why, found in blocks(document):
         assert why is None or why in REASONS, why
         for words in found:
-            command, rest = typer.main.get_command(cli.app), list(words)
+            command, rest = whole, list(words)
             while (group := getattr(command, "commands", None)) is not None:
                 command = group[rest.pop(0)]
             command.make_context(words[0], rest)

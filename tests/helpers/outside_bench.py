@@ -1,19 +1,23 @@
 """A coded-mask bench that shares no code with the program: NumPy alone, own rays, electrons, DN.
 
-Rays run from 144 points of every pixel to whole aperture cells, whose shadow on the mask is a box
-of the mask's summed-area table. Lengths in um. It takes frames in the order in which it is asked,
-by its own clock, and knows the truth of what it took: `Bench.psi()`.
+Rays run from 144 points of every pixel to whole aperture cells, whose shadow on the mask is a box:
+its mean transmittance is read from a table, made of sums over the mask. Lengths in um. It takes
+frames in the order in which it is asked, by its own clock, and knows the truth of what it took:
+`Bench.psi()`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 POINTS = 12
 FINER = 20
+BESIDE_UM = 300.0
+"""How far beside the picture the mask is drawn: where rays aslant and a mask that moves reach."""
 GEOMETRY = (
     "lens_um", "mask_um", "pitch_um", "cell_um", "aperture_cell_um", "views", "offset_um",
     "rotation_rad", "blur_um", "tilt", "glass_um", "astray_um",
@@ -140,11 +144,8 @@ class Bench:
             self.dust *= 1 - 0.3 * np.exp(-((rows - y) ** 2 + (columns - x) ** 2) / 8)
         self.astray = optics.astray_um * fixed.standard_normal((2, *optics.views))
         cells = optics.closed + (optics.open - optics.closed) * np.asarray(self.cells, float)
-        fine = np.atleast_3d(cells).repeat(FINER, 0).repeat(FINER, 1)
-        if optics.blur_um:
-            fine = _blurred(fine, optics.blur_um * FINER / optics.cell_um)
-        self.area = np.pad(fine.cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0)))
-        self.filtered = self.colour if self.area.shape[2] == 3 else np.zeros(self.size, int)
+        self.passing = np.atleast_3d(cells)
+        self.filtered = self.colour if self.passing.shape[2] == 3 else np.zeros(self.size, int)
         # What the mask's shadow depends on; benches that differ in the rest share it.
         traced = {one: getattr(optics, one) for one in GEOMETRY}
         drawn = cells.tobytes(), self.astray.tobytes()
@@ -281,7 +282,6 @@ class Bench:
         within = ((np.arange(POINTS) + 0.5) / POINTS - 0.5) * optics.pitch_um
         within *= POINTS / np.sqrt(POINTS**2 - 1)  # the variance of a whole pixel
         cosine, sine = np.cos(optics.rotation_rad), np.sin(optics.rotation_rad)
-        half = optics.mask_um / optics.lens_um * optics.aperture_cell_um / 2
         passed = np.zeros((*optics.views, *self.size))
         for j, at_v in enumerate(v):
             for i, at_u in enumerate(u):
@@ -298,27 +298,54 @@ class Bench:
                         on_y = y + dy + far * to_y - optics.offset_um[1] - mask_y + stray_y
                         column = cosine * on_x + sine * on_y
                         row = -sine * on_x + cosine * on_y
-                        passed[j, i] += self._box(row, column, half)
+                        passed[j, i] += self._box(row, column)
         return passed / POINTS**2
 
-    def _box(self, row: np.ndarray, column: np.ndarray, half_um: float) -> np.ndarray:
-        """Return the mean transmittance of boxes about places of the mask, um from its middle."""
-        fine_um = self.optics.cell_um / FINER
-        height, width = (count - 1 for count in self.area.shape[:2])
-        top, bottom = ((row + side) / fine_um + height / 2 for side in (-half_um, half_um))
-        left, right = ((column + side) / fine_um + width / 2 for side in (-half_um, half_um))
-        total = self._sum(bottom, right) - self._sum(top, right)
-        total += self._sum(top, left) - self._sum(bottom, left)
-        return total / (2 * half_um / fine_um) ** 2
+    @cached_property
+    def _boxes(self) -> tuple[np.ndarray, tuple[float, float]]:
+        """Return the mean transmittance of boxes about corners of the fine grid, and their origin.
 
-    def _sum(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        if row.min() < 0 or column.min() < 0:
+        (row, column, colour), and where the mask's middle is among them, in steps of the grid.
+        """
+        optics, fine_um = self.optics, self.optics.cell_um / FINER
+        spare = [
+            max(0, int((count * optics.cell_um - pixels * optics.pitch_um) / 2 - BESIDE_UM))
+            for count, pixels in zip(self.passing.shape, self.size, strict=False)
+        ]
+        rows, columns = (int(beside / optics.cell_um) for beside in spare)
+        height, width = self.passing.shape[:2]
+        found = self.passing[rows : height - rows, columns : width - columns]
+        found = found.repeat(FINER, 0).repeat(FINER, 1)
+        if optics.blur_um:
+            found = _blurred(found, optics.blur_um / fine_um)
+        middle = [count / 2 for count in found.shape[:2]]
+        reach = optics.mask_um / optics.lens_um * optics.aperture_cell_um / 2 / fine_um
+        whole, part = int(reach), reach - int(reach)
+        for axis in (0, 1):
+            area = np.moveaxis(found, axis, 0).cumsum(0)
+            area = np.concatenate([np.zeros_like(area[:1]), area])
+            last = len(area) - 2 * whole - 2
+            near, far = (area[first : first + last] for first in (1, 2 * whole + 1))
+            nearer, farther = (area[first : first + last] for first in (0, 2 * whole + 2))
+            sums = (1 - part) * (far - near) + part * (farther - nearer)
+            found = np.moveaxis(sums / (2 * reach), 0, axis)
+        return np.ascontiguousarray(found), (middle[0] - whole - 1, middle[1] - whole - 1)
+
+    def _box(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Return what the mask passes of aperture cells seen about places, um from its middle."""
+        boxes, (middle_row, middle_column) = self._boxes
+        row = row * (FINER / self.optics.cell_um) + middle_row
+        column = column * (FINER / self.optics.cell_um) + middle_column
+        height, width, colours = boxes.shape
+        inside = min(row.min(), column.min()) >= 0
+        if not (inside and row.max() < height - 1 and column.max() < width - 1):
             raise ValueError("the mask is smaller than the beam")
         i, j = row.astype(int), column.astype(int)
         p, q = row - i, column - j
-        k, area = self.filtered, self.area
-        above = (1 - q) * area[i, j, k] + q * area[i, j + 1, k]
-        below = (1 - q) * area[i + 1, j, k] + q * area[i + 1, j + 1, k]
+        values, at = boxes.ravel(), (i * width + j) * colours + self.filtered
+        above = (1 - q) * values[at] + q * values[at + colours]
+        at += width * colours
+        below = (1 - q) * values[at] + q * values[at + colours]
         return (1 - p) * above + p * below
 
 

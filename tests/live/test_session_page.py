@@ -148,7 +148,7 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
         page.close()
     reported = page.state()["light_field"]
     assert reported["shots"] == [2, 2]
-    assert "states" in reported["stage"]
+    assert "estimated accuracy" in reported["stage"]
     assert reported["pictures"]["views"] == [5, 5]
     wanted = page.pictures["light-field.json"]({})
     assert wanted is not None

@@ -53,7 +53,7 @@ def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captu
     out = captured / "calibration"
     assert exit_code("calibrate", captured / "session", "--out", out) == 0
     reported = capsys.readouterr().out
-    assert "of the noise's variance" in reported
+    assert "x noise variance (limit 1.5)" in reported
     metrics = json.loads((out / "metrics.json").read_text())
     judged = metrics["held_out"][metrics["chosen"]]
     assert judged["relative_error"] < 0.01

@@ -1,9 +1,14 @@
 """The methods by name: a new one is one module, which brings its own settings."""
 
+import csv
 import os
+import re
+import statistics
 import subprocess
 import sys
 import textwrap
+from collections import defaultdict
+from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
@@ -17,6 +22,7 @@ from reconstruction.methods.surfaces import sparse_patches, takes_patches
 from reconstruction.patches import regular_grid
 from reconstruction.sparse import SparseSettings
 
+CHART = Path(__file__).parents[2] / "docs/results/chart-group-a-64x80.csv"
 MEAN_PICTURE = textwrap.dedent('''
     """The method `mean`: one grey for all, from the mean reading."""
 
@@ -120,3 +126,19 @@ def test_settings_of_version_0_2_open_with_a_warning_for_what_is_gone():
     assert settings.adaptive == AdaptiveSettings(stride=5)
     with pytest.raises(ValidationError, match="resst"):
         MethodSettings.model_validate({"adaptive": {"resst": False}})
+
+
+def test_methods_are_said_to_take_what_the_chart_measured():
+    measured = defaultdict(list)
+    with CHART.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if row["level"] == "default":
+                measured[row["method"], int(row["shots"])].append(float(row["seconds"]))
+    said = {
+        (name, shots): float(seconds)
+        for name, method in METHODS.items()
+        for shots, seconds in zip((1, 3), re.findall(r"([\d.]+) s\b", method.cost), strict=False)
+    }
+    assert set(said) >= {(name, 1) for name in ("adaptive", "adaptive-fast", "tv", "tv-dict")}
+    for key, seconds in said.items():
+        assert 0.5 < seconds / statistics.median(measured[key]) < 2, key

@@ -28,7 +28,7 @@ def without_times(stated):
 
 def for_each_number_of_threads(call):
     found = {}
-    for threads in (1, 2, 3, 8):
+    for threads in (1, 3, 8):
         numba.set_num_threads(threads)
         cv2.setNumThreads(threads)
         if "torch" in sys.modules:

@@ -63,8 +63,7 @@ def test_sample_windows_lie_within_and_reach_all_corners():
     assert all(place[1].stop <= 131 and place[1].start % 6 == 0 for place in places)
 
 
-def scene(random_psi, binning=1, shots=2):
-    size = (36, 160)
+def scene(random_psi, binning=1, shots=2, size=(36, 160)):
     psi = random_psi(shots, VIEWS, size, binning=binning)
     y, x = np.mgrid[: size[0], : size[1]] / 12
     picture = 0.5 + 0.3 * np.sin(x + np.sin(y))[..., None] * np.array([1, 0.5, -0.5])
@@ -99,7 +98,7 @@ def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step
     ],
 )
 def test_every_method_works_in_blocks_and_loses_little(random_psi, method, binning):
-    psi, frames, truth = scene(random_psi, binning)
+    psi, frames, truth = scene(random_psi, binning, size=(36, 100))
     dictionary = dct_dictionary(VIEWS, (4, 4)) if "dict" in method else None
     # One shot takes no sparse patches in blocks: whether surfaces fail is not known beforehand.
     without = settings_of(method, adaptive=AdaptiveSettings(patches=None))

@@ -397,7 +397,7 @@ def test_a_light_field_that_foretells_less_than_anybody_would_is_doubted(three):
         over = over_baselines(three, frames, residual, 0.003, usable, kept)
         assert (over["over_flat"] > 1) == worse
     # Beside flat fields the mean of neighbours is as good as readings can be: their noise.
-    even = 0.5 + 0.003 * rng.standard_normal(frames.shape)
+    even = (0.5 + 0.003 * rng.standard_normal(frames.shape)).astype(np.float32)
     assert over_baselines(three, even, rough, 0.003, usable, kept)["over_neighbours"] > 10
     too_few = over_baselines(
         three, even, rough, 0.003, usable, kept & (rng.random(kept.shape) < 0.1)
@@ -869,7 +869,7 @@ def test_colours_that_one_grey_shot_hardly_shows_are_uncertain(scene):
 
 @pytest.mark.slow
 def test_with_several_shots_the_default_is_as_good_as_surfaces_and_as_patches():
-    given = trial_of(Capture("wide-disparity", find_camera("rgbw-bayer-3shots"), SIZE, zoom=3))
+    given = trial_of(Capture("wide-disparity", find_camera("rgbw-bayer-3shots"), (32, 40), zoom=3))
     surfaces = fast(AdaptiveSettings())
     both = surfaces.model_copy(update={"patches": 2})
 

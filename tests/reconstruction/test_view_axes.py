@@ -217,9 +217,10 @@ def test_a_report_of_bands_speaks_of_no_view():
     words = page.split("<script")[0]
     for wrong in ("viewpoint, also", "parallax", "centre view", "over views"):
         assert wrong not in words
-    assert "copied middle band" in words
-    assert "Over middle band" in words
-    assert "missed by 5.0 dB more than by the copied middle band" in str(light_field_head(metrics))
+    assert "the true middle band in all places" in words
+    assert "5.0 dB worse than the baseline (middle band in all places)" in str(
+        light_field_head(metrics)
+    )
 
 
 def test_a_result_of_bands_calls_them_so_in_every_file(bands, tmp_path):
@@ -320,7 +321,6 @@ def test_a_row_of_views_is_a_light_field(views):
     [
         ((3, 3), ANGLES, 2, False),
         ((3, 3), ANGLES, 3, True),
-        ((7, 7), ANGLES, 1, True),
         ((9, 9), ANGLES, 1, False),
         ((1, 24), BANDS, 1, False),
         ((1, 28), BANDS, 1, True),
@@ -357,7 +357,7 @@ def test_a_demo_of_bands_is_grey_and_speaks_of_bands(tmp_path):
     assert "over the baseline (middle band in all places)" in output
     words = (tmp_path / "out/report.html").read_text().split("<script")[0]
     assert "parallax" not in words
-    assert "Over middle band" in words
+    assert "the true middle band in all places" in words
     opened = open_export(str(tmp_path / "out"))
     assert opened.view_axes == BANDS
     light = opened.light_field

@@ -171,9 +171,9 @@ def test_a_still_stage_refuses_what_a_real_one_would():
 @pytest.mark.parametrize(
     ("shots", "said"),
     [
-        ([ShotExposure(0, 0.05, 0.0)], "shot 0 is 5.0% of white: 11.5 dB or more"),
-        ([ShotExposure(0, 0.7, 0.0), ShotExposure(1, 0.01, 0.0)], "shot 1 is 1.0% of white"),
-        ([ShotExposure(0, 1.0, 0.03)], "3.0% of the readings of shot 0 are saturated"),
+        ([ShotExposure(0, 0.05, 0.0)], "shot 1 is 5.0% of white: 11.5 dB or more"),
+        ([ShotExposure(0, 0.7, 0.0), ShotExposure(1, 0.01, 0.0)], "shot 2 is 1.0% of white"),
+        ([ShotExposure(0, 1.0, 0.03)], "3.0% of the readings of shot 1 are saturated"),
         ([ShotExposure(0, 0.3, 0.0005)], ""),
     ],
 )

@@ -420,7 +420,7 @@ function choose(overlay) {
 // Acting: pointer, wheel, keys
 
 function set(more) {
-  stopSway();
+  stopAnimation();
   Object.assign(state, more);
   state.v = clamp(state.v, 0, rows - 1);
   state.u = clamp(state.u, 0, columns - 1);
@@ -470,24 +470,24 @@ function focusOn(x, y, event) {
 }
 
 const reduced = matchMedia("(prefers-reduced-motion: reduce)").matches;
-let swaying = 0;
-function sway() {
-  if (swaying) { stopSway(); return; }
-  byId("sway").setAttribute("aria-pressed", "true");
+let animating = 0;
+function animate() {
+  if (animating) { stopAnimation(); return; }
+  byId("animate").setAttribute("aria-pressed", "true");
   const begun = performance.now();
   const turn = (now) => {
     const angle = (now - begun) / 650;
     state.v = ((rows - 1) / 2) * (1 + 0.85 * Math.sin(angle));
     state.u = ((columns - 1) / 2) * (1 + 0.85 * Math.cos(angle));
     changed();
-    swaying = requestAnimationFrame(turn);
+    animating = requestAnimationFrame(turn);
   };
-  swaying = requestAnimationFrame(turn);
+  animating = requestAnimationFrame(turn);
 }
-function stopSway() {
-  cancelAnimationFrame(swaying);
-  swaying = 0;
-  byId("sway").setAttribute("aria-pressed", "false");
+function stopAnimation() {
+  cancelAnimationFrame(animating);
+  animating = 0;
+  byId("animate").setAttribute("aria-pressed", "false");
 }
 
 function listen() {
@@ -540,7 +540,7 @@ function listen() {
     "-": () => set({ aperture: state.aperture - 0.25 }),
     PageUp: () => set({ focus: state.focus + step() }), PageDown: () => set({ focus: state.focus - step() }),
     w: () => atlases.truth && set({ wipe: state.wipe ? 0 : 0.5 }),
-    " ": sway, r: reset, f: full,
+    " ": animate, r: reset, f: full,
   };
   picture.addEventListener("keydown", (event) => {
     const number = "01234".indexOf(event.key);
@@ -552,7 +552,7 @@ function listen() {
   });
   for (const name of ["aperture", "focus", "wipe"])
     byId(name).addEventListener("input", (event) => set({ [name]: +event.target.value }));
-  byId("sway").addEventListener("click", sway);
+  byId("animate").addEventListener("click", animate);
   byId("reset").addEventListener("click", reset);
   byId("full").addEventListener("click", full);
   addEventListener("resize", changed);
