@@ -13,8 +13,7 @@ from pathlib import Path
 import lab
 import pandas as pd
 
-from emmc_rig.model.lightfield import psnr_db, replicate_centre
-from emmc_rig.study.trial import Capture, trial_of
+import emmc_rig as emmc
 
 METHODS = ("adaptive", "adaptive-fast", "tv-dict")
 WHOLE = (*lab.GROUP_A, *lab.GROUP_B[:2])
@@ -22,16 +21,22 @@ WHOLE = (*lab.GROUP_A, *lab.GROUP_B[:2])
 
 
 def measure(scene: str, camera: str, size: tuple[int, int] | None, seed: int, method: str) -> dict:
-    """Return PSNR of a method and of the baseline, and what it took, of one light field."""
-    given = trial_of(Capture(scene, camera, size, seed))
+    """Return PSNR of a method and of the baseline, and what it took, of one light field.
+
+    As `emmc-rig simulate` and `reconstruct` do it: frames are cleaned up, and the result is judged.
+    """
+    seen, through = emmc.scene(scene, size=size), emmc.camera(camera)
+    psi = through.psi(seen.size)
+    frames = through.expose(seen, seed=seed, psi=psi)
     started, cpu = time.perf_counter(), time.process_time()
-    result = given.solved(method)
+    result = emmc.reconstruct(psi, frames, method)
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu
+    reached = result.compare(seen)
     return {
-        "rows": given.truth.shape[2],
-        "columns": given.truth.shape[3],
-        "psnr_db": round(given.psnr_db(result.light_field), 2),
-        "baseline_db": round(psnr_db(replicate_centre(given.truth), given.truth), 2),
+        "rows": seen.size[0],
+        "columns": seen.size[1],
+        "psnr_db": round(reached["psnr_db"], 2),
+        "baseline_db": round(reached["replicate_psnr_db"], 2),
         "cpu_s": round(cpu_s, 1),
         "seconds": round(seconds, 1),
     }
