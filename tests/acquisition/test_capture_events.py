@@ -50,7 +50,7 @@ def test_a_callback_hears_of_every_frame_shot_and_verdict_in_order(plan):
     assert written == list(range(1, len(session.stored) + 1))
     verdict, end = heard[-2].facts, heard[-1].facts
     assert verdict["level"] == "doubt"  # the second shot is exposed for 2 ms
-    assert "shot 1" in verdict["reasons"][0]["what"]
+    assert "shot 2" in verdict["reasons"][0]["what"]
     assert (end["complete"], end["missing"]) == (True, 0)
     assert all(json.loads(event.line())["event"] == event.name for event in heard)
     assert any("metered" in event.facts["text"] for event in heard if event.name == "message")
