@@ -82,7 +82,7 @@ def test_running_a_complete_session_again_takes_nothing(captured, run):
     code, out, err = run("capture", "plan-session")
     assert code == 0
     assert "0 taken" in out
-    assert "62 of 62 frames are there already" in err
+    assert "62 of 62 frames are captured already" in err
 
 
 def test_a_session_is_listed_shown_and_verified(captured, run):
