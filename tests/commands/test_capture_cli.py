@@ -211,7 +211,7 @@ def test_the_report_opens_offline_and_shows_frames_and_times(captured):
     page = (captured / "plan-session" / "report.html").read_text()
     assert page.count("<img ") == 62
     assert "data:image/jpeg;base64," in page
-    assert "writing meanwhile" in page
+    assert " s moving, " in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert 'src="http' not in page
     assert "{{" not in page
