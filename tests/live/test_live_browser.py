@@ -138,7 +138,7 @@ def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
     assert text(page, "viewer-aperture-value") == "0.50"
     assert field.get_attribute("data-renderer") == "WebGL2"
     click(page, "#viewer-overlays label:nth-of-type(2) input")
-    assert "readings missed" in text(page, "viewer-overlays")
+    assert "unexplained residual" in text(page, "viewer-overlays")
     wait(page, lambda: page.find_element(By.ID, "viewer-legend").is_displayed())
     assert complaints(page) == []
 
