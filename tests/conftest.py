@@ -32,7 +32,7 @@ def pytest_addoption(parser):
     )
     parser.addoption("--camera", help="a real camera for tests marked hardware: ptp:SERIAL")
     parser.addoption(
-        "--fuzz-cases", type=int, default=2000, help="random cases for each codec and driver"
+        "--fuzz-cases", type=int, default=500, help="random cases for each codec and driver"
     )
     parser.addoption("--all", action="store_true", help="the slow tests, too, as CI does")
     parser.addoption("--list-run", type=Path, help="file to write: the tests that were run")

@@ -138,7 +138,7 @@ def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
     assert text(page, "viewer-aperture-value") == "0.50"
     assert field.get_attribute("data-renderer") == "WebGL2"
     click(page, "#viewer-overlays label:nth-of-type(2) input")
-    assert "readings missed" in text(page, "viewer-overlays")
+    assert "unexplained residual" in text(page, "viewer-overlays")
     wait(page, lambda: page.find_element(By.ID, "viewer-legend").is_displayed())
     assert complaints(page) == []
 
@@ -365,7 +365,7 @@ def test_no_camera_and_no_stage_are_explained_where_the_picture_would_be(browser
     try:
         with served(application(SetupPage(watch), TOKEN)) as port:
             browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
-            said = "No picture: no camera answers: switch it on. It is tried again every second."
+            said = "No picture: no camera answers: switch it on. Trying again every second."
             wait(browser, lambda: text(browser, "why") == said)
             assert not browser.find_element(By.ID, "picture").is_displayed()
             assert not browser.find_element(By.ID, "stop").is_displayed()

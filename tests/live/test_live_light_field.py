@@ -183,7 +183,7 @@ def test_what_stands_still_becomes_exactly_what_reconstruct_gives(one_shot):
     drawn = json.loads(shown.encoded())
     assert drawn["scale"] == 1
     (missed,) = drawn["overlays"]
-    assert missed["label"] == "readings missed"
+    assert missed["label"] == "unexplained residual"
 
 
 def test_a_preview_states_disparities_in_the_cameras_samples(one_shot):

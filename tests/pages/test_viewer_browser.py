@@ -191,7 +191,7 @@ def test_every_overlay_changes_the_picture_and_is_read_under_the_pointer(page):
     for word in (
         "disparity",
         "standard deviation 0.03",
-        "readings missed",
+        "unexplained residual 1.0 x noise",
     ):
         assert word in state(page)
 

@@ -130,7 +130,7 @@ def test_a_session_corrects_what_is_wrong_with_lamp_sensor_and_board(tmp_path, c
     assert exit_code("calibrate", session, "--out", out) == 0
     reported = capsys.readouterr().out
     for named in ("lamp drifted", "response loses", "colour filters", "white board is uneven"):
-        assert f"found: the {named}" in reported.replace("the sensor's", "the")
+        assert f"finding: the {named}" in reported.replace("the sensor's", "the")
     assert "not measured" not in reported
     camera, flaws = find_camera("rgbw-bayer-1shot"), flawed(NO_FLAWS, EFFECTS.split(","))
     settings = CalibrateSettings("", camera, SIZE, flaws=flaws, rays=1024)
