@@ -109,8 +109,10 @@ def measure(
 
 def main() -> None:
     """Measure twice and half of every constant on every scene."""
-    args = lab.parsed(lab.arguments(__doc__, size="64x64"))
-    names = list(constants())[:1] if args.smallest else list(constants())
+    parser = lab.arguments(__doc__, size="64x64")
+    parser.add_argument("--constant", action="append", help="may repeat; default: all")
+    args = lab.parsed(parser)
+    names = args.constant or list(constants())[: 1 if args.smallest else None]
     points = [
         {
             "scene": scene, "camera": args.camera, "size": args.size, "seed": args.seed,

@@ -201,7 +201,7 @@ def calibrate_simulated(
     watcher.begin("whiteboards", len(frames))
     started = time.perf_counter()
     # What a sensor is takes its response.
-    sensor = "response" not in settings.leave_out
+    sensor = "response" not in settings.skip
     with simulated_session(plan, camera, rig, watcher) as session:
         captured_s = time.perf_counter() - started
         found = calibrate(session, route, sensor=sensor, watcher=watcher)

@@ -32,7 +32,7 @@ def pytest_addoption(parser):
     )
     parser.addoption("--camera", help="a real camera for tests marked hardware: ptp:SERIAL")
     parser.addoption(
-        "--fuzz-cases", type=int, default=2000, help="random cases for each codec and driver"
+        "--fuzz-cases", type=int, default=500, help="random cases for each codec and driver"
     )
     parser.addoption("--all", action="store_true", help="the slow tests, too, as CI does")
     parser.addoption("--list-run", type=Path, help="file to write: the tests that were run")
@@ -58,6 +58,8 @@ def pytest_sessionstart(session):
     """Compile what most tests need once, before the workers begin: each would compile it again."""
     config = session.config
     if hasattr(config, "workerinput") or tests_are_named(config) or config.option.collectonly:
+        return
+    if config.option.but is not None:  # the run that listed those tests has compiled
         return
     first_run = [sys.executable, "-m", "emmc_rig.commands.first_run"]
     for together in (("search", "fit"), ("dict-admm", "dict-omp")):

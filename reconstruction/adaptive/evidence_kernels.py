@@ -275,7 +275,9 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
     terms, inputs = given.waves.shape
     blocks = m // SIDE
     entries = blocks * (blocks + 1) // 2 * SIZE
-    most = -(-counts.max() // SIDE) * SIDE
+    most = 0
+    for count in counts:
+        most = max(most, -(-count // SIDE) * SIDE)
     parts = 1 if stored == 1 else 3
     rays = np.empty((parts, m, inputs, LANES), np.float32)
     spectra = np.empty((parts, m, terms * LANES), np.float32)

@@ -47,7 +47,7 @@ METHODS = (
         "lars",
         "sparse patches by the Lasso path (LARS)",
         "as dict-admm, and the same minimiser to rounding",
-        "several times as long as dict-admm",
+        "longer than dict-admm",
         "the exact minimiser, or few atoms per patch",
     ),
     _method(
@@ -61,14 +61,14 @@ METHODS = (
         "ista",
         "sparse patches by proximal gradient",
         "as dict-admm",
-        "many times as long as dict-admm",
+        "longer than dict-fista",
         "to compare solvers",
     ),
     _method(
         "fista",
         "sparse patches by accelerated proximal gradient with restart",
         "as dict-admm",
-        "many times as long as dict-admm",
+        "about 20 times as long as dict-admm",
         "to compare solvers",
     ),
     _method(

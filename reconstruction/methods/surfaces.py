@@ -84,7 +84,7 @@ METHODS = (
         "the scene consists of opaque surfaces that look the same from all views; from two shots "
         "on, that or what `tv-dict` assumes, each where it holds",
         cost_words(1.4, 6.8),
-        "the default; gives disparity and standard deviation, needs no training",
+        "any scene and number of shots; gives disparity and standard deviation; the default",
         partial(_solve, "adaptive", lambda settings: settings),
         "adaptive",
         AdaptiveSettings,

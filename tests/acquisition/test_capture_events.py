@@ -50,10 +50,11 @@ def test_a_callback_hears_of_every_frame_shot_and_verdict_in_order(plan):
     assert written == list(range(1, len(session.stored) + 1))
     verdict, end = heard[-2].facts, heard[-1].facts
     assert verdict["level"] == "doubt"  # the second shot is exposed for 2 ms
-    assert "shot 1" in verdict["reasons"][0]["what"]
+    assert "shot 2" in verdict["reasons"][0]["what"]
     assert (end["complete"], end["missing"]) == (True, 0)
     assert all(json.loads(event.line())["event"] == event.name for event in heard)
-    assert any("metered" in event.facts["text"] for event in heard if event.name == "message")
+    said = [event.facts["text"] for event in heard if event.name == "message"]
+    assert any(text.startswith("shot 1 exposure ") for text in said)
 
 
 def test_a_callback_that_raises_ends_no_capture_and_is_not_called_again(plan):

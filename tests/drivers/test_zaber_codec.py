@@ -93,6 +93,12 @@ def test_any_flipped_bit_in_a_checksummed_reply_is_noticed(position):
         decode_message(bytes(line))
 
 
+def test_each_of_the_255_wrong_checksums_is_noticed():
+    for wrong in set(range(256)) - {0xE6}:
+        with pytest.raises(GarbledReplyError, match="checksum is wrong"):
+            decode_message(b"@01 1 10 OK BUSY -- 0:%02X\r\n" % wrong)
+
+
 @pytest.mark.parametrize(
     ("line", "reason"),
     [

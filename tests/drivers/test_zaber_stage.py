@@ -57,9 +57,6 @@ class Bench:
         options = {"axes": AXES, "microstep_um": MICROSTEP_UM, "clock": self.clock} | arguments
         return ZaberStage(self.transport, settings=settings, **options)
 
-    def moves_sent(self):
-        return [line for line in self.sent if " move " in line]
-
     def stops_sent(self):
         return [line for line in self.sent if " stop" in line]
 

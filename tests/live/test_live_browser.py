@@ -365,7 +365,7 @@ def test_no_camera_and_no_stage_are_explained_where_the_picture_would_be(browser
     try:
         with served(application(SetupPage(watch), TOKEN)) as port:
             browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
-            said = "No picture: no camera answers: switch it on. It is tried again every second."
+            said = "No picture: no camera answers: switch it on. Trying again every second."
             wait(browser, lambda: text(browser, "why") == said)
             assert not browser.find_element(By.ID, "picture").is_displayed()
             assert not browser.find_element(By.ID, "stop").is_displayed()
