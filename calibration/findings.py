@@ -123,8 +123,8 @@ def angle_findings(board: BoardAngle) -> list[str]:
         turn_deg, moved_um, deviation = min(moved)
         found.append(
             f"the mask moved by {moved_um:.2f} +- {deviation:.2f} um before the board turned by "
-            f"{turn_deg:g} degrees: the board's unevenness is corrected for it; let the mount "
-            "settle, and capture the turned boards right after the others"
+            f"{turn_deg:g} degrees: corrected for; let the mount settle, and capture the turned "
+            "boards right after the others"
         )
     if not board.uneven:
         return found

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 import emmc_rig as emmc
 from emmc_rig.model.novel_view import between, view_disparities
 
-SCENE, CAMERA, SIZE = "deep-occlusions", "rgbw-bayer-1shot", (192, 256)
+SCENE, CAMERA, SIZE = "toy-table", "rgbw-bayer-1shot", (192, 256)
 ZOOM, GAP_PX, CAPTION_PX = 1.875, 16, 34
 POSITIONS, RADIUS_VIEWS, PAUSE_MS = 32, 1.6, 70
 CAPTIONS = "the one frame that the camera recorded", "the light field recovered from it"

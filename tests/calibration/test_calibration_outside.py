@@ -109,14 +109,15 @@ def test_open_whiteboards_say_what_one_through_the_pinhole_would_buy():
     how = {"optics": {"aperture": 0.05}, "size": SMALLER}
     found, _ = measured(pinholes=(), **how)
     words = re.search(
-        r"expected ([\d.]+)% wrong, .* before view \((\d), (\d)\) ([\d.]+)%", found.unwatched[-1]
+        r"expected error of Psi ([\d.]+)%, .* before view \((\d), (\d)\) ([\d.]+)%",
+        found.unwatched[-1],
     )
     assert words
     now, promised, view = float(words[1]), float(words[4]), (int(words[2]), int(words[3]))
     more, _ = measured(pinholes=(view,), **how)
     assert 100 * more.calibration.stated_error == pytest.approx(promised, rel=0.1)
     assert promised < 0.95 * now
-    assert not any("single views" in one for one in more.unwatched)
+    assert not any("each view alone" in one for one in more.unwatched)
 
 
 def test_rows_that_flicker_are_named():

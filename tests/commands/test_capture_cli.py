@@ -82,7 +82,7 @@ def test_running_a_complete_session_again_takes_nothing(captured, run):
     code, out, err = run("capture", "plan-session")
     assert code == 0
     assert "0 taken" in out
-    assert "62 of 62 frames are there already" in err
+    assert "62 of 62 frames are captured already" in err
 
 
 def test_a_session_is_listed_shown_and_verified(captured, run):
@@ -211,7 +211,7 @@ def test_the_report_opens_offline_and_shows_frames_and_times(captured):
     page = (captured / "plan-session" / "report.html").read_text()
     assert page.count("<img ") == 62
     assert "data:image/jpeg;base64," in page
-    assert "writing meanwhile" in page
+    assert " s moving, " in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert 'src="http' not in page
     assert "{{" not in page

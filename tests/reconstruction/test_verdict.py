@@ -349,9 +349,9 @@ def judged_trial(
         ("repeated-shot", 1, "shot 3 shows the masks of shot 2"),
         ("missing-shot", 1, "shot 3 is dark"),
         ("camera-motion", 2, " saw "),
-        ("bad-pixels", 10, "far off"),
+        ("bad-pixels", 10, "differ from all their neighbours"),
         ("saturation", 60, "saturated"),
-        ("masked-pixels", 90, "holes"),
+        ("masked-pixels", 90, "largest hole"),
         ("exposure", 50, "noise"),
     ],
 )
