@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.settings import SIDES, AdaptiveSettings, Side
 from reconstruction.adaptive.survey import contrast_of
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
@@ -79,13 +79,15 @@ class PsiSource(Protocol):
 @dataclass(frozen=True)
 class Block:
     """outer: rows and columns reconstructed; part: those that count, with what overlaps the
-    neighbours; inner: those nearer to it than to any other; all in the light field's samples."""
+    neighbours; inner: those nearer to it than to any other; all in the light field's samples.
+    sides: of the light field, at which it lies."""
 
     row: int
     column: int
     outer: Place
     part: Place
     inner: Place
+    sides: tuple[Side, ...]
 
     @property
     def name(self) -> str:
@@ -157,13 +159,16 @@ class Grid:
         """Return a block by its row and column in the grid."""
         halo = ceil(self.halo / self.multiple) * self.multiple
         places: list[list[slice]] = [[], [], []]
+        sides: list[Side] = []
         for axis, at in enumerate((row, column)):
             length = self.size[axis]
+            sides += SIDES[2 * axis : 2 * axis + 1] if at == 0 else ()
+            sides += SIDES[2 * axis + 1 : 2 * axis + 2] if at == self.shape[axis] - 1 else ()
             first, last = self.edges[axis][at : at + 2]
             for place, more in zip(places, (self._blend + halo, self._blend, 0), strict=True):
                 place.append(slice(max(first - more, 0), min(last + more, length)))
         outer, part, inner = ((rows, columns) for rows, columns in places)
-        return Block(row, column, outer, part, inner)
+        return Block(row, column, outer, part, inner, tuple(sides))
 
     def _weight(self, axis: int, at: int, place: slice) -> NDArray[np.float32]:
         """Return the weights along an axis of the at-th blocks, in a place."""
@@ -408,9 +413,12 @@ def solve_block(
         dark = np.zeros((*views, *(part.stop - part.start for part in block.part), 3), np.float32)
         result = Reconstruction(name, dark, Status.INCOMPLETE, "", 0, (), 0.0, {})
         return SolvedBlock({"light_field": dark}, result.without_light_field(), None)
+    edges = tuple(side for side in settings.adaptive.edges if side in block.sides)
+    adaptive = settings.adaptive.model_copy(update={"edges": edges})
     result, verdict = reconstruct_judged(
-        name, psi, frames, noise_sigma, dictionary, settings, usable
-    )
+        name, psi, frames, noise_sigma, dictionary,
+        settings.model_copy(update={"adaptive": adaptive}), usable,
+    )  # fmt: skip
     place = within(block.part, block.outer)
     arrays = {"light_field": result.light_field[:, :, *place]}
     for key, values in result.maps.items():

@@ -1,5 +1,7 @@
 """The adaptive method: disparities by evidence, then the texture of the surfaces they make.
 
+Edges that views do not reach are left out of what follows, and given back at the end (`edges`).
+
 1. The disparity of a patch has a likelihood, given its readings (`evidence`, `search`), and
    patches agree with their neighbours.
 2. Contrast, disparities and weights are decided once for the whole picture (`survey`).
@@ -20,6 +22,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -27,6 +30,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
+from reconstruction.adaptive.edges import dark_edges, faded
 from reconstruction.adaptive.evidence import TexturePrior
 from reconstruction.adaptive.fits import Patches, averaged, fitted_models
 from reconstruction.adaptive.second import searched_again
@@ -75,8 +79,11 @@ def reconstruct_adaptive(
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
-    given = checked(psi, frames, noise_sigma, usable)
+    whole = given = checked(psi, frames, noise_sigma, usable)
     known = None if disparity is None else checked_disparity(disparity, psi)
+    edges = dark_edges(psi, given.frames, given.usable, settings.edges)
+    if edges is not None:
+        given = replace(given, usable=given.usable & ~edges.within)
     survey = surveyed(given, settings, known, report)
     second = searched_again(survey, settings) if known is None else None
     if second is not None:
@@ -94,11 +101,14 @@ def reconstruct_adaptive(
         "texture": _texture_map(survey.volume, size, k),
         **({} if mean.sigma is None else {"sigma": mean.sigma}),
     }
+    light_field = mean.light_field
+    if edges is not None:
+        light_field = faded(edges, psi, light_field, whole.frames, whole.usable)
     report(total)
     decided = _decided(survey.volume)
     return Reconstruction(
         method="adaptive",
-        light_field=mean.light_field,
+        light_field=light_field,
         status=Status.CONVERGED,
         advice="",
         steps=total,
@@ -112,6 +122,7 @@ def reconstruct_adaptive(
             "search_seconds": searched_s,
             "held_readings": int(survey.held.sum()),
             "at_end": survey.volume.at_end,
+            **({} if edges is None else {"dark_edge_px": float(max(edges.widths))}),
             **misfit(residual, given.noise, given.usable & ~survey.held),
             **({} if decided is None else {"decided": decided}),
             **({} if mean.over_plain is None else {"over_plain": mean.over_plain}),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import Field
 
@@ -10,6 +10,8 @@ from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.joint import TextureSettings
 
 Length = Annotated[float, Field(gt=0)]
+Side = Literal["top", "bottom", "left", "right"]
+SIDES: tuple[Side, ...] = get_args(Side)
 
 
 class AdaptiveSettings(Settings):
@@ -19,7 +21,7 @@ class AdaptiveSettings(Settings):
     and the chrominance and threshold of the shrinkage (0.3 to 0.8 dB).
     """
 
-    removed: ClassVar[tuple[str, ...]] = ("parsimony", "free", "rest", "views", "edges", "plane")
+    removed: ClassVar[tuple[str, ...]] = ("parsimony", "free", "rest", "views", "plane")
 
     furthest_px: float = Field(
         default=24.0, gt=0, description="largest disparity searched, to both sides"
@@ -59,6 +61,9 @@ class AdaptiveSettings(Settings):
     )
     patches: int | None = Field(
         default=2, ge=1, description="shots from which sparse patches are in the mean; none: never"
+    )
+    edges: tuple[Side, ...] = Field(
+        default=SIDES, description="sides that may be dark because views do not reach them"
     )
     contrast: float | None = Field(
         default=None,

@@ -8,7 +8,7 @@ import pytest
 from emmc_rig.files.psi import SavedPsi
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.settings import SIDES, AdaptiveSettings
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
@@ -55,6 +55,13 @@ def test_inner_parts_cover_every_sample_once_and_weights_of_parts_add_up_to_one(
             assert all(part.start >= 0 for part in within(place, other.part))
     np.testing.assert_array_equal(seen, 1)
     np.testing.assert_allclose(weights, 1, atol=1e-6)
+
+
+def test_only_blocks_at_the_border_may_have_dark_edges():
+    grid = Grid((90, 90), 2, 4, BlockSettings(whole=1, side=30, blend=2))
+    assert grid.block(1, 1).sides == ()
+    assert grid.block(0, 2).sides == ("top", "right")
+    assert {side for block in grid for side in block.sides} == set(SIDES)
 
 
 def test_sample_windows_lie_within_and_reach_all_corners():
