@@ -58,6 +58,8 @@ UNVARYING = 0.15
 """Deviation of a line's readings over that of the lines on either side, below which it is dead or
 stuck. Of good lines of 13 scenes (96x96) it is 0.4 at least behind masks, 0.25 without; of lines
 that pass 2 % of the light 0.02."""
+DARK = 0.5
+"""Brightness of a line over that of most, below which it may be an edge of the light field."""
 AS_LIGHT = 0.3
 """Square misfit of what a pixel reads too much, as light that the masks let through, over that as
 the same in every shot, below which it is a bright detail. On 64x80 middles of four real scenes,
@@ -208,13 +210,26 @@ def dead_lines(
     """Return the rows and the columns (both one-dimensional) that are dead or stuck in all shots.
 
     Their readings hardly vary, while those of the lines on either side do. A line's neighbours are
-    as dead as its pixels, so that none of these seems to differ from those around.
+    as dead as its pixels, so that none of these seems to differ from those around. Outermost lines
+    that are dark are no such lines: light fields that were rectified end so, and `adaptive` tells
+    these edges from the scene.
     """
     seen, k = usable.any(axis=(1, 2)), flat.binning
     colours = np.zeros(frames.shape) if flat.colour is None else flat.colour[:, ::k, ::k]
     frames, usable, colours = frames[seen], usable[seen], colours[seen]
-    rows = _unvarying(frames, usable, colours)
-    return rows, _unvarying(frames.swapaxes(1, 2), usable.swapaxes(1, 2), colours.swapaxes(1, 2))
+    rows = _dead(frames, usable, colours)
+    return rows, _dead(frames.swapaxes(1, 2), usable.swapaxes(1, 2), colours.swapaxes(1, 2))
+
+
+def _dead(frames: Array, usable: NDArray[np.bool_], colours: NDArray) -> NDArray[np.bool_]:
+    """Return the rows (pixel_y,) that vary in no shot, but for dark ones at the ends."""
+    dead = _unvarying(frames, usable, colours)
+    if dead[[0, -1]].any():
+        brightness = frames.mean(axis=(0, 2), where=usable | ~usable.any(axis=2, keepdims=True))
+        edge = dead & (brightness < DARK * np.median(brightness))
+        first, last = edge.argmin(), len(edge) - edge[::-1].argmin()
+        dead[:first] = dead[last:] = False
+    return dead
 
 
 def _unvarying(frames: Array, usable: NDArray[np.bool_], colours: NDArray) -> NDArray[np.bool_]:

@@ -187,6 +187,17 @@ def test_a_glint_behind_masks_that_differ_is_no_hot_pixel():
     assert bad_pixels(flat_psi(one.psi), frames, alone)[glint], "one shot cannot tell"
 
 
+def test_dark_outermost_lines_are_an_edge_of_the_light_field_and_no_dead_lines():
+    one = made("bad-pixels", 0, find_camera("rgbw-bayer-1shot"))
+    frames = one.readings.copy()
+    frames[:, -1] = frames[:, :, :2] = 0.01 * frames.mean()
+    assert not screened(one.psi, frames, one.usable).lines.any()
+    frames[:, :, -1] = 2 * frames.mean()
+    stuck = np.zeros(SIZE, bool)
+    stuck[:, -1] = True
+    np.testing.assert_array_equal(screened(one.psi, frames, one.usable).lines, stuck)
+
+
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-mono", "conventional"])
 @pytest.mark.parametrize("response", [0.02, 0.0])
 def test_dead_lines_are_left_out_though_their_neighbours_are_dead_as_well(camera, response):
