@@ -188,7 +188,7 @@ FIGURES = {
     "parameters.at_end": Figure("Patches at the end of the range", ".1%", "",
         "whose best disparity is the lowest or highest searched; good: at most 1 %"),
     "parameters.dark_edge_px": Figure("Dark edge of the picture", ".0f", "px",
-        "the widest one, left out of the fit: views do not reach there"),
+        "the widest one, excluded from the fit: views do not reach there"),
     "parameters.misfit": Figure("Unexplained residual", ".2f", "x noise",
         "root mean square residual of the readings over their noise; good: about 1"),
     "parameters.misfit_row": Figure("Row of the largest residual", ".0f", "px"),
