@@ -739,7 +739,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
         running.send_signal(signal.SIGINT)
         out, err = running.communicate(timeout=PATIENCE_S)
     assert running.returncode == 0, err
-    assert "the stage stands" in out
+    assert "the stage does not move" in out
     assert err == ""
 
 
