@@ -159,16 +159,18 @@ class Grid:
         """Return a block by its row and column in the grid."""
         halo = ceil(self.halo / self.multiple) * self.multiple
         places: list[list[slice]] = [[], [], []]
-        sides: list[Side] = []
+        rows, columns = self.shape
+        ends = row == 0, row == rows - 1, column == 0, column == columns - 1
+        sides: tuple[Side, ...] = tuple(
+            side for side, here in zip(SIDES, ends, strict=True) if here
+        )
         for axis, at in enumerate((row, column)):
             length = self.size[axis]
-            sides += SIDES[2 * axis : 2 * axis + 1] if at == 0 else ()
-            sides += SIDES[2 * axis + 1 : 2 * axis + 2] if at == self.shape[axis] - 1 else ()
             first, last = self.edges[axis][at : at + 2]
             for place, more in zip(places, (self._blend + halo, self._blend, 0), strict=True):
                 place.append(slice(max(first - more, 0), min(last + more, length)))
         outer, part, inner = ((rows, columns) for rows, columns in places)
-        return Block(row, column, outer, part, inner, tuple(sides))
+        return Block(row, column, outer, part, inner, sides)
 
     def _weight(self, axis: int, at: int, place: slice) -> NDArray[np.float32]:
         """Return the weights along an axis of the at-th blocks, in a place."""
