@@ -20,20 +20,52 @@ light that bounces between surfaces.
 Textures are (side, side, 4) RGBA in [0, 1], side a power of two.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from emmc_rig.model.compiling import njit
 
-_QUOTED_VIEWS, _QUOTED_WIDTH_PX = 5, 256
+QUOTED = 5 / 256
+"""D, in widths per aperture, of a disparity as quoted of 1."""
 _START_D = 1.0
 """Rays start nearer than any object."""
 _MAX_SURFACES = 24
 """Surfaces one ray may pass before it is given up."""
 _SUPERSAMPLES = 2
 _MISSED = -1
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How an object moves: it swings to either side of its place, and turns about its centre.
+
+    swing: farthest in S and T, in widths, and in disparity, as quoted; it goes to and fro once in
+    `period_s`, fastest at time 0. turn_rad_s: about the axes S, T and D; a card turns about D
+    alone.
+    """
+
+    swing: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    period_s: float = 1.0
+    turn_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+STILL = Motion()
+
+
+@dataclass(frozen=True)
+class CameraMotion:
+    """How the camera moves, to and fro once in `period_s`, fastest at time 0.
+
+    pan: to the right and downwards, in widths, as it turns: the whole picture moves the other way.
+    slide: in apertures, to where views of larger u see the scene from: near things move most.
+    """
+
+    pan: tuple[float, float] = (0.0, 0.0)
+    slide: float = 0.0
+    period_s: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +85,7 @@ class Card:
     tiled: bool = False
     sheen: float = 0.0
     sheen_depth: float = 0.0
+    motion: Motion = STILL
 
 
 @dataclass(frozen=True)
@@ -60,7 +93,8 @@ class Ball:
     """A sphere of radius `radius` (in widths) that spans disparity +- `depth`, as quoted.
 
     `gloss` is the mirror reflectance head on (it rises to 1 at the limb where it is not 0);
-    `glass` balls show no texture but what they refract (index 1.5), tinted by `tint`.
+    `glass` balls show no texture but what they refract (index 1.5), tinted by `tint`. `turn` is
+    the rotation vector, in radians, by which the ball and its texture are turned.
     """
 
     s: float
@@ -73,17 +107,23 @@ class Ball:
     gloss: float = 0.0
     glass: bool = False
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    motion: Motion = STILL
 
 
 @dataclass(frozen=True)
 class World:
-    """All objects of a scene, its surroundings (an equal-area map of directions), its light."""
+    """All objects of a scene, its surroundings (an equal-area map of directions), its light.
+
+    camera: how the camera moves, see `simulators.moving`.
+    """
 
     cards: tuple[Card, ...]
     balls: tuple[Ball, ...]
     surroundings: np.ndarray
     ambient: float = 0.45
     brightness: float = 1.0
+    camera: CameraMotion = CameraMotion()
 
 
 # Rows of the tables that the compiled kernels read.
@@ -95,6 +135,7 @@ _CARD = np.dtype(
 _BALL = np.dtype(
     [(field, np.float64) for field in ("s", "t", "d", "radius", "depth", "scale", "gloss")]
     + [(field, np.float64) for field in ("tint_r", "tint_g", "tint_b")]
+    + [(f"r{i}{j}", np.float64) for i in range(3) for j in range(3)]
     + [(field, np.int64) for field in ("offset", "side", "glass")]
 )
 _LIGHT = np.array([-0.45, -0.65, 0.61]) / np.linalg.norm([-0.45, -0.65, 0.61])
@@ -119,13 +160,17 @@ class Tables:
     lighting: np.ndarray
 
 
-def tabulated(world: World) -> Tables:
-    """Lay out a world for `paint_view` and `measure_disparity`."""
-    quoted = _QUOTED_VIEWS / _QUOTED_WIDTH_PX
+def tabulated(world: World, like: Tables | None = None) -> Tables:
+    """Lay out a world for `paint_view`, `measure_disparity` and `surfaces`.
+
+    like: tables of the same objects at other places, whose textures are taken over.
+    """
     pool: dict[int, tuple[int, int]] = {}
     texels: list[np.ndarray] = []
 
     def placed(texture: np.ndarray) -> tuple[int, int]:
+        if like is not None:
+            return 0, 0
         if id(texture) not in pool:
             pool[id(texture)] = sum(t.size for t in texels), texture.shape[0]
             texels.append(texture.astype(np.float32).ravel())
@@ -134,25 +179,32 @@ def tabulated(world: World) -> Tables:
     cards = np.zeros(len(world.cards), _CARD)
     corners = np.empty((len(world.cards), 4, 2))
     for row, corner, card in zip(cards, corners, world.cards, strict=True):
-        row["d"] = card.disparity * quoted
-        row["slope_s"], row["slope_t"] = card.slope_s * quoted, card.slope_t * quoted
+        row["d"] = card.disparity * QUOTED
+        row["slope_s"], row["slope_t"] = card.slope_s * QUOTED, card.slope_t * QUOTED
         for i, j in np.ndindex(3, 3):
             row[f"h{i}{j}"] = card.to_texture[i, j]
         row["offset"], row["side"] = placed(card.texture)
         row["tiled"] = card.tiled
-        row["sheen"], row["sheen_depth"] = card.sheen, card.sheen_depth * quoted
+        row["sheen"], row["sheen_depth"] = card.sheen, card.sheen_depth * QUOTED
         ends = np.linalg.inv(card.to_texture) @ np.array([[0, 1, 0, 1], [0, 0, 1, 1], [1, 1, 1, 1]])
         corner[:] = np.inf if card.tiled else (ends[:2] / ends[2]).T
     balls = np.zeros(len(world.balls), _BALL)
     for row, ball in zip(balls, world.balls, strict=True):
-        row["s"], row["t"], row["d"] = ball.s, ball.t, ball.disparity * quoted
-        row["radius"], row["depth"] = ball.radius, ball.depth * quoted
+        row["s"], row["t"], row["d"] = ball.s, ball.t, ball.disparity * QUOTED
+        row["radius"], row["depth"] = ball.radius, ball.depth * QUOTED
         row["scale"], row["gloss"], row["glass"] = ball.texture_scale, ball.gloss, ball.glass
         row["tint_r"], row["tint_g"], row["tint_b"] = ball.tint
+        turned = cv2.Rodrigues(np.array(ball.turn))[0]
+        for i, j in np.ndindex(3, 3):
+            row[f"r{i}{j}"] = turned[j, i]
         if ball.texture is not None:
             row["offset"], row["side"] = placed(ball.texture)
     surroundings = placed(world.surroundings)
     lighting = np.array([*_LIGHT, world.ambient, world.brightness])
+    if like is not None:
+        for rows, known in ((cards, like.cards), (balls, like.balls)):
+            rows["offset"], rows["side"] = known["offset"], known["side"]
+        return replace(like, cards=cards, balls=balls, corners=corners)
     return Tables(cards, balls, corners, np.concatenate(texels), surroundings, lighting)
 
 
@@ -166,7 +218,24 @@ def measure_disparity(disparity: np.ndarray, a_s: float, a_t: float, tables: Tab
 
     A ball counts as opaque; D is 0 where there is no surface.
     """
-    _trace_disparity(disparity, a_s, a_t, *_kernel_arguments(a_s, a_t, tables))
+    height, width = disparity.shape
+    y, x = np.indices(disparity.shape)
+    points = np.stack([(x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width], axis=-1)
+    disparity[:] = surfaces(points, a_s, a_t, tables)[0]
+
+
+def surfaces(
+    points: np.ndarray, a_s: float, a_t: float, tables: Tables
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is seen at points (..., X and Y) of a view: D, and which object, as (...).
+
+    D as `measure_disparity` says. Objects: cards by their place in the tables, then balls; -1 where
+    there is no surface.
+    """
+    flat = np.ascontiguousarray(points, np.float64).reshape(-1, 2)
+    d, objects = np.empty(len(flat)), np.empty(len(flat), np.int64)
+    _trace_surfaces(flat, d, objects, a_s, a_t, *_kernel_arguments(a_s, a_t, tables))
+    return d.reshape(points.shape[:-1]), objects.reshape(points.shape[:-1])
 
 
 def _kernel_arguments(a_s: float, a_t: float, tables: Tables) -> tuple:
@@ -409,10 +478,14 @@ def _trace_colours(
                 b += passes * mirrored * tint_b * eb
             passes *= 1 - mirrored
             if not ball.glass:
-                stretch = ball.scale / (1 + max(nz, 0.0))
+                own_x = ball.r00 * nx + ball.r01 * ny + ball.r02 * nz
+                own_y = ball.r10 * nx + ball.r11 * ny + ball.r12 * nz
+                own_z = ball.r20 * nx + ball.r21 * ny + ball.r22 * nz
+                stretch = ball.scale / (1 + max(own_z, 0.0))
                 cr, cg, cb, _ = _texel(
-                    texels, ball.offset, ball.side, 0.5 + stretch * nx, 0.5 + stretch * ny, True
-                )
+                    texels, ball.offset, ball.side,
+                    0.5 + stretch * own_x, 0.5 + stretch * own_y, True,
+                )  # fmt: skip
                 lamp = nx * lighting[0] + ny * lighting[1] + nz * lighting[2]
                 lit = ambient * (0.75 - 0.25 * ny) + (1 - ambient) * 1.15 * max(lamp, 0.0)
                 r += passes * tint_r * cr * lit
@@ -443,30 +516,27 @@ def _trace_colours(
 
 
 @_kernel
-def _trace_disparity(
-    disparity, a_s, a_t, card_windows, ball_windows,
+def _trace_surfaces(
+    points, d, objects, a_s, a_t, card_windows, ball_windows,
     cards, balls, texels, around, around_side, lighting,
 ):  # fmt: skip
-    """Fill D (y, x) of the first surface that is at least half opaque; 0 where there is none."""
-    height, width = disparity.shape
-    for row in range(height):
-        for column in range(width):
-            x = (column + 0.5) / width - 0.5
-            y = (row + 0.5 - height / 2) / width
-            start = -_START_D
-            disparity[row, column] = 0.0
-            for _ in range(_MAX_SURFACES):
-                k, found = _nearest(
-                    x, y, 0.0, a_s, a_t, -1.0, start, True, card_windows, ball_windows, cards, balls
-                )
-                if found == _MISSED:
-                    break
-                if found < cards.size:
-                    card = cards[found]
-                    p, q = _on_card(card, x + k * a_s, y + k * a_t)
-                    alpha = _texel(texels, card.offset, card.side, p, q, card.tiled)[3]
-                    if alpha < 0.5:
-                        start = k + 1e-9
-                        continue
-                disparity[row, column] = -k
+    """Fill D and object of the first surface at points (point, 2) that is at least half opaque."""
+    for i in range(points.shape[0]):
+        x, y = points[i]
+        start = -_START_D
+        d[i], objects[i] = 0.0, _MISSED
+        for _ in range(_MAX_SURFACES):
+            k, found = _nearest(
+                x, y, 0.0, a_s, a_t, -1.0, start, True, card_windows, ball_windows, cards, balls
+            )
+            if found == _MISSED:
                 break
+            if found < cards.size:
+                card = cards[found]
+                p, q = _on_card(card, x + k * a_s, y + k * a_t)
+                alpha = _texel(texels, card.offset, card.side, p, q, card.tiled)[3]
+                if alpha < 0.5:
+                    start = k + 1e-9
+                    continue
+            d[i], objects[i] = -k, found
+            break

@@ -1,5 +1,7 @@
 """Built-in procedural scenes: seeded light fields with known disparity, on any grid of views.
 
+Those of `MOVING_SCENES` move: they are known at any time, with their exact optical flow.
+
 Coordinates and disparities are those of `simulators.raycaster`: `Scene.disparity_px` quotes
 pixels per view step of 5 views of 256 columns. S runs from -1/2 to 1/2 across the picture, T
 downwards, +-3/8 at 3:4.
@@ -8,14 +10,25 @@ downwards, +-3/8 at 3:4.
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from emmc_rig.model.errors import SceneError, did_you_mean
 from simulators import textures
-from simulators.raycaster import Ball, Card, Tables, World, measure_disparity, paint_view, tabulated
+from simulators.moving import flow_between, world_at
+from simulators.raycaster import (
+    Ball,
+    CameraMotion,
+    Card,
+    Motion,
+    Tables,
+    World,
+    measure_disparity,
+    paint_view,
+    tabulated,
+)
 
 _SMALLEST_PX = 16
 
@@ -52,7 +65,7 @@ def render(
     """Render a built-in scene.
 
     Args:
-        name: a key of `SCENES`.
+        name: a key of `SCENES` or `MOVING_SCENES`; what moves is as at time 0.
         views: rows and columns of views, 1 or more.
         size: rows and columns of pixels, 16 or more.
         seed: chooses the random textures and places; equal seeds give equal scenes on every grid.
@@ -68,6 +81,45 @@ def render(
     known = change is None
     tables = _tables(name, seed) if known else tabulated(change(_world(name, seed)))
     return rendered(tables, views, size)
+
+
+def render_at(
+    name: str,
+    views: tuple[int, int] = (5, 5),
+    size: tuple[int, int] = (192, 256),
+    seed: int = 0,
+    time_s: float = 0.0,
+) -> RenderedScene:
+    """Render a built-in scene as it is at a time, at once: without motion blur.
+
+    Args, Returns and Raises as of `render`; a scene that does not move is the same at any time.
+    """
+    _check(name, views, size, seed)
+    return rendered(_tables_at(name, seed, time_s), views, size)
+
+
+def flow_px(name: str, size: tuple[int, int], seed: int, from_s: float, to_s: float) -> np.ndarray:
+    """Return the exact optical flow of the centre view of an odd count of views.
+
+    It follows the point that each pixel's centre sees at one time to where it is at the other: no
+    estimate.
+
+    Returns:
+        (y, x, 2) float64, pixels to the right and downwards; NaN where that point is hidden at the
+        other time, or beside the picture.
+
+    Raises:
+        SceneError: as `render`.
+    """
+    _check(name, (1, 1), size, seed)
+    times_s = from_s, to_s
+    before, after = (_tables_at(name, seed, time_s) for time_s in times_s)
+    return flow_between(_world(name, seed), size, times_s, (before, after))
+
+
+def built_in() -> dict[str, Scene]:
+    """Return every built-in scene by its name, those that move last."""
+    return {**SCENES, **MOVING_SCENES}
 
 
 def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> RenderedScene:
@@ -97,9 +149,10 @@ def rendered_disparity_px(
 
 
 def _check(name: str, views: tuple[int, int], size: tuple[int, int], seed: int) -> None:
-    if name not in SCENES:
-        hint = did_you_mean(name, SCENES, 0.4)
-        raise SceneError(f"no built-in scene '{name}': {hint}built in are {', '.join(SCENES)}")
+    known = built_in()
+    if name not in known:
+        hint = did_you_mean(name, known, 0.4)
+        raise SceneError(f"no built-in scene '{name}': {hint}built in are {', '.join(known)}")
     if min(views) < 1:
         raise SceneError(f"{views[0]}x{views[1]} views: needs 1x1 or more")
     if min(size) < _SMALLEST_PX:
@@ -123,9 +176,14 @@ def _tables(name: str, seed: int) -> Tables:
     return tabulated(_world(name, seed))
 
 
+@lru_cache(maxsize=4)
+def _tables_at(name: str, seed: int, time_s: float) -> Tables:
+    return tabulated(world_at(_world(name, seed), time_s), like=_tables(name, seed))
+
+
 @lru_cache(maxsize=2)
 def _world(name: str, seed: int) -> World:
-    return SCENES[name].build(np.random.default_rng([seed, *name.encode()]))
+    return built_in()[name].build(np.random.default_rng([seed, *name.encode()]))
 
 
 def _frame(s: float, t: float, width: float, height: float, turn_deg: float = 0.0) -> np.ndarray:
@@ -420,6 +478,37 @@ def _toy_table(rng: np.random.Generator) -> World:
     )  # fmt: skip
 
 
+def _moving_toys(rng: np.random.Generator) -> World:
+    """The toy table whose blocks turn and whose balls roll, before and behind each other."""
+    still = _toy_table(rng)
+    blocks = (
+        Motion((0.10, 0.02, 0.2), 5.0, (0, 0, 0.35)),
+        Motion((-0.12, 0.0, 0.3), 6.0, (0, 0, -0.25)),
+        Motion((-0.08, -0.05, 0.2), 4.0, (0, 0, 0.2)),
+    )
+    balls = (
+        Motion((0.13, 0.03, 0.5), 6.0, (0, 0.8, 0)),
+        Motion((0.16, 0.02, 0.0), 7.0, (0, 0, 0.9)),
+        Motion((-0.12, -0.06, -0.3), 4.5, (0.5, -0.5, 0.3)),
+    )
+    count = len(still.cards) - len(blocks)
+    moving = (
+        replace(card, motion=motion)
+        for card, motion in zip(still.cards[count:], blocks, strict=True)
+    )
+    return replace(
+        still,
+        cards=(*still.cards[:count], *moving),
+        balls=tuple(
+            replace(ball, motion=motion) for ball, motion in zip(still.balls, balls, strict=True)
+        ),
+    )
+
+
+def _panning_desk(rng: np.random.Generator) -> World:
+    return replace(_desk(rng), camera=CameraMotion((0.15, 0.05), slide=1.5, period_s=8.0))
+
+
 SCENES: dict[str, Scene] = {
     "near-planar": Scene("papers, a leaf and marbles on a tilted desk", (-0.3, 0.3), _desk),
     "deep-occlusions": Scene("a garden behind leaves and grass", (-2.0, 2.0), _garden),
@@ -427,4 +516,8 @@ SCENES: dict[str, Scene] = {
     "dark": Scene("blossoms at night, a few saturated glints", (-0.6, 0.6), _night_blossoms),
     "wide-disparity": Scene("an avenue seen through a fence", (-6.0, 10.0), _avenue),
     "toy-table": Scene("letter blocks and balls on a checked cloth", (-2.0, 2.0), _toy_table),
+}
+MOVING_SCENES: dict[str, Scene] = {
+    "moving-toys": Scene("blocks that turn and balls that roll", (-2.0, 2.0), _moving_toys),
+    "panning-desk": Scene("the desk before a camera that pans", (-0.4, 0.4), _panning_desk),
 }

@@ -1,0 +1,120 @@
+"""Worlds that move: where everything is at a time, and the exact optical flow between two times.
+
+Every object is moved by an affine map of (S, T, D), D as quoted, from its place at time 0. A flat
+card stays flat under it; a ball stays a ball, whose centre moves as the map says. Each point of an
+object is so known at any time, and its flow needs no estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.raycaster import QUOTED, Ball, Card, Motion, Tables, World, surfaces
+
+Array = NDArray[np.float64]
+_SAME_D = 1e-6
+"""Widths per aperture by which a point that was followed may lie off the surface seen there."""
+
+
+def world_at(world: World, time_s: float) -> World:
+    """Return the world as it is at a time, in seconds."""
+    return replace(
+        world,
+        cards=tuple(_moved_card(card, _map_of(card, world, time_s)) for card in world.cards),
+        balls=tuple(
+            replace(
+                ball,
+                **dict(zip("st", centre, strict=False)),
+                disparity=centre[2],
+                turn=_turn(ball.motion, time_s),
+            )
+            for ball in world.balls
+            for centre in [(_map_of(ball, world, time_s) @ _centre(ball))[:3]]
+        ),
+    )
+
+
+def flow_between(
+    world: World, size: tuple[int, int], times_s: tuple[float, float], tables: tuple[Tables, Tables]
+) -> Array:
+    """Return where each point that the central view sees goes, (y, x, 2): right and down, pixels.
+
+    tables: of the world at both times. NaN where there is no surface at the first time, and where
+    the point is hidden, or beside the picture, at the second. A point's surface is the first one
+    that is at least half opaque, as for disparities.
+    """
+    height, width = size
+    y, x = np.indices(size)
+    from_px = np.stack([x, y], axis=-1)
+    corner = np.array([0.5 - width / 2, 0.5 - height / 2])
+    points = (from_px + corner) / width
+    d, objects = surfaces(points, 0.0, 0.0, tables[0])
+    seen = np.concatenate([points, d[..., np.newaxis] / QUOTED, np.ones((*size, 1))], axis=-1)
+    for place, thing in enumerate((*world.cards, *world.balls)):
+        there = objects == place
+        before, after = (_map_of(thing, world, time_s) for time_s in times_s)
+        seen[there] = seen[there] @ (after @ np.linalg.inv(before)).T
+    to_px = seen[..., :2] * width - corner
+    there_d, there_objects = surfaces(seen[..., :2], 0.0, 0.0, tables[1])
+    shown = (objects >= 0) & (there_objects == objects)
+    shown &= np.abs(there_d - seen[..., 2] * QUOTED) < _SAME_D
+    shown &= ((to_px >= -0.5) & (to_px < np.array([width, height]) - 0.5)).all(axis=-1)
+    return np.where(shown[..., np.newaxis], to_px - from_px, np.nan)
+
+
+def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:
+    """Return the affine map (4, 4) of (S, T, D as quoted, 1) from time 0 to a time."""
+    motion, centre = thing.motion, _centre(thing)
+    swung = np.sin(2 * np.pi * time_s / motion.period_s)
+    turn = cv2.Rodrigues(np.array(_turn(motion, time_s)))[0]
+    if isinstance(thing, Ball):
+        # Turned in the space in which the ball is round.
+        radii = np.array([thing.radius, thing.radius, thing.depth])
+        turn = turn * radii[:, np.newaxis] / radii
+    own = np.eye(4)
+    own[:3, :3] = turn
+    own[:3, 3] = centre[:3] + swung * np.array(motion.swing) - turn @ centre[:3]
+    camera = world.camera
+    swung = np.sin(2 * np.pi * time_s / camera.period_s)
+    seen = np.eye(4)
+    seen[:2, 3] = -swung * np.array(camera.pan)
+    seen[0, 2] = swung * camera.slide * QUOTED
+    if isinstance(thing, Ball):
+        # Seen from aside a ball is still a ball: it moves as its centre does.
+        seen[0, 3] += seen[0, 2] * (own @ centre)[2]
+        seen[0, 2] = 0.0
+    return seen @ own
+
+
+def _turn(motion: Motion, time_s: float) -> tuple[float, float, float]:
+    about_s, about_t, about_d = (rate * time_s for rate in motion.turn_rad_s)
+    return about_s, about_t, about_d
+
+
+def _centre(thing: Card | Ball) -> Array:
+    """Return an object's centre at time 0: S, T, D as quoted, 1."""
+    if isinstance(thing, Ball):
+        return np.array([thing.s, thing.t, thing.disparity, 1.0])
+    s, t, scale = np.linalg.solve(thing.to_texture, [0.5, 0.5, 1.0])
+    s, t = s / scale, t / scale
+    return np.array([s, t, thing.disparity + thing.slope_s * s + thing.slope_t * t, 1.0])
+
+
+def _moved_card(card: Card, moved: Array) -> Card:
+    """Return a card whose points went where a map sends them."""
+    plane = np.array([card.slope_s, card.slope_t, card.disparity])
+    # From (S, T, 1) of the card's points to (S, T, D, 1) where they are.
+    there = moved @ np.array([[1, 0, 0], [0, 1, 0], plane, [0, 0, 1]])
+    back = np.linalg.inv(there[[0, 1, 3]])
+    slope_s, slope_t, disparity = there[2] @ back
+    return replace(
+        card,
+        to_texture=card.to_texture @ back,
+        slope_s=slope_s,
+        slope_t=slope_t,
+        disparity=disparity,
+    )

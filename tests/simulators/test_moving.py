@@ -1,0 +1,132 @@
+"""Scenes that move: places and optical flow against closed forms, and against what is rendered."""
+
+import cv2
+import numpy as np
+import pytest
+
+from emmc_rig.model.lightfield import centre_view
+from simulators.moving import flow_between, world_at
+from simulators.raycaster import Ball, CameraMotion, Card, Motion, World, tabulated
+from simulators.scenes import MOVING_SCENES, flow_px, render, render_at, rendered
+
+SIZE_PX = (48, 64)
+UNLIT = np.zeros((256, 256, 4), np.float32)
+_q, _p = (np.indices((256, 256)) + 0.5) / 256
+SMOOTH = np.stack(
+    [
+        0.5 + 0.3 * np.sin(2 * np.pi * 2 * _p) * np.cos(2 * np.pi * _q),
+        0.5 + 0.3 * np.cos(2 * np.pi * (_p + 2 * _q)),
+        0.5 + 0.3 * np.sin(2 * np.pi * (2 * _p - _q)),
+        np.ones_like(_p),
+    ],
+    axis=-1,
+).astype(np.float32)
+PICTURE_PLANE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], dtype=float)
+WALL = Card(SMOOTH, -2.0, PICTURE_PLANE, tiled=True)
+# A square of a quarter of the width in the middle of the picture.
+SQUARE = np.array([[4, 0, 0.5], [0, 4, 0.5], [0, 0, 1]], dtype=float)
+STANDING = CameraMotion()
+
+
+def world(*things: Card | Ball, camera: CameraMotion = STANDING) -> World:
+    cards = tuple(one for one in things if isinstance(one, Card))
+    balls = tuple(one for one in things if isinstance(one, Ball))
+    return World(cards, balls, UNLIT, ambient=1.0, camera=camera)
+
+
+def flow(of: World, from_s: float, to_s: float, size: tuple[int, int] = SIZE_PX) -> np.ndarray:
+    tables = tabulated(world_at(of, from_s)), tabulated(world_at(of, to_s))
+    return flow_between(of, size, (from_s, to_s), tables)
+
+
+def carried(view: np.ndarray, by_px: np.ndarray) -> np.ndarray:
+    """What every pixel's point looks like in a later view; 0 where it is not seen there."""
+    y, x = np.indices(view.shape[:2], dtype=np.float32)
+    to = np.where(np.isfinite(by_px), by_px, -1e3).astype(np.float32)
+    return cv2.remap(view, x + to[..., 0], y + to[..., 1], cv2.INTER_CUBIC)
+
+
+def test_a_card_swings_as_its_motion_says_and_hides_what_it_comes_before():
+    swing = Motion((0.125, 0.0, 0.0), period_s=4.0)
+    moving = world(WALL, Card(SMOOTH, 1.0, SQUARE, motion=swing))
+    # A quarter of the period later it has gone an eighth of the width: 8 pixels to the right.
+    found = flow(moving, 0.0, 1.0)
+    np.testing.assert_allclose(found[16:32, 24:40], np.broadcast_to([8, 0], (16, 16, 2)))
+    still = found[:, :24]
+    np.testing.assert_allclose(still, np.zeros_like(still), atol=1e-12)
+    assert np.isnan(found[16:32, 40:48]).all()
+    assert np.isfinite(np.delete(found, np.s_[16:32], axis=0)).all()
+
+
+def test_a_card_turns_about_its_centre_by_the_angle_of_its_rate():
+    moving = world(WALL, Card(SMOOTH, 1.0, SQUARE, motion=Motion(turn_rad_s=(0, 0, 0.4))))
+    found = flow(moving, 0.0, 0.5)
+    y, x = np.indices(SIZE_PX)
+    from_middle = np.stack([x + 0.5 - 32, y + 0.5 - 24], axis=-1)
+    cos, sin = np.cos(0.2), np.sin(0.2)
+    expected = from_middle @ np.array([[cos, sin], [-sin, cos]]) - from_middle
+    np.testing.assert_allclose(found[16:32, 24:40], expected[16:32, 24:40], atol=1e-9)
+
+
+def test_a_tilted_card_that_is_moved_keeps_the_disparity_of_each_of_its_points():
+    tilted = Card(SMOOTH, 1.0, PICTURE_PLANE, slope_s=3.0, slope_t=-1.0, tiled=True)
+    moving = world(Card(**{**vars(tilted), "motion": Motion((0.125, 0.0, 0.5), period_s=4.0)}))
+    before, after = (
+        rendered(tabulated(world_at(moving, time_s)), (5, 5), SIZE_PX).disparity_px
+        for time_s in (0.0, 1.0)
+    )
+    nearer_px = 0.5 * SIZE_PX[1] / 256
+    np.testing.assert_allclose(after[:, 8:], before[:, :-8] + nearer_px, atol=1e-6)
+
+
+def test_a_camera_that_slides_by_a_view_step_sees_what_the_next_view_saw():
+    camera = CameraMotion(slide=1 / 5, period_s=4.0)
+    cards = (WALL, Card(SMOOTH, 3.0, SQUARE, slope_s=2.0))
+    before, after = (
+        rendered(tabulated(world_at(world(*cards, camera=camera), time_s)), (5, 5), SIZE_PX)
+        for time_s in (0.0, 1.0)
+    )
+    np.testing.assert_allclose(after.light_field[:, :4], before.light_field[:, 1:], atol=1e-5)
+
+
+@pytest.mark.parametrize("turn_rad_s", [(0, 0, 0.5), (0, 0.5, 0), (0.3, -0.2, 0.4)])
+def test_the_flow_of_a_rolling_ball_carries_its_colours(turn_rad_s):
+    size = (192, 256)
+    motion = Motion((0.1, 0.05, 0.5), 6.0, turn_rad_s)
+    moving = world(WALL, Ball(0.0, 0.0, 0.5, 0.2, 0.8, SMOOTH, motion=motion))
+    views = [
+        rendered(tabulated(world_at(moving, time_s)), (1, 1), size).light_field[0, 0]
+        for time_s in (0.4, 0.9)
+    ]
+    found = flow(moving, 0.4, 0.9, size)
+    seen = np.isfinite(found).all(axis=-1)
+    # At the limb the pixels of either time mix ball and wall.
+    inner = cv2.erode(seen.astype(np.uint8), np.ones((7, 7))).astype(bool)
+    error = np.abs(carried(views[1], found) - views[0])[inner]
+    assert inner.mean() > 0.5
+    # The light from above stays with the room, a quarter of it less per radius downwards.
+    assert np.percentile(error, 99) < 0.05
+    assert np.percentile(np.abs(views[1] - views[0])[inner], 99) > 0.2
+
+
+@pytest.mark.parametrize("name", MOVING_SCENES)
+def test_a_built_in_scene_moves_and_its_flow_returns(name):
+    at_0 = render_at(name, (3, 3), SIZE_PX, 1, 0.0)
+    np.testing.assert_array_equal(at_0.light_field, render(name, (3, 3), SIZE_PX, 1).light_field)
+    later = render_at(name, (3, 3), SIZE_PX, 1, 0.5)
+    still_error = np.abs(centre_view(later.light_field) - centre_view(at_0.light_field))
+    found = flow_px(name, SIZE_PX, 1, 0.0, 0.5)
+    seen = np.isfinite(found).all(axis=-1)
+    assert 0.8 < seen.mean() < 1
+    error = np.abs(carried(centre_view(later.light_field), found) - centre_view(at_0.light_field))
+    assert error[seen].mean() < 0.6 * still_error[seen].mean()
+    back = flow_px(name, SIZE_PX, 1, 0.5, 0.0)
+    returned = found + carried(back, found)
+    # Where a pixel lies between two surfaces the way back is one of either.
+    assert np.nanmedian(np.abs(returned)) < 0.02
+
+
+def test_a_scene_that_does_not_move_is_the_same_at_any_time():
+    still, later = (render_at("toy-table", (2, 2), SIZE_PX, 0, time_s) for time_s in (0.0, 3.0))
+    np.testing.assert_array_equal(later.light_field, still.light_field)
+    np.testing.assert_allclose(flow_px("toy-table", SIZE_PX, 0, 0.0, 3.0), 0, atol=1e-9)
