@@ -95,6 +95,19 @@ class StreamingCamera(Camera, Protocol):
         ...
 
 
+class PacedCamera(StreamingCamera, Protocol):
+    """A camera that can be told how many frames a second to send."""
+
+    @property
+    def rate_limits_hz(self) -> Limits:
+        """Fewest and most frames a second at the present exposure; equal: it has no choice."""
+        ...
+
+    def stream_at(self, rate_hz: float) -> Iterator[RawFrame]:
+        """Yield frames as `stream`, at the nearest rate; raises `CameraSettingError` beyond it."""
+        ...
+
+
 class StoppableCamera(Camera, Protocol):
     """A camera that can break off an exposure."""
 

@@ -70,6 +70,7 @@ RAW_SETTINGS = (
 )
 """What makes frames raw, manual and untriggered, where the camera has it."""
 
+RATE = "AcquisitionFrameRate"
 SHORTEST_S, LONGEST_S = 1e-7, 3600.0
 FRAME_GRACE_S = 2.0
 LOST_IN_A_ROW = 3
@@ -185,6 +186,34 @@ class U3vCamera:
                     self._in_flight -= 1
                     frame = replace(frame, exposure_s=None, gain=None)
                 yield replace(frame, metadata={**frame.metadata, "frames_lost": str(lost)})
+
+    @property
+    def rate_limits_hz(self) -> Limits:
+        """See `drivers.camera.PacedCamera`."""
+        if not self.features.has(RATE):
+            return 1 / LONGEST_S, 1 / SHORTEST_S
+        if not self.features.is_writable(RATE):
+            only = self.features.number(RATE)
+            return only, only
+        low, high = self.features.limits(RATE)
+        return low, high
+
+    def stream_at(self, rate_hz: float) -> Generator[RawFrame, None, None]:
+        """Yield frames as `stream` at a rate, where the camera can be told one; then as before."""
+        self._set_if_possible(f"{RATE}Enable", 1)
+        if not (self.features.has(RATE) and self.features.is_writable(RATE)):
+            yield from self.stream()
+            return
+        check_setting("frame rate in Hz", rate_hz, self.rate_limits_hz)
+        before_hz = self.features.number(RATE)
+        self.features.set_nearest(RATE, rate_hz)
+        self._read_settings()
+        try:
+            yield from self.stream()
+        finally:
+            with suppress(DriverError):
+                self.features.set_nearest(RATE, before_hz)
+                self._read_settings()
 
     def stop_exposure(self) -> bool:
         """See `drivers.camera.StoppableCamera`."""
@@ -325,8 +354,8 @@ class U3vCamera:
         self.white_level_dn = self._format.white_dn
         self.black_level_dn = self._black_level_dn()
         self._period_s = 0.0
-        if features.has("AcquisitionFrameRate"):
-            self._period_s = 1 / max(features.number("AcquisitionFrameRate"), 1 / LONGEST_S)
+        if features.has(RATE):
+            self._period_s = 1 / max(features.number(RATE), 1 / LONGEST_S)
         self._in_flight = IN_FLIGHT
 
     def _linear(self, shown: float) -> float:

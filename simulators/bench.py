@@ -277,7 +277,9 @@ def window_side_um(views: tuple[int, int], cell_um: float) -> float:
 class Bench:
     """Scene or whiteboard, lamp, masks, pinhole plate and sensor of a camera, as they really are.
 
-    scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1.
+    scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1. Or, of one
+        that moves, what returns that as it is at a time in seconds: a frame shows it as it was when
+        the exposure began, without motion blur.
     positions_um: asks where the stages really are; keys mask_x, mask_y (0: masks centred on the
         axis), aperture_x, aperture_y (0: the pinhole on the axis), and focus (0: as the scene is),
         where there is such an axis.
@@ -288,7 +290,7 @@ class Bench:
     def __init__(
         self,
         camera: Camera,
-        scene: NDArray[np.float32],
+        scene: NDArray[np.float32] | Callable[[float], NDArray[np.float32]],
         size: tuple[int, int],
         positions_um: Callable[[], Mapping[str, float]],
         window_um: float,
@@ -302,6 +304,9 @@ class Bench:
         seconds: Callable[[], float] = lambda: 0.0,
     ) -> None:
         views = camera.views
+        self._scene_at = scene if callable(scene) else None
+        if callable(scene):
+            scene = scene(0.0)
         finer = (scene.shape[0] // views[0], scene.shape[2] // size[0])
         expected = (
             views[0] * finer[0],
@@ -316,6 +321,7 @@ class Bench:
         self.shot = 0
         self.masks_in = True
         self.board_turn_deg = 0.0
+        self._began_s = 0.0
         self.camera, self._scene, self._size, self._finer = camera, scene, size, finer
         self.positions_um, self.window_um, self.rng = positions_um, window_um, rng
         self._errors = MountingErrors() if errors is None else errors
@@ -353,6 +359,9 @@ class Bench:
         """Return the readings under a lamp of this level in red, green and blue."""
         at_um = self.positions_um()
         state = (lamp, self.target, self.shot, self.masks_in, self.board_turn_deg, *at_um.values())
+        if self._scene_at is not None and self.target == "scene":
+            self._scene = self._scene_at(self._began_s)
+            state = (*state, self._began_s)
         if state not in self._seen:
             if sum(one.nbytes for one in self._seen.values()) > KEPT_BYTES:
                 self._seen.clear()
@@ -409,8 +418,12 @@ class Bench:
             self.shot, self.masks_in = standing
         return psi
 
-    def expose(self, exposure_s: float) -> NDArray[np.uint16]:
-        """Return one noisy frame (pixel_y, pixel_x) in DN."""
+    def expose(self, exposure_s: float, began_s: float | None = None) -> NDArray[np.uint16]:
+        """Return one noisy frame (pixel_y, pixel_x) in DN.
+
+        began_s: when its exposure began; by default it is over just now.
+        """
+        self._began_s = self._seconds() - exposure_s if began_s is None else began_s
         noise, light = self.camera.sensor.noise, self._light[self.shot]
         if self._sensor is PERFECT_SENSOR:
             return noise.expose_dn(self.readings(), exposure_s, light, self.rng)

@@ -141,11 +141,11 @@ def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> R
 
 
 def rendered_disparity_px(
-    name: str, views: tuple[int, int], size: tuple[int, int], seed: int
+    name: str, views: tuple[int, int], size: tuple[int, int], seed: int, time_s: float = 0.0
 ) -> np.ndarray:
-    """Return the disparity alone of what `render` returns, (y, x) float32; raises SceneError."""
+    """Return the disparity alone of what `render_at` returns, (y, x) float32; raises SceneError."""
     _check(name, views, size, seed)
-    return _disparity_px(_tables(name, seed), views, size)
+    return _disparity_px(_tables_at(name, seed, time_s), views, size)
 
 
 def _check(name: str, views: tuple[int, int], size: tuple[int, int], seed: int) -> None:

@@ -98,11 +98,11 @@ class U3vCameraSimulator(UsbFunction):
     """The camera; plug it into a `SimulatedUsb`.
 
     `render(exposure_s)` returns the uint16 `(y, x)` mosaic in DN of the sensor's `bits`, at no
-    gain, called when the exposure is over. It must have `shape`, the sensor's. `depths` names the
-    formats offered, as in `drivers.pixel_formats.CODES`. `alignment_bits`: transfers are
-    multiples of 2 to its power. Faults, armed with `faults.inject`, strike commands, frames or
-    the middle of a payload, as their names say; `when` is given a command's address, or a frame's
-    number.
+    gain, called when the exposure is over, which began at `exposed_from_s` of the clock. It must
+    have `shape`, the sensor's. `depths` names the formats offered, as in
+    `drivers.pixel_formats.CODES`. `alignment_bits`: transfers are multiples of 2 to its power.
+    Faults, armed with `faults.inject`, strike commands, frames or the middle of a payload, as their
+    names say; `when` is given a command's address, or a frame's number.
     """
 
     def __init__(
@@ -127,6 +127,7 @@ class U3vCameraSimulator(UsbFunction):
         self.spec = _spec(serial, packet)
         self._render = render
         self._clock = clock
+        self.exposed_from_s = 0.0
         self._shape = shape
         self._bits = bits
         self._black_level_dn = black_level_dn
@@ -406,6 +407,7 @@ class U3vCameraSimulator(UsbFunction):
 
     def _send(self, exposure_s: float, block: int, start_s: float) -> None:
         """Queue the transfers of a frame, as the faults leave them."""
+        self.exposed_from_s = start_s
         form = BY_CODE[self._read_u32(xml.BASE, xml.PIXEL_FORMAT)]
         rows, columns, top, left = (
             self._read_u32(xml.BASE, offset)

@@ -87,12 +87,7 @@ def check(
     before: the mosaic of the frame before this one. may_saturate: a longer one of a bracket.
     """
     span = max(1.0, frame.white_level_dn - float(frame.black_level_dn.mean()))
-    if before is not None and _same(frame.mosaic, before):
-        raise FrameRefusedError(
-            planned.id,
-            "is identical to the frame before it",
-            "the camera sent its last frame again; if this repeats, switch it off and on",
-        )
+    refuse_repeated(planned, frame, before)
     if planned.kind == "dark":
         if found.mean_dn > checks.largest_dark * span:
             raise FrameRefusedError(
@@ -114,6 +109,18 @@ def check(
             planned.id,
             f"is saturated in {found.saturated:.1%} of its pixels",
             f"lower {exposure_setting(planned)} in the plan",
+        )
+
+
+def refuse_repeated(
+    planned: PlannedFrame, frame: RawFrame, before: NDArray[np.uint16] | None
+) -> None:
+    """Raise `FrameRefusedError` where a frame is the one before it, whose mosaic is `before`."""
+    if before is not None and _same(frame.mosaic, before):
+        raise FrameRefusedError(
+            planned.id,
+            "is identical to the frame before it",
+            "the camera sent its last frame again; if this repeats, switch it off and on",
         )
 
 

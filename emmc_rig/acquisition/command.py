@@ -23,6 +23,7 @@ from emmc_rig.acquisition.devices import identity_of
 from emmc_rig.acquisition.estimate import Estimate, known_exposures, pace_of
 from emmc_rig.acquisition.events import EventWatcher, OnEvent
 from emmc_rig.acquisition.expand import expand
+from emmc_rig.acquisition.film import refuse_impossible_film
 from emmc_rig.acquisition.metering import first_meterings
 from emmc_rig.acquisition.order import ordered
 from emmc_rig.acquisition.plan import Plan, load_plan, planned_camera
@@ -289,6 +290,8 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
     """
     watcher, plan = front.watcher, request.plan
     if request.until_db is not None:
+        if plan.film is not None:
+            raise AppError("--until: a film is taken to its end: leave --until or film out")
         refuse_unless_shots_can_be_spared(plan, request.camera)
     with ExitStack() as open_things:
         session = begun_session(request)
@@ -323,6 +326,8 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                 "of the stage, or leave focus out of the plan"
             )
         refuse_impossible(rig, frames)
+        film = [frame for frame in frames if frame.film is not None]
+        refuse_impossible_film(plan, rig, film)
         if session is not None:
             refuse_other_devices(session, rig, request.other_devices)
         expected = estimated(frames, plan, rig, session)

@@ -179,10 +179,11 @@ class Devices:
             read_um[axis] = at_um
         return read_um
 
-    def beside(self) -> dict[str, Any]:
+    def beside(self, streaming: bool = False) -> dict[str, Any]:
         """Return what is read beside a frame: see `FrameEntry`; what cannot be read is left out.
 
-        Devices are asked for temperatures every few seconds only.
+        Devices are asked for temperatures every few seconds only; a camera that is streaming, whose
+        wire another thread reads, is not.
         """
         stage, stands_um = self._rig.stage, {}
         for axis in stage.axes:
@@ -192,7 +193,8 @@ class Devices:
         now_s = self._rig.clock.now_s()
         if now_s - self._warmth_s >= TEMPERATURES_EVERY_S:
             self._warmth_s, self._warmth_c = now_s, {}
-            for name, device in (("camera", self.camera), ("stage", stage)):
+            asked = [("stage", stage)] if streaming else [("camera", self.camera), ("stage", stage)]
+            for name, device in asked:
                 with suppress(DriverError):
                     told = getattr(device, "temperatures_c", dict)()
                     self._warmth_c |= {
@@ -205,7 +207,7 @@ class Devices:
     def snap(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
         """Expose one frame where everything stands."""
         self._rig.about_to_expose(planned.id)
-        self._set_camera(planned, exposure_s)
+        self.set_camera(planned, exposure_s)
         self.asked = self._wall(), self._rig.clock.now_s()
         frame = self.camera.snap()
         return frame, figures(frame)
@@ -221,7 +223,7 @@ class Devices:
 
         def snapped() -> RawFrame:
             self._rig.about_to_expose(next(names))
-            self._set_camera(planned, exposure_s)
+            self.set_camera(planned, exposure_s)
             return self.camera.snap()
 
         found = focused(
@@ -276,7 +278,7 @@ class Devices:
             return self.snap(planned, exposure_s)
         low_s, high_s = self.camera.exposure_limits_s
         if planned.bench.target == "scene":
-            high_s = min(high_s, self._plan.metering.longest_s)
+            high_s = min(high_s, self._plan.longest_s)
         for _ in range(METERING_TRIES):
             frame, found = self.snap(planned, exposure_s)
             next_s = better_metering_s(frame, found, exposure_s, (low_s, high_s))
@@ -285,7 +287,8 @@ class Devices:
             exposure_s = next_s
         return frame, found
 
-    def _set_camera(self, planned: PlannedFrame, exposure_s: float) -> None:
+    def set_camera(self, planned: PlannedFrame, exposure_s: float) -> None:
+        """Set gain and exposure, unless they are so; raises where the camera takes others."""
         camera, sent = self.camera, self.sent
         if sent.gain != planned.gain:
             sent.gain = None

@@ -37,7 +37,8 @@ class Estimate:
     """Seconds by what they are spent on, and bytes on the disk.
 
     by_hand: how often a person is asked to change something at the bench, which takes time of its
-    own. guessed: frames whose exposure is not metered yet.
+    own. guessed: frames whose exposure is not metered yet. filming_s: of the frames of a film, so
+    many at their rate.
     """
 
     frames: int
@@ -47,18 +48,20 @@ class Estimate:
     bytes: int
     by_hand: int
     guessed: int = 0
+    filmed: int = 0
+    filming_s: float = 0.0
 
     @property
     def seconds(self) -> float:
         """Total, without what is done by hand."""
-        return self.moving_s + self.exposing_s + self.downloading_s
+        return self.moving_s + self.exposing_s + self.downloading_s + self.filming_s
 
 
 class Pace:
     """What frames cost in time, learnt from those that were taken.
 
     waits: whether moves and exposures take their time; those of most simulated rigs do not. hands:
-    axes that a hand moves. asks: whether a person is that hand.
+    axes that a hand moves. asks: whether a person is that hand. period_s: of a film's frames.
     """
 
     def __init__(
@@ -69,9 +72,10 @@ class Pace:
         waits: bool = True,
         hands: Collection[str] = (),
         asks: bool = True,
+        period_s: float = 0.0,
     ) -> None:
         self._speeds_um_s, self._settle_s, self._waits = speeds_um_s, settle_s, waits
-        self._hands, self._asks = hands, asks
+        self._hands, self._asks, self._period_s = hands, asks, period_s
         self._bytes = frame_bytes + FILE_OVERHEAD_BYTES
         self._usual_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
         self._learnt_s: deque[float] = deque(maxlen=LEARNT_FROM)
@@ -99,10 +103,13 @@ class Pace:
         """Return what frames in this order will take; at_um: where the stage stands before."""
         here_um = dict(at_um or {})
         stood: tuple | None = None
-        count, by_hand, guessed = 0, 0, 0
+        count = filmed = by_hand = guessed = 0
         moving_s = exposing_s = 0.0
         for frame in frames:
             count += 1
+            if frame.film is not None and self._waits:
+                filmed += 1
+                continue
             moving_s += self.moving_s(frame, here_um)
             here_um |= frame.bench.offsets_um
             if frame.bench.lamp != "off":
@@ -116,7 +123,17 @@ class Pace:
             moving_s = exposing_s = 0.0
         size = count * (self._bytes + JOURNAL_BYTES_PER_FRAME)
         frame_s = median(self._learnt_s) if self._learnt_s else self._usual_s
-        return Estimate(count, moving_s, exposing_s, count * frame_s, size, by_hand, guessed)
+        return Estimate(
+            count,
+            moving_s,
+            exposing_s,
+            (count - filmed) * frame_s,
+            size,
+            by_hand,
+            guessed,
+            filmed,
+            filmed * self._period_s,
+        )
 
 
 def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
@@ -124,7 +141,9 @@ def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
     rows, columns = rig.camera.shape
     speeds_um_s = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
     asks = isinstance(rig.attendant, AskingAttendant)
-    return Pace(speeds_um_s, plan.settle_s, 2 * rows * columns, waits, rig.hands, asks)
+    period_s = 0.0 if plan.film is None else 1 / plan.film.rate
+    size = 2 * rows * columns
+    return Pace(speeds_um_s, plan.settle_s, size, waits, rig.hands, asks, period_s)
 
 
 def known_exposures(

@@ -30,8 +30,12 @@ def ordered(
     frames = tuple(frames)
     if order == "as-planned":
         return frames
+    # A film has its order in time.
+    film = tuple(frame for frame in frames if frame.film is not None)
     groups: dict[object, list[PlannedFrame]] = {}
     for frame in frames:
+        if frame.film is not None:
+            continue
         # The scene is metered, all of it, before the first shot and the darks of the shots.
         meters = frame.bench.target == "scene" and (
             frame.kind == "metering" or (frame.kind == "dark" and frame.is_exposed_as_shots)
@@ -52,7 +56,7 @@ def ordered(
             toured += places[place]
             at_um |= dict(place)
         found += spread(toured, checks)
-    return tuple(found)
+    return (*found, *film)
 
 
 def _open_before_holes(groups: list[list[PlannedFrame]]) -> list[list[PlannedFrame]]:

@@ -217,6 +217,17 @@ class Focusing(Settings):
     span_um: Positive = Field(default=400.0, description="to either side of where the axis stands")
 
 
+class Film(Settings):
+    """A film of the scene: frame after frame, each at its time, by the plan's shots in turn.
+
+    With one shot the masks stand still. With several, frame t is taken by shot t modulo their
+    number, so that the masks are stepped between frames and come back after a cycle.
+    """
+
+    frames: Annotated[int, Field(ge=1, le=1_000_000)]
+    rate: Annotated[float, Field(gt=0, le=10_000, description="frames per second")]
+
+
 BEFORE_SHOTS = "before-shots"
 
 
@@ -230,6 +241,9 @@ class Plan(Settings):
     whiteboards: Boards | None = Boards()
     darks: Darks | None = Darks()
     metering: Metering = Metering()
+    film: Film | None = Field(
+        default=None, description="frames and rate: the shots are taken as a film of the scene"
+    )
     order: Literal["least-travel", "as-planned"] = "least-travel"
     between: str | None = Field(
         default=None,
@@ -258,6 +272,29 @@ class Plan(Settings):
         if isinstance(focus, str) and focus != BEFORE_SHOTS:
             raise ValueError(f"write {BEFORE_SHOTS}, or {{every: 50}}, not {focus!r}")
         return {} if focus == BEFORE_SHOTS else focus
+
+    @property
+    def longest_s(self) -> float:
+        """The longest exposure of the scene that metering may choose; a film's end in time."""
+        longest_s = self.metering.longest_s
+        return longest_s if self.film is None else min(longest_s, 1 / self.film.rate)
+
+    @model_validator(mode="after")
+    def _filmed_alike(self) -> Plan:
+        shots = self.shots
+        if self.film is None:
+            return self
+        if len({(one.exposure_s, one.gain, one.lamp) for one in shots}) > 1:
+            raise ValueError("film: all frames are exposed alike, give its shots one exposure_s")
+        if any(one.repeats > 1 or len(_bracket(one)) > 1 for one in shots):
+            raise ValueError("film: a frame is exposed once, leave brackets and repeats out")
+        if not self.metering.alike:
+            raise ValueError("film: all frames are exposed alike, leave metering.alike out")
+        return self
+
+
+def _bracket(shot: PlannedShot) -> tuple[float, ...]:
+    return shot.exposure_s if isinstance(shot.exposure_s, tuple) else ()
 
 
 def load_plan(path: Path) -> Plan:
@@ -381,6 +418,8 @@ darks:
   exposure_s: [0.01]
   repeats: 4
   of_shots: 4               # at the longest exposure of the shots, for their dark current
+
+# film: {{frames: 200, rate: 10}}   # the shots in turn, at 10 Hz; one shot: the masks stand still
 
 order: least-travel         # or as-planned
 settle_s: 0                 # after a move, beyond the stage's own

@@ -9,6 +9,7 @@ lamp is off and the stage stands when `run` returns or raises.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,10 +25,26 @@ from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.between import Between, HookError, plain
 from emmc_rig.acquisition.by_hand import HandPlaces, WrongPlaceError
-from emmc_rig.acquisition.checks import LEAST_LIKENESS, Figures, check, refuse_impossible
+from emmc_rig.acquisition.checks import (
+    LEAST_LIKENESS,
+    Figures,
+    FrameRefusedError,
+    check,
+    figures,
+    refuse_impossible,
+    refuse_repeated,
+)
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
 from emmc_rig.acquisition.estimate import known_exposures, pace_of
+from emmc_rig.acquisition.film import (
+    ARRIVAL_POLL_S,
+    INTERRUPTED,
+    LATE,
+    Ring,
+    room_for,
+    streams,
+)
 from emmc_rig.acquisition.focus import FocusFound
 from emmc_rig.acquisition.metering import asked_of_scene, first_meterings, metered_exposure_s
 from emmc_rig.acquisition.plan import Boards, Plan
@@ -46,7 +63,9 @@ from emmc_rig.session.frame_file import decode_frame, frame_entry, frame_file
 from emmc_rig.session.journal import (
     ComparedEntry,
     CompleteEntry,
+    DroppedEntry,
     Entry,
+    FilmEntry,
     FocusEntry,
     FrameEntry,
     HaltEntry,
@@ -56,6 +75,7 @@ from emmc_rig.session.journal import (
     RunEntry,
     SourceEntry,
     metered,
+    of_kind,
 )
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session, wall_time
@@ -65,6 +85,8 @@ REPORTED_BYTES = 1_000_000_000
 """Hashing more takes long enough to be reported."""
 REMAINING_TIME_INTERVAL_S = 1.0
 """Least time between two reports of the remaining time."""
+STAGE_READ_INTERVAL_S = 1.0
+"""How often the stage is read while a film streams: it stands still, and answers slowly."""
 ALL_TAKEN = "all frames are taken: finish, or take some once more"
 Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 """What to take next, asked again once that is on the disk; it gets the seconds of the run."""
@@ -112,6 +134,9 @@ class Sequencer:
         # How long the frame before took to hand over: its own line is written by then.
         self._handed: dict[str, tuple[float, float]] = {}
         self._may_saturate = _may_saturate(session.frames)
+        self._segment = len(of_kind(session.journal.entries, FilmEntry)) - 1
+        # On the clock of the rig, when the first frame of a film's segment was asked for.
+        self._film_began_s: float | None = None
 
     def run(self) -> RunEnd:
         """Take what is missing.
@@ -181,7 +206,11 @@ class Sequencer:
         session, devices = self._session, self._devices
         by_id = {frame.id: frame for frame in session.frames}
         latest = [by_id[name] for name in reversed(session.stored) if name in by_id]
-        candidates = [f for kind in ("whiteboard", "shot") for f in latest if f.kind == kind]
+        # The scene of a film may be another one by now.
+        candidates = [
+            *(frame for frame in latest if frame.kind == "whiteboard"),
+            *(frame for frame in latest if frame.is_still_shot),
+        ]
         if not candidates:
             return
         planned = candidates[0]
@@ -249,8 +278,12 @@ class Sequencer:
         return self._next() if self._may_go_on(ALL_TAKEN) else ()
 
     def _discard_retakes(self) -> None:
-        """Count the frames that are wanted once more as not taken."""
-        ids = [name for name in self._control.pop_again() if name in self._session.stored]
+        """Count the frames that are wanted once more as not taken; those of a film stay."""
+        film = {frame.id for frame in self._session.frames if frame.film is not None}
+        wanted = [name for name in self._control.pop_again() if name in self._session.stored]
+        if film & set(wanted):
+            self._watcher.tell("frames of a film cannot be taken again: their time is over")
+        ids = [name for name in wanted if name not in film]
         if not ids:
             return
         self._writer.flush()
@@ -267,7 +300,7 @@ class Sequencer:
         """Return by shot which frames of it are still to be taken."""
         found: dict[int, set[str]] = {}
         for frame in self._session.missing():
-            if frame.kind == "shot":
+            if frame.is_still_shot:
                 found.setdefault(frame.bench.shot, set()).add(frame.id)
         return found
 
@@ -304,7 +337,7 @@ class Sequencer:
 
         Ends early where metering the scene asked for more frames than were known of.
         """
-        for frame in frames:
+        for place, frame in enumerate(frames):
             if not self._may_go_on():
                 return False
             if self._control.again:
@@ -314,6 +347,8 @@ class Sequencer:
             self._prepared = None
             if self._focus_is_due(frame) and not self._focus(frame):
                 return False
+            if frame.film is not None:
+                return self._take_film(frames[place:])
             self._take(frame)
         return True
 
@@ -436,6 +471,155 @@ class Sequencer:
             )
         self._handed, self._before = handing.seconds, frame.mosaic
 
+    def _take_film(self, frames: tuple[PlannedFrame, ...]) -> bool:
+        """Take a film's frames, each at its time; returns False when asked to stop.
+
+        A pause, or a fault that is mended, ends a segment: the film goes on at its next place in
+        another one. What is missing before the last frame stored cannot be made up for.
+        """
+        self._writer.flush()
+        session = self._session
+        stored = [frame for frame in session.frames if frame.id in session.stored]
+        last = max((frame.film for frame in stored if frame.film is not None), default=-1)
+        left = list(frames)
+        self._drop(left, last + 1, INTERRUPTED)
+        is_streamed = streams(self._plan, self._devices.camera)
+        take = self._take_stream if is_streamed else self._take_steps
+        while left and self._may_go_on():
+            if self._control.again:
+                return True
+            self._retrying(left[0].id, partial(take, left))
+        self._writer.flush()
+        self._watcher.more(len(session.needed) + self._more)
+        return not left
+
+    def _begin_segment(self, planned: PlannedFrame) -> None:
+        assert self._plan.film is not None
+        self._segment, self._film_began_s = self._segment + 1, None
+        rate = self._plan.film.rate
+        self._note(FilmEntry(segment=self._segment, id=planned.id, rate=rate, wall=self._wall()))
+
+    def _drop(self, left: list[PlannedFrame], end: int, why: str | Callable[[int], str]) -> None:
+        """Take note that the frames left before a place are dropped; why: the same for all, or of
+        each place."""
+        reasons: dict[str, list[str]] = {}
+        while left and _place(left[0]) < end:
+            frame = left.pop(0)
+            reason = why if isinstance(why, str) else why(_place(frame))
+            reasons.setdefault(reason, []).append(frame.id)
+        for reason, ids in reasons.items():
+            entry = DroppedEntry(ids=ids, reason=reason, wall=self._wall())
+            self._note(entry)
+            self._watcher.tell(str(entry))
+
+    @property
+    def _halting(self) -> bool:
+        """Whether somebody wants something else than the next frame."""
+        control = self._control
+        return control.stopping or control.paused or control.again
+
+    def _take_stream(self, left: list[PlannedFrame]) -> None:
+        """Take a segment of a film from the camera's stream; what is taken or dropped leaves left.
+
+        Ends early where somebody pauses or stops; raises what the camera raises.
+        """
+        devices, rig, film = self._devices, self._rig, self._plan.film
+        assert film is not None
+        first = left[0]
+        devices.attend(first)
+        self._prepare(first)
+        if devices.move(first) and self._plan.settle_s:
+            devices.settle()
+        devices.set_camera(first, self._exposure_s(first))
+        self._begin_segment(first)
+        rows, columns = devices.camera.shape
+        ids, end = {_place(frame): frame.id for frame in left}, _place(left[-1]) + 1
+        read_s, beside = -STAGE_READ_INTERVAL_S, dict[str, Any]()
+        with Ring(
+            devices.camera,
+            film.rate,
+            range(_place(first), end),
+            room_for(2 * rows * columns),
+            rig.clock,
+            rig.clock is not SYSTEM_CLOCK,
+            lambda place: rig.about_to_expose(ids.get(place, "")),
+        ) as ring:
+            while left and not ring.over:
+                if self._halting:
+                    ring.stop()
+                arrived = ring.next()
+                if arrived is None:
+                    continue
+                place, film_s, frame = arrived
+                self._drop(left, place, ring.why_missing)
+                if _place(left[0]) != place:
+                    continue
+                if self._now_s() - read_s >= STAGE_READ_INTERVAL_S:
+                    read_s = self._now_s()
+                    beside = {
+                        "read_um": devices.read_back_um(left[0]),
+                        **devices.beside(streaming=True),
+                        "environment": self._read_sources(),
+                    }
+                devices.asked = self._wall(), rig.clock.now_s()
+                self._take_arrived(left, frame, film_s, **beside)
+        if not self._halting:
+            self._drop(left, end, ring.why_missing)
+
+    def _take_arrived(
+        self, left: list[PlannedFrame], frame: RawFrame, film_s: float, **about: Any
+    ) -> None:
+        """Store the next frame left of a film, or drop it where the camera sent one twice.
+
+        A segment's first must pass every check; a flash or darkness later is the scene's own.
+        """
+        planned, found = left[0], figures(frame)
+        if film_s == 0:
+            check(planned, frame, found, self._before, self._plan.checks)
+        try:
+            refuse_repeated(planned, frame, self._before)
+        except FrameRefusedError as fault:
+            self._drop(left, _place(planned) + 1, fault.reason)
+            return
+        left.pop(0)
+        self._watcher.taken(planned, frame, found)
+        self._hand_over(planned, frame, found, {}, film_s=film_s, **about)
+        self._before = frame.mosaic
+        self._taken += 1
+        self._report_remaining(planned)
+
+    def _take_steps(self, left: list[PlannedFrame]) -> None:
+        """Take a segment of a film frame by frame, the stage moving in between, as `_take_stream`.
+
+        A frame whose time is over by more than half a period is dropped.
+        """
+        rig, film, first = self._rig, self._plan.film, left[0]
+        assert film is not None
+        self._begin_segment(first)
+        while left and not self._halting:
+            if self._film_began_s is not None and not rig.recorded_s:
+                passed = (rig.clock.now_s() - self._film_began_s) * film.rate
+                due = _place(first) + passed
+                self._drop(left, math.ceil(due - 0.5), LATE)
+                if left and _place(left[0]) > due:
+                    wait_s = (_place(left[0]) - due) / film.rate
+                    rig.clock.sleep(min(wait_s, ARRIVAL_POLL_S))
+                    continue
+            if left:
+                self._prepared = None
+                self._take(left[0])
+                left.pop(0)
+
+    def _film_s(self, planned: PlannedFrame) -> float:
+        """Return when a film's frame was asked for, in seconds from the first of its segment."""
+        assert self._plan.film is not None
+        asked_s = self._devices.asked[1]
+        if self._film_began_s is None:
+            self._film_began_s = asked_s
+        if self._rig.recorded_s:
+            return _place(planned) / self._plan.film.rate
+        return asked_s - self._film_began_s
+
     def _prepare(self, planned: PlannedFrame | None) -> None:
         """Call the plan's hook, once a frame, and again where the stage was homed since.
 
@@ -510,7 +694,8 @@ class Sequencer:
         session = self._session
         if metered(session.journal.entries) is not None:
             return False
-        limits_s = self._devices.camera.exposure_limits_s
+        low_s, high_s = self._devices.camera.exposure_limits_s
+        limits_s = low_s, min(high_s, self._plan.longest_s)
         asked = asked_of_scene(session.frames, self._metered, self._plan.metering, limits_s)
         self._note(asked)
         self._writer.flush()
@@ -567,6 +752,8 @@ class Sequencer:
         """Give a frame to the writer's thread, with what its journal line says (`about` it)."""
         camera = self._devices.camera
         wall, monotonic_s = self._devices.asked
+        if planned.film is not None:
+            about = {"segment": self._segment, "film_s": self._film_s(planned)} | about
         entry = frame_entry(
             frame,
             # Only asked for where it is needed: a camera may read its next frame for that.
@@ -664,6 +851,12 @@ class Sequencer:
 
     def _now_s(self) -> float:
         return round(self._timer() - self._began_s, 6)
+
+
+def _place(frame: PlannedFrame) -> int:
+    """Return the place in time of a film's frame."""
+    assert frame.film is not None
+    return frame.film
 
 
 def _may_saturate(frames: tuple[PlannedFrame, ...]) -> set[str]:

@@ -224,7 +224,7 @@ class SimulatedAttendant:
 
 def simulated_rig(
     camera: Camera,
-    fine_scene: NDArray[np.float32],
+    fine_scene: NDArray[np.float32] | Callable[[float], NDArray[np.float32]],
     size: tuple[int, int],
     seed: int,
     clock: Clock | None = None,
@@ -311,8 +311,12 @@ def simulated_rig(
     black_dn, white_dn = noise.black_level_dn, noise.white_level_dn
     if fitted.camera == "u3v":
         bits = white_dn.bit_length()
-        simulator = U3vCameraSimulator(bench.expose, clock, shape, cfa, black_dn, bits)
-        function: UsbFunction = simulator
+        u3v = U3vCameraSimulator(
+            lambda exposure_s: bench.expose(exposure_s, u3v.exposed_from_s),
+            clock, shape, cfa, black_dn, bits,
+        )  # fmt: skip
+        simulator = u3v
+        function: UsbFunction = u3v
     else:
         simulator = PtpCameraSimulator(
             bench.expose, clock, cfa, black_dn, white_dn, span=ANY_EXPOSURE

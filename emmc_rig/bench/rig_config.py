@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -33,6 +34,7 @@ from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
 from simulators.bench import RAYS_PER_VIEW
 from simulators.effects import EFFECTS, TOGETHER, flawed
+from simulators.scenes import MOVING_SCENES
 from simulators.still import StillStage
 
 SIMULATED = "simulated"
@@ -272,7 +274,8 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
     settings = {key: value for key, value in description.items() if key not in NO_SETTINGS}
     if description["kind"] == SIMULATED:
         imaged = validated(ImagedRig, settings, "the simulated rig", AppError)
-        fine = fine_scene(
+        opened = partial(
+            fine_scene,
             imaged.scene,
             APERTURE_FACTOR,
             PIXEL_FACTOR,
@@ -280,11 +283,14 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
             views=camera.views,
             seed=imaged.seed,
         )
+        fine = opened()
         height, width = fine.scene.light_field.shape[2:4]
         clock = SYSTEM_CLOCK if imaged.real_time else None
         rig, _ = simulated_rig(
             camera,
-            fine.samples,
+            (lambda at_s: opened(time_s=at_s).samples)
+            if imaged.scene in MOVING_SCENES
+            else fine.samples,
             (height, width),
             imaged.seed,
             clock,

@@ -243,8 +243,8 @@ class SessionPage(EventWatcher):
                     "number": 0,
                     "stored": True,
                 }
-        missing = {frame.bench.shot for frame in session.missing() if frame.kind == "shot"}
-        taken = {frame.bench.shot for frame in session.needed if frame.kind == "shot"} - missing
+        missing = {frame.bench.shot for frame in session.missing() if frame.is_still_shot}
+        taken = {frame.bench.shot for frame in session.needed if frame.is_still_shot} - missing
         self._shots |= taken
         self._wanted = bool(taken) and self._computes
         self._changed.notify_all()

@@ -116,8 +116,9 @@ class FrameEntry(Entry):
     read to stand; of one that a hand moved, where the frame shows it, to `deviation_um`. wall,
     monotonic_s: when its exposure was asked for, by the time of day and on the clock of the rig.
     stands_um: where axes of the stage read to stand that no plan moves. temperatures_c: of stage
-    and camera, environment: of other sources, whose units the run's line has. spans_s: by step, its
-    begin and end in seconds of the run.
+    and camera, environment: of other sources, whose units the run's line has. segment: of a film's
+    frame, see `FilmEntry`; film_s: when it was exposed, in seconds from the segment's first.
+    spans_s: by step, its begin and end in seconds of the run.
     """
 
     kind: Literal["frame"] = "frame"
@@ -149,6 +150,8 @@ class FrameEntry(Entry):
     stands_um: dict[str, float] = {}
     temperatures_c: dict[str, float] = {}
     environment: dict[str, float] = {}
+    segment: int | None = None
+    film_s: float | None = None
     spans_s: dict[str, tuple[float, float]] = {}
 
     @property
@@ -342,6 +345,36 @@ class SourceEntry(Entry):
         return f"{self.wall}: {self.name}: {self.fault or 'gives values again'}"
 
 
+class FilmEntry(Entry):
+    """A segment of a film begins, from frame `id` on: time goes on within it without a break.
+
+    segment: counted from 0. One begins with the film, and another wherever it was interrupted: the
+    scene may be another one by then.
+    """
+
+    kind: Literal["film"] = "film"
+    segment: int
+    id: str
+    rate: float
+    wall: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.wall}: film, segment {self.segment + 1} begins with {self.id}"
+
+
+class DroppedEntry(Entry):
+    """Frames of a film that were not stored at their time, which cannot be made up for."""
+
+    kind: Literal["dropped"] = "dropped"
+    ids: list[str]
+    reason: str = ""
+    wall: str = ""
+
+    def __str__(self) -> str:
+        shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
+        return f"{len(self.ids)} dropped ({self.reason}): {shown}"
+
+
 class CompleteEntry(Entry):
     """Every frame was read back and found good."""
 
@@ -452,6 +485,11 @@ def metered(entries: Sequence[Entry]) -> MeteredEntry | None:
     """Return what metering of the scene asks for; None while that is open."""
     last = _last_of(entries, MeteredEntry, AmendedEntry)
     return last if isinstance(last, MeteredEntry) else None
+
+
+def dropped(entries: Iterable[Entry]) -> set[str]:
+    """Return the ids of the frames of a film that were dropped."""
+    return {name for entry in of_kind(entries, DroppedEntry) for name in entry.ids}
 
 
 def _last_of(entries: Sequence[Entry], *kinds: type[Entry]) -> Entry | None:

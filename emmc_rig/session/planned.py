@@ -58,7 +58,7 @@ class PlannedFrame:
     sensor. view: (v, u) of a whiteboard's pinhole. Frames of one shot that differ in exposure
     alone are its bracket; `repeat` counts equal ones. part: frames of one come before those of
     the next, in whatever order else. window: by how many aperture cells the plate's window is
-    moved, x and y.
+    moved, x and y. film: its place in time, from 0, of a frame of a film.
     """
 
     id: str
@@ -72,6 +72,12 @@ class PlannedFrame:
     light: float = 1.0
     part: int = 0
     window: tuple[int, int] = (0, 0)
+    film: int | None = None
+
+    @property
+    def is_still_shot(self) -> bool:
+        """Whether it is a shot of the scene that is no frame of a film."""
+        return self.kind == "shot" and self.film is None
 
     @property
     def is_metered_shot(self) -> bool:
@@ -96,6 +102,8 @@ class PlannedFrame:
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, for JSON."""
         own = asdict(self)
+        if self.film is None:
+            del own["film"]
         return {"id": own.pop("id"), "kind": own.pop("kind"), **own.pop("bench"), **own}
 
     @classmethod

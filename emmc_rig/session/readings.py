@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +14,14 @@ from calibration.frames import MeanFrame, SensorGain
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.session.frame_means import camera_of, decoded
+from emmc_rig.session.journal import FilmEntry, FrameEntry, of_kind
 from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
+
+SHOWN_FAULTS = 5
+SAME_EXPOSURE = 0.01
+"""By how much the exposures of a film's frames may differ: by less than cameras state them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +44,13 @@ class SessionReadings:
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
-    """Return the frames of each shot of the scene that is needed: its bracket and repeats."""
+    """Return the frames of each shot of the scene that is needed, film excepted: see `film_frames`.
+
+    Those of a shot are its bracket and repeats.
+    """
     shots: dict[int, list[PlannedFrame]] = defaultdict(list)
     for frame in session.needed:
-        if frame.kind == "shot":
+        if frame.is_still_shot:
             shots[frame.bench.shot].append(frame)
     return dict(sorted(shots.items()))
 
@@ -85,7 +93,7 @@ def fused_shot(
 
 def taken_shots(session: Session) -> tuple[int, ...]:
     """Return the shots of the scene that the session needs, by their place in the plan."""
-    return tuple(sorted({f.bench.shot for f in session.needed if f.kind == "shot"}))
+    return tuple(sorted({f.bench.shot for f in session.needed if f.is_still_shot}))
 
 
 def camera_json_of(session: Session, shots: Sequence[int]) -> str:
@@ -115,14 +123,118 @@ def scaled_readings(session: Session, scale: Scale, shots: Sequence[int]) -> Ses
     usable = np.empty(psi.frames_shape, dtype=bool)
     for place, shot in enumerate(shots):
         linear = fused_shot(session, frames[shot], scale.darks, scale.gain)
-        seen = scale.white_dn_per_s[shot] > 0
-        white = np.where(seen, scale.white_dn_per_s[shot], 1.0)
-        readings[place] = linear.dn_per_s / white
-        variance[place] = linear.variance / white**2
-        usable[place] = linear.usable & seen & scale.good
-        # What a pixel that is not to be used reads says nothing, not even how much at least.
-        readings[place] *= seen & scale.good
+        readings[place], variance[place], usable[place] = _normalised(linear, scale, shot)
     return SessionReadings(psi, readings, variance, usable)
+
+
+def _normalised(linear: LinearFrame, scale: Scale, shot: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Return a shot's readings, their variance and which are usable, each (y, x)."""
+    seen = scale.white_dn_per_s[shot] > 0
+    white = np.where(seen, scale.white_dn_per_s[shot], 1.0)
+    # What a pixel that is not to be used reads says nothing, not even how much at least.
+    readings = linear.dn_per_s / white * (seen & scale.good)
+    return readings, linear.variance / white**2, linear.usable & seen & scale.good
+
+
+@dataclass(frozen=True, eq=False)
+class FilmFrame:
+    """One frame of a film, normalised as Psi is; readings, deviation, usable: (1, y, x).
+
+    place: in time, from 0; places that were dropped are left out. time_s: seconds from the film's
+    first frame; what passed between two segments is not known, and counts as one period for each
+    place. segment: within one, time went on without a break. shot: which of Psi's shots it is.
+    deviation: of the readings, infinite where not usable. entry: its line of the journal.
+    """
+
+    place: int
+    time_s: float
+    segment: int
+    shot: int
+    readings: NDArray[np.float32]
+    deviation: NDArray[np.float32]
+    usable: NDArray[np.bool_]
+    entry: FrameEntry
+
+
+def film_frames(session: Session, scale: Scale | None = None) -> Iterator[FilmFrame]:
+    """Yield the film that a session holds, frame by frame in the order of time.
+
+    One frame is in memory at a time. scale: what `session_scale` returns, which it is by default.
+    Raises AppError, before the first frame, naming frames that are out of order, doubled, exposed
+    unlike the first, or whose mask did not step; later for one that shows the same as the frame
+    before it; CalibrationError.
+    """
+    film = _film(session)
+    if not film:
+        raise AppError(f"{session.folder}: holds no film; its plan needs `film: {{frames, rate}}`")
+    if faults := list(_film_faults(film)):
+        shown = "; ".join(faults[:SHOWN_FAULTS]) + ("; ..." if len(faults) > SHOWN_FAULTS else "")
+        raise AppError(f"{session.folder}: no film to reconstruct: {shown}")
+    rates = {one.segment: one.rate for one in of_kind(session.journal.entries, FilmEntry)}
+    scale = session_scale(session) if scale is None else scale
+    began_s, segment, before = 0.0, -1, np.zeros(0)
+    for frame, entry in film:
+        assert frame.film is not None
+        assert entry.segment is not None
+        assert entry.film_s is not None
+        if entry.segment != segment:
+            segment, began_s = entry.segment, frame.film / rates[entry.segment] - entry.film_s
+        shot = frame.bench.shot
+        linear = fused_shot(session, [frame], scale.darks, scale.gain)
+        if np.array_equal(linear.dn_per_s, before):
+            raise AppError(f"{session.folder}: {frame.id} shows the same as the frame before it")
+        before = linear.dn_per_s
+        readings, variance, usable = _normalised(linear, scale, shot)
+        yield FilmFrame(
+            frame.film,
+            began_s + entry.film_s,
+            segment,
+            shot,
+            readings[np.newaxis].astype(np.float32),
+            np.sqrt(variance)[np.newaxis].astype(np.float32),
+            usable[np.newaxis],
+            entry,
+        )
+
+
+def _film(session: Session) -> list[tuple[PlannedFrame, FrameEntry]]:
+    """Return the frames of a film that are stored, and their lines, in the order of time."""
+    film = [frame for frame in session.frames if frame.film is not None]
+    film.sort(key=lambda frame: frame.film or 0)
+    return [(frame, session.stored[frame.id]) for frame in film if frame.id in session.stored]
+
+
+def _film_faults(film: Sequence[tuple[PlannedFrame, FrameEntry]]) -> Iterator[str]:
+    """Yield what is wrong with the frames of a film, as their lines say."""
+    first, seen = film[0][1], dict[tuple[int | None, str], str]()
+    before = first
+    for frame, entry in film:
+        if entry is not first and _moment(entry) <= _moment(before):
+            yield f"{frame.id} was not exposed after {before.id}: out of order"
+        numbers = [entry.camera_sha256 or entry.sha256]
+        if block := entry.metadata.get("block_id"):
+            numbers.append(f"number {block}")
+        for number in numbers:
+            twin = seen.setdefault((entry.segment, number), frame.id)
+            if twin != frame.id:
+                yield f"{frame.id} is {twin} again: doubled"
+                break
+        exposed, alike = (entry.exposure_s, entry.gain), (first.exposure_s, first.gain)
+        if not np.allclose(exposed, alike, rtol=SAME_EXPOSURE):
+            yield f"{frame.id} was exposed for {entry.exposure_s:g} s, not {first.exposure_s:g} s"
+        for axis, um in entry.read_um.items():
+            there_um = entry.commanded_um.get(axis, um)
+            left_um = before.commanded_um.get(axis, there_um)
+            if abs(um - there_um) > abs(um - left_um):
+                yield f"{frame.id}: {axis} did not step, it read {um:g} um, not {there_um:g} um"
+        before = entry
+
+
+def _moment(entry: FrameEntry) -> tuple[int, float]:
+    """Return by what the frames of a film are ordered: segment, and time within it."""
+    if entry.segment is None or entry.film_s is None:
+        raise AppError(f"{entry.id}: its line in the journal does not say when it was exposed")
+    return entry.segment, entry.film_s
 
 
 def session_readings(session: Session) -> SessionReadings:

@@ -67,6 +67,7 @@ from emmc_rig.session.journal import (
     UntilEntry,
     count_entry,
     count_stored,
+    dropped,
     encode_line,
     ended,
     found_complete,
@@ -314,17 +315,19 @@ class Session:
     def needed(self) -> tuple[PlannedFrame, ...]:
         """Every frame to be taken.
 
-        Without those of shots that the scene was found not to need, and longer ones of brackets
-        that metering does not ask for.
+        Without those of shots that the scene was found not to need, longer ones of brackets
+        that metering does not ask for, and frames of a film that were dropped.
         """
         decided, exposed = ended(self.journal.entries), metered(self.journal.entries)
         spared = () if decided is None else decided.spared
         asked = () if exposed is None else set(exposed.asked)
+        gone = dropped(self.journal.entries)
         return tuple(
             frame
             for frame in self.frames
             if not (frame.kind == "shot" and frame.bench.shot in spared)
             and not (frame.is_optional and frame.id not in asked)
+            and frame.id not in gone
         )
 
     def missing(self) -> tuple[PlannedFrame, ...]:

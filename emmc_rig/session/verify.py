@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from emmc_rig.errors import AppError
-from emmc_rig.session.journal import FrameEntry
+from emmc_rig.session.journal import FrameEntry, dropped
 from emmc_rig.session.session import Session
 
 THREADS = min(8, os.cpu_count() or 1)
@@ -24,7 +24,8 @@ THREADS = min(8, os.cpu_count() or 1)
 class Verdict:
     """What became of a session.
 
-    planned: frames, but for `spared` ones that the scene was found not to need. missing: frames not
+    planned: frames, but for `spared` ones that the scene was found not to need, and
+    `dropped` ones of a film. missing: frames not
     captured yet. damaged: by id, what is wrong. frozen: files that were
     changed since the session began. unreadable: journal lines torn or damaged.
     leftovers, foreign: files that do not count, relative to the session.
@@ -39,6 +40,7 @@ class Verdict:
     leftovers: tuple[str, ...] = ()
     foreign: tuple[str, ...] = ()
     spared: int = 0
+    dropped: int = 0
 
     @property
     def is_complete(self) -> bool:
@@ -55,6 +57,8 @@ class Verdict:
             yield f"{len(self.missing)} of {self.planned} frames not captured yet: {shown}"
         if self.spared:
             yield f"{self.spared} more frame(s) planned, which were not needed (--until)"
+        if self.dropped:
+            yield f"{self.dropped} frame(s) of the film dropped, each named in the journal"
         if self.unreadable:
             yield f"{self.unreadable} journal line(s) torn or damaged; their frames do not count"
         if self.leftovers:
@@ -111,6 +115,7 @@ def verify(
     stored = {name: entry for name, entry in session.stored.items() if name in planned}
     damaged = verify_frames(session, stored.values(), on_frame)
     leftovers, foreign = session.unexpected_files()
+    gone = len(dropped(session.journal.entries))
     return Verdict(
         planned=len(planned),
         good=len(stored) - len(damaged),
@@ -120,7 +125,8 @@ def verify(
         unreadable=session.journal.unreadable,
         leftovers=tuple(leftovers),
         foreign=tuple(foreign),
-        spared=len(session.frames) - len(planned),
+        spared=len(session.frames) - len(planned) - gone,
+        dropped=gone,
     )
 
 
