@@ -84,6 +84,7 @@ GUARDS = (
     "shows the shadow through ",  # walked in test_by_hand.py
     "shows the mask ",
     "an imported session takes no further frames",  # it is complete; its remedy is another import
+    "its time stamps run backwards",  # walked in test_film.py
     "no file of it is frame ",  # frames without a file are not taken, but for --until
 )
 """What other commands print, and what earlier checks keep a capture from."""
@@ -223,6 +224,8 @@ ONE = {"exposure_s": 0.01}
 STANDING = {"camera": "coded-aperture-random", "shots": [ONE]}
 PLAIN = {"views": [], "references": 2, "exposure_s": 0.02}
 CHANGING = {"camera": "coded-aperture-sequential-random"}
+FILM = {"frames": 3, "rate": 2}
+PLACES = [{**ONE, "mask_um": [0, 0]}, {**ONE, "mask_um": [48, 0]}]
 PLANS = {
     "whiteboards.views: [": (boards(views=[[7, 2]]), boards(views=[[4, 2]])),
     " uncovers none of the camera's ": (
@@ -255,6 +258,25 @@ PLANS = {
     ),
     "so that camera_shot has no effect: leave it out": (
         {**CHANGING, "shots": [{**ONE, "camera_shot": 1}]}, {**CHANGING, "shots": [ONE]},
+    ),
+    "film: all frames are exposed alike, give its shots one exposure_s": (
+        {"film": FILM}, {"film": FILM, "shots": [ONE, ONE]},
+    ),
+    "film: all frames are exposed alike, leave metering.alike out": (
+        {"film": FILM, "shots": [ONE], "metering": {"alike": False}},
+        {"film": FILM, "shots": [ONE]},
+    ),
+    "film: a frame is exposed once, leave brackets and repeats out": (
+        {"film": FILM, "shots": [{**ONE, "repeats": 2}]}, {"film": FILM, "shots": [ONE]},
+    ),
+    "film: an exposure of ": (
+        {"film": {**FILM, "rate": 200}, "shots": [ONE]}, {"film": FILM, "shots": [ONE]},
+    ),
+    ": lower film.rate from ": (
+        {"film": {**FILM, "rate": 8}, "shots": PLACES}, {"film": FILM, "shots": PLACES},
+    ),
+    "film: its shots differ in what somebody does by hand": (
+        {**CHANGING, "film": FILM, "shots": [ONE, ONE]}, {**CHANGING, "film": FILM, "shots": [ONE]},
     ),
 }  # fmt: skip
 
@@ -693,6 +715,12 @@ def work_by_hand_without_a_terminal(bench):
     terminal = io.StringIO("\n" * 40)
     terminal.isatty = lambda: True
     bench.patch.setattr("sys.stdin", terminal)
+
+
+@walk("--until: a film is taken to its end")
+def a_film_with_a_target(bench):
+    bench.plan(film=FILM, shots=[ONE])
+    yield bench.refused(*CAPTURE, "--until", "30dB")
 
 
 @walk(" frames by number and exposures; name them after the frames")
