@@ -150,26 +150,46 @@ class Ring:
             self._changed.notify_all()
 
     def _placed(self) -> Iterator[tuple[int, float, RawFrame]]:
-        """Yield frames with their places and times, those of a camera that is faster left out."""
-        place, first_s = self._places.start - 1, None
+        """Yield the frame nearest in time to each place, with its place and time.
+
+        Of a camera that is faster than the film the others are left out.
+        """
+        start, end = self._places.start, self._places.stop
+        done, first_s, held_off = start - 1, None, 0.0
+        held: tuple[int, float, RawFrame] | None = None
         paced = getattr(self._camera, "stream_at", None)
         stream = self._camera.stream() if paced is None else paced(self._rate_hz)
         with closing(stream):
-            self._announce(place + 1)
+            self._announce(start)
             for frame in stream:
-                at_s = frame.camera_time_s
-                if at_s is None:
-                    at_s = self._clock.now_s() if frame.host_time_s is None else frame.host_time_s
+                at_s = self._time_s(frame)
                 first_s = at_s if first_s is None else first_s
-                here = self._places.start + round((at_s - first_s) * self._rate_hz)
-                if here < place:
+                passed = (at_s - first_s) * self._rate_hz
+                place = start + round(passed)
+                if place < (done if held is None else held[0]):
                     raise CaptureError("its time stamps run backwards", "open the camera again")
-                if place < here < self._places.stop:
-                    yield here, at_s - first_s, frame
-                place = here
-                if place + 1 >= self._places.stop or self._ended:
-                    return
-                self._announce(place + 1)
+                if held is not None and place > held[0]:
+                    yield held
+                    done, held = held[0], None
+                if done < place < end:
+                    off = passed - (place - start)
+                    if held is None or abs(off) < held_off:
+                        held, held_off = (place, at_s - first_s, frame), abs(off)
+                    if off >= 0:
+                        # Any later one is farther from the place's time.
+                        yield held
+                        done, held = place, None
+                if place >= end or done + 1 >= end or self._ended:
+                    break
+                self._announce(done + 1)
+            if held is not None:
+                yield held
+
+    def _time_s(self, frame: RawFrame) -> float:
+        """Return when a frame was taken: by the camera's own clock, else when it arrived."""
+        if frame.camera_time_s is not None:
+            return frame.camera_time_s
+        return self._clock.now_s() if frame.host_time_s is None else frame.host_time_s
 
     def _keep(self, place: int, film_s: float, frame: RawFrame) -> None:
         with self._changed:

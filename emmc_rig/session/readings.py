@@ -172,13 +172,15 @@ def film_frames(session: Session, scale: Scale | None = None) -> Iterator[FilmFr
         raise AppError(f"{session.folder}: no film to reconstruct: {shown}")
     rates = {one.segment: one.rate for one in of_kind(session.journal.entries, FilmEntry)}
     scale = session_scale(session) if scale is None else scale
-    began_s, segment, before = 0.0, -1, np.zeros(0)
+    segment, before, began_s, time_s, place = -1, np.zeros(0), 0.0, 0.0, 0
     for frame, entry in film:
         assert frame.film is not None
         assert entry.segment is not None
         assert entry.film_s is not None
         if entry.segment != segment:
-            segment, began_s = entry.segment, frame.film / rates[entry.segment] - entry.film_s
+            segment = entry.segment
+            began_s = time_s + (frame.film - place) / rates[segment] - entry.film_s
+        time_s, place = began_s + entry.film_s, frame.film
         shot = frame.bench.shot
         linear = fused_shot(session, [frame], scale.darks, scale.gain)
         if np.array_equal(linear.dn_per_s, before):
@@ -186,8 +188,8 @@ def film_frames(session: Session, scale: Scale | None = None) -> Iterator[FilmFr
         before = linear.dn_per_s
         readings, variance, usable = _normalised(linear, scale, shot)
         yield FilmFrame(
-            frame.film,
-            began_s + entry.film_s,
+            place,
+            time_s,
             segment,
             shot,
             readings[np.newaxis].astype(np.float32),
