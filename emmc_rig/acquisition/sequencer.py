@@ -2,9 +2,10 @@
 
 `run` sets up, takes frame after frame, and leaves the bench safe. Of each frame `_take_once` shows
 the steps: set up (lamp, board, masks), expose (move, settle, expose, download, read back, check),
-store. A writer thread stores and journals the frame while the stage already moves to the next. A
-fault is met by mending what it broke and trying again, within a budget. However a run ends, the
-lamp is off and the stage stands when `run` returns or raises.
+store. A writer thread stores and journals the frame while the stage already moves to the next. The
+frames of a film, which cannot be tried again, have `_take_film`: each is taken at its time, or
+dropped. A fault is met by mending what it broke and trying again, within a budget. However a run
+ends, the lamp is off and the stage stands when `run` returns or raises.
 """
 
 from __future__ import annotations
@@ -500,8 +501,7 @@ class Sequencer:
         self._note(FilmEntry(segment=self._segment, id=planned.id, rate=rate, wall=self._wall()))
 
     def _drop(self, left: list[PlannedFrame], end: int, why: str | Callable[[int], str]) -> None:
-        """Take note that the frames left before a place are dropped; why: the same for all, or of
-        each place."""
+        """Take note that the frames left before a place are dropped; why: by place, or of all."""
         reasons: dict[str, list[str]] = {}
         while left and _place(left[0]) < end:
             frame = left.pop(0)
@@ -602,6 +602,9 @@ class Sequencer:
                 due = _place(first) + passed
                 self._drop(left, math.ceil(due - 0.5), LATE)
                 if left and _place(left[0]) > due:
+                    # A hook is called before any axis moves.
+                    if self._between is None and self._devices.move(left[0]):
+                        continue
                     wait_s = (_place(left[0]) - due) / film.rate
                     rig.clock.sleep(min(wait_s, ARRIVAL_POLL_S))
                     continue

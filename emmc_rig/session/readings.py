@@ -93,7 +93,7 @@ def fused_shot(
 
 def taken_shots(session: Session) -> tuple[int, ...]:
     """Return the shots of the scene that the session needs, by their place in the plan."""
-    return tuple(sorted({f.bench.shot for f in session.needed if f.is_still_shot}))
+    return tuple(sorted({f.bench.shot for f in session.needed if f.kind == "shot"}))
 
 
 def camera_json_of(session: Session, shots: Sequence[int]) -> str:
@@ -242,6 +242,11 @@ def _moment(entry: FrameEntry) -> tuple[int, float]:
 def session_readings(session: Session) -> SessionReadings:
     """Return what the shots read that a session needs, by the Psi of its whiteboards.
 
-    Raises AppError or CalibrationError.
+    Raises AppError, as for a film, or CalibrationError.
     """
+    if not shot_frames(session) and _film(session):
+        raise AppError(
+            f"{session.folder}: holds a film, whose frames are no shots of one light field: read "
+            "it frame by frame, see `film_frames`"
+        )
     return scaled_readings(session, session_scale(session), taken_shots(session))

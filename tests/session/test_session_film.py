@@ -45,7 +45,7 @@ def captured(text, camera="u3v"):
 
 def test_a_films_frames_read_what_shots_of_their_exposure_do_to_their_deviation():
     film = captured(STEPPED, "ptp")
-    assert taken_shots(film) == ()
+    assert taken_shots(film) == (0, 1)
     shots = session_readings(captured(STILL, "ptp"))
     frames = list(film_frames(film))
     assert [(one.place, one.shot, one.segment) for one in frames] == [
@@ -122,6 +122,11 @@ def test_a_mask_that_did_not_step_is_named_with_the_axis():
     altered(3, read_um=before)(session)
     with pytest.raises(AppError, match="film-000003: mask_x did not step"):
         list(film_frames(session))
+
+
+def test_a_film_is_not_taken_for_shots_of_one_light_field():
+    with pytest.raises(AppError, match="holds a film"):
+        session_readings(captured(STREAMED))
 
 
 def test_a_session_without_a_film_says_what_its_plan_needs():
