@@ -62,6 +62,7 @@ class Pace:
 
     waits: whether moves and exposures take their time; those of most simulated rigs do not. hands:
     axes that a hand moves. asks: whether a person is that hand. period_s: of a film's frames.
+    usual_s: what a frame takes beside moves and exposure, as long as nothing is learnt.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Pace:
         self._speeds_um_s, self._settle_s, self._waits = speeds_um_s, settle_s, waits
         self._hands, self._asks, self._period_s = hands, asks, period_s
         self._bytes = frame_bytes + FILE_OVERHEAD_BYTES
-        self._usual_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
+        self.usual_s = EXCHANGES_S + self._bytes / DOWNLOAD_BYTES_PER_S
         self._learnt_s: deque[float] = deque(maxlen=LEARNT_FROM)
 
     def learn(self, seconds: float, exposure_s: float, moving_s: float) -> None:
@@ -122,7 +123,7 @@ class Pace:
         if not self._waits:
             moving_s = exposing_s = 0.0
         size = count * (self._bytes + JOURNAL_BYTES_PER_FRAME)
-        frame_s = median(self._learnt_s) if self._learnt_s else self._usual_s
+        frame_s = median(self._learnt_s) if self._learnt_s else self.usual_s
         return Estimate(
             count,
             moving_s,

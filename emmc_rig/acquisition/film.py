@@ -29,6 +29,9 @@ RING_BYTES = 256_000_000
 LEAST_ROOM = 2
 ARRIVAL_POLL_S = 0.1
 """How soon a key counts while no frame comes."""
+ON_TIME = 0.05
+"""Of a period, by which a frame may come before its place's time without the next being awaited:
+that one is nearer only of a camera that is ten times as fast as the film."""
 SLOW_DISK = "the disk was too slow"
 NONE_CAME = "the camera sent no frame at that time"
 LATE = "the bench was not ready at that time"
@@ -67,8 +70,9 @@ def refuse_impossible_film(plan: Plan, rig: Rig, frames: Sequence[PlannedFrame])
         longest_s = max(
             (pace.moving_s(to, by.bench.offsets_um) for by, to in pairwise(cycle)), default=0.0
         )
-        most_hz = 1 / (longest_s + exposure_s) if longest_s else rate_hz
-        why = f"the stage takes {longest_s:.3g} s from one mask place to the next"
+        frame_s = longest_s + exposure_s + pace.usual_s
+        most_hz = 1 / frame_s
+        why = f"a frame takes about {frame_s:.2g} s, of which the stage moves {longest_s:.2g} s"
     if most_hz < rate_hz:
         raise AppError(f"film: {why}: lower film.rate from {rate_hz:g} to {most_hz:.3g}")
 
@@ -175,13 +179,12 @@ class Ring:
                     off = passed - (place - start)
                     if held is None or abs(off) < held_off:
                         held, held_off = (place, at_s - first_s, frame), abs(off)
-                    if off >= 0:
-                        # Any later one is farther from the place's time.
+                    if off >= -ON_TIME:
                         yield held
                         done, held = place, None
                 if place >= end or done + 1 >= end or self._ended:
                     break
-                self._announce(done + 1)
+                self._announce((done if held is None else place) + 1)
             if held is not None:
                 yield held
 

@@ -275,7 +275,7 @@ class Plan(Settings):
 
     @property
     def longest_s(self) -> float:
-        """The longest exposure of the scene that metering may choose; a film's end in time."""
+        """The longest exposure that metering may choose for the scene: at most a film's period."""
         longest_s = self.metering.longest_s
         return longest_s if self.film is None else min(longest_s, 1 / self.film.rate)
 

@@ -497,8 +497,8 @@ class Sequencer:
     def _begin_segment(self, planned: PlannedFrame) -> None:
         assert self._plan.film is not None
         self._segment, self._film_began_s = self._segment + 1, None
-        rate = self._plan.film.rate
-        self._note(FilmEntry(segment=self._segment, id=planned.id, rate=rate, wall=self._wall()))
+        rate_hz, wall = self._plan.film.rate, self._wall()
+        self._note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=rate_hz, wall=wall))
 
     def _drop(self, left: list[PlannedFrame], end: int, why: str | Callable[[int], str]) -> None:
         """Take note that the frames left before a place are dropped; why: by place, or of all."""

@@ -355,7 +355,7 @@ class FilmEntry(Entry):
     kind: Literal["film"] = "film"
     segment: int
     id: str
-    rate: float
+    rate_hz: float
     wall: str = ""
 
     def __str__(self) -> str:

@@ -170,7 +170,7 @@ def film_frames(session: Session, scale: Scale | None = None) -> Iterator[FilmFr
     if faults := list(_film_faults(film)):
         shown = "; ".join(faults[:SHOWN_FAULTS]) + ("; ..." if len(faults) > SHOWN_FAULTS else "")
         raise AppError(f"{session.folder}: no film to reconstruct: {shown}")
-    rates = {one.segment: one.rate for one in of_kind(session.journal.entries, FilmEntry)}
+    rates = {one.segment: one.rate_hz for one in of_kind(session.journal.entries, FilmEntry)}
     scale = session_scale(session) if scale is None else scale
     segment, before, began_s, time_s, place = -1, np.zeros(0), 0.0, 0.0, 0
     for frame, entry in film:

@@ -1,6 +1,7 @@
 """Films: frames at their places in time, from the camera's stream or with the mask stepped."""
 
 import threading
+from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,7 @@ from pydantic import ValidationError
 from simulated_disk import PowerCutError, SimulatedDisk
 
 from drivers.camera import CameraIdentity
+from drivers.clock import SYSTEM_CLOCK
 from drivers.dng import encode_dng
 from drivers.errors import CaptureError
 from drivers.raw import decode_raw
@@ -110,7 +112,9 @@ def test_a_film_of_a_still_mask_comes_from_the_cameras_stream_at_its_rate():
     np.testing.assert_allclose([one.film_s for one in run.lines], np.arange(12) / 10, atol=1e-6)
     np.testing.assert_allclose(np.diff([one.camera_time_s for one in run.lines]), 0.1, atol=1e-6)
     assert [int(one.metadata["block_id"]) for one in run.lines] == list(range(12))
-    assert [(one.segment, one.id, one.rate) for one in run.segments] == [(0, "film-000000", 10.0)]
+    assert [(one.segment, one.id, one.rate_hz) for one in run.segments] == [
+        (0, "film-000000", 10.0)
+    ]
     assert not run.dropped
 
 
@@ -335,6 +339,30 @@ def test_a_frame_that_the_camera_sends_twice_is_dropped():
     assert "identical to the frame before it" in entry.reason
 
 
+def test_micro_managers_stream_becomes_a_film_at_the_plans_rate():
+    pytest.importorskip("pymmcore_plus", reason="the extra `micromanager` is not installed")
+    pytest.importorskip("mm_test_adapters", reason="the extra `micromanager` is not installed")
+    from drivers.micromanager import CameraSetup, MicroManagerCamera, load_core
+
+    text = FILM.replace("rate: 10", "rate: 20").replace("exposure_s: 0.02", "exposure_s: 0.002")
+    text = text.replace("darks: {repeats: 2}", "darks: null\nchecks: {smallest_signal: 0}")
+    setup = CameraSetup(roi=(0, 0, 64, 64))
+    with closing(MicroManagerCamera(load_core("MMConfig_demo.cfg"), setup)) as camera:
+        rig = replace(
+            still_rig((64, 64)),
+            camera=camera,
+            clock=SYSTEM_CLOCK,
+            about_to_expose=lambda name: None,
+        )
+        session, plan = begun(ROOT, SimulatedDisk(), rig, text)
+        assert Sequencer(session, plan, rig).run().complete
+    gone = [name for one in of_kind(session.journal.entries, DroppedEntry) for name in one.ids]
+    assert {*session.stored, *gone} == {frame.id for frame in session.frames}
+    for name, entry in session.stored.items():
+        # The camera sends some hundred a second.
+        assert entry.film_s * 20 == pytest.approx(int(name[5:]), abs=0.51)
+
+
 class Retakes(CaptureWatcher):
     def __init__(self, control):
         self.control, self.messages = control, []
@@ -360,7 +388,8 @@ def test_a_frame_of_a_film_is_not_taken_again():
     [
         (FILM.replace("exposure_s: 0.02", "exposure_s: 0.2"), "u3v", "lower film.rate to 5"),
         (FILM.replace("rate: 10", "rate: 5000").replace("0.02", "0.0001"), "u3v", "at most 1e"),
-        (STEPPED.replace("rate: 2", "rate: 8"), "ptp", "the stage takes"),
+        (STEPPED.replace("rate: 2", "rate: 8"), "ptp", "the stage moves 0.2"),
+        (FILM, "ptp", "a frame takes about 0.17 s"),
     ],
 )
 def test_a_rate_that_camera_or_stage_cannot_reach_is_refused_in_one_line(text, camera, what):

@@ -171,6 +171,24 @@ def test_a_stream_numbers_its_frames_and_stops_when_closed(bench):
     np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
 
 
+def test_a_stream_at_a_rate_keeps_it_and_the_camera_has_its_own_back(bench):
+    camera = bench.open()
+    with closing(camera.stream_at(8.0)) as stream:
+        steps = np.diff([frame.camera_time_s for frame in itertools.islice(stream, 4)])
+    np.testing.assert_allclose(steps, 1 / 8, rtol=1e-6)
+    with closing(camera.stream()) as stream:
+        steps = np.diff([frame.camera_time_s for frame in itertools.islice(stream, 4)])
+    np.testing.assert_allclose(steps, 1 / 30, rtol=1e-6)
+
+
+def test_a_rate_beyond_the_cameras_is_refused_before_it_streams(bench):
+    camera = bench.open()
+    assert camera.rate_limits_hz == (0.001, 1000)
+    with pytest.raises(CameraSettingError, match="frame rate in Hz"):
+        next(camera.stream_at(1001.0))
+    assert not bench.simulator.streaming
+
+
 def test_a_stream_is_broken_off_in_the_middle_of_a_long_exposure(bench, monkeypatch):
     camera = bench.open()
     camera.set_exposure_s(10.0)

@@ -71,7 +71,7 @@ def test_the_time_of_a_streamed_frame_is_that_of_the_cameras_stamps():
 
 def test_a_second_segment_goes_on_in_time_at_its_place():
     session = captured(STREAMED)
-    session.note(FilmEntry(segment=1, id="film-000004", rate=2.0))
+    session.note(FilmEntry(segment=1, id="film-000004", rate_hz=2.0))
     for place in (4, 5):
         entry = session.stored[f"film-00000{place}"]
         session.note(entry.model_copy(update={"segment": 1, "film_s": (place - 4) / 2 + 0.0}))
