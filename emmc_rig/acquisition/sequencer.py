@@ -574,6 +574,7 @@ class Sequencer:
         A segment's first must pass every check; a flash or darkness later is the scene's own.
         """
         planned, found = left[0], figures(frame)
+        self._watcher.step("check", planned)
         if film_s == 0:
             check(planned, frame, found, self._before, self._plan.checks)
         try:

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from emmc_rig.files.scenes import fine_scene, open_scene
 from emmc_rig.model.lightfield import centre_view
 from simulators.moving import flow_between, world_at
 from simulators.raycaster import Ball, CameraMotion, Card, Motion, World, tabulated
@@ -124,6 +125,14 @@ def test_a_built_in_scene_moves_and_its_flow_returns(name):
     returned = found + carried(back, found)
     # Where a pixel lies between two surfaces the way back is one of either.
     assert np.nanmedian(np.abs(returned)) < 0.02
+
+
+def test_a_capture_is_simulated_of_the_scene_as_it_is_at_a_time():
+    fine = fine_scene("moving-toys", 2, 1, size=SIZE_PX, views=(2, 2), seed=1, time_s=0.5)
+    samples = render_at("moving-toys", (4, 4), SIZE_PX, 1, 0.5).light_field
+    np.testing.assert_array_equal(fine.samples, samples)
+    assert not np.array_equal(samples, render("moving-toys", (4, 4), SIZE_PX, 1).light_field)
+    assert open_scene("moving-toys", SIZE_PX, (2, 2)).light_field.shape == (2, 2, *SIZE_PX, 3)
 
 
 def test_a_scene_that_does_not_move_is_the_same_at_any_time():
