@@ -17,7 +17,14 @@ import numpy as np
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.child import read_in_child
-from emmc_rig.files.formats.format import Array, Export, Format, extra_module, write_picture
+from emmc_rig.files.formats.format import (
+    Array,
+    Export,
+    Format,
+    each_frame,
+    extra_module,
+    write_picture,
+)
 from emmc_rig.model.lightfield import grid_of_views
 from emmc_rig.model.srgb import codes_of
 
@@ -84,15 +91,25 @@ def _read(path: Path, ending: str) -> Array:
     return stacked.reshape(len(rows), len(columns), *stacked.shape[1:])
 
 
+def _png(bits: int) -> Format:
+    write = partial(_write_png, bits=bits)
+    return Format(
+        f"png{bits}", "view_ROW_COL.png", f"{bits} bits, linear, tagged so", write,
+        write_film=each_frame(write),
+    )  # fmt: skip
+
+
 FORMATS = (
-    Format("png8", "view_ROW_COL.png", "8 bits, linear, tagged so", partial(_write_png, bits=8)),
-    Format("png16", "view_ROW_COL.png", "16 bits, linear, tagged so", partial(_write_png, bits=16)),
+    _png(8),
+    _png(16),
     Format(
         "tiff", "view_ROW_COL.tif", "32-bit floating values, linear", _write_tiff,
         partial(_holds, ending="tif"), partial(_read, ending="tif"),
+        write_film=each_frame(_write_tiff),
     ),
     Format(
         "exr", "view_ROW_COL.exr", "32-bit floating values, linear", _write_exr,
         partial(_holds, ending="exr"), partial(_read, ending="exr"),
+        write_film=each_frame(_write_exr),
     ),
 )  # fmt: skip
