@@ -9,9 +9,9 @@ views themselves by canvas. A pixel between four views takes 12 texture reads wh
 even, 36 at outlines, a fourth of it at a view, and one per view that an open aperture takes in.
 
 Of a film the page has every frame's light field, in fewer pixels where it is long, and all centre
-views in one atlas: `film.js` draws a row of them over time. Pictures are WebP, which takes half of
-JPEG's bytes at these sizes. A video of the atlases would take as many again less, but browsers
-reach a frame of it only by those before.
+views in one atlas: `film.js` draws a row of them over time. Pictures are WebP, which takes a third
+less than JPEG when they are small. VP9 has 2 dB more for the same bytes of a film of atlases, and
+was left: browsers reach a frame of it only by those before.
 """
 
 from __future__ import annotations
@@ -53,12 +53,13 @@ from emmc_rig.pages.page import VERDICTS, Head, estimated, fragment, light_field
 Array = NDArray[np.floating]
 BYTES_PER_PIXEL = 0.36
 """Of the atlases: 25 views of 376x541, the truth and the maps stay below 6 MB."""
-FILM_BYTES = 19_000_000
+FILM_BYTES = 18_000_000
 """Of all light fields of a film; with centre views and in base64 the page stays about 30 MB."""
-FILM_BYTES_PER_PIXEL = 0.12
-"""Of their atlases: a long film has fewer pixels before WebP gets worse than 32 dB."""
-MAP_QUALITY, MAP_BYTES_PER_PIXEL = 70, 0.027
-"""Of WebP, for maps of a film: disparity to 0.015 px, a fourteenth of the bytes of PNG."""
+FILM_BYTES_PER_PIXEL = 0.15
+"""Of their atlases: longer films have fewer pixels. Half as many bytes a pixel leave WebP's coarsest
+quality with 200 frames of 192x256 too large by a third, twice as many lose 0.3 to 1.1 dB."""
+MAP_QUALITY, MAP_BYTES_PER_PIXEL = 40, 0.025
+"""Of WebP, for maps of a film: disparity to 0.03 px, in a fifth of PNG's bytes or less."""
 BYTES_PER_ROW_PIXEL = 0.2
 """Of the atlas of centre views, a row of which is drawn over time."""
 DEPTH = (
@@ -269,8 +270,9 @@ def render_film(film: Film, on_frame: Callable[[], object]) -> str:
     return fragment(
         "viewer_page.html",
         title=film.folder.resolve().name, about=[f"{about}."], caveats=(), sections=(), lead="",
-        summary=_film_head(film, metrics), styles=("viewer.css",), scripts=("viewer.js", "film.js"),
-        data={"film-data": data}, poster=poster(film.opened(places[0]), most_pixels, like), film=True,
+        summary=_film_head(film, metrics), styles=("viewer.css",),
+        scripts=("viewer.js", "film.js"), data={"film-data": data},
+        poster=poster(film.opened(places[0]), most_pixels, like), film=True,
     )  # fmt: skip
 
 
