@@ -9,9 +9,9 @@ views themselves by canvas. A pixel between four views takes 12 texture reads wh
 even, 36 at outlines, a fourth of it at a view, and one per view that an open aperture takes in.
 
 Of a film the page has every frame's light field, in fewer pixels where it is long, and all centre
-views in one atlas: `film.js` draws a row of them over time. Pictures are WebP, which takes a third
-less than JPEG when they are small. VP9 has 2 dB more for the same bytes of a film of atlases, and
-was left: browsers reach a frame of it only by those before.
+views in one atlas: `film.js` draws a row of them over time. Pictures are WebP, which takes a sixth
+to a third less than JPEG there. A video of the atlases (VP9) has 2 dB more for the same bytes, but
+browsers reach a frame of it only by those before.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ BYTES_PER_PIXEL = 0.36
 FILM_BYTES = 18_000_000
 """Of all light fields of a film; with centre views and in base64 the page stays about 30 MB."""
 FILM_BYTES_PER_PIXEL = 0.15
-"""Of their atlases: longer films have fewer pixels. Half as many bytes a pixel leave WebP's coarsest
-quality with 200 frames of 192x256 too large by a third, twice as many lose 0.3 to 1.1 dB."""
+"""Of their atlases: longer films have fewer pixels. By half as many bytes a pixel 200 frames of
+192x256 are a third too large at WebP's coarsest quality; twice as many lose 0.3 to 1.1 dB."""
 MAP_QUALITY, MAP_BYTES_PER_PIXEL = 40, 0.025
 """Of WebP, for maps of a film: disparity to 0.03 px, in a fifth of PNG's bytes or less."""
 BYTES_PER_ROW_PIXEL = 0.2
