@@ -24,7 +24,7 @@ async function go(to) {
 }
 
 function drawTime() {
-  const gone = !film.frames[place], parts = [`${film.times_s[place].toFixed(2)} s, frame ${place} / ${count - 1}`];
+  const gone = !film.frames[place], parts = [`${film.times_s[place].toFixed(film.rate > 20 ? 3 : 2)} s, frame ${place} / ${count - 1}`];
   if (film.levels[place]) parts.push(film.levels[place]);
   byId("time").value = place;
   byId("time").setAttribute("aria-valuetext", parts.join(": "));
