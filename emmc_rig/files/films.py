@@ -66,7 +66,8 @@ def film_folder(spec: str) -> Path:
 
 def is_film(folder: Path) -> bool:
     """Return whether a folder holds a film, whole or not."""
-    return (folder / FRAMES).is_dir() and not is_session(folder)
+    parts = (folder / FRAMES).is_dir() and (folder / METRICS).is_file()
+    return parts and not is_session(folder)
 
 
 def open_film(folder: Path) -> Film:

@@ -42,7 +42,8 @@ def test_one_result_and_a_session_are_no_films(film, tmp_path):
     assert is_film(film.folder)
     assert not is_film(film.frames[0])
     (tmp_path / "frames").mkdir()
-    for name in ("session.json", "journal.jsonl"):
+    assert not is_film(tmp_path)  # of a camera, by `devices snap`
+    for name in ("session.json", "journal.jsonl", "metrics.json"):
         (tmp_path / name).touch()
     assert not is_film(tmp_path)
     assert film_folder(str(tmp_path)) == tmp_path / "reconstruction"
@@ -199,7 +200,7 @@ def test_a_film_of_quilts_is_named_and_laid_out_as_one_quilt_is(tmp_path, film):
     FORMATS["quilt"].write(tmp_path, film.opened(4))
     quilt = cv2.imread(str(tmp_path / "quilt_qs8x6a1.33.png"), cv2.IMREAD_COLOR).astype(float)
     video = cv2.VideoCapture(str(path))
-    shown = [video.read()[1] for _ in range(6)]
+    shown = np.array([video.read()[1] for _ in range(6)], float)
     assert not video.read()[0]
     assert np.abs(shown[4] - quilt).mean() < 6 < np.abs(shown[0] - quilt).mean()
 

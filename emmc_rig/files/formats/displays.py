@@ -1,7 +1,7 @@
 """For displays: quilts of views between the views, and parallax as video and animation. sRGB.
 
 Of a film, videos and animations show the centre view in time, and a quilt is a frame of a video.
-They run at the film's mean rate; a missing frame shows the one before it.
+They run at the film's rate; a missing frame shows the one before it.
 """
 
 from __future__ import annotations
