@@ -9,6 +9,7 @@ number. Up to version 0.4 a view was a time point, (t, c, y, x), which is still 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 
 NAME, FILM_NAME = "light_field.ome.zarr", "film.ome.zarr"
 SCALES = 3
-CHUNK = 512
-"""Samples a side of what is read at once, of a row of views."""
+CHUNK_PX, CHUNK_BYTES = 512, 2**26
+"""Of what is read at once: pixels a side, and the most bytes, of as many views as fit."""
 
 
 def _planes(light_field: Array) -> Array:
@@ -76,13 +77,14 @@ def _write_image(
         data, dims=tuple(axes), scale=steps, axes_units=units, name=export.title
     )
     scales = [2**k for k in range(1, SCALES) if min(shape[2:4]) >= 2 ** (k + 4)]
-    sides = {"t": 1, "c": shape[4], "z": shape[1], "y": CHUNK, "x": CHUNK}
+    sides = {"t": 1, "c": shape[4], "y": CHUNK_PX, "x": CHUNK_PX}
+    chunks = {axis: min(sides.get(axis, 1), n) for axis, n in zip(axes, data.shape, strict=True)}
+    chunks["z"] = min(max(CHUNK_BYTES // (4 * math.prod(chunks.values())), 1), shape[0] * shape[1])
     multiscales = ngff.to_multiscales(
         image,
         [{"z": 1, "y": s, "x": s} for s in scales],
-        chunks={
-            axis: min(sides[axis], length) for axis, length in zip(axes, data.shape, strict=True)
-        },
+        ngff.Methods.ITKWASM_BIN_SHRINK,  # means of what a coarse pixel covers
+        chunks=chunks,
         cache=False,  # which writes all of a film to the disk once more
     )
     ngff.to_ngff_zarr(str(path), multiscales, version="0.4")
