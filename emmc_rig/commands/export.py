@@ -65,13 +65,13 @@ def export(
             tell(f"{one.name:<10} {one.title}: {one.keeps}{''.join(uses)}")
         give_result(formats={one.name: one.keeps for one in known.values()})
         return
-    form = form or VIEWER.name
-    form = ALIASES.get(form, form)
+    named = form or VIEWER.name
+    form = ALIASES.get(named, named)
     if form not in known:
-        raise typer.BadParameter(f"no format {form!r}; there are {', '.join(known)}")
+        raise typer.BadParameter(f"no format {named!r}; there are {', '.join(known)}")
     if result is None:
         raise typer.BadParameter("name a result or a scene, or list the formats by --list")
-    out = out or Path(f"emmc-{form}")
+    out = out or Path(f"emmc-{named}")
     film = open_film(film_folder(result)) if is_film(film_folder(result)) else None
     write_film = known[form].write_film
     if film is not None:
@@ -85,7 +85,7 @@ def export(
         if truth is not None:
             raise typer.BadParameter(f"--truth: export a single frame, such as {one_frame}")
     facts: dict[str, object] = {}
-    with result_folder(out, f"export --format {form}") as folder, shown_progress("read") as bars:
+    with result_folder(out, f"export --format {named}") as folder, shown_progress("read") as bars:
         if film is not None and write_film is not None:
             facts |= {"shape": list(film.shape), "missing_frames": film.missing}
             known[form].refuse_without_parallax(film.opened(min(film.frames)))

@@ -66,8 +66,7 @@ def film_folder(spec: str) -> Path:
 
 def is_film(folder: Path) -> bool:
     """Return whether a folder holds a film, whole or not."""
-    parts = (folder / FRAMES).is_dir() and (folder / METRICS).is_file()
-    return parts and not is_session(folder)
+    return (folder / METRICS).is_file() and (folder / FRAMES).is_dir() and not is_session(folder)
 
 
 def open_film(folder: Path) -> Film:
@@ -82,9 +81,8 @@ def open_film(folder: Path) -> Film:
     gone = [name for name in listing.files if not (folder / name).is_file()] if listing else []
     if gone:
         raise AppError(f"{folder}: {gone[0]} is missing; {REMEDY}")
-    frames = {
-        place: path for place in range(len(times_s)) if (path := _frame(folder, place)).is_dir()
-    }
+    paths = ((place, folder / FRAMES / f"{place:06d}") for place in range(len(times_s)))
+    frames = {place: path for place, path in paths if path.is_dir()}
     if not frames:
         raise AppError(f"{folder}: a film without a frame; {REMEDY}")
     shapes = {place: _shape(path / LIGHT_FIELD) for place, path in frames.items()}
@@ -96,10 +94,6 @@ def open_film(folder: Path) -> Film:
                 "reconstruct it again"
             )
     return Film(folder, rate, times_s, frames, shape)
-
-
-def _frame(folder: Path, place: int) -> Path:
-    return folder / FRAMES / f"{place:06d}"
 
 
 def _times(folder: Path) -> tuple[float, tuple[float, ...]]:

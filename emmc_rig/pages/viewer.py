@@ -199,9 +199,9 @@ def overlays_of(content: Export, like: Export | None = None) -> list[Overlay]:
         found.append(Overlay("sigma", "standard deviation", "", values, 0, high))
     if content.misfit is not None:
         found.append(Overlay("doubt", "unexplained residual", "x noise", content.misfit, 1.0, 5.0))
-    shared = {one.key: (one.low, one.high) for one in overlays_of(like)} if like else {}
-    ends_of = {one.key: shared.get(one.key, (one.low, one.high)) for one in found}
-    return [replace(one, low=ends_of[one.key][0], high=ends_of[one.key][1]) for one in found]
+    scales = overlays_of(like) if like else []
+    ends_of = {one.key: {"low": one.low, "high": one.high} for one in scales}
+    return [replace(one, **ends_of.get(one.key, {})) for one in found]
 
 
 def _resized(values: NDArray, shown: Array) -> NDArray:
@@ -247,8 +247,9 @@ def render_film(film: Film, on_frame: Callable[[], object]) -> str:
         centre = reduced(centre_view(export.light_field)[None, None], SPRITE_PIXELS // count)
         centres[divmod(place, columns)] = three_colours(curve.encode(centre))[0, 0]
     focus = [one["focus"] for one in frames if one]
-    for one in focus:  # one scale of the slider for all
-        one.update(low=min(f["low"] for f in focus), high=max(f["high"] for f in focus))
+    ends_of_slider = {"low": min(f["low"] for f in focus), "high": max(f["high"] for f in focus)}
+    for one in focus:
+        one.update(ends_of_slider)
     data = {
         "rate": film.rate,
         "times_s": film.times_s,

@@ -1,7 +1,7 @@
 """For displays: quilts of views between the views, and parallax as video and animation. sRGB.
 
-Of a film, videos and animations show the centre view in time, and a quilt is a frame of a video.
-They run at the film's rate; a missing frame shows the one before it.
+Of a film, videos show the centre view in time, and a quilt is a frame of a video. They run at the
+film's rate; a missing frame shows the one before it.
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ def _encode(path: Path, codec: str, rate: float, pictures: Iterable[Codes]) -> N
             str(path), cv2.VideoWriter.fourcc(*codec), rate, (width, height)
         )
         if not video.isOpened():
-            raise AppError(f"{path.name}: this OpenCV has no encoder {codec}; choose --format gif")
+            raise AppError(
+                f"{path.name}: this OpenCV has no encoder {codec}; choose another format"
+            )
         video.write(np.ascontiguousarray(picture[:height, :width, ::-1]))
     if video is not None:
         video.release()
@@ -126,20 +128,15 @@ def _write_film(
     _encode(folder / f"film.{ending}", codec, film.rate, in_time(film, _centre, on_frame))
 
 
-def _animate(path: Path, rate: float, pictures: Iterable[Codes]) -> None:
+def _write_gif(folder: Path, export: Export) -> None:
     # OpenCV's GIF has 216 fixed colours, seven times as far off.
     from PIL import Image
 
-    first, *others = (Image.fromarray(picture).quantize(256) for picture in pictures)
-    first.save(path, save_all=True, append_images=others, duration=int(1000 / rate), loop=0)
-
-
-def _write_gif(folder: Path, export: Export) -> None:
-    _animate(folder / "parallax.gif", FRAMES_PER_S, walk(export))
-
-
-def _write_gif_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
-    _animate(folder / "film.gif", film.rate, in_time(film, _centre, on_frame))
+    first, *others = (Image.fromarray(picture).quantize(256) for picture in walk(export))
+    first.save(
+        folder / "parallax.gif", save_all=True, append_images=others,
+        duration=1000 // FRAMES_PER_S, loop=0,
+    )  # fmt: skip
 
 
 FORMATS = (
@@ -159,7 +156,6 @@ FORMATS = (
         write_film=partial(_write_film, ending="webm", codec="VP80"),
     ),
     Format(
-        "gif", "parallax.gif, a round over the views", "256 colours", _write_gif, parallax=True,
-        write_film=_write_gif_film,
+        "gif", "parallax.gif, a round over the views", "256 colours", _write_gif, parallax=True
     ),
 )  # fmt: skip

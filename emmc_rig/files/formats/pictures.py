@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -91,25 +92,16 @@ def _read(path: Path, ending: str) -> Array:
     return stacked.reshape(len(rows), len(columns), *stacked.shape[1:])
 
 
-def _png(bits: int) -> Format:
-    write = partial(_write_png, bits=bits)
-    return Format(
-        f"png{bits}", "view_ROW_COL.png", f"{bits} bits, linear, tagged so", write,
-        write_film=each_frame(write),
-    )  # fmt: skip
-
-
-FORMATS = (
-    _png(8),
-    _png(16),
+SINGLE = (
+    Format("png8", "view_ROW_COL.png", "8 bits, linear, tagged so", partial(_write_png, bits=8)),
+    Format("png16", "view_ROW_COL.png", "16 bits, linear, tagged so", partial(_write_png, bits=16)),
     Format(
         "tiff", "view_ROW_COL.tif", "32-bit floating values, linear", _write_tiff,
         partial(_holds, ending="tif"), partial(_read, ending="tif"),
-        write_film=each_frame(_write_tiff),
     ),
     Format(
         "exr", "view_ROW_COL.exr", "32-bit floating values, linear", _write_exr,
         partial(_holds, ending="exr"), partial(_read, ending="exr"),
-        write_film=each_frame(_write_exr),
     ),
 )  # fmt: skip
+FORMATS = tuple(replace(one, write_film=each_frame(one.write)) for one in SINGLE)
