@@ -9,13 +9,15 @@ import typer
 
 from emmc_rig.commands.options import ExportSizeOption
 from emmc_rig.commands.output import give_result, shown_progress, tell
+from emmc_rig.errors import AppError
 
 
 def export(
     result: Annotated[
         str | None,
         typer.Argument(
-            help="a folder of `reconstruct` or `demo`, a session, a scene, or the word psi"
+            help="a folder of `reconstruct` or `demo`, of a film too, a session, a scene, or the "
+            "word psi"
         ),
     ] = None,
     of: Annotated[
@@ -45,8 +47,9 @@ def export(
 ) -> None:
     """Export a light field or Psi to other programs, or as a viewer."""
     from emmc_rig.files.exports import LIGHT_FIELD, open_export
+    from emmc_rig.files.films import film_folder, is_film, open_film
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.formats import FORMATS
+    from emmc_rig.files.formats import ALIASES, FORMATS
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
     from emmc_rig.pages.viewer import VIEWER
 
@@ -58,20 +61,41 @@ def export(
     known = {VIEWER.name: VIEWER, **FORMATS}
     if list_formats:
         for one in known.values():
-            scene = "; --scene reads it" if one.read else ""
-            tell(f"{one.name:<10} {one.title}: {one.keeps}{scene}")
+            uses = ["; --scene reads it"] * bool(one.read) + ["; films"] * bool(one.write_film)
+            tell(f"{one.name:<10} {one.title}: {one.keeps}{''.join(uses)}")
         give_result(formats={one.name: one.keeps for one in known.values()})
         return
-    form = form or VIEWER.name
+    named = form or VIEWER.name
+    form = ALIASES.get(named, named)
     if form not in known:
-        raise typer.BadParameter(f"no format {form!r}; there are {', '.join(known)}")
+        raise typer.BadParameter(f"no format {named!r}; there are {', '.join(known)}")
     if result is None:
         raise typer.BadParameter("name a result or a scene, or list the formats by --list")
-    out = out or Path(f"emmc-{form}")
-    with result_folder(out, f"export --format {form}") as folder, shown_progress("read") as bars:
-        opened = open_export(result, truth, parse_size(size))
-        bars.begin("write")
-        known[form].write_whole(folder, opened)
+    out = out or Path(f"emmc-{named}")
+    film = open_film(film_folder(result)) if is_film(film_folder(result)) else None
+    write_film = known[form].write_film
+    if film is not None:
+        one_frame = next(iter(film.frames.values()))
+        if write_film is None:
+            names = ", ".join(one.name for one in known.values() if one.write_film)
+            raise AppError(
+                f"--format {form} has no time: films are exported as {names}; a single frame by "
+                f"its folder, such as {one_frame}"
+            )
+        if truth is not None:
+            raise typer.BadParameter(f"--truth: export a single frame, such as {one_frame}")
+    facts: dict[str, object] = {}
+    with result_folder(out, f"export --format {named}") as folder, shown_progress("read") as bars:
+        if film is not None and write_film is not None:
+            facts |= {"shape": list(film.shape), "missing_frames": film.missing}
+            known[form].refuse_without_parallax(film.opened(min(film.frames)))
+            bars.begin("write", len(film.frames))
+            write_film(folder, film, bars.step)
+        else:
+            opened = open_export(result, truth, parse_size(size))
+            facts["shape"] = list(opened.light_field.shape)
+            bars.begin("write")
+            known[form].write_whole(folder, opened)
         files = [path for path in folder.rglob("*") if path.is_file()]
         written = sum(path.stat().st_size for path in files)
         write_metrics(
@@ -80,7 +104,7 @@ def export(
                 "source": result,
                 "format": form,
                 "keeps": known[form].keeps,
-                "shape": list(opened.light_field.shape),
+                **facts,
                 "bytes": written,
             },
         )

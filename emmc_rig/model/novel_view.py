@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.lightfield import centre_view, disagreement, focus_disparities, small_grey_views
 
 Array = NDArray[np.floating]
@@ -31,12 +32,29 @@ LARGEST_PX = 320
 
 
 def sampled(picture: Array, y: Array, x: Array) -> Array:
-    """Return a picture (y, x) or (y, x, c) at places (y, x), bilinear."""
-    if picture.ndim == 3:
-        return np.stack([sampled(picture[..., c], y, x) for c in range(picture.shape[2])], axis=-1)
-    from scipy.ndimage import map_coordinates  # SciPy loads for a third of a second
+    """Return a picture (y, x) or (y, x, c) at places (row, column), bilinear."""
+    colours = picture.reshape(*picture.shape[:2], -1)
+    found = np.empty((*y.shape, colours.shape[2]), np.float32)
+    _sample(colours, y, x, found)
+    return found.reshape(*y.shape, *picture.shape[2:])
 
-    return map_coordinates(picture, (y, x), order=1, mode="nearest", output=np.float32)
+
+@row_kernel("found", 0)
+def _sample(begin, end, picture, y, x, found):
+    """Set found (row, column, c) to the picture (y, x, c) at places y and x (row, column)."""
+    last_y, last_x = picture.shape[0] - 1, picture.shape[1] - 1
+    for row in range(begin, end):
+        for column in range(found.shape[1]):
+            at_y, at_x = y[row, column], x[row, column]
+            at_y = min(at_y, last_y) if at_y > 0 else 0.0  # also where it is not a number
+            at_x = min(at_x, last_x) if at_x > 0 else 0.0
+            top, left = int(at_y), int(at_x)
+            down, right = at_y - top, at_x - left
+            bottom, beside = min(top + 1, last_y), min(left + 1, last_x)
+            for c in range(found.shape[2]):
+                above = (1 - right) * picture[top, left, c] + right * picture[top, beside, c]
+                below = (1 - right) * picture[bottom, left, c] + right * picture[bottom, beside, c]
+                found[row, column, c] = (1 - down) * above + down * below
 
 
 def estimated_disparity(light_field: Array) -> NDArray[np.float32]:

@@ -16,6 +16,8 @@ Array = NDArray[np.floating]
 
 JPEG_QUALITIES = (88, 78, 68, 58, 48, 38)
 """Tried from the first until a picture is small enough; the last is taken in any case."""
+WEBP_QUALITIES = (85, 75, 65, 55, 45, 35)
+"""Likewise."""
 TILE_MULTIPLE_PX = 16  # a JPEG block never straddles two views
 SPRITE_PIXELS = 24_000_000  # canvases above this fail on small machines; larger views are reduced
 PART_PIXELS = 4_500_000
@@ -70,6 +72,19 @@ def _data_uri(image: NDArray[np.uint8], extension: str, *options: int) -> str:
 def png_of(image: NDArray[np.uint8]) -> str:
     """A lossless picture as a data URL."""
     return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
+
+
+def webp_of(image: NDArray[np.uint8], quality: int) -> str:
+    """A small lossy picture as a data URL."""
+    return _data_uri(image, ".webp", cv2.IMWRITE_WEBP_QUALITY, quality)
+
+
+def webp_quality(image: NDArray[np.uint8], most_bytes: int) -> int:
+    """The finest quality at which a picture stays below most_bytes; the last in any case."""
+    for quality in WEBP_QUALITIES[:-1]:
+        if len(webp_of(image, quality)) <= most_bytes * 4 / 3:
+            return quality
+    return WEBP_QUALITIES[-1]
 
 
 def tiled(views: NDArray[np.uint8], tile: int = TILE_MULTIPLE_PX) -> NDArray[np.uint8]:

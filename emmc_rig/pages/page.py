@@ -21,6 +21,7 @@ KINDS = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
     ".svg": "image/svg+xml",
+    ".webp": "image/webp",
 }
 TEMPLATES = PackageLoader("emmc_rig.pages")
 AGREE = "the frames, Psi and the noise agree with it"

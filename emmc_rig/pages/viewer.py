@@ -7,22 +7,31 @@
 `viewer.js` draws with WebGL2, by the formulas of `emmc_rig.model.novel_view`; without it, the
 views themselves by canvas. A pixel between four views takes 12 texture reads where disparity is
 even, 36 at outlines, a fourth of it at a view, and one per view that an open aperture takes in.
+
+Of a film the page has every frame's light field, in fewer pixels where it is long, and all centre
+views in one atlas: `film.js` draws a row of them over time. Pictures are WebP, which takes a sixth
+to a third less than JPEG there. A video of the atlases (VP9) has 2 dB more for the same bytes, but
+browsers reach a frame of it only by those before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import ceil, sqrt
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.files.films import Film
 from emmc_rig.files.formats import Export, Format
 from emmc_rig.model.files import write_text
+from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import centre_disparity, view_disparities
-from emmc_rig.model.view_axes import axis_names, place_name, shows_parallax
+from emmc_rig.model.view_axes import axis_names, grid_name, place_name, shows_parallax
 from emmc_rig.pages.display import (
     HEAT,
     SPRITE_PIXELS,
@@ -36,12 +45,23 @@ from emmc_rig.pages.display import (
     sprite,
     three_colours,
     tiled,
+    webp_of,
+    webp_quality,
 )
-from emmc_rig.pages.page import estimated, fragment, light_field_head
+from emmc_rig.pages.page import VERDICTS, Head, estimated, fragment, light_field_head
 
 Array = NDArray[np.floating]
 BYTES_PER_PIXEL = 0.36
 """Of the atlases: 25 views of 376x541, the truth and the maps stay below 6 MB."""
+FILM_BYTES = 18_000_000
+"""Of all light fields of a film; with centre views and in base64 the page stays about 30 MB."""
+FILM_BYTES_PER_PIXEL = 0.15
+"""Of their atlases: longer films have fewer pixels. By half as many bytes a pixel 200 frames of
+192x256 are a third too large at WebP's coarsest quality; twice as many lose 0.3 to 1.1 dB."""
+MAP_QUALITY, MAP_BYTES_PER_PIXEL = 40, 0.025
+"""Of WebP, for maps of a film: disparity to 0.03 px, in a fifth of PNG's bytes or less."""
+BYTES_PER_ROW_PIXEL = 0.2
+"""Of the atlas of centre views, a row of which is drawn over time."""
 DEPTH = (
     (48, 18, 59),
     (50, 108, 222),
@@ -82,16 +102,17 @@ def render_viewer(content: Export, lossless: bool = False) -> str:
     )  # fmt: skip
 
 
-def poster(content: Export, most_pixels: int = SPRITE_PIXELS) -> dict[str, object]:
+def poster(
+    content: Export, most_pixels: int = SPRITE_PIXELS, like: Export | None = None
+) -> dict[str, object]:
     """Return the centre view, shown until the light field can be turned, and the canvas's size.
 
-    most_pixels: of all views together.
+    most_pixels: of all views together. like: whose brightness is taken, of a film.
     """
     views, (rows, columns) = content.light_field, content.light_field.shape[:2]
     centre = views[rows // 2, columns // 2][None, None]
     shown = reduced(centre, most_pixels // (rows * columns))
-    curve = DisplayCurve.fitted_to(views if content.truth is None else content.truth)
-    codes = three_colours(curve.encode(shown))
+    codes = three_colours(curve_of(like or content).encode(shown))
     picture = sprite(codes, int(BYTES_PER_PIXEL * codes.size / 3), tile=1)
     name = "centre view"
     if not shows_parallax(content.view_axes):
@@ -103,18 +124,23 @@ def poster(content: Export, most_pixels: int = SPRITE_PIXELS) -> dict[str, objec
 
 
 def viewer_data(
-    content: Export, lossless: bool = False, most_pixels: int = SPRITE_PIXELS
-) -> dict[str, object]:
+    content: Export,
+    lossless: bool = False,
+    most_pixels: int = SPRITE_PIXELS,
+    like: Export | None = None,
+    webp: int | None = None,
+) -> dict[str, Any]:
     """Return what viewer.js reads.
 
     Disparity is estimated where the light field comes without; bands and times have none.
-    most_pixels: of all views.
+    most_pixels: of all views. like: whose brightness and scales of colour are taken, of a film.
+    webp: quality of pictures, where they are to be small.
     """
     shown = reduced(content.light_field, most_pixels)
     rows, columns, height, width, _ = shown.shape
     shrink = width / content.light_field.shape[3]
     truth = content.truth
-    curve = DisplayCurve.fitted_to(content.light_field if truth is None else truth)
+    curve = curve_of(like or content)
     parallax = shows_parallax(content.view_axes)
     if parallax:
         centre = _resized(centre_disparity(content.light_field, content.disparity), shown)
@@ -128,22 +154,38 @@ def viewer_data(
     back, middle, front = (
         float(d) * shrink for d in (np.percentile(centre, (2, 50, 98)) / shrink).tolist()
     )
+    map_of = png_of if webp is None else lambda picture: webp_of(picture, MAP_QUALITY)
+
+    def atlas(views: Array) -> str:
+        picture = three_colours(curve.encode(views))
+        if lossless or webp is not None:
+            ordered = np.ascontiguousarray(tiled(picture)[..., ::-1])
+            return png_of(ordered) if webp is None else webp_of(ordered, webp)
+        return sprite(picture, int(BYTES_PER_PIXEL * picture.size / 3))
+
     return {
         "views": {"rows": rows, "columns": columns, "height": height, "width": width},
         "axes": None if parallax else axis_names(content.view_axes, (rows, columns)),
         "scale": shrink,
         "tile": TILE_MULTIPLE_PX,
         "gamma": curve.gamma,
-        "estimate": _atlas(curve, shown, lossless),
-        "truth": None if truth is None else _atlas(curve, reduced(truth, most_pixels), lossless),
-        "disparity": {"atlas": _grey_atlas(codes), "low": low, "high": low + span},
+        "estimate": atlas(shown),
+        "truth": None if truth is None else atlas(reduced(truth, most_pixels)),
+        "disparity": {
+            "atlas": map_of(tiled(codes[..., None])[..., 0]), "low": low, "high": low + span,
+        },
         "focus": {"low": back - 0.25 * span, "high": front + 0.25 * span, "at": middle},
-        "overlays": [_overlay(one, shown) for one in overlays_of(content)],
-    }
+        "overlays": [_overlay(one, shown, map_of) for one in overlays_of(content, like)],
+    }  # fmt: skip
 
 
-def overlays_of(content: Export) -> list[Overlay]:
-    """Return the maps that there are, ready to be drawn."""
+def curve_of(content: Export) -> DisplayCurve:
+    """Return how a light field is shown: as bright as the truth is, where there is one."""
+    return DisplayCurve.fitted_to(content.light_field if content.truth is None else content.truth)
+
+
+def overlays_of(content: Export, like: Export | None = None) -> list[Overlay]:
+    """Return the maps that there are, ready to be drawn. like: whose ends of scales are taken."""
     found = []
     rows, columns = content.light_field.shape[:2]
     if content.disparity is not None and shows_parallax(content.view_axes):
@@ -157,7 +199,9 @@ def overlays_of(content: Export) -> list[Overlay]:
         found.append(Overlay("sigma", "standard deviation", "", values, 0, high))
     if content.misfit is not None:
         found.append(Overlay("doubt", "unexplained residual", "x noise", content.misfit, 1.0, 5.0))
-    return found
+    scales = overlays_of(like) if like else []
+    ends_of = {one.key: {"low": one.low, "high": one.high} for one in scales}
+    return [replace(one, **ends_of.get(one.key, {})) for one in found]
 
 
 def _resized(values: NDArray, shown: Array) -> NDArray:
@@ -167,7 +211,7 @@ def _resized(values: NDArray, shown: Array) -> NDArray:
     )
 
 
-def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
+def _overlay(one: Overlay, shown: Array, encode: Callable[[NDArray], str]) -> dict[str, object]:
     levels = np.clip((_resized(one.values, shown) - one.low) / (one.high - one.low), 0, 1)
     picture = np.rint(levels * 255).astype(np.uint8)
     if np.isnan(one.values).any():  # clear where nothing is known
@@ -175,27 +219,91 @@ def _overlay(one: Overlay, shown: Array) -> dict[str, object]:
         picture = np.dstack([picture, picture, picture, np.rint(known * 255).astype(np.uint8)])
     return {
         "key": one.key, "label": one.label, "unit": one.unit, "low": one.low, "high": one.high,
-        "colours": one.colours, "picture": png_of(picture),
+        "colours": one.colours, "picture": encode(picture),
     }  # fmt: skip
 
 
-def _atlas(curve: DisplayCurve, views: Array, lossless: bool) -> str:
-    codes = three_colours(curve.encode(views))
-    return (
-        png_of(np.ascontiguousarray(tiled(codes)[..., ::-1]))
-        if lossless
-        else sprite(codes, int(BYTES_PER_PIXEL * codes.size / 3))
+def render_film(film: Film, on_frame: Callable[[], object]) -> str:
+    """Return the page of a film as text. on_frame: called after every frame.
+
+    One frame in the middle gives all of them their brightness and scales of colour.
+    """
+    places, count = list(film.frames), len(film.times_s)
+    like = film.opened(places[len(places) // 2])
+    curve, columns = curve_of(like), ceil(sqrt(count))
+    most_pixels = min(SPRITE_PIXELS, int(FILM_BYTES / FILM_BYTES_PER_PIXEL / len(places)))
+    shown = reduced(like.light_field, most_pixels)
+    picture = np.ascontiguousarray(tiled(three_colours(curve.encode(shown)))[..., ::-1])
+    quality = webp_quality(
+        picture, int(FILM_BYTES / len(places) - MAP_BYTES_PER_PIXEL * shown[..., 0].size)
     )
+    frames: list[dict[str, Any] | None] = [None] * count
+    metrics: dict[int, Mapping[str, object]] = {}
+    small = reduced(like.light_field[:1, :1], SPRITE_PIXELS // count)
+    centres = np.zeros((ceil(count / columns), columns, *small.shape[2:4], 3), np.uint8)
+    for place, export in film.each(on_frame):
+        frames[place] = viewer_data(export, most_pixels=most_pixels, like=like, webp=quality)
+        metrics[place] = export.metrics
+        centre = reduced(centre_view(export.light_field)[None, None], SPRITE_PIXELS // count)
+        centres[divmod(place, columns)] = three_colours(curve.encode(centre))[0, 0]
+    focus = [one["focus"] for one in frames if one]
+    ends_of_slider = {"low": min(f["low"] for f in focus), "high": max(f["high"] for f in focus)}
+    for one in focus:
+        one.update(ends_of_slider)
+    data = {
+        "rate": film.rate,
+        "times_s": film.times_s,
+        "frames": frames,
+        "levels": [_level(metrics.get(place, {})) for place in range(count)],
+        "rows": {
+            "picture": sprite(centres, int(BYTES_PER_ROW_PIXEL * centres.size / 3)),
+            "columns": columns, "height": small.shape[2], "width": small.shape[3],
+            "tile": TILE_MULTIPLE_PX,
+        },
+    }  # fmt: skip
+    rows, columns, height, width, _ = film.shape
+    about = (
+        f"{len(places)} of {count} frames at {film.rate:g} Hz, "
+        f"{grid_name(like.view_axes, (rows, columns))} of {height}x{width}"
+    )
+    if shown.shape != film.shape:
+        about += f", shown as {shown.shape[2]}x{shown.shape[3]}"
+    return fragment(
+        "viewer_page.html",
+        title=film.folder.resolve().name, about=[f"{about}."], caveats=(), sections=(), lead="",
+        summary=_film_head(film, metrics), styles=("viewer.css",),
+        scripts=("viewer.js", "film.js"), data={"film-data": data},
+        poster=poster(film.opened(places[0]), most_pixels, like), film=True,
+    )  # fmt: skip
 
 
-def _grey_atlas(codes: NDArray[np.uint8]) -> str:
-    return png_of(tiled(codes[..., None])[..., 0])
+def _level(metrics: Mapping[str, object]) -> str:
+    """Return the level of a verdict, "" where there is none."""
+    verdict = metrics.get("verdict")
+    return str(verdict.get("level")) if isinstance(verdict, Mapping) else ""
+
+
+def _film_head(film: Film, metrics: Mapping[int, Mapping[str, object]]) -> Head:
+    """Return what to think of a film: of its worst frames, and how many they are."""
+    order = ["trust", "", *list(VERDICTS)[1:]]
+    worst = max(metrics, key=lambda place: order.index(_level(metrics[place])))
+    head = light_field_head(metrics[worst], str(film.folder), viewer=True)
+    alike = [place for place in metrics if _level(metrics[place]) == _level(metrics[worst])]
+    if len(alike) == len(metrics):
+        return head
+    first = f"{len(alike)} of {len(metrics)} frames, the first at {film.times_s[worst]:.2f} s"
+    return replace(head, why=f"{first}: {head.why}")
 
 
 def _write(folder: Path, export: Export) -> None:
     write_text(folder / "viewer.html", render_viewer(export))
 
 
+def _write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
+    write_text(folder / "viewer.html", render_film(film, on_frame))
+
+
 VIEWER = Format(
-    "viewer", "viewer.html, one page to turn, focus and look into", "8-bit pictures, maps", _write
-)
+    "viewer", "viewer.html, one page to turn, focus and look into", "8-bit pictures, maps", _write,
+    write_film=_write_film,
+)  # fmt: skip

@@ -3,12 +3,14 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import (
     between,
     centre_disparity,
     estimated_disparity,
+    sampled,
     view_disparities,
 )
 
@@ -38,6 +40,17 @@ def scene():
     light_field = np.array([[one[0] for one in row] for row in seen])
     disparities = np.array([[one[1] for one in row] for row in seen])
     return light_field, disparities
+
+
+@pytest.mark.parametrize("size", [(7, 9), (1, 5), (6, 1)])
+def test_samples_between_pixels_are_those_of_scipy(size):
+    rng = np.random.default_rng(3)
+    picture = rng.random((*size, 3), np.float32)
+    y, x = (rng.uniform(-2, length + 1, (20, 30)).astype(np.float32) for length in size)
+    for c in range(3):
+        twin = map_coordinates(picture[..., c].astype(float), (y, x), order=1, mode="nearest")
+        np.testing.assert_allclose(sampled(picture, y, x)[..., c], twin, atol=1e-6)
+        np.testing.assert_allclose(sampled(picture[..., c], y, x), twin, atol=1e-6)
 
 
 def test_a_view_that_there_is_comes_back_as_it_is(scene):

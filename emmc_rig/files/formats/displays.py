@@ -1,10 +1,15 @@
-"""For displays: quilts of views between the views, and parallax as video and animation. sRGB."""
+"""For displays: quilts of views between the views, and parallax as video and animation. sRGB.
+
+Of a film, videos show the centre view in time, and a quilt is a frame of a video. They run at the
+film's rate; a missing frame shows the one before it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -12,9 +17,14 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.formats.format import Array, Export, Format, write_picture
+from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import between, centre_disparity, view_disparities
 from emmc_rig.model.srgb import codes_of, srgb_of
 
+if TYPE_CHECKING:
+    from emmc_rig.files.films import Film
+
+Codes = NDArray[np.uint8]
 QUILT_COLUMNS, QUILT_ROWS = 8, 6
 FRAMES, FRAMES_PER_S = 48, 24
 REACH = 0.9
@@ -27,8 +37,8 @@ def _all_disparities(export: Export) -> Array:
     return view_disparities(centre, (rows, columns))
 
 
-def _write_quilt(folder: Path, export: Export) -> None:
-    """Views from left to right along the middle row, the leftmost at the bottom left.
+def _quilt(export: Export) -> Codes:
+    """Return views from left to right along the middle row, the leftmost at the bottom left.
 
     Near points move right with u here, which is what a camera moving left sees: u falls. The
     views are off-axis: disparity 0 lies in the display's plane. Source: Looking Glass, "Quilts".
@@ -42,8 +52,22 @@ def _write_quilt(folder: Path, export: Export) -> None:
         top, left = (QUILT_ROWS - 1 - row) * height, column * width
         view = between(export.light_field, disparities, rows // 2, float(u))
         quilt[top : top + height, left : left + width] = codes_of(srgb_of(view))
-    name = f"quilt_qs{QUILT_COLUMNS}x{QUILT_ROWS}a{width / height:.3g}.png"
-    write_picture(folder / name, quilt)
+    return quilt
+
+
+def _quilt_name(shape: tuple[int, ...], ending: str) -> str:
+    """Return the name by which displays know a quilt of light fields (v, u, y, x, c)."""
+    return f"quilt_qs{QUILT_COLUMNS}x{QUILT_ROWS}a{shape[3] / shape[2]:.3g}.{ending}"
+
+
+def _write_quilt(folder: Path, export: Export) -> None:
+    write_picture(folder / _quilt_name(export.light_field.shape, "png"), _quilt(export))
+
+
+def _write_quilt_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
+    """Write a video of quilts; VP8 is what Looking Glass names for 8 x 6 of them."""
+    path = folder / _quilt_name(film.shape, "webm")
+    _encode(path, "VP80", film.rate, in_time(film, _quilt, on_frame))
 
 
 def walk(export: Export) -> Iterator[NDArray[np.uint8]]:
@@ -56,16 +80,52 @@ def walk(export: Export) -> Iterator[NDArray[np.uint8]]:
         yield codes_of(srgb_of(between(export.light_field, disparities, float(v), float(u))))
 
 
-def _write_video(folder: Path, export: Export, ending: str, codec: str) -> None:
-    path = folder / f"parallax.{ending}"
-    height, width = (n // 2 * 2 for n in export.light_field.shape[2:4])  # codecs want even sides
-    fourcc = cv2.VideoWriter.fourcc(*codec)
-    video = cv2.VideoWriter(str(path), fourcc, FRAMES_PER_S, (width, height))
-    if not video.isOpened():
-        raise AppError(f"{path.name}: this OpenCV has no encoder {codec}; choose --format gif")
-    for picture in walk(export):
+def _centre(export: Export) -> Codes:
+    return codes_of(srgb_of(centre_view(export.light_field)))
+
+
+def in_time(
+    film: Film, picture_of: Callable[[Export], Codes], on_frame: Callable[[], object]
+) -> Iterator[Codes]:
+    """Yield the picture (y, x, rgb) of every place in time; a missing one repeats the one before.
+
+    Before the first frame that there is, it is that one.
+    """
+    shown, due = None, 0
+    for place, export in film.each(on_frame):
+        picture = picture_of(export)
+        yield from [picture if shown is None else shown] * (place - due)
+        yield picture
+        shown, due = picture, place + 1
+    if shown is not None:
+        yield from [shown] * (len(film.times_s) - due)
+
+
+def _encode(path: Path, codec: str, rate: float, pictures: Iterable[Codes]) -> None:
+    """Write pictures (y, x, rgb) as a video. rate: pictures a second."""
+    video = None
+    for picture in pictures:
+        height, width = (n // 2 * 2 for n in picture.shape[:2])  # codecs want even sides
+        video = video or cv2.VideoWriter(
+            str(path), cv2.VideoWriter.fourcc(*codec), rate, (width, height)
+        )
+        if not video.isOpened():
+            raise AppError(
+                f"{path.name}: this OpenCV has no encoder {codec}; choose another format"
+            )
         video.write(np.ascontiguousarray(picture[:height, :width, ::-1]))
-    video.release()
+    if video is not None:
+        video.release()
+
+
+def _write_video(folder: Path, export: Export, ending: str, codec: str) -> None:
+    _encode(folder / f"parallax.{ending}", codec, FRAMES_PER_S, walk(export))
+
+
+def _write_film(
+    folder: Path, film: Film, on_frame: Callable[[], object], ending: str, codec: str
+) -> None:
+    _encode(folder / f"film.{ending}", codec, film.rate, in_time(film, _centre, on_frame))
 
 
 def _write_gif(folder: Path, export: Export) -> None:
@@ -83,14 +143,17 @@ FORMATS = (
     Format(
         "quilt", f"quilt of {QUILT_COLUMNS * QUILT_ROWS} views for light-field displays",
         "8-bit sRGB, views of the middle row and between them", _write_quilt, parallax=True,
+        write_film=_write_quilt_film,
     ),
     Format(
-        "video", "parallax.mp4, a round over the views", "8-bit video",
+        "mp4", "parallax.mp4 (MPEG-4 Part 2), a round over the views", "8-bit video",
         partial(_write_video, ending="mp4", codec="mp4v"), parallax=True,
+        write_film=partial(_write_film, ending="mp4", codec="mp4v"),
     ),
     Format(
         "webm", "parallax.webm (VP8), the same for web pages", "8-bit video",
         partial(_write_video, ending="webm", codec="VP80"), parallax=True,
+        write_film=partial(_write_film, ending="webm", codec="VP80"),
     ),
     Format(
         "gif", "parallax.gif, a round over the views", "256 colours", _write_gif, parallax=True

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,7 +16,12 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, picture_name, shows_parallax
 
+if TYPE_CHECKING:
+    from emmc_rig.files.films import Film
+
 Array = NDArray[np.floating]
+WriteFilm = Callable[[Path, "Film", Callable[[], object]], None]
+"""Writes a film into an existing folder; the last is called after every frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +53,8 @@ class Format:
     name: as typed after --format. title: what it is. keeps: what survives. write: an export into
     an existing folder. parallax: whether it shows views from where none was, or depth, which bands
     and times do not have. holds: whether a path is of this format, and read: that path as a light
-    field; None where it cannot be a scene.
+    field; None where it cannot be a scene. write_film: a film into an existing folder; None where
+    the format has nothing in time.
     """
 
     name: str
@@ -57,16 +64,33 @@ class Format:
     holds: Callable[[Path], bool] | None = None
     read: Callable[[Path], Array] | None = None
     parallax: bool = False
+    write_film: WriteFilm | None = None
 
     def write_whole(self, folder: Path, export: Export) -> None:
         """Write an export; raises AppError where its views have not what the format shows."""
+        self.refuse_without_parallax(export)
+        self.write(folder, export)
+
+    def refuse_without_parallax(self, export: Export) -> None:
+        """Raise AppError where the views of an export have not what the format shows."""
         if self.parallax and not shows_parallax(export.view_axes):
             named = picture_name(export.view_axes)
             raise AppError(
                 f"--format {self.name} shows parallax, and {export.title} has {named}s for views: "
                 "choose another format"
             )
-        self.write(folder, export)
+
+
+def each_frame(write: Callable[[Path, Export], None]) -> WriteFilm:
+    """Return what writes every frame of a film into a folder named by its place in time."""
+
+    def write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
+        for place, export in film.each(on_frame):
+            inside = folder / film.frames[place].name
+            inside.mkdir()
+            write(inside, export)
+
+    return write_film
 
 
 def extra_module(name: str, what: str) -> ModuleType:

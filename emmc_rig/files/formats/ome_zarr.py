@@ -1,13 +1,18 @@
-"""OME-Zarr, for browsers of large pictures: all views as time points of a multiscale (t, c, y, x).
+"""OME-Zarr, for browsers of large pictures: multiscale (c, z, y, x), of a film (t, c, z, y, x).
 
-Zarr has axes for time and colour and none for views: view (v, u) is time point v U + u, and the
-attribute `emmc_rig` holds the grid. Extra `formats`. Source: NGFF 0.4.
+Zarr has axes for time, colour and space, and none for views: view (v, u) is plane v U + u along z,
+and the attribute `emmc_rig` holds the grid. Time is real, in seconds; a missing frame is not a
+number. Up to version 0.4 a view was a time point, (t, c, y, x), which is still read. Extra
+`formats`. Source: NGFF 0.4.
 """
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,29 +21,83 @@ from emmc_rig.files.formats.format import Array, Export, Format, extra_module
 from emmc_rig.files.shards import check_fits
 from emmc_rig.model.json_text import parse_json
 
-NAME = "light_field.ome.zarr"
+if TYPE_CHECKING:
+    from emmc_rig.files.films import Film
+
+NAME, FILM_NAME = "light_field.ome.zarr", "film.ome.zarr"
 SCALES = 3
+CHUNK_PX, CHUNK_BYTES = 512, 2**26
+"""Of what is read at once: pixels a side, and the most bytes, of as many views as fit."""
+
+
+def _planes(light_field: Array) -> Array:
+    """Return views (v, u, y, x, c) as planes (c, z, y, x)."""
+    planes = light_field.reshape(-1, *light_field.shape[2:]).transpose(3, 0, 1, 2)
+    return np.ascontiguousarray(planes, dtype=np.float32)
 
 
 def _write(folder: Path, export: Export) -> None:
+    planes = _planes(export.light_field)
+    _write_image(folder / NAME, planes, "czyx", export.light_field.shape, export)
+
+
+def _write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
+    """Write frame after frame: what is in memory is what ngff-zarr works on at once."""
+    rows, columns, height, width, colours = film.shape
+    shape = 1, colours, rows * columns, height, width
+    dask, array = extra_module("dask", "OME-Zarr"), extra_module("dask.array", "OME-Zarr")
+    first = film.opened(next(iter(film.frames)))
+
+    def frame(place: int) -> Array:
+        planes = _planes(film.opened(place).light_field)[None]
+        on_frame()
+        return planes
+
+    def lazily(place: int) -> Any:
+        if place in film.frames:
+            return array.from_delayed(dask.delayed(frame)(place), shape, np.float32)
+        return array.full(shape, np.nan, np.float32, chunks=shape)
+
+    data = array.concatenate([lazily(place) for place in range(len(film.times_s))])
+    about = {"times_s": list(film.times_s), "missing": film.missing}
+    _write_image(
+        folder / FILM_NAME, data, "tczyx", film.shape, first, {"t": 1 / film.rate}, film=about
+    )
+
+
+def _write_image(
+    path: Path, data: Any, axes: str, shape: Sequence[int], export: Export,
+    scale: dict[str, float] | None = None, **more: object,
+) -> None:  # fmt: skip
+    """Write an array of named axes. shape: of the light field. scale: seconds a step of time."""
     ngff = extra_module("ngff_zarr", "OME-Zarr")
-    rows, columns, height, width, colours = export.light_field.shape
-    views = export.light_field.reshape(rows * columns, height, width, colours)
-    data = np.ascontiguousarray(views.transpose(0, 3, 1, 2), dtype=np.float32)
-    image = ngff.to_ngff_image(data, dims=("t", "c", "y", "x"), name=export.title)
-    scales = [2**k for k in range(1, SCALES) if min(height, width) >= 2 ** (k + 4)]
-    multiscales = ngff.to_multiscales(image, [{"y": s, "x": s} for s in scales])
-    ngff.to_ngff_zarr(str(folder / NAME), multiscales, version="0.4")
-    path = folder / NAME / ".zattrs"
-    attributes = parse_json(path.read_bytes(), path.name, AppError)
+    steps = {**dict.fromkeys(axes, 1.0), **(scale or {})}
+    units = {"t": "second"} if "t" in axes else {}
+    image = ngff.to_ngff_image(
+        data, dims=tuple(axes), scale=steps, axes_units=units, name=export.title
+    )
+    scales = [2**k for k in range(1, SCALES) if min(shape[2:4]) >= 2 ** (k + 4)]
+    sides = {"t": 1, "c": shape[4], "y": CHUNK_PX, "x": CHUNK_PX}
+    chunks = {axis: min(sides.get(axis, 1), n) for axis, n in zip(axes, data.shape, strict=True)}
+    chunks["z"] = min(max(CHUNK_BYTES // (4 * math.prod(chunks.values())), 1), shape[0] * shape[1])
+    multiscales = ngff.to_multiscales(
+        image,
+        [{"z": 1, "y": s, "x": s} for s in scales],
+        ngff.Methods.ITKWASM_BIN_SHRINK,  # means of what a coarse pixel covers
+        chunks=chunks,
+        cache=False,  # which writes all of a film to the disk once more
+    )
+    ngff.to_ngff_zarr(str(path), multiscales, version="0.4")
+    attributes = parse_json((path / ".zattrs").read_bytes(), ".zattrs", AppError)
     attributes["emmc_rig"] = {
-        "views": [rows, columns],
+        "views": list(shape[:2]),
         "view_axes": list(export.view_axes),
         "colour": "linear RGB, 1 is white",
+        **more,
     }
-    path.write_text(json.dumps(attributes))
+    (path / ".zattrs").write_text(json.dumps(attributes))
     # Where Zarr keeps its metadata together too, both must agree.
-    (folder / NAME / ".zmetadata").unlink(missing_ok=True)
+    (path / ".zmetadata").unlink(missing_ok=True)
 
 
 def _holds(path: Path) -> bool:
@@ -49,9 +108,12 @@ def _read(path: Path) -> Array:
     try:
         attributes = parse_json((path / ".zattrs").read_bytes(), ".zattrs", ValueError)
         rows, columns = attributes["emmc_rig"]["views"]
-        stored = extra_module("ngff_zarr", "OME-Zarr").from_ngff_zarr(str(path)).images[0].data
-        check_fits(stored.nbytes, path)
-        data = np.asarray(stored, dtype=np.float32)
+        image = extra_module("ngff_zarr", "OME-Zarr").from_ngff_zarr(str(path)).images[0]
+        if len(image.dims) == 5:
+            raise AppError(f"{path}: holds a film; open one frame of what it was exported from")
+        check_fits(image.data.nbytes, path)
+        data = np.asarray(image.data, dtype=np.float32)
+        data = data if "t" in image.dims else data.swapaxes(0, 1)
         return data.reshape(rows, columns, *data.shape[1:]).transpose(0, 1, 3, 4, 2)
     except (OSError, ValueError, KeyError, TypeError) as fault:
         raise AppError(f"{path}: no light field that emmc-rig wrote as OME-Zarr") from fault
@@ -59,7 +121,7 @@ def _read(path: Path) -> Array:
 
 FORMATS = (
     Format(
-        "ome-zarr", f"{NAME}, multiscale, a time point a view", "32-bit floating values, linear",
-        _write, _holds, _read,
+        "ome-zarr", f"{NAME}, multiscale, a plane along z a view",
+        "32-bit floating values, linear", _write, _holds, _read, write_film=_write_film,
     ),
 )  # fmt: skip

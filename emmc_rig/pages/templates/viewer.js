@@ -664,7 +664,7 @@ function failed(error) {
   byId("status").textContent = `The light field could not be drawn (${error}).`;
   console.error(error);
 }
-return { take: (next) => take(next).catch(failed) };
+return { take: (next) => take(next).catch(failed), state };
 })();
 
 // What a page holds itself; the live page hands light fields over as they come.

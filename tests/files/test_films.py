@@ -1,0 +1,212 @@
+"""Films: opened frame by frame, refused in one line, and exported in the formats that have time."""
+
+import importlib
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from filmed import SIZE, light_field_at, write_film
+from programs import one_line, program
+
+from emmc_rig.errors import AppError
+from emmc_rig.files.films import film_folder, is_film, open_film
+from emmc_rig.files.folders import result_folder
+from emmc_rig.files.formats import FORMATS
+from emmc_rig.files.formats.displays import in_time
+from emmc_rig.files.scenes import open_scene
+from emmc_rig.model.lightfield import centre_view
+from emmc_rig.model.srgb import codes_of, srgb_of
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    return open_film(write_film(tmp_path_factory.mktemp("film") / "slide"))
+
+
+def test_frames_stand_at_their_places_in_time_and_a_missing_one_leaves_its_place_empty(film):
+    assert (film.rate, film.shape) == (8.0, (3, 3, *SIZE, 3))
+    assert film.times_s == (0, 0.125, 0.25, 0.375, 0.5, 0.625)
+    assert (list(film.frames), film.missing) == ([0, 1, 2, 4, 5], [3])
+    np.testing.assert_array_equal(film.opened(4).light_field, light_field_at(4))
+    assert film.opened(4).disparity is not None
+    done = []
+    assert [place for place, _ in film.each(lambda: done.append(1))] == [0, 1, 2, 4, 5]
+    assert len(done) == 5
+
+
+def test_one_result_and_a_session_are_no_films(film, tmp_path):
+    assert is_film(film.folder)
+    assert not is_film(film.frames[0])
+    (tmp_path / "frames").mkdir()
+    assert not is_film(tmp_path)  # of a camera, by `devices snap`
+    for name in ("session.json", "journal.jsonl", "metrics.json"):
+        (tmp_path / name).touch()
+    assert not is_film(tmp_path)
+    assert film_folder(str(tmp_path)) == tmp_path / "reconstruction"
+
+
+def cut_metrics(folder):
+    path = folder / "metrics.json"
+    path.write_bytes(path.read_bytes()[:60])
+
+
+def drop_times(folder):
+    about = json.loads((folder / "metrics.json").read_text())
+    about["film"]["times_s"].pop()
+    (folder / "metrics.json").write_text(json.dumps(about))
+
+
+def drop_film(folder):
+    (folder / "metrics.json").write_text("{}")
+
+
+def drop_frames(folder):
+    shutil.rmtree(folder / "frames")
+    (folder / "frames").mkdir()
+
+
+def cut_frame(folder):
+    path = folder / "frames/000002/light_field.h5"
+    path.write_bytes(path.read_bytes()[:3000])
+
+
+def drop_light_field(folder):
+    (folder / "frames/000002/light_field.h5").unlink()
+
+
+def other_shape(folder):
+    open_file = importlib.import_module("h5py").File
+    with open_file(folder / "frames/000002/light_field.h5", "w") as file:
+        file["light_field"] = light_field_at(0)[..., :-1, :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (cut_metrics, "metrics.json: not that of a film"),
+        (drop_times, "5 times of 6 frames"),
+        (drop_film, "metrics.json: not that of a film"),
+        (drop_frames, "a film without a frame"),
+        (cut_frame, "000002/light_field.h5: cannot be read, damaged or incomplete"),
+        (drop_light_field, "000002/light_field.h5: no such file"),
+        (other_shape, "frame 2 has the shape (3, 3, 36, 47, 3), frame 0 (3, 3, 36, 48, 3)"),
+    ],
+)
+def test_what_is_no_whole_film_is_one_clear_line(tmp_path, film, damage, words):
+    folder = tmp_path / "film"
+    shutil.copytree(film.folder, folder)
+    damage(folder)
+    with pytest.raises(AppError) as refused:
+        open_film(folder)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_frame_that_was_written_and_is_gone_is_no_frame_that_could_not_be_made(tmp_path):
+    out = tmp_path / "film"
+    with result_folder(out, "reconstruct") as folder:
+        write_film(folder)
+    assert open_film(out).missing == [3]
+    shutil.rmtree(out / "frames/000001")
+    with pytest.raises(AppError, match=r"frames/000001/light_field\.h5 is missing; copy"):
+        open_film(out)
+
+
+def exported(tmp_path, film, name):
+    """Write a film; returns the folder and how many frames were shown as done."""
+    done = []
+    write = FORMATS[name].write_film
+    assert write is not None
+    write(tmp_path, film, lambda: done.append(1))
+    return tmp_path, len(done)
+
+
+def centre_codes(place):
+    return codes_of(srgb_of(centre_view(light_field_at(place)))).astype(float)
+
+
+def test_ome_zarr_has_time_in_seconds_and_views_along_z(tmp_path, film):
+    ngff = pytest.importorskip("ngff_zarr", reason="extra `formats`")
+    folder, done = exported(tmp_path, film, "ome-zarr")
+    stored = ngff.from_ngff_zarr(str(folder / "film.ome.zarr"), validate=True)
+    image = stored.images[0]
+    assert image.dims == ("t", "c", "z", "y", "x")
+    assert image.data.shape == (6, 3, 9, *SIZE)
+    assert (image.scale["t"], image.axes_units["t"], image.scale["z"]) == (0.125, "second", 1)
+    assert [one.data.shape[-2:] for one in stored.images] == [SIZE, (18, 24)]
+    frames = np.asarray(image.data)
+    for place in film.frames:
+        views = light_field_at(place).reshape(9, *SIZE, 3)
+        np.testing.assert_array_equal(frames[place], views.transpose(3, 0, 1, 2))
+    assert np.isnan(frames[3]).all()
+    coarse = np.asarray(stored.images[1].data)
+    blocks = frames.reshape(6, 3, 9, 18, 2, 24, 2).mean(axis=(4, 6))
+    np.testing.assert_allclose(coarse, blocks, atol=1e-6)
+    attributes = json.loads((folder / "film.ome.zarr/.zattrs").read_text())["emmc_rig"]
+    assert attributes["views"] == [3, 3]
+    assert attributes["film"] == {"times_s": list(film.times_s), "missing": [3]}
+    assert done == 5
+    with pytest.raises(AppError, match="holds a film; open one frame"):
+        open_scene(str(folder / "film.ome.zarr"))
+
+
+@pytest.mark.parametrize(("name", "ending"), [("mp4", "mp4"), ("webm", "webm")])
+def test_a_video_shows_the_centre_view_at_the_film_s_rate(tmp_path, film, name, ending):
+    av = pytest.importorskip("av", reason="extra `peers`")
+    folder, done = exported(tmp_path, film, name)
+    with av.open(str(folder / f"film.{ending}")) as stream:
+        assert float(stream.streams.video[0].average_rate) == pytest.approx(film.rate, rel=0.01)
+        shown = [one.to_ndarray(format="rgb24") for one in stream.decode(video=0)]
+    assert (len(shown), done) == (6, 5)
+    for place, picture in enumerate(shown):
+        missed = [np.abs(centre_codes(other) - picture).mean() for other in film.frames]
+        # A missing frame shows the one before it.
+        assert list(film.frames)[int(np.argmin(missed))] == (2 if place == 3 else place)
+
+
+def test_what_comes_before_the_first_frame_shows_that_frame(tmp_path):
+    film = open_film(write_film(tmp_path / "film", missing=(0, 1, 5)))
+    shown = list(in_time(film, lambda one: centre_view(one.light_field), lambda: None))
+    assert len(shown) == 6
+    for place, picture in zip((2, 2, 2, 3, 4, 4), shown, strict=True):
+        np.testing.assert_array_equal(picture, centre_view(light_field_at(place)))
+
+
+def test_a_film_of_quilts_is_named_and_laid_out_as_one_quilt_is(tmp_path, film):
+    folder, _ = exported(tmp_path, film, "quilt")
+    (path,) = folder.iterdir()
+    assert path.name == "quilt_qs8x6a1.33.webm"
+    FORMATS["quilt"].write(tmp_path, film.opened(4))
+    quilt = np.asarray(cv2.imread(str(tmp_path / "quilt_qs8x6a1.33.png")), float)
+    video = cv2.VideoCapture(str(path))
+    shown = [np.asarray(video.read()[1], float) for _ in range(6)]
+    assert not video.read()[0]
+    assert np.abs(shown[4] - quilt).mean() < 6 < np.abs(shown[0] - quilt).mean()
+
+
+@pytest.mark.parametrize("name", ["png16", "tiff"])
+def test_pictures_lie_in_a_folder_a_frame_which_is_a_scene(tmp_path, film, name):
+    folder, _ = exported(tmp_path, film, name)
+    assert sorted(one.name for one in folder.iterdir()) == [f"{place:06d}" for place in film.frames]
+    light_field = open_scene(folder / "000004").light_field
+    np.testing.assert_allclose(light_field, light_field_at(4), atol=0.51 / 65535)
+
+
+def test_the_command_exports_a_film_and_says_what_a_film_is_not_for(tmp_path, monkeypatch, film):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = program("export", film.folder, "--format", "hci", "--out", "hci")
+    assert code == 1
+    said = one_line(err)
+    assert "films are exported as viewer, png8, png16, tiff, exr, ome-zarr, quilt, mp4" in said
+    assert "frames/000000" in said
+    assert not (tmp_path / "hci").exists()
+    assert program("export", film.folder, "--truth", "near-planar")[0] == 2
+    code, reported, err = program("export", film.folder, "--format", "video")
+    assert code == 0, err
+    assert "emmc-video/film.mp4" in reported  # the name of version 0.4, in its folder
+    about = json.loads((tmp_path / "emmc-video/metrics.json").read_text())
+    assert (about["format"], about["missing_frames"]) == ("mp4", [3])
+    assert about["shape"] == [3, 3, *SIZE, 3]
+    assert "; films" in program("export", "--list")[1].splitlines()[0]
