@@ -14,7 +14,7 @@ from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.second import surfaces_fail
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Survey
+from reconstruction.adaptive.survey import Plain, Survey
 from reconstruction.adaptive.sweep import swept
 from reconstruction.adaptive.uncertainty import blur_views, features, stated, variance_of_mean
 
@@ -135,7 +135,7 @@ class Mean:
     reported: dict[str, float] = field(default_factory=dict)
 
 
-def averaged(survey: Survey, fits: Fits, disparity_sigma: Array) -> Mean:
+def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
     """Return the mean of the models, by the held-out readings; the first model without any.
 
     disparity_sigma: deviation of the centre view's disparity, (y, x).
