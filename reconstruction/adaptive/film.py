@@ -14,15 +14,13 @@ better than total variation does over more than NEW_SHARE of the picture, it is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.fits import Fits
@@ -38,7 +36,7 @@ from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Plain, Readings, plain_of
-from reconstruction.adaptive.sweep import STRIDE, swept
+from reconstruction.adaptive.sweep import STRIDE, Swept, swept
 from reconstruction.adaptive.visibility import carried
 
 Array = NDArray[np.floating]
@@ -54,6 +52,9 @@ class FilmSettings(Settings):
     earlier: int = 2
 
 
+import os
+
+MORE = int(os.environ.get("MORE", "1"))
 WINDOW_PX = 4.0
 """Deviation of the window in which squared residuals of what is foretold are averaged."""
 KEPT = 0.8
@@ -61,6 +62,9 @@ KEPT = 0.8
 NEW_SHARE = 0.4
 """Share of the picture that is foretold worse than by total variation, from which on a frame is a
 first one."""
+STILL, REST_PX = 1.05, 2.0
+"""Where what is carried without motion misses readings by no more than so many times what it misses
+with, the scene rests; and the deviation by which such places are blurred."""
 ROOM_PX = 1.0
 """By which disparities may grow while a film goes on."""
 
@@ -69,35 +73,40 @@ ROOM_PX = 1.0
 class Earlier:
     """A frame of before, and where its points are now.
 
-    psi: of its shot. centre: the centre view's disparity (y, x), padded by `margin`. nearer: see
-    `carried`. readings: over the scale. used: those that count, (shot, pixel_y, pixel_x). flow:
-    from its time to the present, (y, x, 2), padded as `centre`.
+    readings: over the scale. used: those that count, (shot, pixel_y, pixel_x). there, back: flow
+    from its time to the present, and back, (y, x, 2), padded by `margin`.
     """
 
-    psi: ImagingMatrix
-    centre: Array
-    margin: int
-    nearer: int
     readings: Readings
     used: NDArray[np.bool_]
-    flow: Array
+    margin: int
+    there: Array
+    back: Array
 
-    @cached_property
-    def rays(self) -> tuple[Array, NDArray[np.uint8]]:
-        """Disparity of every ray then, and whether its centre view could not see it."""
-        return carried(self.centre, self.margin, self.nearer, self.psi.light_field_shape[:4])
+    def since(self, there: Array, back: Array) -> Earlier:
+        """Return the same one frame later; there, back: flows between these two frames, padded."""
+        return replace(self, there=joined(self.there, there), back=joined(back, self.back))
 
-    def surfaces(self, colours: int) -> Surfaces:
-        """Return what it saw of the present texture."""
-        disparity, hidden = self.rays
-        views, size = disparity.shape[:2], disparity.shape[2:]
+    def then(self, field: Array, cubic: bool = False) -> Array:
+        """Return a field of the present, padded (y, x), as it was at that time."""
+        return sampled(field, at_places(field.shape) + self.there, cubic)
+
+    def surfaces(self, centre: Array, nearer: int, colours: int) -> Surfaces:
+        """Return what it saw of the present texture.
+
+        centre: the present disparity of the centre view (y, x), padded. nearer: see `carried`.
+        """
+        psi = self.readings.psi
+        disparity, hidden = carried(
+            self.then(centre), self.margin, nearer, psi.light_field_shape[:4]
+        )
+        views, own = disparity.shape[:2], at_places(psi.size)
         moved = np.empty((2, *disparity.shape), dtype=np.float32)
-        own = at_places(size)
         for v, u in np.ndindex(views):
             steps = np.array([v - views[0] // 2, u - views[1] // 2], dtype=np.float32)
             met = own - disparity[v, u][..., None] * steps + np.float32(self.margin)
-            moved[:, v, u] = np.moveaxis(sampled(self.flow, met), -1, 0)
-        return Surfaces(self.psi, disparity, hidden, self.margin, colours, moved=moved)
+            moved[:, v, u] = np.moveaxis(sampled(self.there, met), -1, 0)
+        return Surfaces(psi, disparity, hidden, self.margin, colours, moved=moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,35 +127,33 @@ class Film:
     picture: Array | None = None
     earlier: tuple[Earlier, ...] = ()
 
+    @property
+    def is_new(self) -> bool:
+        """Whether no frame was seen yet."""
+        return self.texture is None
+
     def after(
         self,
         plain: Plain,
         scene: FittedScene,
         beliefs: search.Volume,
-        nearer: str,
-        flow: Array | None = None,
+        earlier: Sequence[Earlier] = (),
     ) -> Film:
-        """Return what is known after a frame; flow: from the frame before, none of a first one."""
+        """Return what is known after a frame; earlier: frames before, none of a first one."""
         psi = plain.given.psi
         margin = scene.surfaces.margin
-        texture, earlier = scene.texture, ()
-        if flow is None:
+        texture = scene.texture
+        if not earlier:
             wider = margin_of(psi, scene.centre, ROOM_PX + self.settings.texture.room_px) - margin
             margin += wider
             texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")
-        else:
-            earlier = tuple(
-                replace(one, flow=joined(one.flow, _padded(flow, margin))) for one in self.earlier
-            )
         centre = np.pad(scene.centre, margin, mode="edge")
-        front = 1 if nearer == "larger" else -1
         used = plain.given.usable & ~plain.held
         still = np.zeros((*centre.shape, 2), dtype=np.float32)
-        this = Earlier(psi, centre, margin, front, plain.bright, used, still)
-        kept = (*earlier, this)[-self.settings.earlier :] if self.settings.earlier else ()
+        kept = (*earlier, Earlier(plain.bright, used, margin, still, still))
         return replace(
             self, scale=plain.scale, margin=margin, texture=texture, centre=centre,
-            beliefs=beliefs, picture=plain.picture, earlier=kept,
+            beliefs=beliefs, picture=plain.picture, earlier=kept[-self.settings.earlier :],
         )  # fmt: skip
 
 
@@ -156,13 +163,13 @@ def _padded(flow: Array, margin: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """The models of a frame: see `Plain`, `Fits`; beliefs about disparities; flow: from the frame
-    before to it, (y, x, 2); parameters: what is reported of it."""
+    """The models of a frame: see `Plain`, `Fits`; beliefs about disparities; earlier: frames, with
+    the flow to it; parameters: what is reported of it."""
 
     plain: Plain
     fits: Fits
     beliefs: search.Volume
-    flow: Array
+    earlier: list[Earlier]
     parameters: dict[str, float]
 
 
@@ -178,33 +185,47 @@ def followed(
     assert film.beliefs is not None and film.picture is not None
     unseen = np.zeros(psi.size)
     plain = plain_of(given, film.scale, unseen, settings.start_steps)
-    there, back = flow_between(film.picture, plain.picture)
     bright, used = plain.bright, given.usable & ~plain.held
-    at = at_places(film.centre.shape) + _padded(back, margin)
-    centre = sampled(film.centre, at)
-    texture = np.stack([sampled(one, at, cubic=True) for one in film.texture])
     nearer = 1 if settings.nearer == "larger" else -1
-    foretold = bright.frames - surfaces_of(psi, centre, margin, nearer).forward(texture)
+
+    def carried_by(back: Array) -> tuple[Array, Array, Array]:
+        at = at_places(film.centre.shape) + _padded(back, margin)
+        centre = sampled(film.centre, at)
+        texture = np.stack([sampled(one, at, cubic=True) for one in film.texture])
+        surfaces = surfaces_of(psi, centre, margin, nearer, len(texture))
+        return centre, texture, bright.frames - surfaces.forward(texture)
+
+    there, back = flow_between(film.picture, plain.picture)
+    missed, missed_still = (
+        _around(np.square(carried_by(flow)[2]), used).sum(axis=0) for flow in (back, 0 * back)
+    )
+    there, back = _rested(there, back, (missed_still <= STILL * missed).astype(np.float32))
+    centre, texture, foretold = carried_by(back)
     new = _share_new(foretold, plain)
     if new > NEW_SHARE:
         return None
-    seen = []
-    for one in film.earlier:
-        flow = joined(one.flow, _padded(there, margin))
-        surfaces = replace(one, flow=flow).surfaces(len(texture))
-        missed = one.readings.frames - surfaces.forward(texture)
-        wrong = np.maximum(_around(np.square(missed), one.used) - one.readings.noise, 0)
-        variance = one.readings.variance(own.misfit) + wrong
-        precision = np.where(one.used, 1 / variance, 0).astype(np.float32)
-        seen.append(Seen(surfaces, one.readings.frames, precision))
+    earlier = [one.since(_padded(there, margin), _padded(back, margin)) for one in film.earlier]
+    seen: list[Seen] = []
+
+    def seen_through(centre: Array, texture: Array = texture) -> list[Seen]:
+        seen[:] = [_seen(one, centre, texture, nearer, own.misfit) for one in earlier]
+        return seen
+
     beliefs = _carried(film.beliefs, back, psi.binning)
 
     def again(texture: Array, residual: Array, margin: int) -> Array:
         nonlocal beliefs
+
+        def of_earlier(labels: Array) -> Array:
+            return sum(
+                _then_likely(one, through, texture, labels)
+                for one, through in zip(earlier, seen, strict=True)
+            )
+
+        present = Swept(psi, bright.frames, bright.noise, used, texture, residual)
         beliefs = swept(
-            beliefs, psi, bright.frames, bright.noise, used, texture, residual, margin,
-            settings.slope_px, settings.jump,
-        )  # fmt: skip
+            beliefs, present, margin, settings.slope_px, settings.jump, of_earlier if MORE else None
+        )
         return search.per_pixel(beliefs, psi.size, psi.binning)
 
     inner = np.s_[margin : margin + psi.size[0], margin : margin + psi.size[1]]
@@ -218,7 +239,7 @@ def followed(
         own.texture,
         on_step=on_step,
         again=again,
-        earlier=seen,
+        earlier=seen_through,
         margin=margin,
     )
     scale = np.float32(film.scale)
@@ -229,7 +250,39 @@ def followed(
     fits = Fits([light_field, plain.plain], [residual, plain.plain_residual], scene, False)
     moved = float(np.median(np.linalg.norm(there, axis=-1)))
     parameters = {"flow_px": moved, "new_share": new}
-    return Followed(plain, fits, beliefs, there, parameters)
+    return Followed(plain, fits, beliefs, earlier, parameters)
+
+
+def _seen(one: Earlier, centre: Array, texture: Array, nearer: int, misfit: float) -> Seen:
+    """Return what an earlier frame saw; its readings count the less the more is missed around."""
+    surfaces = one.surfaces(centre, nearer, len(texture))
+    missed = one.readings.frames - surfaces.forward(texture)
+    wrong = np.maximum(_around(np.square(missed), one.used) - one.readings.noise, 0)
+    variance = one.readings.variance(misfit) + wrong
+    precision = np.where(one.used, 1 / variance, 0).astype(np.float32)
+    return Seen(surfaces, one.readings.frames, precision)
+
+
+def _then_likely(one: Earlier, seen: Seen, texture: Array, labels: Array) -> Array:
+    """Return log-likelihoods (row, column, label) by an earlier frame, at the present places."""
+    readings, margin, k = one.readings, one.margin, one.readings.psi.binning
+    residual = readings.frames - seen.surfaces.forward(texture)
+    then = np.stack([one.then(part, cubic=True) for part in texture])
+    swept = Swept(readings.psi, readings.frames, readings.noise, one.used, then, residual)
+    likely = swept.likelihoods(labels, margin)
+    rows, columns = readings.psi.size
+    inner = one.back[margin : margin + rows, margin : margin + columns]
+    moved = inner[:: STRIDE * k, :: STRIDE * k] / np.float32(STRIDE * k)
+    at = at_places(likely.shape[:2]) + moved
+    return np.stack([sampled(likely[..., label], at) for label in range(len(labels))], axis=-1)
+
+
+def _rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
+    """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
+    k = len(back) // len(rests)
+    rests = cv2.GaussianBlur(rests, (0, 0), REST_PX).repeat(k, axis=0).repeat(k, axis=1)
+    then = sampled(rests, at_places(rests.shape) + there)
+    return there * (1 - then)[..., None], back * (1 - rests)[..., None]
 
 
 def _around(values: Array, used: NDArray[np.bool_]) -> Array:
