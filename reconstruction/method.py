@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
+from reconstruction.adaptive.film import Film
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_noise
@@ -30,7 +31,8 @@ class Given:
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). dictionary: for methods that need one.
-    estimates: what `estimate_patches` found from the same inputs, to go on from.
+    estimates: what `estimate_patches` found from the same inputs, to go on from. film: that frames
+    are the next one of, see `reconstruction.adaptive.film`.
     """
 
     psi: ImagingMatrix
@@ -40,6 +42,7 @@ class Given:
     dictionary: Dictionary | None
     on_step: Callable[[Progress], None] | None
     estimates: PatchEstimates | None = None
+    film: Film | None = None
 
     @property
     def typical_noise(self) -> float:
@@ -74,7 +77,7 @@ class Method:
     """One way to reconstruct, as a module of `reconstruction.methods` offers it.
 
     assumes, cost, when: for people, cost in seconds. solve: from what is given and
-    the settings of all methods. part, settings: the name and type of its own part of the settings.
+    the settings of all methods. films: whether it goes on from frame to frame of a film. part, settings: the name and type of its own part of the settings.
     package: what it needs beyond the core installation; it is then learned, for some views only.
     """
 
@@ -87,6 +90,7 @@ class Method:
     part: str
     settings: type[Settings]
     needs_dictionary: bool = False
+    films: bool = False
     sensitivity: Sensitivity = field(default_factory=Sensitivity)
     package: str | None = None
 

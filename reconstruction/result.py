@@ -39,7 +39,7 @@ class Reconstruction:
 
     objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
     it found, by name: `disparity` (y, x) in pixels per view step, ... screening: what was
-    done to the frames before, in words.
+    done to the frames before, in words. film: of a frame of a film, what the next one goes on from.
     """
 
     method: str
@@ -52,6 +52,7 @@ class Reconstruction:
     parameters: dict[str, float]
     maps: Mapping[str, NDArray] = field(default_factory=dict)
     screening: tuple[str, ...] = ()
+    film: Any = None
 
     @property
     def stated(self) -> dict[str, Any]:
@@ -63,7 +64,7 @@ class Reconstruction:
     def without_light_field(self) -> Reconstruction:
         """Return the result with an empty light field and no maps, to keep many."""
         empty = np.empty((0, 0, 0, 0, 3), dtype=np.float32)
-        return replace(self, light_field=empty, maps={})
+        return replace(self, light_field=empty, maps={}, film=None)
 
 
 TAILS, WITHIN, SCALE = "stated_tails_db", "stated_within_db", "stated_scale_db"

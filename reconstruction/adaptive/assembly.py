@@ -58,28 +58,34 @@ class Cells(NamedTuple):
 
 
 @njit(forceinline=True, fastmath=True)
-def _place(disparity, y, margin, size, taps, fractions):
-    """Set taps and fractions (2, ray, x) of row y's rays, along y and x, see `first_tap`."""
+def _place(disparity, moved, y, margin, size, taps, fractions):
+    """Set taps and fractions (2, ray, x) of row y's rays, along y and x.
+
+    moved: (2, v, u, y, x), what is added to where each ray meets the texture; or one row of zeros.
+    """
     views_v, views_u, _, _ = disparity.shape
+    still = moved.shape[1] == 1
     ahead, none, one = np.float32(margin - 1), np.float32(0), np.float32(1)
     last_y, last_x = np.float32(size[0] - TAPS), np.float32(size[1] - TAPS)
     for v in range(views_v):
         for u in range(views_u):
             ray, row = v * views_u + u, disparity[v, u, y]
             dv, du = np.float32(v - views_v // 2), np.float32(u - views_u // 2)
-            _along(row, np.float32(y), none, dv, ahead, last_y, taps[0, ray], fractions[0, ray])
-            _along(row, none, one, du, ahead, last_x, taps[1, ray], fractions[1, ray])
+            by = moved[:, 0, 0, 0] if still else moved[:, v, u, y]
+            where = taps[:, ray], fractions[:, ray]
+            _along(row, by[0], np.float32(y), none, dv, ahead, last_y, where[0][0], where[1][0])
+            _along(row, by[1], none, one, du, ahead, last_x, where[0][1], where[1][1])
 
 
 @njit(forceinline=True, fastmath=True)
-def _along(row, start, step, by, ahead, last, taps, parts):
+def _along(row, moved, start, step, by, ahead, last, taps, parts):
     """Set taps and fractions of a row of rays along one axis.
 
     An axis at a time: a compiler vectorises no loop that sets many arrays, which might overlap.
     """
     none, full = np.float32(0), np.float32(1)
     for x in range(row.size):
-        at = start + step * np.float32(np.int32(x)) - row[x] * by
+        at = start + step * np.float32(np.int32(x)) - row[x] * by + moved[x]
         whole = np.floor(at)
         first = whole + ahead
         part = none if first < none else at - whole
@@ -116,7 +122,7 @@ def _widen(row, taps, first, last):
 
 
 @njit(cache=True, nogil=True)
-def _measure(weights, disparity, margin, binning, size, first_row, last_row, boxes, counts):
+def _measure(weights, disparity, moved, margin, binning, size, first_row, last_row, boxes, counts):
     """Set boxes (reading, 4) and the rows of cells that they or their rays take, see `Cells`."""
     shots, views_v, views_u, _, stored, columns = weights.shape
     pixels_y, pixels_x = weights.shape[3] // binning, columns // binning
@@ -125,7 +131,8 @@ def _measure(weights, disparity, margin, binning, size, first_row, last_row, box
     reach = np.empty((5, columns), np.int32)
     for pixel_y in range(first_row, last_row):
         for sub_y in range(binning):
-            _place(disparity, pixel_y * binning + sub_y, margin, size, taps[sub_y], fractions)
+            y = pixel_y * binning + sub_y
+            _place(disparity, moved, y, margin, size, taps[sub_y], fractions)
         for s in range(shots):
             reach[0], reach[2], reach[1], reach[3], reach[4] = size[0], size[1], 0, 0, 0
             for sub_y in range(binning):
@@ -156,7 +163,7 @@ def _measure(weights, disparity, margin, binning, size, first_row, last_row, box
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _lay(weights, disparity, margin, laid, first_row, last_row):
+def _lay(weights, disparity, moved, margin, laid, first_row, last_row):
     """Set the cells of readings: boxes of taps, or rays."""
     colour, binning, size, stored, boxes, starts, scales, values, rays, taps_of = laid
     shots, views_v, views_u, _, _, columns = weights.shape
@@ -170,7 +177,7 @@ def _lay(weights, disparity, margin, laid, first_row, last_row):
     for pixel_y in range(first_row, last_row):
         for sub_y in range(binning):
             y = pixel_y * binning + sub_y
-            _place(disparity, y, margin, size, taps[sub_y], fractions[sub_y])
+            _place(disparity, moved, y, margin, size, taps[sub_y], fractions[sub_y])
         for s in range(shots):
             for pixel_x in range(pixels_x):
                 reading = (s * pixels_y + pixel_y) * pixels_x + pixel_x
@@ -313,12 +320,19 @@ def laid_out(
     margin: int,
     shape: tuple[int, int, int],
     alike: Layout | None = None,
+    moved: Array | None = None,
 ) -> Iterator[Layout]:
     """Yield where bands of pixel rows see textures (c, y, x) of a shape, MOST_ROWS at a time.
 
     disparity: of every ray, (v, u, y, x). alike: the layout of all rows of another Psi, both of one
-    colour in store, of the same disparity; its dark rays are dark in this Psi, too.
+    colour in store, of the same disparity; its dark rays are dark in this Psi, too. moved: (2, v,
+    u, y, x), by which rays meet the texture elsewhere, along y and x.
     """
+    reach_rows = _reach_rows(psi, disparity)
+    if moved is None:
+        moved = np.zeros((2, 1, 1, 1, psi.size[1]), dtype=np.float32)
+    else:
+        reach_rows += float(np.abs(moved[0]).max()) / psi.binning
     readings, rows = int(np.prod(psi.frames_shape)), psi.frames_shape[1]
     size, stored = shape[1:], psi.weights.shape[4]
     if alike is not None:
@@ -328,7 +342,9 @@ def laid_out(
         boxes = np.zeros((readings, 4), dtype=np.int32)
 
         def measure(_: int, first: int, last: int) -> None:
-            _measure(psi.weights, disparity, margin, psi.binning, size, first, last, boxes, counts)
+            _measure(
+                psi.weights, disparity, moved, margin, psi.binning, size, first, last, boxes, counts
+            )
 
         in_bands(measure, rows)
     by_row = counts.reshape(psi.frames_shape)
@@ -346,7 +362,7 @@ def laid_out(
         )
 
         def lay(_: int, first: int, last: int, begin: int = begin, cells: Cells = cells) -> None:
-            _lay(psi.weights, disparity, margin, cells, begin + first, begin + last)
+            _lay(psi.weights, disparity, moved, margin, cells, begin + first, begin + last)
 
         in_bands(lay, end - begin)
-        yield Layout(range(begin, end), cells, _reach_rows(psi, disparity))
+        yield Layout(range(begin, end), cells, reach_rows)

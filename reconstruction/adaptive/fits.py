@@ -14,8 +14,8 @@ from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.second import surfaces_fail
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Survey
-from reconstruction.adaptive.sweep import swept
+from reconstruction.adaptive.survey import Plain, Survey
+from reconstruction.adaptive.sweep import Swept, swept
 from reconstruction.adaptive.uncertainty import blur_views, features, stated, variance_of_mean
 
 Array = NDArray[np.floating]
@@ -62,18 +62,10 @@ def fitted_models(
     scale = np.float32(survey.scale)
 
     def again(volume: search.Volume, texture: Array, residual: Array, margin: int) -> Array:
-        beliefs = swept(
-            volume,
-            given.psi,
-            bright.frames,
-            bright.noise,
-            given.usable & ~held,
-            texture,
-            residual,
-            margin,
-            settings.slope_px,
-            settings.jump,
+        seen = Swept(
+            given.psi, bright.frames, bright.noise, given.usable & ~held, texture, residual
         )
+        beliefs = swept(volume, seen, margin, settings.slope_px, settings.jump)
         return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
 
     first, size, k = settings.misfits[0], given.psi.size, given.psi.binning
@@ -135,7 +127,7 @@ class Mean:
     reported: dict[str, float] = field(default_factory=dict)
 
 
-def averaged(survey: Survey, fits: Fits, disparity_sigma: Array) -> Mean:
+def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
     """Return the mean of the models, by the held-out readings; the first model without any.
 
     disparity_sigma: deviation of the centre view's disparity, (y, x).

@@ -8,7 +8,7 @@ the disparity (`refine`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from pydantic import Field
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import fitted, refined
+from reconstruction.adaptive.refine import Seen, fitted, refined
 from reconstruction.adaptive.shrinkage import denoised
 from reconstruction.adaptive.visibility import carried
 
@@ -88,6 +88,12 @@ def surfaces_of(
     return Surfaces(psi, disparity, hidden, margin, colours)
 
 
+def margin_of(psi: ImagingMatrix, centre: Array, room_px: float) -> int:
+    """Return by how many samples views of the centre view's disparity see beyond it, at most."""
+    furthest = float(np.abs(centre).max()) + room_px
+    return int(np.ceil(furthest * (max(psi.light_field_shape[:2]) // 2))) + 4
+
+
 def solve(
     psi: ImagingMatrix,
     centre: Array,
@@ -99,6 +105,8 @@ def solve(
     on_step: Callable[[int], None] | None = None,
     again: Callable[[Array, Array, int], Array] | None = None,
     begun: Begun | None = None,
+    earlier: Callable[[Array], Sequence[Seen]] | None = None,
+    margin: int | None = None,
 ) -> FittedScene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
@@ -107,15 +115,16 @@ def solve(
     not usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the
     disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given its residual of
     the frames, and the margin. begun: of another fit of the same centre, from which to go on.
+    earlier: returns what other times saw of the texture, given the padded disparity. margin: of the texture, instead of the least.
     """
-    furthest = float(np.abs(centre).max()) + settings.room_px
-    half = max(psi.light_field_shape[:2]) // 2
-    margin = int(np.ceil(furthest * half)) + 4
+    if margin is None:
+        margin = margin_of(psi, centre, settings.room_px)
     around = ((margin, margin), (margin, margin))
     padded = searched = np.pad(centre, around, mode="edge")
     colours = picture.shape[-1]
     surfaces = surfaces_of(psi, padded, margin, nearer, colours)
     rows_squared = np.einsum("ssyx->syx", psi.gram)
+    others = earlier(padded) if earlier is not None else ()
     now = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge").astype(np.float32)
     at = kept = begun or Begun(now, now, now)
     sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
@@ -142,6 +151,7 @@ def solve(
             )
             padded = searched
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
+            others = earlier(padded) if earlier is not None else ()
         left = settings.steps - 1 - step
         if step >= 2 and left < settings.refine_steps and left % 2 == 0:
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
@@ -151,7 +161,7 @@ def solve(
             )
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
-        fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps)
+        fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps, others)
         at = Begun(fit, now, clean)
         if on_step is not None:
             on_step(step + 1)

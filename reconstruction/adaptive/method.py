@@ -30,12 +30,19 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
-from reconstruction.adaptive.edges import dark_edges, faded
+from reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
 from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.fits import Patches, averaged, fitted_models
+from reconstruction.adaptive.film import Film, followed
+from reconstruction.adaptive.fits import Fits, Patches, averaged, fitted_models
 from reconstruction.adaptive.second import searched_again
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import checked, checked_disparity, surveyed
+from reconstruction.adaptive.survey import (
+    Plain,
+    Readings,
+    checked,
+    checked_disparity,
+    surveyed,
+)
 from reconstruction.adaptive.uncertainty import within_db
 from reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
@@ -58,13 +65,15 @@ def reconstruct_adaptive(
     on_step: Callable[[Progress], None] | None = None,
     disparity: Array | None = None,
     patches: Patches | None = None,
+    film: Film | None = None,
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
     it is known, in place of the one searched. patches: see `Patches`; they are asked for from
-    `settings.patches` shots on, or where surfaces fail (`second`).
+    `settings.patches` shots on, or where surfaces fail (`second`). film: that this is a frame of,
+    see `reconstruction.result.Reconstruction.film`.
     Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
@@ -89,39 +98,100 @@ def reconstruct_adaptive(
     if second is not None:
         total = 2 * settings.texture.steps + 3
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second)
-    size, k = psi.size, psi.binning
-    # The less sure of two searches knows better how sure to be.
     believed = survey.volume if second is None else second
+    result = _put_together(survey, fits, survey.volume, believed, edges, whole)
+    report(total)
+    return replace(
+        result,
+        steps=total,
+        seconds=time.perf_counter() - started,
+        parameters=result.parameters | {"search_seconds": searched_s},
+        film=film and film.after(survey, fits.scene, believed),
+    )
+
+
+def reconstruct_next(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float | Array,
+    film: Film,
+    settings: AdaptiveSettings,
+    usable: NDArray[np.bool_] | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+) -> Reconstruction | None:
+    """Return the light field of the next frame of a film, from what the frames before showed.
+
+    film: after the frame before; others as those of `reconstruct_adaptive`, of one shot. None where
+    what was seen before does not foretell the frame: it is a first frame then.
+    """
+    started = time.perf_counter()
+    whole = given = checked(psi, frames, noise_sigma, usable)
+    edges = dark_edges(psi, given.frames, given.usable, settings.edges)
+    if edges is not None:
+        given = replace(given, usable=given.usable & ~edges.within)
+    total = film.settings.texture.steps + 1
+
+    def report(step: int) -> None:
+        if on_step is not None:
+            on_step(Progress(step, None, None, total))
+
+    found = followed(film, given, settings, report)
+    if found is None:
+        return None
+    result = _put_together(found.plain, found.fits, found.beliefs, found.beliefs, edges, whole)
+    report(total)
+    return replace(
+        result,
+        steps=total,
+        seconds=time.perf_counter() - started,
+        parameters=result.parameters | found.parameters,
+        film=film.after(found.plain, found.fits.scene, found.beliefs, found.earlier),
+    )
+
+
+def _put_together(
+    survey: Plain,
+    fits: Fits,
+    searched: search.Volume,
+    believed: search.Volume,
+    edges: DarkEdges | None,
+    whole: Readings,
+) -> Reconstruction:
+    """Return the mean of fits, with its maps; steps and seconds are left open.
+
+    believed: the less sure of two searches, which knows better how sure to be. whole: the readings
+    with dark edges.
+    """
+    given, psi = survey.given, survey.given.psi
+    size, k = psi.size, psi.binning
     disparity_sigma = np.sqrt(search.variance_per_pixel(believed, size, k))
     mean = averaged(survey, fits, disparity_sigma)
-    residual = (given.frames - given.psi.forward(mean.light_field)).astype(np.float32)
+    residual = (given.frames - psi.forward(mean.light_field)).astype(np.float32)
     maps = {
         "disparity": fits.scene.centre,
         "disparity_sigma": disparity_sigma,
-        "texture": _texture_map(survey.volume, size, k),
+        "texture": _texture_map(searched, size, k),
         **({} if mean.sigma is None else {"sigma": mean.sigma}),
     }
     light_field = mean.light_field
     if edges is not None:
         light_field = faded(edges, psi, light_field, whole.frames, whole.usable)
-    report(total)
-    decided = _decided(survey.volume)
+    decided = _decided(searched)
     return Reconstruction(
         method="adaptive",
         light_field=light_field,
         status=Status.CONVERGED,
         advice="",
-        steps=total,
+        steps=0,
         objective=(),
-        seconds=time.perf_counter() - started,
+        seconds=0.0,
         parameters={
             "noise_sigma": given.typical,
             "lowest_px": float(fits.scene.centre.min()),
             "highest_px": float(fits.scene.centre.max()),
-            "disparities": len(survey.volume.disparities),
-            "search_seconds": searched_s,
+            "disparities": len(searched.disparities),
             "held_readings": int(survey.held.sum()),
-            "at_end": survey.volume.at_end,
+            "at_end": searched.at_end,
             **({} if edges is None else {"dark_edge_px": float(max(edges.widths))}),
             **misfit(residual, given.noise, given.usable & ~survey.held),
             **({} if decided is None else {"decided": decided}),

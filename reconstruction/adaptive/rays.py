@@ -105,7 +105,8 @@ class Surfaces:
     disparity: (v, u, y, x) of every ray, hidden: (v, u, y, x) uint8, 1 where the ray sees what the
     centre view does not: there it sees the texture beside it. Textures have the shape
     `texture_shape`, (c, y, x), padded by `margin` samples on all sides; colours: of them, 1 for a
-    Psi that sees only the first. alike: see `laid_out`.
+    Psi that sees only the first. alike, moved: see `laid_out`; `derivative` and `light_field` are of
+    rays that are not moved.
     """
 
     _whole: Layout | None
@@ -118,11 +119,12 @@ class Surfaces:
         margin: int,
         colours: int = 3,
         alike: Layout | None = None,
+        moved: Array | None = None,
     ) -> None:
         self.psi, self.disparity, self.hidden, self.margin = psi, disparity, hidden, margin
         rows, columns = psi.size
         self.texture_shape = (colours, rows + 2 * margin, columns + 2 * margin)
-        self._alike, self._whole = alike, None
+        self._alike, self._moved, self._whole = alike, moved, None
 
     def release(self) -> None:
         """Give back the memory of the rays' layout; a later product lays them out again."""
@@ -131,7 +133,9 @@ class Surfaces:
     def _bands(self) -> Iterable[Layout]:
         """Return the layouts of bands of rows; one of all rows is kept."""
         if self._whole is None:
-            bands = laid_out(self.psi, self.disparity, self.margin, self.texture_shape, self._alike)
+            bands = laid_out(
+                self.psi, self.disparity, self.margin, self.texture_shape, self._alike, self._moved
+            )
             first = next(bands)
             if len(first.rows) < self.psi.frames_shape[1]:
                 return chain([first], bands)

@@ -8,7 +8,8 @@ neighbours are Laplace distributed (reweighted squares keep edges).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,16 @@ def conjugate_gradients(
     return solution
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Frames of a texture through surfaces, and the inverse variance of their readings, 0 to leave
+    it out, both (shot, pixel_y, pixel_x)."""
+
+    surfaces: Surfaces
+    frames: Array
+    precision: Array
+
+
 def fitted(
     surfaces: Surfaces,
     frames: Array,
@@ -107,6 +118,7 @@ def fitted(
     prior: Array,
     sigma: float,
     steps: int,
+    earlier: Sequence[Seen] = (),
 ) -> Array:
     """Return the texture (c, y, x) near `prior`, deviation sigma, that explains the frames.
 
@@ -114,15 +126,17 @@ def fitted(
     each reading: the mean of T given the frames, if its prior is Gaussian.
 
     precision: (shot, pixel_y, pixel_x), the inverse variance of each reading, 0 to leave it out.
+    earlier: what other times saw of the same texture.
     """
-    nothing = np.zeros_like(frames)
-    change = conjugate_gradients(
-        lambda texture, sums: surfaces.add_missed(texture, nothing, precision, sums),
-        1 / sigma**2,
-        surfaces.missed(prior, frames, precision),
-        steps,
-    )
-    return prior + change
+    all_seen = [Seen(surfaces, frames, precision), *earlier]
+
+    def subtract(texture: Array, sums: Array) -> None:
+        for seen in all_seen:
+            nothing = np.zeros_like(seen.frames)
+            seen.surfaces.add_missed(texture, nothing, seen.precision, sums)
+
+    rhs = np.sum([one.surfaces.missed(prior, one.frames, one.precision) for one in all_seen], 0)
+    return prior + conjugate_gradients(subtract, 1 / sigma**2, rhs, steps)
 
 
 def slopes(texture: Array) -> Array:

@@ -97,28 +97,47 @@ def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
-    """given: what is fitted. scale: of the scene's contrast; bright: `given` over it. held: the
-    readings kept from every fit. data, prior, rough: of the fine search, for another one. volume:
-    beliefs about disparities. unseen: variance by colours that frames do not show, (y, x). plain:
-    light field of total variation, as `mixture.stored`; plain_residual: frames less what it
-    predicts. centre, picture: the centre view's disparity (y, x) and picture (y, x, c), over the
-    scale, to begin with.
+class Plain:
+    """The readings, and the light field without surfaces that theirs must beat.
+
+    given: what is fitted. scale: of the scene's contrast; bright: `given` over it. held: the
+    readings kept from every fit. unseen: variance by colours that frames do not show, (y, x).
+    plain: light field of total variation, as `mixture.stored`; plain_residual: frames less what it
+    predicts; picture: its centre view (y, x, c), over the scale.
     """
 
     given: Readings
     scale: float
     bright: Readings
     held: NDArray[np.bool_]
+    unseen: Array
+    plain: NDArray[np.uint16]
+    plain_residual: Array
+    picture: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Survey(Plain):
+    """data, prior, rough: of the fine search, for another one. volume: beliefs about disparities.
+    centre: the centre view's disparity (y, x), to begin with.
+    """
+
     data: search.SearchData
     prior: TexturePrior
     rough: search.Volume
     volume: search.Volume
-    unseen: Array
-    plain: NDArray[np.uint16]
-    plain_residual: Array
     centre: Array
-    picture: Array
+
+
+def plain_of(given: Readings, scale: float, unseen: Array, steps: int) -> Plain:
+    """Return a few steps of total variation from all readings but the held-out ones."""
+    held = held_out(given.usable)
+    fitted = given.usable & ~held
+    mu = choose_mu(given.psi, given.frames[fitted], given.typical)
+    plain = few_steps(given.psi, given.frames, fitted, mu, steps)
+    missed = given.frames - given.psi.forward(plain)
+    picture = centre_view(plain) / np.float32(scale)
+    return Plain(given, scale, given.over(scale), held, unseen, stored(plain), missed, picture)
 
 
 def surveyed(
@@ -160,17 +179,8 @@ def surveyed(
     )
     on_searched(2)
     centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
-    held = held_out(given.usable)
-    fitted = given.usable & ~held
-    mu = choose_mu(psi, given.frames[fitted], given.typical)
-    # The model that surfaces must beat on the held-out readings, and from which they begin.
-    plain = few_steps(psi, given.frames, fitted, mu, settings.start_steps)
-    begun = centre_view(plain) / np.float32(scale)
-    missed = given.frames - psi.forward(plain)
-    return Survey(
-        given, scale, bright, held, data, fine, rough, volume, unseen, stored(plain), missed,
-        centre, begun,
-    )  # fmt: skip
+    begun = plain_of(given, scale, unseen, settings.start_steps)
+    return Survey(**vars(begun), data=data, prior=fine, rough=rough, volume=volume, centre=centre)
 
 
 def contrast_of(

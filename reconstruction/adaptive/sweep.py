@@ -14,7 +14,8 @@ agree by belief propagation as in the search.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from math import floor
 from typing import Any
 
@@ -163,29 +164,56 @@ def _smooth(values: Array, used: Array) -> Array:
     return np.stack(blurred).mean(axis=0)
 
 
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """Frames whose planes are compared: their Psi, frames, variance `noise`, which are used, and the
+    residual of the present surfaces, (shot, pixel_y, pixel_x); texture: (c, y, x), padded."""
+
+    psi: ImagingMatrix
+    frames: Array
+    noise: Array
+    used: NDArray[np.bool_]
+    texture: Array
+    residual: Array
+
+    def likelihoods(self, disparities: Array, margin: int) -> NDArray[np.float32]:
+        """Return log-likelihoods (row, column, disparity) of every STRIDE-th pixel."""
+        psi, k = self.psi, self.psi.binning
+        weight = self.used.astype(np.float32)
+        variance = np.maximum(_smooth(np.square(self.residual), weight), self.noise.mean(axis=0))
+        inner = self.texture[:, margin : margin + psi.size[0], margin : margin + psi.size[1]]
+        blocks = inner.reshape(len(inner), psi.size[0] // k, k, psi.size[1] // k, k)
+        guide = np.moveaxis(blocks.mean(axis=(2, 4)), 0, -1)
+        guide = np.ascontiguousarray(guide.astype(np.float32))
+        shape = [len(range(0, length, STRIDE)) for length in psi.frames_shape[1:]]
+        out = np.empty((*shape, len(disparities)), dtype=np.float32)
+
+        def work(_: int, first: int, last: int) -> None:
+            alike = cv2.ximgproc.createGuidedFilter(guide, RADIUS_PX, EDGE)
+            for label in range(first, last):
+                of_plane = plane_frames(psi, self.texture, disparities[label], margin)
+                missed = self.frames - of_plane
+                every = _likelihood(missed, variance, weight, alike)
+                out[..., label] = every[::STRIDE, ::STRIDE]
+
+        in_bands(work, len(disparities))
+        return out
+
+
 def swept(
     volume: Volume,
-    psi: ImagingMatrix,
-    frames: Array,
-    noise: Array,
-    used: NDArray[np.bool_],
-    texture: Array,
-    residual: Array,
+    seen: Swept,
     margin: int,
     slope_px: float,
     jump: float,
+    more: Callable[[Array], Array] | None = None,
 ) -> Volume:
     """Return what to believe of every STRIDE-th pixel's disparity, given texture and patches.
 
-    volume: of the search. frames, their variance `noise`, which are used, and the residual
-    of the present surfaces: (shot, pixel_y, pixel_x). texture: (c, y, x), padded by a margin.
+    volume: of the search. margin: of the texture. more: returns further log-likelihoods of
+    disparities, such as of other times, (row, column, disparity).
     """
-    weight = used.astype(np.float32)
-    variance = np.maximum(_smooth(np.square(residual), weight), noise.mean(axis=0))
-    k = psi.binning
-    inner = texture[:, margin : margin + psi.size[0], margin : margin + psi.size[1]]
-    pixels = inner.reshape(len(inner), psi.size[0] // k, k, psi.size[1] // k, k).mean(axis=(2, 4))
-    guide = np.ascontiguousarray(np.moveaxis(pixels, 0, -1).astype(np.float32))
+    psi = seen.psi
     rows, columns = (np.arange(0, length, STRIDE) for length in psi.frames_shape[1:])
     at = places(volume, rows.astype(float), columns.astype(float))
     half = max(psi.light_field_shape[:2]) // 2
@@ -194,18 +222,12 @@ def swept(
     within = (volume.disparities >= low - BEYOND_PX) & (volume.disparities <= high + BEYOND_PX)
     within &= np.abs(volume.disparities) * half + TAPS <= margin
     labels = volume.disparities[within]
-    evidence = np.empty((len(rows), len(columns), len(labels)), dtype=np.float32)
-    all_known = np.flatnonzero(within)
-
-    def work(_: int, first: int, last: int) -> None:
-        alike = cv2.ximgproc.createGuidedFilter(guide, RADIUS_PX, EDGE)
-        for label, known in enumerate(all_known[first:last], first):
-            of_plane = frames - plane_frames(psi, texture, labels[label], margin)
-            likelihood = _likelihood(of_plane, variance, weight, alike)[::STRIDE, ::STRIDE]
-            believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
-            evidence[..., label] = likelihood + np.log(believed + LEAST_BELIEF)
-
-    in_bands(work, len(labels))
+    evidence = seen.likelihoods(labels, margin)
+    if more is not None:
+        evidence += more(labels)
+    for label, known in enumerate(np.flatnonzero(within)):
+        believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
+        evidence[..., label] += np.log(believed + LEAST_BELIEF)
     chances = posteriors(evidence, compatibility(labels, slope_px * STRIDE, jump))
     return replace(
         volume,

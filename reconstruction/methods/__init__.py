@@ -22,6 +22,7 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
+from reconstruction.adaptive.film import Film
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
@@ -109,6 +110,7 @@ def reconstruct(
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     estimates: PatchEstimates | None = None,
+    film: Film | None = None,
 ) -> Reconstruction:
     """Return the light field that the method called `name` estimates.
 
@@ -116,12 +118,16 @@ def reconstruct(
     one or of each (known: estimated from a reading it would favour those that noise made small);
     methods that take one take the root mean square. usable: pixels to fit (default all).
     estimates: what `estimate_patches` found from the same inputs, for `dict-...` and `tv-dict` to
-    go on from. Raises ReconstructionError for a method that is not known, a dictionary
-    that is missing, and inputs that do not fit each other.
+    go on from. film: that the frames, of one shot, are the next one of: `Film()` before the first,
+    then `film` of the result before. Raises ReconstructionError for a method that is not known or
+    takes no films, a dictionary that is missing, and inputs that do not fit each other.
     """
     method = find_method(name)
+    if film is not None and not method.films:
+        able = ", ".join(one.name for one in METHODS.values() if one.films)
+        raise ReconstructionError(f"'{name}' takes no films: --method one of {able}")
     settings = settings or MethodSettings()
-    given = Given(psi, frames, noise_sigma, usable, dictionary, on_step, estimates)
+    given = Given(psi, frames, noise_sigma, usable, dictionary, on_step, estimates, film)
     if not settings.screening:
         return method.solve(given, settings)
     started = time.perf_counter()

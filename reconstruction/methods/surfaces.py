@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.method import reconstruct_adaptive
+from reconstruction.adaptive.method import reconstruct_adaptive, reconstruct_next
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
 from reconstruction.method import Given, Method, Sensitivity, cost_words
@@ -69,10 +69,16 @@ def _solve(
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
         return solve_tv_dict(fitted, quick).light_field
 
-    result = reconstruct_adaptive(
-        psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step,
-        patches=patches if may_take_patches(psi, adaptive) else None,
-    )  # fmt: skip
+    result, film = None, given.film
+    if film is not None and not film.is_new:
+        result = reconstruct_next(
+            psi, given.frames, given.noise_sigma, film, adaptive, given.usable, given.on_step
+        )
+    if result is None:
+        result = reconstruct_adaptive(
+            psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step,
+            patches=patches if may_take_patches(psi, adaptive) else None, film=film,
+        )  # fmt: skip
     return dataclasses.replace(result, method=name)
 
 
@@ -88,6 +94,7 @@ METHODS = (
         partial(_solve, "adaptive", lambda settings: settings),
         "adaptive",
         AdaptiveSettings,
+        films=True,
         sensitivity=Sensitivity(one_shot=True),
     ),
     Method(
@@ -99,6 +106,7 @@ METHODS = (
         partial(_solve, "adaptive-fast", fast),
         "adaptive",
         AdaptiveSettings,
+        films=True,
         sensitivity=Sensitivity(one_shot=True),
     ),
 )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import shows_parallax
+from reconstruction.adaptive.film import Film
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.methods import MethodSettings, reconstruct
@@ -43,12 +44,14 @@ def reconstruct_judged(
     settings: MethodSettings | None = None,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
+    film: Film | None = None,
 ) -> tuple[Reconstruction, Verdict]:
     """Return what `reconstruct` finds, given the same, and whether to trust it.
 
     frames: what a pixel reads that is not usable is the least that it can be, see `Read.clipped`; 0
     says nothing. The light field is that of all readings but the few kept, which costs it next to
-    nothing. Where every pixel sees the same colour, its three colours are alike.
+    nothing. Where every pixel sees the same colour, its three colours are alike. film: see
+    `reconstruct`.
     """
     settings = settings or MethodSettings()
     typical, _ = checked_noise(psi, noise_sigma, usable)
@@ -57,7 +60,7 @@ def reconstruct_judged(
 
     def solved(readings: Array, fitted: NDArray[np.bool_], before: float = 0.0) -> Reconstruction:
         result = reconstruct(
-            name, psi, readings, noise_sigma, dictionary, unscreened, fitted, on_step
+            name, psi, readings, noise_sigma, dictionary, unscreened, fitted, on_step, film=film
         )
         return dataclasses.replace(result, seconds=result.seconds + before)
 

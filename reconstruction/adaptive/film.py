@@ -1,0 +1,339 @@
+"""Frame after frame of a film: what earlier frames showed is carried along by the scene's motion.
+
+Of the frame before, disparity, texture and beliefs about disparities are carried to the present by
+optical flow (`flow`). The present texture is then fitted not to the present frame alone, but to the
+last few: an earlier frame sees the present texture where the flow since then says, through its own
+disparities (`Seen`). In the next frame the same point of a surface meets other cells of the mask:
+time is a code as good as another shot.
+
+Nothing carried is believed further than readings go. A reading of an earlier frame counts with the
+variance that what is foretold misses around it, so that where flow is wrong, or something is hidden
+meanwhile, the present frame decides alone. Where the carried scene foretells the present frame no
+better than total variation does over more than NEW_SHARE of the picture, it is a first frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.settings import Settings
+from reconstruction.adaptive import mixture, search
+from reconstruction.adaptive.fits import Fits
+from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
+from reconstruction.adaptive.joint import (
+    FittedScene,
+    TextureSettings,
+    margin_of,
+    solve,
+    surfaces_of,
+)
+from reconstruction.adaptive.rays import Surfaces
+from reconstruction.adaptive.refine import Seen
+from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.survey import Plain, Readings, plain_of
+from reconstruction.adaptive.sweep import STRIDE, Swept, swept
+from reconstruction.adaptive.visibility import carried
+
+Array = NDArray[np.floating]
+
+
+class FilmSettings(Settings):
+    """Settings of the frames after the first."""
+
+    texture: TextureSettings = TextureSettings(
+        steps=8, first_noise=0.1, refine_steps=4, shared_steps=0, sweeps=(0, 3)
+    )
+    misfit: float = 0.002
+    earlier: int = 2
+
+
+import os
+
+MORE = int(os.environ.get("MORE", "1"))
+WINDOW_PX = 4.0
+"""Deviation of the window in which squared residuals of what is foretold are averaged."""
+KEPT = 0.8
+"""Part of the belief in a disparity that the next frame keeps; the rest is spread over all."""
+NEW_SHARE = 0.4
+"""Share of the picture that is foretold worse than by total variation, from which on a frame is a
+first one."""
+STILL, REST_PX = 1.05, 2.0
+"""Where what is carried without motion misses readings by no more than so many times what it misses
+with, the scene rests; and the deviation by which such places are blurred."""
+ROOM_PX = 1.0
+"""By which disparities may grow while a film goes on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Earlier:
+    """A frame of before, and where its points are now.
+
+    readings: over the scale. used: those that count, (shot, pixel_y, pixel_x). there, back: flow
+    from its time to the present, and back, (y, x, 2), padded by `margin`.
+    """
+
+    readings: Readings
+    used: NDArray[np.bool_]
+    margin: int
+    there: Array
+    back: Array
+
+    def since(self, there: Array, back: Array) -> Earlier:
+        """Return the same one frame later; there, back: flows between these two frames, padded."""
+        return replace(self, there=joined(self.there, there), back=joined(back, self.back))
+
+    def then(self, field: Array, cubic: bool = False) -> Array:
+        """Return a field of the present, padded (y, x), as it was at that time."""
+        return sampled(field, at_places(field.shape) + self.there, cubic)
+
+    def surfaces(self, centre: Array, nearer: int, colours: int) -> Surfaces:
+        """Return what it saw of the present texture.
+
+        centre: the present disparity of the centre view (y, x), padded. nearer: see `carried`.
+        """
+        psi = self.readings.psi
+        disparity, hidden = carried(
+            self.then(centre), self.margin, nearer, psi.light_field_shape[:4]
+        )
+        views, own = disparity.shape[:2], at_places(psi.size)
+        moved = np.empty((2, *disparity.shape), dtype=np.float32)
+        for v, u in np.ndindex(views):
+            steps = np.array([v - views[0] // 2, u - views[1] // 2], dtype=np.float32)
+            met = own - disparity[v, u][..., None] * steps + np.float32(self.margin)
+            moved[:, v, u] = np.moveaxis(sampled(self.there, met), -1, 0)
+        return Surfaces(psi, disparity, hidden, self.margin, colours, moved=moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """What is known after a frame; nothing before the first.
+
+    scale: of the scene, see `Plain`. texture, clean: (c, y, x), as of `FittedScene`, padded as the
+    centre view's disparity `centre` (y, x). beliefs: about disparities. picture: centre view of
+    the light field without surfaces, (y, x, c). earlier: the latest frame last.
+    """
+
+    settings: FilmSettings = field(default_factory=FilmSettings)
+    scale: float = 1.0
+    margin: int = 0
+    texture: Array | None = None
+    centre: Array | None = None
+    beliefs: search.Volume | None = None
+    picture: Array | None = None
+    earlier: tuple[Earlier, ...] = ()
+
+    @property
+    def is_new(self) -> bool:
+        """Whether no frame was seen yet."""
+        return self.texture is None
+
+    def after(
+        self,
+        plain: Plain,
+        scene: FittedScene,
+        beliefs: search.Volume,
+        earlier: Sequence[Earlier] = (),
+    ) -> Film:
+        """Return what is known after a frame; earlier: frames before, none of a first one."""
+        psi = plain.given.psi
+        margin = scene.surfaces.margin
+        texture = scene.texture
+        if not earlier:
+            wider = margin_of(psi, scene.centre, ROOM_PX + self.settings.texture.room_px) - margin
+            margin += wider
+            texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")
+        centre = np.pad(scene.centre, margin, mode="edge")
+        used = plain.given.usable & ~plain.held
+        still = np.zeros((*centre.shape, 2), dtype=np.float32)
+        kept = (*earlier, Earlier(plain.bright, used, margin, still, still))
+        return replace(
+            self, scale=plain.scale, margin=margin, texture=texture, centre=centre,
+            beliefs=beliefs, picture=plain.picture, earlier=kept[-self.settings.earlier :],
+        )  # fmt: skip
+
+
+def _padded(flow: Array, margin: int) -> Array:
+    return np.pad(flow, ((margin, margin), (margin, margin), (0, 0)), mode="edge")
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """The models of a frame: see `Plain`, `Fits`; beliefs about disparities; earlier: frames, with
+    the flow to it; parameters: what is reported of it."""
+
+    plain: Plain
+    fits: Fits
+    beliefs: search.Volume
+    earlier: list[Earlier]
+    parameters: dict[str, float]
+
+
+def followed(
+    film: Film,
+    given: Readings,
+    settings: AdaptiveSettings,
+    on_step: Callable[[int], None],
+) -> Followed | None:
+    """Return the models of a frame that follows; None where it is a first one."""
+    own, psi, margin = film.settings, given.psi, film.margin
+    assert film.texture is not None and film.centre is not None
+    assert film.beliefs is not None and film.picture is not None
+    unseen = np.zeros(psi.size)
+    plain = plain_of(given, film.scale, unseen, settings.start_steps)
+    bright, used = plain.bright, given.usable & ~plain.held
+    nearer = 1 if settings.nearer == "larger" else -1
+
+    def carried_by(back: Array) -> tuple[Array, Array, Array]:
+        at = at_places(film.centre.shape) + _padded(back, margin)
+        centre = sampled(film.centre, at)
+        texture = np.stack([sampled(one, at, cubic=True) for one in film.texture])
+        surfaces = surfaces_of(psi, centre, margin, nearer, len(texture))
+        return centre, texture, bright.frames - surfaces.forward(texture)
+
+    there, back = flow_between(film.picture, plain.picture)
+    missed, missed_still = (
+        _around(np.square(carried_by(flow)[2]), used).sum(axis=0) for flow in (back, 0 * back)
+    )
+    there, back = _rested(there, back, (missed_still <= STILL * missed).astype(np.float32))
+    centre, texture, foretold = carried_by(back)
+    new = _share_new(foretold, plain)
+    if new > NEW_SHARE:
+        return None
+    earlier = [one.since(_padded(there, margin), _padded(back, margin)) for one in film.earlier]
+    seen: list[Seen] = []
+
+    def seen_through(centre: Array, texture: Array = texture) -> list[Seen]:
+        seen[:] = [_seen(one, centre, texture, nearer, own.misfit) for one in earlier]
+        return seen
+
+    beliefs = _carried(film.beliefs, back, psi.binning)
+
+    def again(texture: Array, residual: Array, margin: int) -> Array:
+        nonlocal beliefs
+
+        def of_earlier(labels: Array) -> Array:
+            return sum(
+                _then_likely(one, through, texture, labels)
+                for one, through in zip(earlier, seen, strict=True)
+            )
+
+        present = Swept(psi, bright.frames, bright.noise, used, texture, residual)
+        beliefs = swept(
+            beliefs, present, margin, settings.slope_px, settings.jump, of_earlier if MORE else None
+        )
+        return search.per_pixel(beliefs, psi.size, psi.binning)
+
+    inner = np.s_[margin : margin + psi.size[0], margin : margin + psi.size[1]]
+    scene = solve(
+        psi,
+        np.ascontiguousarray(centre[inner]),
+        nearer,
+        bright.frames,
+        bright.precision(plain.held, own.misfit),
+        np.moveaxis(texture, 0, -1)[inner],
+        own.texture,
+        on_step=on_step,
+        again=again,
+        earlier=seen_through,
+        margin=margin,
+    )
+    scale = np.float32(film.scale)
+    residual = scale * (bright.frames - scene.surfaces.forward(scene.texture))
+    scene.surfaces.release()
+    light_field = scene.surfaces.light_field(scale * scene.texture)
+    light_field = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
+    fits = Fits([light_field, plain.plain], [residual, plain.plain_residual], scene, False)
+    moved = float(np.median(np.linalg.norm(there, axis=-1)))
+    parameters = {"flow_px": moved, "new_share": new}
+    return Followed(plain, fits, beliefs, earlier, parameters)
+
+
+def _seen(one: Earlier, centre: Array, texture: Array, nearer: int, misfit: float) -> Seen:
+    """Return what an earlier frame saw; its readings count the less the more is missed around."""
+    surfaces = one.surfaces(centre, nearer, len(texture))
+    missed = one.readings.frames - surfaces.forward(texture)
+    wrong = np.maximum(_around(np.square(missed), one.used) - one.readings.noise, 0)
+    variance = one.readings.variance(misfit) + wrong
+    precision = np.where(one.used, 1 / variance, 0).astype(np.float32)
+    return Seen(surfaces, one.readings.frames, precision)
+
+
+def _then_likely(one: Earlier, seen: Seen, texture: Array, labels: Array) -> Array:
+    """Return log-likelihoods (row, column, label) by an earlier frame, at the present places."""
+    readings, margin, k = one.readings, one.margin, one.readings.psi.binning
+    residual = readings.frames - seen.surfaces.forward(texture)
+    then = np.stack([one.then(part, cubic=True) for part in texture])
+    swept = Swept(readings.psi, readings.frames, readings.noise, one.used, then, residual)
+    likely = swept.likelihoods(labels, margin)
+    rows, columns = readings.psi.size
+    inner = one.back[margin : margin + rows, margin : margin + columns]
+    moved = inner[:: STRIDE * k, :: STRIDE * k] / np.float32(STRIDE * k)
+    at = at_places(likely.shape[:2]) + moved
+    return np.stack([sampled(likely[..., label], at) for label in range(len(labels))], axis=-1)
+
+
+def _rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
+    """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
+    k = len(back) // len(rests)
+    rests = cv2.GaussianBlur(rests, (0, 0), REST_PX).repeat(k, axis=0).repeat(k, axis=1)
+    then = sampled(rests, at_places(rests.shape) + there)
+    return there * (1 - then)[..., None], back * (1 - rests)[..., None]
+
+
+def _around(values: Array, used: NDArray[np.bool_]) -> Array:
+    """Return the mean over used pixels around, of (shot, pixel_y, pixel_x)."""
+    weight = used.astype(np.float32)
+    sums, counts = (
+        np.stack([cv2.GaussianBlur(one, (0, 0), WINDOW_PX) for one in part])
+        for part in (np.where(used, values, 0).astype(np.float32), weight)
+    )
+    return sums / np.maximum(counts, 1e-6)
+
+
+def _share_new(foretold: Array, plain: Plain) -> float:
+    """Return the share of pixels around which held-out readings are foretold worse by what is
+    carried than by total variation; foretold: residual, over the scale."""
+    if not plain.held.any():
+        return 0.0
+    own, others = (
+        _around(np.square(one), plain.held)
+        for one in (foretold, plain.plain_residual / plain.scale)
+    )
+    return float(np.mean(own > others))
+
+
+def _carried(beliefs: search.Volume, back: Array, binning: int) -> search.Volume:
+    """Return beliefs of the frame before, on every STRIDE-th pixel of the present one."""
+    rows, columns = (
+        np.arange(0, length // binning, STRIDE, dtype=float) for length in back.shape[:2]
+    )
+    moved = back[:: STRIDE * binning, :: STRIDE * binning] / binning
+    across, down = np.meshgrid(columns, rows)
+    places = []
+    for grid in beliefs.grids:
+        where = [
+            np.interp(at, centres, np.arange(len(centres))).astype(np.float32)
+            for at, centres in zip(
+                (across + moved[..., 1], down + moved[..., 0]), grid.centres[::-1], strict=True
+            )
+        ]
+        places.append((where[0], where[1]))
+    chances = np.stack(
+        [
+            search.interpolated(beliefs, lambda grid, i=i: grid.probability[..., i], places)
+            for i in range(len(beliefs.disparities))
+        ],
+        axis=-1,
+    )
+    chances /= np.maximum(chances.sum(axis=-1, keepdims=True), 1e-20)
+    chances = np.float32(KEPT) * chances + np.float32((1 - KEPT) / chances.shape[-1])
+    nearest = tuple(np.rint(part).astype(int) for part in places[0][::-1])
+    return replace(
+        beliefs, centres=(rows, columns), probability=chances, evidence=np.log(chances),
+        kind=beliefs.kind[nearest], decisive=beliefs.decisive[nearest], between=None,
+    )  # fmt: skip
