@@ -9,8 +9,8 @@
 >>> result.light_field.shape, result.verdict.level != "do not use"
 ((5, 5, 24, 32, 3), True)
 
-Functions: `camera`, `scene`, `frames`, `reconstruct`, `rig`, `capture`, `calibrate`,
-`open_frames`.
+Functions: `camera`, `scene`, `frames`, `reconstruct`, `reconstruct_film`, `rig`, `capture`,
+`calibrate`, `open_frames`.
 What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. Faults that the user can
 mend are of the classes in `ERRORS`, each one line that says what to do. A hook that a plan calls
 between frames raises `StopCapture` to end the capture.
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from emmc_rig.model.frames import Frames
     from emmc_rig.model.sensing import ImagingMatrix as Psi
     from emmc_rig.processing.calibrating import calibrate
+    from emmc_rig.processing.filming import reconstruct_film
     from emmc_rig.processing.raw_frames import frames
     from emmc_rig.processing.reconstructing import open_frames, reconstruct
     from emmc_rig.processing.result import Result
@@ -48,6 +49,7 @@ _HOME = {
     "scene": "emmc_rig.files.scenes:open_scene",
     "open_frames": "emmc_rig.processing.reconstructing:open_frames",
     "reconstruct": "emmc_rig.processing.reconstructing:reconstruct",
+    "reconstruct_film": "emmc_rig.processing.filming:reconstruct_film",
     "Camera": "emmc_rig.model.camera:Camera",
     "ERRORS": "emmc_rig.errors:ERRORS",
     "Frames": "emmc_rig.model.frames:Frames",
@@ -75,6 +77,7 @@ __all__ = [
     "frames",
     "open_frames",
     "reconstruct",
+    "reconstruct_film",
     "rig",
     "scene",
 ]

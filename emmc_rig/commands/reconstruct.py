@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from emmc_rig.commands.options import PARALLEL, ClusterOption, DictionaryOption, check_workers
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
+
+if TYPE_CHECKING:
+    from reconstruction.methods import MethodSettings
+
+
+DEFAULT = Path("emmc-reconstruction")
+"""The folder that is written, unless it is in a session."""
 
 
 def reconstruct(
@@ -41,6 +48,10 @@ def reconstruct(
     without_shots: Annotated[
         list[int] | None,
         typer.Option("--without-shots", help="exclude a shot, counted from 1; may repeat"),
+    ] = None,
+    frame: Annotated[
+        int | None,
+        typer.Option("--frame", min=0, help="one frame of a film alone, counted from 0"),
     ] = None,
     workers: Annotated[
         int | None,
@@ -83,7 +94,7 @@ def reconstruct(
         ),
     ] = None,
 ) -> None:
-    """Reconstruct light fields from frames, with a verdict."""
+    """Reconstruct light fields from frames, or a film of them, with a verdict."""
     from emmc_rig.processing.memory import parse_memory
     from emmc_rig.processing.reconstructing import load_settings, reconstruct_captures
     from reconstruction.methods import DEFAULT_METHOD, find_method
@@ -99,6 +110,20 @@ def reconstruct(
     if memory is not None and cluster is not None:
         raise typer.BadParameter("--memory is for this machine only: leave it out with --cluster")
     chosen, why = load_settings(settings), None
+    if any(map(_is_film, frames)) and frame is None:
+        others = {
+            "--truth": truth, "--without-shots": without_shots, "--workers": workers,
+            "--cluster": cluster, "--zarr": as_zarr, "--budget": budget, "--dictionary": dictionary,
+        }  # fmt: skip
+        if len(frames) > 1:
+            raise typer.BadParameter("a film is reconstructed alone: name one session")
+        for name, given in others.items():
+            if given:
+                raise typer.BadParameter(f"{name}: not of a film; leave it out, or add --frame")
+        _film(frames[0], out, method or DEFAULT_METHOD, psi, chosen, memory, strict)
+        return
+    if frame is not None and not (len(frames) == 1 and _is_film(frames[0])):
+        raise typer.BadParameter("--frame: is of a film; name one session that holds a film")
     if budget is not None:
         if method is not None or settings is not None:
             raise typer.BadParameter(
@@ -107,12 +132,12 @@ def reconstruct(
         from emmc_rig.processing.budget import method_within
         from emmc_rig.processing.reconstructing import open_frames
 
-        method, why = method_within(*open_frames(frames[0], psi), budget)
+        method, why = method_within(*open_frames(frames[0], psi, frame), budget)
         say("chosen", why, "cyan")
     method = method or DEFAULT_METHOD
     if dictionary is not None and not find_method(method).needs_dictionary:
         raise typer.BadParameter(f"--dictionary: no effect on --method {method}; leave it out")
-    places = _places(frames, out)
+    places = _places(frames, out if frame is None else out or DEFAULT)
     limit = None if memory is None else parse_memory(memory)
     failed, refused = False, False
     with shown_progress() as bars:
@@ -121,7 +146,7 @@ def reconstruct(
         for place, outcome in reconstruct_captures(
             places, workers, cluster, limit, lambda step: bars.advance(step),
             method=method, psi_path=psi, dictionary_spec=dictionary, settings=chosen, truth=truth,
-            chosen=why, as_zarr=as_zarr, without_shots=without_shots or (),
+            chosen=why, as_zarr=as_zarr, without_shots=without_shots or (), frame=frame,
         ):  # fmt: skip
             if isinstance(outcome, Exception) and len(places) == 1:
                 raise outcome
@@ -141,13 +166,63 @@ def reconstruct(
         raise typer.Exit(1)
 
 
+def _is_film(folder: Path) -> bool:
+    from emmc_rig.files.folders import is_session
+
+    if not is_session(folder):
+        return False
+    from emmc_rig.processing.filming import holds_film
+
+    return holds_film(folder)
+
+
+def _film(
+    session: Path,
+    out: Path | None,
+    method: str,
+    psi: Path | None,
+    settings: MethodSettings,
+    memory: str | None,
+    strict: bool,
+) -> None:
+    """Reconstruct a film, and say in a line how that went."""
+    from emmc_rig.files.results import shown_seconds, stated_words
+    from emmc_rig.processing.filming import reconstruct_film_session
+    from emmc_rig.processing.memory import parse_memory
+
+    ((_, out),) = _places([session], out)
+    limit = None if memory is None else parse_memory(memory)
+    with shown_progress(method) as bars:
+        metrics = reconstruct_film_session(
+            session, out, method, psi, settings, limit,
+            on_step=bars.advance, on_note=lambda text: say("note", text),
+        )  # fmt: skip
+    film = metrics["film"]
+    if "assumed" in metrics:
+        say("note", metrics["assumed"])
+    for frame, why in film["failed"].items():
+        say(f"frame {frame}", why)
+    worst, count = film["worst"], sum(film["verdicts"].values())
+    stated = stated_words(worst)
+    tell(
+        f"{method}: {count} of {film['frames']} frames in {shown_seconds(metrics['seconds'])}, "
+        f"{film['seconds_per_frame']:.1f} s each; trusted: {film['verdicts']['trust']}; worst: "
+        f"frame {worst['frame']} at {worst['time_s']:.1f} s"
+        + (f", estimated accuracy {stated}" if stated else "")
+    )
+    show_verdict(metrics["verdict"])
+    tell(f"emmc-rig export {session if out.parent == session else out} shows it")
+    give_result(out)
+    if strict and film["verdicts"]["do not use"]:
+        raise typer.Exit(1)
+
+
 def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
     """Return each folder of frames with the folder to write."""
     from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session
 
-    default = Path("emmc-reconstruction")
     if len(frames) == 1:
-        place = frames[0] / SESSION_RECONSTRUCTION if is_session(frames[0]) else default
+        place = frames[0] / SESSION_RECONSTRUCTION if is_session(frames[0]) else DEFAULT
         return [(frames[0], out or place)]
     names = [folder.resolve().name for folder in frames]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -158,7 +233,7 @@ def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
     return [
         (folder, folder / SESSION_RECONSTRUCTION)
         if out is None and is_session(folder)
-        else (folder, (out or default) / name)
+        else (folder, (out or DEFAULT) / name)
         for folder, name in zip(frames, names, strict=True)
     ]
 

@@ -145,6 +145,31 @@ def kept_folder(new: Path) -> Path:
     return kept
 
 
+def emptied(folder: Path) -> None:
+    """Remove all in a folder; links are not followed."""
+    for path in list(folder.iterdir()):
+        _remove(path)
+
+
+def placed(new: Path, path: Path) -> None:
+    """Give a file or a folder of files its name, once it is on the disk; return when that is, too.
+
+    What had the name is replaced.
+    """
+    for one in new.rglob("*") if new.is_dir() else [new]:
+        _sync(one)
+    if new.is_dir():
+        _sync_folders(new, [])
+    if path.exists():
+        _remove(path)
+    os.replace(new, path)
+    _sync_folders(path.parent, [])
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Yield a name to write to; the file becomes `path`, which must be free, when the block ends.
@@ -268,7 +293,7 @@ def _clear(place: Path, spared: str | None = None) -> None:
         is_folder = path.is_dir() and not path.is_symlink()
         if path.name == LOCK or (path.name == spared and is_folder and any(path.iterdir())):
             continue
-        shutil.rmtree(path) if is_folder else path.unlink()
+        _remove(path)
 
 
 def _replaceable(folder: Path, out: Path, command: str, adds: bool) -> Listing:

@@ -6,7 +6,7 @@ of samples); the sensor has `binning` times fewer pixels along each axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -312,6 +312,22 @@ def camera_of(psi: ImagingMatrix) -> Camera:
     source = "the imaging matrix's camera"
     described = parse_json(psi.camera_json, source, SensingError)
     return validated(Camera, described, source, SensingError)
+
+
+def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
+    """Return the camera with some of its shots alone, as `ImagingMatrix.camera_json`.
+
+    "" where no camera is made of them: where a mask shows another pattern in every shot.
+    """
+    count = len(camera.shots)
+    if any(mask.pattern.frame_count(count) > 1 for mask in camera.masks.values()):
+        return ""
+    exposures_s = camera.exposures_s()
+    chosen = [
+        camera.shots[shot].model_copy(update={"exposure_s": float(exposures_s[shot])})
+        for shot in shots
+    ]
+    return camera.model_copy(update={"shots": tuple(chosen)}).model_dump_json()
 
 
 @dataclass(frozen=True)

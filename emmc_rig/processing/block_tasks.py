@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
+from emmc_rig.files.folders import emptied
 from emmc_rig.files.psi import SavedPsi, open_psi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
@@ -250,8 +251,7 @@ def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> CaptureS
         }
         known["settings"] = MethodSettings.model_validate(known["settings"])
         return CaptureSurvey(**known)
-    for path in job.kept.iterdir():
-        path.unlink()
+    emptied(job.kept)
     arrays = {"readings": frames.readings, "usable": frames.usable}
     _write(job.kept / FRAMES, arrays, {"fingerprint": ""})
     if alone:

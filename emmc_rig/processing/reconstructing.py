@@ -110,16 +110,23 @@ def reconstruct(
     required(psi, ImagingMatrix, "psi", PSI_TAKES)
     required(method, str, "method", "the name of a method, such as 'adaptive'")
     needs_dictionary = find_method(method).needs_dictionary
-    if isinstance(settings, Mapping):
-        settings = validated(MethodSettings, dict(settings), "settings", AppError)
-    elif settings is not None:
-        required(settings, MethodSettings, "settings", "MethodSettings, or a dict of settings")
+    chosen = settings_of(settings)
     if on_step is not None and not callable(on_step):
         raise refusal(on_step, "on_step", "a function of the progress")
     if needs_dictionary and dictionary is not None and not isinstance(dictionary, Dictionary):
         required(dictionary, NAMES, "dictionary", "a dictionary, its file, or a built-in name")
-    readings = _as_frames(psi, frames, noise_sigma, usable)
-    return _solved(psi, readings, method, dictionary, settings or MethodSettings(), on_step)
+    readings = as_frames(psi, frames, noise_sigma, usable)
+    return _solved(psi, readings, method, dictionary, chosen, on_step)
+
+
+def settings_of(settings: MethodSettings | Mapping[str, Any] | None) -> MethodSettings:
+    """Return the settings of methods that a caller gave; raises AppError or ArgumentError."""
+    if isinstance(settings, Mapping):
+        return validated(MethodSettings, dict(settings), "settings", AppError)
+    if settings is None:
+        return MethodSettings()
+    required(settings, MethodSettings, "settings", "MethodSettings, or a dict of settings")
+    return settings
 
 
 def _solved(
@@ -148,7 +155,7 @@ def _solved(
     return Result(solved, verdict, psi, frames, None if dictionary is None else dictionary.kind)
 
 
-def _as_frames(
+def as_frames(
     psi: ImagingMatrix,
     frames: Frames | ArrayLike,
     noise_sigma: float | None,
@@ -248,6 +255,7 @@ def reconstruct_undrawn(
     pool: Pool | None = None,
     as_zarr: bool = False,
     without_shots: Sequence[int] = (),
+    frame: int | None = None,
 ) -> tuple[dict, Result | None]:
     """Reconstruct a folder's frames into an existing folder `out`, all but the pictures.
 
@@ -258,12 +266,12 @@ def reconstruct_undrawn(
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
     as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
-    without_shots: counted from 1, that are not used.
+    without_shots: counted from 1, that are not used. frame: of a session's film, alone.
     """
     find_method(method)
     settings = settings or MethodSettings()
     assumed = psi_path is None and is_session(folder) and _is_assumed(folder)
-    frames, psi_path = stored_frames(folder, out, psi_path)
+    frames, psi_path = stored_frames(folder, out, psi_path, frame)
     frames = _without(frames, without_shots)
     saved = open_psi(psi_path)
     in_memory = is_one_block(saved.size, settings) and not as_zarr
@@ -469,24 +477,28 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
         return fault
 
 
-def session_frames(folder: Path) -> tuple[ImagingMatrix, Frames]:
+def session_frames(folder: Path, frame: int | None = None) -> tuple[ImagingMatrix, Frames]:
     """Return a session's shots, and the Psi of its whiteboards that they were normalised by.
 
-    Raises AppError or CalibrationError.
+    frame: of a film, by its place in time from 0: that one alone. Raises AppError or
+    CalibrationError.
     """
-    from emmc_rig.session.readings import session_readings
+    from emmc_rig.session.readings import film_readings, session_readings
     from emmc_rig.session.session import Session
 
-    taken = session_readings(Session(folder))
+    session = Session(folder)
+    taken = session_readings(session) if frame is None else film_readings(session, frame)
     return taken.psi, Frames(taken.readings, np.sqrt(taken.variance), taken.usable)
 
 
-def open_frames(folder: str | Path, psi: str | Path | None = None) -> tuple[ImagingMatrix, Frames]:
+def open_frames(
+    folder: str | Path, psi: str | Path | None = None, frame: int | None = None
+) -> tuple[ImagingMatrix, Frames]:
     """Return Psi and the frames of a folder: a session, or what `simulate` or `demo` wrote.
 
     psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, what
-    its whiteboards measure). Raises AppError, SensingError, CalibrationError, or ArgumentError for
-    what is no path.
+    its whiteboards measure). frame: of a session's film, by its place in time from 0. Raises
+    AppError, SensingError, CalibrationError, or ArgumentError for what is no path.
     """
     takes = "the folder of a session, or one that `emmc-rig simulate` or `demo` wrote"
     folder = path_of(folder, "folder", takes)
@@ -498,15 +510,17 @@ def open_frames(folder: str | Path, psi: str | Path | None = None) -> tuple[Imag
             "`reconstruct` as an array (shot, pixel_y, pixel_x)"
         )
     if is_session(folder):
-        measured, frames = session_frames(folder)
+        measured, frames = session_frames(folder, frame)
         return measured if psi is None else open_psi(Path(psi)).load(), frames
     return open_psi(Path(psi or psi_beside(folder))).load(), read_frames(folder)
 
 
-def stored_frames(folder: Path, out: Path, psi_path: Path | None) -> tuple[Frames, Path]:
+def stored_frames(
+    folder: Path, out: Path, psi_path: Path | None, frame: int | None = None
+) -> tuple[Frames, Path]:
     """Return the frames of a folder, and the file of their Psi: a session's is written to `out`."""
     if is_session(folder):
-        measured, frames = session_frames(folder)
+        measured, frames = session_frames(folder, frame)
         measured.save(out / PSI)
         return frames, psi_path or out / PSI
     return read_frames(folder), psi_path or psi_beside(folder)

@@ -24,6 +24,7 @@ from emmc_rig.files.results import command_line, metrics_text, versions, write_m
 from emmc_rig.model.arguments import numbers_of, path_of
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import camera_of as camera_of_psi
+from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
@@ -31,7 +32,7 @@ from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import sensor_pairs
 from emmc_rig.session.frame_means import camera_of
 from emmc_rig.session.measured_psi import session_outcome
-from emmc_rig.session.readings import camera_json_of, taken_shots
+from emmc_rig.session.readings import taken_shots
 from emmc_rig.session.session import CALIBRATION, Session
 from reconstruction.inputs import check_frames
 
@@ -174,7 +175,7 @@ def _calibrated(
     chosen = outcome.calibration
     if len(shots) < chosen.psi.shots:
         # What `reconstruct --psi` takes with the session's own shots.
-        chosen = chosen.of_shots(shots, camera_json_of(session, shots))
+        chosen = chosen.of_shots(shots, json_of_shots(camera_of(session), shots))
     sheet = None
     if sensor:
         watcher.begin("sensor", None)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calibration.bracket import LinearFrame, fuse
 from calibration.frames import MeanFrame, SensorGain
 from emmc_rig.errors import AppError
+from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.session.frame_means import camera_of, decoded
 from emmc_rig.session.journal import FilmEntry, FrameEntry, of_kind
@@ -96,27 +97,12 @@ def taken_shots(session: Session) -> tuple[int, ...]:
     return tuple(sorted({f.bench.shot for f in session.needed if f.kind == "shot"}))
 
 
-def camera_json_of(session: Session, shots: Sequence[int]) -> str:
-    """Return the camera with some of its shots alone, as `ImagingMatrix.camera_json`.
-
-    "" where no camera is made of them: where a mask shows another pattern in every shot.
-    """
-    camera = camera_of(session)
-    count = len(camera.shots)
-    if any(mask.pattern.frame_count(count) > 1 for mask in camera.masks.values()):
-        return ""
-    exposures_s = camera.exposures_s()
-    chosen = [
-        camera.shots[shot].model_copy(update={"exposure_s": float(exposures_s[shot])})
-        for shot in shots
-    ]
-    return camera.model_copy(update={"shots": tuple(chosen)}).model_dump_json()
-
-
 def scaled_readings(session: Session, scale: Scale, shots: Sequence[int]) -> SessionReadings:
     """Return what some shots read, and their Psi, in the order given."""
     whole = list(shots) == list(range(scale.psi.shots))
-    psi = scale.psi if whole else scale.psi.of_shots(shots, camera_json_of(session, shots))
+    psi = (
+        scale.psi if whole else scale.psi.of_shots(shots, json_of_shots(camera_of(session), shots))
+    )
     frames = shot_frames(session)
     readings = np.empty(psi.frames_shape, dtype=np.float32)
     variance = np.empty(psi.frames_shape, dtype=np.float32)
@@ -246,7 +232,20 @@ def session_readings(session: Session) -> SessionReadings:
     """
     if not shot_frames(session) and _film(session):
         raise AppError(
-            f"{session.folder}: holds a film, whose frames are no shots of one light field: read "
-            "it frame by frame, see `film_frames`"
+            f"{session.folder}: holds a film, whose frames are no shots of one light field: "
+            "choose one, such as --frame 0"
         )
     return scaled_readings(session, session_scale(session), taken_shots(session))
+
+
+def film_readings(session: Session, place: int) -> SessionReadings:
+    """Return what one frame of a film reads, by its place in time, as of a capture of one shot.
+
+    Raises AppError, as `film_frames` and for a place without a frame, or CalibrationError.
+    """
+    scale = session_scale(session)
+    for one in film_frames(session, scale):
+        if one.place == place:
+            psi = scale.psi.of_shots([one.shot], json_of_shots(camera_of(session), [one.shot]))
+            return SessionReadings(psi, one.readings, np.square(one.deviation), one.usable)
+    raise AppError(f"{session.folder}: no frame {place}; frames are counted from 0")

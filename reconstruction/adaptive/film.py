@@ -14,13 +14,15 @@ better than total variation does over more than NEW_SHARE of the picture, it is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.fits import Fits
@@ -32,10 +34,11 @@ from reconstruction.adaptive.joint import (
     solve,
     surfaces_of,
 )
+from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Plain, Readings, plain_of
+from reconstruction.adaptive.survey import Plain, Readings, checked, plain_of
 from reconstruction.adaptive.sweep import STRIDE, Swept, swept
 from reconstruction.adaptive.visibility import carried
 
@@ -131,6 +134,22 @@ class Film:
     def is_new(self) -> bool:
         """Whether no frame was seen yet."""
         return self.texture is None
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Return all but Psi as arrays by name, to be stored: `restored` makes a film of them."""
+        arrays: dict[str, NDArray] = {}
+        about = json.dumps(taken_apart(self, arrays))
+        return {"about": np.array(about), **arrays}
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, NDArray], psis: Sequence[ImagingMatrix]) -> Film:
+        """Return the film that `arrays` was called of.
+
+        psis: of each of the frames `earlier`, as `reconstruct` was given it, of one shot.
+        """
+        fitted = (checked(psi, np.zeros(psi.frames_shape), 1.0, None).psi for psi in psis)
+        kinds = (cls, FilmSettings, Earlier, Readings, search.Volume)
+        return put_together(json.loads(str(arrays["about"])), arrays, kinds, lambda: next(fitted))
 
     def after(
         self,

@@ -1,0 +1,68 @@
+"""Dataclasses taken apart into plain data and arrays, to be stored, and put together again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import Settings
+
+KIND = "kind"
+PLAIN = bool, int, float, str, type(None)
+
+
+def taken_apart(value: Any, arrays: dict[str, NDArray]) -> Any:
+    """Return a value as JSON has it; its arrays, in rows, are added to `arrays` under numbers.
+
+    value: dataclasses, settings, tuples, arrays, numbers of Python and NumPy, and Psi, of which
+    only the place is kept.
+    """
+    if type(value) in PLAIN:
+        return value
+    if isinstance(value, tuple):
+        return [taken_apart(one, arrays) for one in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        name = str(len(arrays))
+        arrays[name] = np.asarray(value, order="C")
+        return {KIND: "array", "name": name}
+    kind = {KIND: type(value).__name__}
+    if isinstance(value, ImagingMatrix):
+        return kind
+    if isinstance(value, Settings):
+        return kind | {"settings": value.model_dump(mode="json")}
+    return kind | {one.name: taken_apart(getattr(value, one.name), arrays) for one in fields(value)}
+
+
+def put_together(
+    plain: Any,
+    arrays: Mapping[str, NDArray],
+    kinds: Iterable[type],
+    next_psi: Callable[[], ImagingMatrix],
+) -> Any:
+    """Return the value that `taken_apart` was given.
+
+    kinds: classes of the dataclasses and settings in it. next_psi: returns its Psi, one after the
+    other in the order of the fields.
+    """
+    known = {kind.__name__: kind for kind in kinds}
+
+    def whole(part: Any) -> Any:
+        if isinstance(part, list):
+            return tuple(whole(one) for one in part)
+        if not isinstance(part, dict):
+            return part
+        kind = part[KIND]
+        if kind == "array":
+            return arrays[part["name"]][()]
+        if kind == ImagingMatrix.__name__:
+            return next_psi()
+        if "settings" in part and issubclass(known[kind], Settings):
+            return known[kind].model_validate(part["settings"])
+        return known[kind](**{name: whole(one) for name, one in part.items() if name != KIND})
+
+    return whole(plain)
