@@ -14,7 +14,7 @@ import shutil
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -120,15 +120,15 @@ class Latest:
     def opened(cls, path: Path, fingerprint: str, psi: ImagingMatrix) -> Latest | None:
         """Return what was written there; None where that is damaged, or of another film."""
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
-        except (OSError, ValueError, EOFError, zlib.error, BadZipFile):
+            about = json.loads(str(arrays["latest"]))
+            if about.pop("fingerprint") != fingerprint:
+                return None
+            shots, failed = tuple(about.pop("shots")), about.pop("failed")
+            film = Film.restored(arrays, [_one_shot(psi, shot) for shot in shots])
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zlib.error, BadZipFile):
             return None
-        about = json.loads(str(arrays["latest"]))
-        if about.pop("fingerprint") != fingerprint:
-            return None
-        shots, failed = tuple(about.pop("shots")), about.pop("failed")
-        film = Film.restored(arrays, [_one_shot(psi, shot) for shot in shots])
         return cls(film, shots, failed={int(place): why for place, why in failed.items()}, **about)
 
 
@@ -337,8 +337,14 @@ class _SessionFilm:
         if not done:
             raise AppError(f"{self.session.folder}: {next(iter(failed.values()), 'no frame')}")
         rate = of_kind(self.session.journal.entries, FilmEntry)[0].rate_hz
-        begun = {segment: one.frame for one in reversed(done) for segment in [one.segment]}
-        alone = [one.frame for one in done if one.is_first and begun[one.segment] != one.frame]
+        places = [one.known["frame"] for one in done]
+        before = [None, *(one.known["segment"] for one in done)]
+        anew = [
+            place
+            for one, place, segment in zip(done, places, before, strict=False)
+            if one.is_first and one.known["segment"] == segment
+        ]
+        took_s = sum(one.known["seconds"] for one in done)
         levels, worst = Counter(one.level for one in done), max(done, key=_Figures.doubt)
         return {
             "method": self.method,
@@ -347,16 +353,16 @@ class _SessionFilm:
                 "frames": count,
                 "rate": rate,
                 "times_s": _all_times(times_s, count, rate),
-                "missing": sorted(set(range(count)) - {one.frame for one in done}),
+                "missing": sorted(set(range(count)) - set(places)),
                 "failed": {str(place): why for place, why in failed.items()},
-                "begun_anew": alone,
+                "begun_anew": anew,
                 "verdicts": {level: levels[level] for level in LEVELS},
                 "trusted_share": levels["trust"] / len(done),
-                "seconds_per_frame": sum(one.seconds for one in done) / len(done),
-                "worst": asdict(worst),
+                "seconds_per_frame": took_s / len(done),
+                "worst": worst.shown(),
             },
-            "seconds": sum(one.seconds for one in done),
-            "verdict": worst.verdict,
+            "seconds": took_s,
+            "verdict": worst.known["verdict"],
             "psi_sha256": self.psi.checksum(),
             "program_peak_gib": peak_memory_mib() / 2**10,
         }
@@ -364,35 +370,34 @@ class _SessionFilm:
 
 @dataclass(frozen=True)
 class _Figures:
-    """What the metrics of a film take from those of a frame.
+    """What the metrics of a film take from those of a frame, `known`."""
 
-    is_first: nothing was carried to it.
-    """
-
-    frame: int
-    time_s: float
-    segment: int
-    seconds: float
-    stated_db: float | None
-    is_first: bool
-    verdict: dict[str, Any]
+    known: Mapping[str, Any]
 
     @classmethod
     def read(cls, folder: Path) -> _Figures:
-        """Return those of a frame's folder."""
-        known = parse_json((folder / METRICS).read_bytes(), str(folder / METRICS), AppError)
-        return cls(
-            known["frame"], known["time_s"], known["segment"], known["seconds"],
-            known["stated_db"], "new_share" not in known["parameters"], known["verdict"],
-        )  # fmt: skip
+        """Return those of a frame's folder; raises AppError."""
+        path = folder / METRICS
+        return cls(parse_json(path.read_bytes(), str(path), AppError))
 
     @property
     def level(self) -> str:
-        return self.verdict["level"]
+        """Of the verdict."""
+        return self.known["verdict"]["level"]
+
+    @property
+    def is_first(self) -> bool:
+        """Whether nothing was carried to it."""
+        return "new_share" not in self.known["parameters"]
 
     def doubt(self) -> tuple[int, float]:
         """Return what is larger the worse a frame is."""
-        return LEVELS.index(self.level), -(self.stated_db or 0.0)
+        return LEVELS.index(self.level), -(self.known["stated_db"] or 0.0)
+
+    def shown(self) -> dict[str, Any]:
+        """Return what says which frame it is, and how good."""
+        names = "frame", "time_s", "stated_db", "stated_interval_db"
+        return {"level": self.level, **{name: self.known[name] for name in names}}
 
 
 def _all_times(times_s: Mapping[int, float], count: int, rate: float) -> list[float]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 
-KIND = "kind"
+KIND = "class"
 PLAIN = bool, int, float, str, type(None)
 
 

@@ -1,0 +1,360 @@
+"""Films of a session to light fields: frame after frame, and the same bytes whatever is killed."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from programs import one_line, program
+
+import emmc_rig as emmc
+from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.files.films import open_film
+from emmc_rig.model.arguments import ArgumentError
+from emmc_rig.model.frames import Frames
+from emmc_rig.model.lightfield import load_hdf5
+from emmc_rig.processing import filming
+from emmc_rig.processing.filming import reconstruct_film_session
+from reconstruction.adaptive.film import Film
+from reconstruction.methods import MethodSettings
+
+FRAMES, RATE, METHOD = 6, 10, "adaptive-fast"
+PLAN = f"""
+camera: rgbw-bayer-1shot
+shots: [{{exposure_s: 0.1}}]
+film: {{frames: {FRAMES}, rate: {RATE}}}
+whiteboards: null
+darks: {{repeats: 2}}
+"""
+TIMES = {"seconds", "search_seconds", "seconds_per_frame", "program_peak_gib", "command"}
+"""What differs from run to run."""
+PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
+
+
+class KilledError(Exception):
+    """The program ended there."""
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A session with a film of toys that move, captured on the simulated rig."""
+    folder = tmp_path_factory.mktemp("film")
+    (folder / "plan.yaml").write_text(PLAN)
+    (folder / "rig.yaml").write_text("kind: simulated\nusb_camera: u3v\n")
+    code, _, err = program(
+        "capture", folder / "plan.yaml", "--rig", folder / "rig.yaml", "--scene", "moving-toys",
+        "--size", "40x48", "--out", folder / "session",
+    )  # fmt: skip
+    assert code == 0, err
+    return folder / "session"
+
+
+@pytest.fixture(scope="module")
+def whole(session):
+    """The film's result of one run that nothing interrupted."""
+    out = session.parent / "whole"
+    reconstruct_film_session(session, out, METHOD)
+    return out
+
+
+def content(out):
+    """Return the bytes of every file by name; of metrics all but what differs from run to run."""
+    found = {}
+    for path in sorted(out.rglob("*")):
+        if path.name == "metrics.json":
+            found[path.relative_to(out)] = without_times(json.loads(path.read_text()))
+        elif path.is_file() and path != out / "files.json":
+            found[path.relative_to(out)] = path.read_bytes()
+    return found
+
+
+def without_times(part):
+    if isinstance(part, dict):
+        return {name: without_times(value) for name, value in part.items() if name not in TIMES}
+    return [without_times(one) for one in part] if isinstance(part, list) else part
+
+
+def film_metrics(out):
+    return json.loads((out / "metrics.json").read_text())["film"]
+
+
+def changed_frames(monkeypatch, change):
+    """Let a film's frames be those that `change` makes of them; None leaves one out."""
+    real = filming.film_frames
+
+    def frames(*given):
+        return (one for frame in real(*given) if (one := change(frame)) is not None)
+
+    monkeypatch.setattr(filming, "film_frames", frames)
+
+
+def kill_after(frames):
+    def on_step(progress):
+        if progress.step == frames:
+            raise KilledError
+
+    return on_step
+
+
+def test_every_frame_has_its_result_at_its_time(session, whole):
+    film = open_film(whole)
+    assert list(film.frames) == list(range(FRAMES))
+    assert film.rate == RATE
+    np.testing.assert_allclose(film.times_s, np.arange(FRAMES) / RATE, atol=1e-6)
+    about, verdicts = film_metrics(whole), []
+    for place, frame in film.each(lambda: None):
+        metrics = json.loads((film.frames[place] / "metrics.json").read_text())
+        verdicts.append(metrics["verdict"]["level"])
+        assert metrics["frame"] == place
+        assert frame.light_field.shape == (5, 5, 40, 48, 3)
+        assert ("new_share" in metrics["parameters"]) == (place not in {0, *about["begun_anew"]})
+    assert about["verdicts"] == about["verdicts"] | {one: verdicts.count(one) for one in verdicts}
+    assert about["trusted_share"] == verdicts.count("trust") / FRAMES
+    assert sum(about["verdicts"].values()) == FRAMES
+    assert about["missing"] == []
+    first, last = (film.opened(place).light_field for place in (0, FRAMES - 1))
+    assert np.abs(first - last).max() > 0.2 * first.max()
+
+
+def test_a_film_is_exported_as_one_page(whole, run):
+    code, _, err = run("export", whole, "--out", "page")
+    assert code == 0, err
+
+
+@pytest.mark.parametrize("done", [4, FRAMES])
+def test_after_a_kill_the_same_command_goes_on_to_the_same_bytes(session, whole, tmp_path, done):
+    out, notes = tmp_path / "out", []
+    with pytest.raises(KilledError):
+        reconstruct_film_session(session, out, METHOD, on_step=kill_after(done))
+    assert not (out / "metrics.json").exists()
+    kept = out / ".emmc-rig.partial/kept/frames"
+    before = {path: path.stat().st_mtime_ns for path in kept.rglob("light_field.h5")}
+    assert len(before) == done
+    reconstruct_film_session(session, out, METHOD, on_note=notes.append)
+    assert notes == [f"goes on after frame {done - 1} of an earlier run"]
+    after = {path.stat().st_mtime_ns for path in out.rglob("light_field.h5")}
+    assert set(before.values()) < after or done == FRAMES
+    assert content(out) == content(whole)
+
+
+def test_a_frame_that_was_cut_short_is_made_again(session, whole, tmp_path, monkeypatch):
+    out, write = tmp_path / "out", filming.Result.write
+
+    def cut(result, folder, metrics):
+        if metrics["frame"] == 2:
+            (folder / "light_field.h5").write_bytes(b"half")
+            raise KilledError
+        write(result, folder, metrics)
+
+    monkeypatch.setattr(filming.Result, "write", cut)
+    with pytest.raises(KilledError):
+        reconstruct_film_session(session, out, METHOD)
+    monkeypatch.undo()
+    reconstruct_film_session(session, out, METHOD)
+    assert content(out) == content(whole)
+
+
+@pytest.mark.parametrize("what", ["settings", "damage"])
+def test_what_an_earlier_run_left_of_another_film_is_not_gone_on_from(
+    session, whole, tmp_path, what
+):
+    out, notes = tmp_path / "out", []
+    other = MethodSettings(screening=what != "settings")
+    with pytest.raises(KilledError):
+        reconstruct_film_session(session, out, METHOD, settings=other, on_step=kill_after(1))
+    if what == "damage":
+        path = out / ".emmc-rig.partial/kept/next.npz"
+        path.write_bytes(path.read_bytes()[:-1000])
+    reconstruct_film_session(session, out, METHOD, on_note=notes.append)
+    assert [note.split(":")[0] for note in notes] == ["starts anew"]
+    assert content(out) == content(whole)
+
+
+@pytest.mark.slow
+def test_killed_by_the_system_the_same_command_goes_on_to_the_same_bytes(session, whole, tmp_path):
+    out = tmp_path / "out"
+    command = *PROGRAM, "reconstruct", str(session), "--method", METHOD, "--out", str(out)
+    running = subprocess.Popen(command, env={**os.environ, "COLUMNS": "160"})
+    while not (out / ".emmc-rig.partial/kept/frames/000001").exists():
+        assert running.poll() is None
+        time.sleep(0.01)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    assert not (out / "metrics.json").exists()
+    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "goes on after frame" in again.stderr
+    assert content(out) == content(whole)
+
+
+def test_ctrl_c_says_that_frames_are_kept(session, tmp_path):
+    def stop(progress):
+        raise KeyboardInterrupt
+
+    with pytest.raises(StoppedError, match="frames that are done are kept in"):
+        reconstruct_film_session(session, tmp_path / "out", METHOD, on_step=stop)
+
+
+def test_a_missing_frame_keeps_its_place_and_the_next_goes_on_from_the_one_before(
+    session, tmp_path, monkeypatch
+):
+    changed_frames(monkeypatch, lambda frame: None if frame.place == 2 else frame)
+    reconstruct_film_session(session, tmp_path / "out", METHOD)
+    film = open_film(tmp_path / "out")
+    assert film.missing == film_metrics(tmp_path / "out")["missing"] == [2]
+    np.testing.assert_allclose(film.times_s, np.arange(FRAMES) / RATE, atol=1e-6)
+
+
+def test_a_frame_without_usable_pixels_is_named_and_the_others_are_made(
+    session, tmp_path, monkeypatch
+):
+    def dark(frame):
+        return replace(frame, usable=frame.usable & (frame.place != 3))
+
+    changed_frames(monkeypatch, dark)
+    reconstruct_film_session(session, tmp_path / "out", METHOD)
+    about = film_metrics(tmp_path / "out")
+    assert about["missing"] == [3]
+    assert "no usable pixel" in about["failed"]["3"]
+
+
+def test_a_film_without_a_usable_frame_is_one_line(session, tmp_path, monkeypatch):
+    changed_frames(monkeypatch, lambda frame: replace(frame, usable=frame.usable & False))
+    with pytest.raises(AppError, match="no usable pixel"):
+        reconstruct_film_session(session, tmp_path / "out", METHOD)
+
+
+def test_a_segments_first_frame_is_that_of_a_capture_of_its_own(
+    session, tmp_path, monkeypatch, run
+):
+    def broken(frame):
+        return replace(frame, segment=int(frame.place >= 3))
+
+    changed_frames(monkeypatch, broken)
+    reconstruct_film_session(session, tmp_path / "out", METHOD)
+    assert 3 not in film_metrics(tmp_path / "out")["begun_anew"]
+    code, _, err = run("reconstruct", session, "--frame", 3, "--method", METHOD, "--out", "alone")
+    assert code == 0, err
+    of_film = load_hdf5(tmp_path / "out/frames/000003/light_field.h5")
+    np.testing.assert_array_equal(of_film, load_hdf5(tmp_path / "alone/light_field.h5"))
+
+
+def test_the_command_says_how_a_film_went_and_where_it_is_worst(session, run):
+    copy = session.parent / "copy"
+    shutil.copytree(session, copy)
+    code, out, err = run("reconstruct", copy, "--method", METHOD)
+    assert code == 0, err
+    about = film_metrics(copy / "reconstruction")
+    assert f"{FRAMES} of {FRAMES} frames in" in out
+    assert f"trusted: {about['verdicts']['trust']}; worst: frame {about['worst']['frame']}" in out
+    assert not list((copy / "reconstruction").rglob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["--method", "tv"], "'tv' takes no films: choose adaptive or adaptive-fast, or a single"),
+        (["--truth", "moving-toys"], "--truth: not of a film"),
+        (["--workers", "2"], "--workers: not of a film"),
+        (["--frame", "99"], "no frame 99"),
+        (["--memory", "100MiB"], "--memory of 100 MiB"),
+        (["--psi", "absent.h5"], "absent.h5"),
+    ],
+)
+def test_what_a_film_does_not_take_is_refused_in_a_line(session, run, options, what):
+    code, _, err = run("reconstruct", session, "--out", "out", *options)
+    assert code in (1, 2)
+    assert what in (one_line(err) if code == 1 else " ".join(err.split()))
+
+
+def test_one_frame_is_of_a_film_only(session, run):
+    (session.parent / "nothing").mkdir(exist_ok=True)
+    code, _, err = run("reconstruct", session.parent / "nothing", "--frame", "1")
+    assert code == 2
+    assert "name one session that holds a film" in " ".join(err.split())
+
+
+def test_a_film_of_more_than_a_block_is_refused_with_what_to_do(session, tmp_path):
+    small = MethodSettings.model_validate({"blocks": {"whole": 1000}})
+    with pytest.raises(AppError, match=r"40x48 are more than one block.*raise blocks"):
+        reconstruct_film_session(session, tmp_path / "out", METHOD, settings=small)
+
+
+@pytest.fixture(scope="module")
+def psi():
+    return emmc.camera("rgbw-bayer-2shots").psi((24, 32))
+
+
+def readings(psi, count):
+    """Return noisy readings (t, y, x) of a scene that slides by a pixel a frame."""
+    rng, shots = np.random.default_rng(0), psi.shots
+    scene = np.asarray(emmc.scene("near-planar", size=(24, 32 + count)))
+    film = []
+    for place in range(count):
+        moved = np.ascontiguousarray(scene[:, :, :, place : place + 32], dtype=np.float32)
+        film.append((psi @ moved)[place % shots])
+    return np.stack(film) + rng.normal(0, 0.003, (count, 24, 32)).astype(np.float32)
+
+
+def test_shots_of_psi_are_taken_in_turn(psi):
+    film = readings(psi, 3)
+    results = list(emmc.reconstruct_film(psi, film, METHOD, noise_sigma=0.003))
+    alone = emmc.reconstruct(psi.of_shots([0]), film[:1], METHOD, noise_sigma=0.003)
+    np.testing.assert_array_equal(results[0].light_field, alone.light_field)
+    for place, result in enumerate(results):
+        np.testing.assert_array_equal(result.psi.weights[0], psi.weights[place % 2])
+        missed = result.psi.forward(result.light_field) - result.frames.readings
+        assert np.sqrt(np.mean(missed**2)) < 0.02
+
+
+def test_frames_with_deviations_are_taken_one_by_one(psi):
+    film = readings(psi, 3)
+    one = (
+        Frames(part[None], np.full((1, 24, 32), 0.003), np.ones((1, 24, 32), dtype=bool))
+        for part in film
+    )
+    asked = emmc.reconstruct_film(psi, one, METHOD)
+    first = next(asked)
+    assert first.light_field.shape == (5, 5, 24, 32, 3)
+    assert len(list(one)) == 2, "no frame is read before it is asked for"
+
+
+@pytest.mark.parametrize("wrong", [3, Frames(*(np.ones((2, 24, 32), dtype=t) for t in "ff?"))])
+def test_what_is_no_film_is_refused(psi, wrong):
+    with pytest.raises(ArgumentError, match="an array \\(t, pixel_y, pixel_x\\)"):
+        emmc.reconstruct_film(psi, wrong, METHOD)
+    with pytest.raises(AppError, match="'tv' takes no films"):
+        emmc.reconstruct_film(psi, readings(psi, 2), "tv")
+
+
+def test_memory_does_not_grow_with_the_number_of_frames(psi):
+    one = psi.of_shots([0])
+    film, held = readings(one, 12), []
+    tracemalloc.start()
+    for _ in emmc.reconstruct_film(one, film, METHOD, noise_sigma=0.003):
+        held.append(tracemalloc.get_traced_memory())
+    tracemalloc.stop()
+    now, peak = np.array(held).T
+    assert now[11] < 1.1 * now[2]
+    assert peak[11] < 1.1 * peak[2]
+
+
+def test_a_film_restored_goes_on_as_the_film_it_was_of(psi):
+    latest, settings = filming.Latest(), MethodSettings()
+    for place, part in enumerate(readings(psi, 3)):
+        frames = Frames(part[None], np.full((1, 24, 32), 0.003), np.ones((1, 24, 32), dtype=bool))
+        restored = Film.restored(
+            latest.film.arrays(), [psi.of_shots([shot]) for shot in latest.shots]
+        )
+        again, _ = replace(latest, film=restored).next(psi, place % 2, frames, METHOD, settings)
+        result, latest = latest.next(psi, place % 2, frames, METHOD, settings)
+        np.testing.assert_array_equal(result.light_field, again.light_field)
+        for name, values in result.maps.items():
+            np.testing.assert_array_equal(values, again.maps[name])
+    assert len(latest.shots) == len(latest.film.earlier)
