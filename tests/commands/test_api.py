@@ -206,6 +206,7 @@ def test_a_module_loads_only_what_it_needs(module, unwanted):
         "emmc_rig.files.cameras",
         "emmc_rig.files.scenes",
         "emmc_rig.model.sensing",
+        "emmc_rig.processing.filming",
         "emmc_rig.processing.raw_frames",
         "emmc_rig.processing.reconstructing",
         "emmc_rig.bench.rig_config",
