@@ -15,6 +15,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -31,7 +32,7 @@ from emmc_rig.files.folders import (
     placed,
     result_folder,
 )
-from emmc_rig.files.psi import PSI, SavedPsi, open_psi
+from emmc_rig.files.psi import PSI, open_psi
 from emmc_rig.files.results import METRICS, PSI_ASSUMED, write_metrics
 from emmc_rig.model.arguments import refusal, required
 from emmc_rig.model.camera import camera_of, json_of_shots
@@ -55,7 +56,7 @@ from emmc_rig.processing.reconstructing import (
 from emmc_rig.processing.result import Result
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
-from emmc_rig.session.measured_psi import psi_is_assumed, session_scale
+from emmc_rig.session.measured_psi import Scale, psi_is_assumed, session_scale
 from emmc_rig.session.readings import FilmFrame, film_frames
 from emmc_rig.session.session import Session
 from emmc_rig.version import __version__
@@ -106,12 +107,11 @@ class Latest:
 
     def saved(self, path: Path, fingerprint: str, psi: ImagingMatrix) -> Latest:
         """Write it, whole and on the disk; return it as `opened` would."""
-        about = {
-            "fingerprint": fingerprint, "shots": self.shots, "place": self.place,
-            "segment": self.segment, "failed": self.failed,
-        }  # fmt: skip
-        arrays, partial = self.film.arrays(), path.with_name("part.npz")
-        np.savez(partial, latest=np.array(json.dumps(about)), **arrays)
+        of_session = {"place": self.place, "segment": self.segment, "failed": self.failed}
+        about = json.dumps({"fingerprint": fingerprint, "shots": self.shots, **of_session})
+        arrays = {"latest": np.array(about), **self.film.arrays()}
+        partial = path.with_name("part.npz")
+        np.savez(partial, **arrays)  # pyright: ignore[reportArgumentType]
         placed(partial, path)
         # As after a kill: what follows must not depend on how arrays lie in memory.
         return replace(self, film=Film.restored(arrays, [_one_shot(psi, s) for s in self.shots]))
@@ -220,10 +220,12 @@ def reconstruct_film_session(
     _refuse_without_films(method)
     belongs = folder / SESSION_RECONSTRUCTION
     with result_folder(out, "reconstruct", belongs_to=belongs, resumes=True) as new:
-        session, kept = Session(folder), kept_folder(new)
-        film = _SessionFilm(session, kept, method, psi_path, settings or MethodSettings())
+        kept = kept_folder(new)
+        film = _opened(Session(folder), kept, method, psi_path, settings or MethodSettings())
         if memory is not None:
-            film.refuse_more_than(memory)
+            saved = open_psi(psi_path or kept / PSI)
+            ceiling = Ceiling(memory, own_bytes(saved, film.settings, False, False))
+            ceiling.workers(task_bytes(saved, assumed_grid(saved, film.settings)))
         try:
             metrics = film.reconstructed(on_step, on_note)
         except KeyboardInterrupt as stop:
@@ -234,6 +236,7 @@ def reconstruct_film_session(
         shutil.copytree(kept / FRAMES, new / FRAMES, copy_function=_linked)
         if psi_path is None:
             _linked(kept / PSI, new / PSI)
+            metrics |= {"assumed": PSI_ASSUMED} if psi_is_assumed(film.session) else {}
         write_metrics(new, metrics)
     return metrics
 
@@ -246,39 +249,35 @@ def _linked(path: str | Path, place: str | Path) -> None:
         os.replace(path, place)
 
 
+def _opened(
+    session: Session, kept: Path, method: str, psi_path: Path | None, settings: MethodSettings
+) -> _SessionFilm:
+    scale = session_scale(session)
+    if psi_path is None:
+        psi = scale.psi
+        psi.save(kept / PSI)
+    else:
+        psi = open_psi(psi_path).load()
+    if psi.frames_shape != scale.psi.frames_shape:
+        raise AppError(f"{psi_path}: is not of this session's shots and frames")
+    if not is_one_block(psi.size, settings):
+        raise AppError(
+            f"frames of {'x'.join(map(str, psi.size))} are more than one block, and films are "
+            "reconstructed as a whole: raise blocks: {whole: SAMPLES} by --settings"
+        )
+    return _SessionFilm(session, kept, method, settings, scale, psi)
+
+
+@dataclass(frozen=True, eq=False)
 class _SessionFilm:
     """A film on its way from a session to results in the folder `kept`."""
 
-    def __init__(
-        self,
-        session: Session,
-        kept: Path,
-        method: str,
-        psi_path: Path | None,
-        settings: MethodSettings,
-    ) -> None:
-        self.session, self.kept, self.method, self.settings = session, kept, method, settings
-        self.scale = session_scale(session)
-        self.assumed = psi_path is None and psi_is_assumed(session)
-        if psi_path is None:
-            self.psi = self.scale.psi
-            self.psi.save(kept / PSI)
-        else:
-            self.psi = open_psi(psi_path).load()
-        if self.psi.frames_shape != self.scale.psi.frames_shape:
-            raise AppError(f"{psi_path}: is not of this session's shots and frames")
-        self.saved_psi: SavedPsi = open_psi(psi_path or kept / PSI)
-        if not is_one_block(self.psi.size, settings):
-            raise AppError(
-                f"frames of {'x'.join(map(str, self.psi.size))} are more than one block, and films "
-                "are reconstructed as a whole: raise blocks: {whole: SAMPLES} by --settings"
-            )
-
-    def refuse_more_than(self, memory: int) -> None:
-        """Raise AppError where a frame, and what is carried to the next, need more bytes."""
-        psi, settings = self.saved_psi, self.settings
-        ceiling = Ceiling(memory, own_bytes(psi, settings, False, False))
-        ceiling.workers(task_bytes(psi, assumed_grid(psi, settings)))
+    session: Session
+    kept: Path
+    method: str
+    settings: MethodSettings
+    scale: Scale
+    psi: ImagingMatrix
 
     def fingerprint(self) -> str:
         """Return a SHA-256 of all that the light fields follow from."""
@@ -295,11 +294,12 @@ class _SessionFilm:
         latest = Latest.opened(path, fingerprint, self.psi)
         if latest is not None:
             on_note(f"goes on after frame {latest.place} of an earlier run")
-        elif (self.kept / FRAMES).exists():
-            on_note("starts anew: frames, settings or version differ from the earlier run's")
+        elif path.exists():
+            on_note("starts anew: an earlier run was of other frames, settings or version")
+        (self.kept / FRAMES).mkdir(exist_ok=True)
+        if latest is None:
             emptied(self.kept / FRAMES)
         latest = latest or Latest()
-        (self.kept / FRAMES).mkdir(exist_ok=True)
         planned = [frame for frame in self.session.frames if frame.film is not None]
         reasons = exposure_reasons(shot_exposures(self.session))
         times_s: dict[int, float] = {}
@@ -333,71 +333,48 @@ class _SessionFilm:
     def _metrics(
         self, count: int, times_s: Mapping[int, float], failed: Mapping[int, str]
     ) -> dict[str, Any]:
-        done = [_Figures.read(path) for path in sorted((self.kept / FRAMES).iterdir())]
+        done = [_figures(path / METRICS) for path in sorted((self.kept / FRAMES).iterdir())]
         if not done:
             raise AppError(f"{self.session.folder}: {next(iter(failed.values()), 'no frame')}")
         rate = of_kind(self.session.journal.entries, FilmEntry)[0].rate_hz
-        places = [one.known["frame"] for one in done]
-        before = [None, *(one.known["segment"] for one in done)]
+        places = {one["frame"] for one in done}
         anew = [
-            place
-            for one, place, segment in zip(done, places, before, strict=False)
-            if one.is_first and one.known["segment"] == segment
+            one["frame"]
+            for before, one in pairwise(done)
+            if one["segment"] == before["segment"] and "new_share" not in one["parameters"]
         ]
-        took_s = sum(one.known["seconds"] for one in done)
-        levels, worst = Counter(one.level for one in done), max(done, key=_Figures.doubt)
+        took_s = sum(one["seconds"] for one in done)
+        levels = Counter(one["verdict"]["level"] for one in done)
+        worst = max(done, key=_doubt)
+        shown = ("frame", "time_s", "stated_db", "stated_interval_db")
         return {
             "method": self.method,
-            **({"assumed": PSI_ASSUMED} if self.assumed else {}),
             "film": {
                 "frames": count,
                 "rate": rate,
                 "times_s": _all_times(times_s, count, rate),
-                "missing": sorted(set(range(count)) - set(places)),
+                "missing": sorted(set(range(count)) - places),
                 "failed": {str(place): why for place, why in failed.items()},
                 "begun_anew": anew,
                 "verdicts": {level: levels[level] for level in LEVELS},
                 "trusted_share": levels["trust"] / len(done),
                 "seconds_per_frame": took_s / len(done),
-                "worst": worst.shown(),
+                "worst": {name: worst[name] for name in shown},
             },
             "seconds": took_s,
-            "verdict": worst.known["verdict"],
+            "verdict": worst["verdict"],
             "psi_sha256": self.psi.checksum(),
             "program_peak_gib": peak_memory_mib() / 2**10,
         }
 
 
-@dataclass(frozen=True)
-class _Figures:
-    """What the metrics of a film take from those of a frame, `known`."""
+def _figures(path: Path) -> dict[str, Any]:
+    return parse_json(path.read_bytes(), str(path), AppError)
 
-    known: Mapping[str, Any]
 
-    @classmethod
-    def read(cls, folder: Path) -> _Figures:
-        """Return those of a frame's folder; raises AppError."""
-        path = folder / METRICS
-        return cls(parse_json(path.read_bytes(), str(path), AppError))
-
-    @property
-    def level(self) -> str:
-        """Of the verdict."""
-        return self.known["verdict"]["level"]
-
-    @property
-    def is_first(self) -> bool:
-        """Whether nothing was carried to it."""
-        return "new_share" not in self.known["parameters"]
-
-    def doubt(self) -> tuple[int, float]:
-        """Return what is larger the worse a frame is."""
-        return LEVELS.index(self.level), -(self.known["stated_db"] or 0.0)
-
-    def shown(self) -> dict[str, Any]:
-        """Return what says which frame it is, and how good."""
-        names = "frame", "time_s", "stated_db", "stated_interval_db"
-        return {"level": self.level, **{name: self.known[name] for name in names}}
+def _doubt(figures: Mapping[str, Any]) -> tuple[int, float]:
+    """Return what is larger the worse the frame of these metrics is."""
+    return LEVELS.index(figures["verdict"]["level"]), -(figures["stated_db"] or 0.0)
 
 
 def _all_times(times_s: Mapping[int, float], count: int, rate: float) -> list[float]:

@@ -144,20 +144,31 @@ def test_after_a_kill_the_same_command_goes_on_to_the_same_bytes(session, whole,
     assert content(out) == content(whole)
 
 
-def test_a_frame_that_was_cut_short_is_made_again(session, whole, tmp_path, monkeypatch):
-    out, write = tmp_path / "out", filming.Result.write
+@pytest.mark.parametrize("where", ["in a frame", "after it"])
+def test_a_frame_after_which_nothing_was_noted_is_made_again(
+    session, whole, tmp_path, monkeypatch, where
+):
+    out, write, saved = tmp_path / "out", filming.Result.write, filming.Latest.saved
 
     def cut(result, folder, metrics):
-        if metrics["frame"] == 2:
+        if metrics["frame"] == 2 and where == "in a frame":
             (folder / "light_field.h5").write_bytes(b"half")
             raise KilledError
         write(result, folder, metrics)
 
+    def late(latest, *given):
+        if latest.place == 2:
+            raise KilledError
+        return saved(latest, *given)
+
     monkeypatch.setattr(filming.Result, "write", cut)
+    monkeypatch.setattr(filming.Latest, "saved", late)
     with pytest.raises(KilledError):
         reconstruct_film_session(session, out, METHOD)
     monkeypatch.undo()
-    reconstruct_film_session(session, out, METHOD)
+    notes = []
+    reconstruct_film_session(session, out, METHOD, on_note=notes.append)
+    assert notes == ["goes on after frame 1 of an earlier run"]
     assert content(out) == content(whole)
 
 
