@@ -313,6 +313,10 @@ def readings(psi, count):
     return np.stack(film) + rng.normal(0, 0.003, (count, 24, 32)).astype(np.float32)
 
 
+def of_readings(part):
+    return Frames(part[None], np.full((1, 24, 32), 0.003), np.ones((1, 24, 32), dtype=bool))
+
+
 def test_shots_of_psi_are_taken_in_turn(psi):
     film = readings(psi, 3)
     results = list(emmc.reconstruct_film(psi, film, METHOD, noise_sigma=0.003))
@@ -325,11 +329,7 @@ def test_shots_of_psi_are_taken_in_turn(psi):
 
 
 def test_frames_with_deviations_are_taken_one_by_one(psi):
-    film = readings(psi, 3)
-    one = (
-        Frames(part[None], np.full((1, 24, 32), 0.003), np.ones((1, 24, 32), dtype=bool))
-        for part in film
-    )
+    one = (of_readings(part) for part in readings(psi, 3))
     asked = emmc.reconstruct_film(psi, one, METHOD)
     first = next(asked)
     assert first.light_field.shape == (5, 5, 24, 32, 3)
@@ -345,21 +345,23 @@ def test_what_is_no_film_is_refused(psi, wrong):
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(psi):
-    one = psi.of_shots([0])
-    film, held = readings(one, 12), []
+    """Results that were kept would grow it by ten light fields, frames by five times the film."""
+    one, latest, settings = psi.of_shots([0]), filming.Latest(), MethodSettings()
+    carried, held, light_field = [], [], 5 * 5 * 24 * 32 * 3 * 4
     tracemalloc.start()
-    for _ in emmc.reconstruct_film(one, film, METHOD, noise_sigma=0.003):
-        held.append(tracemalloc.get_traced_memory())
+    for part in readings(one, 12):
+        _, latest = latest.next(one, 0, of_readings(part), METHOD, settings)
+        carried.append(sum(array.nbytes for array in latest.film.arrays().values()))
+        held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    now, peak = np.array(held).T
-    assert now[11] < 1.1 * now[2]
-    assert peak[11] < 1.1 * peak[2]
+    assert carried[11] < 1.3 * carried[2]
+    assert held[11] < held[2] + 2 * light_field
 
 
 def test_a_film_restored_goes_on_as_the_film_it_was_of(psi):
     latest, settings = filming.Latest(), MethodSettings()
     for place, part in enumerate(readings(psi, 3)):
-        frames = Frames(part[None], np.full((1, 24, 32), 0.003), np.ones((1, 24, 32), dtype=bool))
+        frames = of_readings(part)
         restored = Film.restored(
             latest.film.arrays(), [psi.of_shots([shot]) for shot in latest.shots]
         )
