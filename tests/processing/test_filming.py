@@ -1,5 +1,6 @@
 """Films of a session to light fields: frame after frame, and the same bytes whatever is killed."""
 
+import gc
 import json
 import os
 import shutil
@@ -22,6 +23,7 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.processing import filming
 from emmc_rig.processing.filming import reconstruct_film_session
+from emmc_rig.processing.reconstructing import sensor_deviation
 from reconstruction.adaptive.film import Film
 from reconstruction.methods import MethodSettings
 
@@ -328,6 +330,13 @@ def test_shots_of_psi_are_taken_in_turn(psi):
         assert np.sqrt(np.mean(missed**2)) < 0.02
 
 
+def test_without_a_deviation_it_is_the_sensors_at_the_exposure_of_each_shot(psi):
+    film = readings(psi, 2)
+    of_both = sensor_deviation(psi, film)
+    for place, result in enumerate(emmc.reconstruct_film(psi, film, METHOD)):
+        np.testing.assert_allclose(result.frames.deviation[0], of_both[place], rtol=1e-6)
+
+
 def test_frames_with_deviations_are_taken_one_by_one(psi):
     one = (of_readings(part) for part in readings(psi, 3))
     asked = emmc.reconstruct_film(psi, one, METHOD)
@@ -352,6 +361,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(psi):
     for part in readings(one, 12):
         _, latest = latest.next(one, 0, of_readings(part), METHOD, settings)
         carried.append(sum(array.nbytes for array in latest.film.arrays().values()))
+        gc.collect()
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert carried[11] < 1.3 * carried[2]
