@@ -77,7 +77,8 @@ class Method:
     """One way to reconstruct, as a module of `reconstruction.methods` offers it.
 
     assumes, cost, when: for people, cost in seconds. solve: from what is given and
-    the settings of all methods. films: whether it goes on from frame to frame of a film. part, settings: the name and type of its own part of the settings.
+    the settings of all methods. part, settings: the name and type of its own part of the settings.
+    films: whether it goes on from frame to frame of a film.
     package: what it needs beyond the core installation; it is then learned, for some views only.
     """
 

@@ -101,7 +101,7 @@ class Latest:
             method, one, frames.readings, frames.noise_sigma, None, settings, frames.usable,
             on_step, self.film,
         )  # fmt: skip
-        shots = (*self.shots, shot)[-len(solved.film.earlier) :]
+        shots = (*self.shots, shot)[-len(solved.film.known.earlier) :]
         result = Result(replace(solved, film=None), verdict, one, frames)
         return result, replace(self, film=solved.film, shots=shots)
 

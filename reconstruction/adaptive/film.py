@@ -2,9 +2,8 @@
 
 Of the frame before, disparity, texture and beliefs about disparities are carried to the present by
 optical flow (`flow`). The present texture is then fitted not to the present frame alone, but to the
-last few: an earlier frame sees the present texture where the flow since then says, through its own
-disparities (`Seen`). In the next frame the same point of a surface meets other cells of the mask:
-time is a code as good as another shot.
+last few: an earlier frame saw the present surfaces where the flow since then says (`Earlier`). In
+the next frame the same point of a surface meets other cells of the mask: time is a code.
 
 Nothing carried is believed further than readings go. A reading of an earlier frame counts with the
 variance that what is foretold misses around it, so that where flow is wrong, or something is hidden
@@ -21,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
@@ -38,9 +38,10 @@ from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Plain, Readings, checked, plain_of
+from reconstruction.adaptive.survey import Plain, Readings, checked, plain_of, unseen_by
 from reconstruction.adaptive.sweep import STRIDE, Swept, swept
 from reconstruction.adaptive.visibility import carried
+from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 
@@ -51,15 +52,15 @@ class FilmSettings(Settings):
     texture: TextureSettings = TextureSettings(
         steps=8, first_noise=0.1, refine_steps=4, shared_steps=0, sweeps=(0, 3)
     )
-    misfit: float = 0.002
-    earlier: int = 2
+    misfit: float = Field(
+        default=0.002, gt=0, description="deviation of readings that no texture explains"
+    )
+    earlier: int = Field(default=2, ge=1, description="frames before that are fitted, too")
 
 
-import os
-
-MORE = int(os.environ.get("MORE", "1"))
-WINDOW_PX = 4.0
-"""Deviation of the window in which squared residuals of what is foretold are averaged."""
+WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0
+"""Deviation of the windows in which squared residuals of what is foretold are averaged; and of the
+few readings that are kept from every fit."""
 KEPT = 0.8
 """Part of the belief in a disparity that the next frame keeps; the rest is spread over all."""
 NEW_SHARE = 0.4
@@ -113,27 +114,29 @@ class Earlier:
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
-    """What is known after a frame; nothing before the first.
+class Known:
+    """What a frame leaves for the next one.
 
-    scale: of the scene, see `Plain`. texture, clean: (c, y, x), as of `FittedScene`, padded as the
-    centre view's disparity `centre` (y, x). beliefs: about disparities. picture: centre view of
-    the light field without surfaces, (y, x, c). earlier: the latest frame last.
+    scale: of the scene, see `Plain`. texture: (c, y, x), padded by `margin` as the centre view's
+    disparity `centre` (y, x). beliefs: about disparities. picture: centre view of the light field
+    without surfaces, (y, x, c). earlier: the latest frame last.
     """
 
-    settings: FilmSettings = field(default_factory=FilmSettings)
-    scale: float = 1.0
-    margin: int = 0
-    texture: Array | None = None
-    centre: Array | None = None
-    beliefs: search.Volume | None = None
-    picture: Array | None = None
-    earlier: tuple[Earlier, ...] = ()
+    scale: float
+    margin: int
+    texture: Array
+    centre: Array
+    beliefs: search.Volume
+    picture: Array
+    earlier: tuple[Earlier, ...]
 
-    @property
-    def is_new(self) -> bool:
-        """Whether no frame was seen yet."""
-        return self.texture is None
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A film up to a frame. known: None before the first one."""
+
+    settings: FilmSettings = field(default_factory=FilmSettings)
+    known: Known | None = None
 
     def arrays(self) -> dict[str, NDArray]:
         """Return all but Psi as arrays by name, to be stored: `restored` makes a film of them."""
@@ -145,10 +148,10 @@ class Film:
     def restored(cls, arrays: Mapping[str, NDArray], psis: Sequence[ImagingMatrix]) -> Film:
         """Return the film that `arrays` was called of.
 
-        psis: of each of the frames `earlier`, as `reconstruct` was given it, of one shot.
+        psis: of each of the frames `known.earlier`, as `reconstruct` was given it, of one shot.
         """
         fitted = (checked(psi, np.zeros(psi.frames_shape), 1.0, None).psi for psi in psis)
-        kinds = (cls, FilmSettings, Earlier, Readings, search.Volume)
+        kinds = (cls, FilmSettings, Known, Earlier, Readings, search.Volume)
         return put_together(json.loads(str(arrays["about"])), arrays, kinds, lambda: next(fitted))
 
     def after(
@@ -159,21 +162,18 @@ class Film:
         earlier: Sequence[Earlier] = (),
     ) -> Film:
         """Return what is known after a frame; earlier: frames before, none of a first one."""
-        psi = plain.given.psi
-        margin = scene.surfaces.margin
-        texture = scene.texture
+        margin, texture = scene.surfaces.margin, scene.clean
         if not earlier:
-            wider = margin_of(psi, scene.centre, ROOM_PX + self.settings.texture.room_px) - margin
+            room_px = ROOM_PX + self.settings.texture.room_px
+            wider = margin_of(plain.given.psi, scene.centre, room_px) - margin
             margin += wider
             texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")
         centre = np.pad(scene.centre, margin, mode="edge")
-        used = plain.given.usable & ~plain.held
         still = np.zeros((*centre.shape, 2), dtype=np.float32)
-        kept = (*earlier, Earlier(plain.bright, used, margin, still, still))
-        return replace(
-            self, scale=plain.scale, margin=margin, texture=texture, centre=centre,
-            beliefs=beliefs, picture=plain.picture, earlier=kept[-self.settings.earlier :],
-        )  # fmt: skip
+        this = Earlier(plain.bright, plain.given.usable & ~plain.held, margin, still, still)
+        kept = (*earlier, this)[-self.settings.earlier :]
+        known = Known(plain.scale, margin, texture, centre, beliefs, plain.picture, kept)
+        return replace(self, known=known)
 
 
 def _padded(flow: Array, margin: int) -> Array:
@@ -199,22 +199,26 @@ def followed(
     on_step: Callable[[int], None],
 ) -> Followed | None:
     """Return the models of a frame that follows; None where it is a first one."""
-    own, psi, margin = film.settings, given.psi, film.margin
-    assert film.texture is not None and film.centre is not None
-    assert film.beliefs is not None and film.picture is not None
-    unseen = np.zeros(psi.size)
-    plain = plain_of(given, film.scale, unseen, settings.start_steps)
+    before, own, psi = film.known, film.settings, given.psi
+    assert before is not None
+    margin = before.margin
+    if before.picture.shape[:2] != psi.size:
+        raise ReconstructionError(
+            f"frames before were of {'x'.join(map(str, before.picture.shape[:2]))} samples, this "
+            f"Psi is of {'x'.join(map(str, psi.size))}"
+        )
+    plain = plain_of(given, before.scale, unseen_by(given), settings.start_steps)
     bright, used = plain.bright, given.usable & ~plain.held
     nearer = 1 if settings.nearer == "larger" else -1
 
     def carried_by(back: Array) -> tuple[Array, Array, Array]:
-        at = at_places(film.centre.shape) + _padded(back, margin)
-        centre = sampled(film.centre, at)
-        texture = np.stack([sampled(one, at, cubic=True) for one in film.texture])
+        at = at_places(before.centre.shape) + _padded(back, margin)
+        centre = sampled(before.centre, at)
+        texture = np.stack([sampled(one, at, cubic=True) for one in before.texture])
         surfaces = surfaces_of(psi, centre, margin, nearer, len(texture))
         return centre, texture, bright.frames - surfaces.forward(texture)
 
-    there, back = flow_between(film.picture, plain.picture)
+    there, back = flow_between(before.picture, plain.picture)
     missed, missed_still = (
         _around(np.square(carried_by(flow)[2]), used).sum(axis=0) for flow in (back, 0 * back)
     )
@@ -223,28 +227,17 @@ def followed(
     new = _share_new(foretold, plain)
     if new > NEW_SHARE:
         return None
-    earlier = [one.since(_padded(there, margin), _padded(back, margin)) for one in film.earlier]
-    seen: list[Seen] = []
+    earlier = [one.since(_padded(there, margin), _padded(back, margin)) for one in before.earlier]
 
-    def seen_through(centre: Array, texture: Array = texture) -> list[Seen]:
-        seen[:] = [_seen(one, centre, texture, nearer, own.misfit) for one in earlier]
-        return seen
+    def seen_through(centre: Array) -> list[Seen]:
+        return [_seen(one, centre, texture, nearer, own.misfit) for one in earlier]
 
-    beliefs = _carried(film.beliefs, back, psi.binning)
+    beliefs = _carried(before.beliefs, back, psi.binning)
 
     def again(texture: Array, residual: Array, margin: int) -> Array:
         nonlocal beliefs
-
-        def of_earlier(labels: Array) -> Array:
-            return sum(
-                _then_likely(one, through, texture, labels)
-                for one, through in zip(earlier, seen, strict=True)
-            )
-
         present = Swept(psi, bright.frames, bright.noise, used, texture, residual)
-        beliefs = swept(
-            beliefs, present, margin, settings.slope_px, settings.jump, of_earlier if MORE else None
-        )
+        beliefs = swept(beliefs, present, margin, settings.slope_px, settings.jump)
         return search.per_pixel(beliefs, psi.size, psi.binning)
 
     inner = np.s_[margin : margin + psi.size[0], margin : margin + psi.size[1]]
@@ -261,7 +254,7 @@ def followed(
         earlier=seen_through,
         margin=margin,
     )
-    scale = np.float32(film.scale)
+    scale = np.float32(before.scale)
     residual = scale * (bright.frames - scene.surfaces.forward(scene.texture))
     scene.surfaces.release()
     light_field = scene.surfaces.light_field(scale * scene.texture)
@@ -282,20 +275,6 @@ def _seen(one: Earlier, centre: Array, texture: Array, nearer: int, misfit: floa
     return Seen(surfaces, one.readings.frames, precision)
 
 
-def _then_likely(one: Earlier, seen: Seen, texture: Array, labels: Array) -> Array:
-    """Return log-likelihoods (row, column, label) by an earlier frame, at the present places."""
-    readings, margin, k = one.readings, one.margin, one.readings.psi.binning
-    residual = readings.frames - seen.surfaces.forward(texture)
-    then = np.stack([one.then(part, cubic=True) for part in texture])
-    swept = Swept(readings.psi, readings.frames, readings.noise, one.used, then, residual)
-    likely = swept.likelihoods(labels, margin)
-    rows, columns = readings.psi.size
-    inner = one.back[margin : margin + rows, margin : margin + columns]
-    moved = inner[:: STRIDE * k, :: STRIDE * k] / np.float32(STRIDE * k)
-    at = at_places(likely.shape[:2]) + moved
-    return np.stack([sampled(likely[..., label], at) for label in range(len(labels))], axis=-1)
-
-
 def _rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
     """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
     k = len(back) // len(rests)
@@ -304,11 +283,11 @@ def _rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
     return there * (1 - then)[..., None], back * (1 - rests)[..., None]
 
 
-def _around(values: Array, used: NDArray[np.bool_]) -> Array:
+def _around(values: Array, used: NDArray[np.bool_], window_px: float = WINDOW_PX) -> Array:
     """Return the mean over used pixels around, of (shot, pixel_y, pixel_x)."""
     weight = used.astype(np.float32)
     sums, counts = (
-        np.stack([cv2.GaussianBlur(one, (0, 0), WINDOW_PX) for one in part])
+        np.stack([cv2.GaussianBlur(one, (0, 0), window_px) for one in part])
         for part in (np.where(used, values, 0).astype(np.float32), weight)
     )
     return sums / np.maximum(counts, 1e-6)
@@ -320,7 +299,7 @@ def _share_new(foretold: Array, plain: Plain) -> float:
     if not plain.held.any():
         return 0.0
     own, others = (
-        _around(np.square(one), plain.held)
+        _around(np.square(one), plain.held, HELD_WINDOW_PX)
         for one in (foretold, plain.plain_residual / plain.scale)
     )
     return float(np.mean(own > others))

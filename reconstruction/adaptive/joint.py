@@ -115,7 +115,8 @@ def solve(
     not usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the
     disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given its residual of
     the frames, and the margin. begun: of another fit of the same centre, from which to go on.
-    earlier: returns what other times saw of the texture, given the padded disparity. margin: of the texture, instead of the least.
+    earlier: returns what other times saw of the texture, given the padded disparity. margin: of the
+    texture, instead of the least.
     """
     if margin is None:
         margin = margin_of(psi, centre, settings.room_px)

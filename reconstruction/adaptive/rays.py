@@ -105,8 +105,8 @@ class Surfaces:
     disparity: (v, u, y, x) of every ray, hidden: (v, u, y, x) uint8, 1 where the ray sees what the
     centre view does not: there it sees the texture beside it. Textures have the shape
     `texture_shape`, (c, y, x), padded by `margin` samples on all sides; colours: of them, 1 for a
-    Psi that sees only the first. alike, moved: see `laid_out`; `derivative` and `light_field` are of
-    rays that are not moved.
+    Psi that sees only the first. alike, moved: see `laid_out`; neither `derivative` nor
+    `light_field` is of moved rays.
     """
 
     _whole: Layout | None

@@ -14,7 +14,6 @@ agree by belief propagation as in the search.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import floor
 from typing import Any
@@ -166,8 +165,8 @@ def _smooth(values: Array, used: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """Frames whose planes are compared: their Psi, frames, variance `noise`, which are used, and the
-    residual of the present surfaces, (shot, pixel_y, pixel_x); texture: (c, y, x), padded."""
+    """What is swept: Psi, frames, their variance `noise`, which are used, and the residual of the
+    present surfaces, (shot, pixel_y, pixel_x); texture: (c, y, x), padded."""
 
     psi: ImagingMatrix
     frames: Array
@@ -206,12 +205,10 @@ def swept(
     margin: int,
     slope_px: float,
     jump: float,
-    more: Callable[[Array], Array] | None = None,
 ) -> Volume:
     """Return what to believe of every STRIDE-th pixel's disparity, given texture and patches.
 
-    volume: of the search. margin: of the texture. more: returns further log-likelihoods of
-    disparities, such as of other times, (row, column, disparity).
+    volume: of the search. margin: of the texture.
     """
     psi = seen.psi
     rows, columns = (np.arange(0, length, STRIDE) for length in psi.frames_shape[1:])
@@ -223,8 +220,6 @@ def swept(
     within &= np.abs(volume.disparities) * half + TAPS <= margin
     labels = volume.disparities[within]
     evidence = seen.likelihoods(labels, margin)
-    if more is not None:
-        evidence += more(labels)
     for label, known in enumerate(np.flatnonzero(within)):
         believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
         evidence[..., label] += np.log(believed + LEAST_BELIEF)

@@ -70,7 +70,7 @@ def _solve(
         return solve_tv_dict(fitted, quick).light_field
 
     result, film = None, given.film
-    if film is not None and not film.is_new:
+    if film is not None and film.known is not None:
         result = reconstruct_next(
             psi, given.frames, given.noise_sigma, film, adaptive, given.usable, given.on_step
         )

@@ -1,0 +1,147 @@
+"""Films: frames that follow are fitted with earlier ones, carried along by optical flow."""
+
+import numpy as np
+import pytest
+
+from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
+from emmc_rig.model.lightfield import psnr_db
+from reconstruction.adaptive.film import Earlier, Film
+from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
+from reconstruction.adaptive.joint import surfaces_of
+from reconstruction.adaptive.survey import Readings
+from reconstruction.errors import ReconstructionError
+from reconstruction.methods import reconstruct
+from simulators.scenes import render
+
+SIZE = (48, 64)
+CAMERA = shipped_cameras()["scenario-ii-cfa"]
+
+
+def _sliding(frame: int, step: tuple[int, int] = (1, 2), scene: str = "toy-table"):
+    """Return a window of a scene whose content moves by whole pixels a frame."""
+    whole = render(scene, (5, 5), (108, 144)).light_field
+    top, left = 34 - step[0] * frame, 44 - step[1] * frame
+    return np.ascontiguousarray(whole[:, :, top : top + SIZE[0], left : left + SIZE[1]])
+
+
+def _readings(psi, light_field, seed):
+    return CAMERA.read_out(psi.forward(light_field), seed)
+
+
+@pytest.fixture(scope="module")
+def psi():
+    return build_imaging_matrix(CAMERA, SIZE)
+
+
+@pytest.fixture(scope="module")
+def followed(psi):
+    """Return the truths, the film's results and those of each frame alone."""
+    film, out = Film(), []
+    for frame in range(4):
+        truth = _sliding(frame)
+        shown = _readings(psi, truth, frame)
+        given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+        result = reconstruct(*given, film=film)
+        film = result.film
+        out.append((truth, result, reconstruct(*given)))
+    return out
+
+
+def test_flow_of_a_sliding_picture_is_its_motion():
+    first, second = (_sliding(frame)[2, 2] for frame in (0, 1))
+    there, back = flow_between(first, second)
+    inner = np.s_[8:-8, 8:-8]
+    assert np.median(np.abs(there[inner] - (1, 2))) < 0.1
+    assert np.median(np.abs(back[inner] + (1, 2))) < 0.1
+
+
+def test_a_flow_after_another_leads_where_both_lead():
+    first = np.broadcast_to(np.float32((1.5, -2)), (20, 30, 2))
+    second = 0.1 * at_places((20, 30))
+    both = joined(first, second)
+    assert np.allclose(
+        both[5:10, 10:15], sampled(second, at_places((20, 30)) + first)[5:10, 10:15] + first[0, 0]
+    )
+    assert np.allclose(both[5, 10], (1.5 + 0.1 * 6.5, -2 + 0.1 * 8), atol=1e-4)
+
+
+def test_an_earlier_frame_sees_the_present_texture_where_it_was(psi):
+    rng = np.random.default_rng(0)
+    margin, shape = 8, (SIZE[0] + 16, SIZE[1] + 16)
+    texture = rng.random((3, *shape), dtype=np.float32)
+    centre = np.full(shape, 0.75, np.float32)
+    there = np.zeros((*shape, 2), np.float32) + np.float32((2, -3))
+    readings = Readings(
+        psi,
+        np.zeros(psi.frames_shape),
+        0.01,
+        np.ones(psi.frames_shape),
+        np.ones(psi.frames_shape, bool),
+    )
+    earlier = Earlier(readings, readings.usable, margin, there, -there)
+    seen = earlier.surfaces(centre, 1, 3).forward(texture)
+    then = np.roll(texture, (-2, 3), axis=(1, 2))
+    expected = surfaces_of(psi, centre, margin, 1).forward(then)
+    inner = np.s_[:, 8:-8, 8:-8]
+    assert np.allclose(seen[inner], expected[inner], atol=2e-4)
+    assert not np.allclose(
+        seen[inner], surfaces_of(psi, centre, margin, 1).forward(texture)[inner], atol=0.02
+    )
+
+
+def test_a_film_is_more_accurate_than_its_frames_alone(followed):
+    gains = [
+        psnr_db(result.light_field, truth) - psnr_db(alone.light_field, truth)
+        for truth, result, alone in followed[2:]
+    ]
+    assert np.mean(gains) > 0.5, gains
+    assert all("new_share" in result.parameters for _, result, _ in followed[1:])
+
+
+def test_the_flow_reported_is_the_motion(followed):
+    assert followed[-1][1].parameters["flow_px"] == pytest.approx(np.hypot(1, 2), abs=0.3)
+
+
+def test_the_first_frame_is_that_of_a_capture(followed):
+    _, result, alone = followed[0]
+    assert np.array_equal(result.light_field, alone.light_field)
+    assert alone.film is None
+
+
+def test_the_psnr_lies_in_the_interval_stated(followed):
+    for truth, result, _ in followed:
+        low, high = result.stated["stated_interval_db"]
+        assert low <= psnr_db(result.light_field, truth) <= high
+
+
+def test_after_a_cut_a_frame_is_a_first_one(psi, followed):
+    shown = _readings(psi, _sliding(0, scene="near-planar"), 9)
+    given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    result = reconstruct(*given, film=followed[-1][1].film)
+    assert "new_share" not in result.parameters
+    assert np.array_equal(result.light_field, reconstruct(*given).light_field)
+
+
+def test_what_rests_has_no_flow(psi):
+    film = Film()
+    for seed in (1, 2):
+        shown = _readings(psi, _sliding(0), seed)
+        given = "adaptive-fast", psi, shown.readings, shown.noise_sigma
+        result = reconstruct(*given, usable=shown.usable, film=film)
+        film = result.film
+    assert result.parameters["flow_px"] < 0.1
+
+
+def test_a_film_of_another_size_is_refused(psi, followed):
+    small = build_imaging_matrix(CAMERA, (40, 48))
+    frames = np.full(small.frames_shape, 0.2, np.float32)
+    with pytest.raises(ReconstructionError, match="48x64 samples, this Psi is of 40x48"):
+        reconstruct("adaptive", small, frames, 0.01, film=followed[0][1].film)
+
+
+def test_a_method_that_takes_no_films_says_which_do(psi):
+    frames = np.full(psi.frames_shape, 0.2, np.float32)
+    with pytest.raises(
+        ReconstructionError, match="'tv' takes no films: --method one of adaptive, adaptive-fast"
+    ):
+        reconstruct("tv", psi, frames, 0.01, film=Film())
