@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.bands import in_views
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import mixture, search
@@ -69,6 +70,8 @@ first one."""
 STILL, REST_PX = 1.05, 2.0
 """Where what is carried without motion misses readings by no more than so many times what it misses
 with, the scene rests; and the deviation by which such places are blurred."""
+RESTING_PX = 0.25
+"""Flow up to which the light field of the frame before stands for that of the present one."""
 ROOM_PX = 1.0
 """By which disparities may grow while a film goes on."""
 
@@ -117,13 +120,14 @@ class Earlier:
 class Known:
     """What a frame leaves for the next one.
 
-    scale: of the scene, see `Plain`. texture: (c, y, x), padded by `margin` as the centre view's
-    disparity `centre` (y, x). beliefs: about disparities. picture: centre view of the light field
-    without surfaces, (y, x, c). earlier: the latest frame last.
+    scale: of the scene, see `Plain`. light_field: as `mixture.stored`. texture: (c, y, x), padded
+    by `margin` as the centre view's disparity `centre` (y, x). beliefs: about disparities.
+    picture: centre view of the light field without surfaces, (y, x, c). earlier: the latest last.
     """
 
     scale: float
     margin: int
+    light_field: NDArray[np.uint16]
     texture: Array
     centre: Array
     beliefs: search.Volume
@@ -158,6 +162,7 @@ class Film:
         self,
         plain: Plain,
         scene: FittedScene,
+        light_field: Array,
         beliefs: search.Volume,
         earlier: Sequence[Earlier] = (),
     ) -> Film:
@@ -172,7 +177,8 @@ class Film:
         still = np.zeros((*centre.shape, 2), dtype=np.float32)
         this = Earlier(plain.bright, plain.given.usable & ~plain.held, margin, still, still)
         kept = (*earlier, this)[-self.settings.earlier :]
-        known = Known(plain.scale, margin, texture, centre, beliefs, plain.picture, kept)
+        seen = mixture.stored(np.clip(light_field, 0, 1))
+        known = Known(plain.scale, margin, seen, texture, centre, beliefs, plain.picture, kept)
         return replace(self, known=known)
 
 
@@ -228,10 +234,7 @@ def followed(
     if new > NEW_SHARE:
         return None
     earlier = [one.since(_padded(there, margin), _padded(back, margin)) for one in before.earlier]
-
-    def seen_through(centre: Array) -> list[Seen]:
-        return [_seen(one, centre, texture, nearer, own.misfit) for one in earlier]
-
+    seen = [_seen(one, centre, texture, nearer, own.misfit) for one in earlier]
     beliefs = _carried(before.beliefs, back, psi.binning)
 
     def again(texture: Array, residual: Array, margin: int) -> Array:
@@ -251,18 +254,41 @@ def followed(
         own.texture,
         on_step=on_step,
         again=again,
-        earlier=seen_through,
+        earlier=seen,
         margin=margin,
     )
     scale = np.float32(before.scale)
     residual = scale * (bright.frames - scene.surfaces.forward(scene.texture))
     scene.surfaces.release()
     light_field = scene.surfaces.light_field(scale * scene.texture)
-    light_field = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
-    fits = Fits([light_field, plain.plain], [residual, plain.plain_residual], scene, False)
+    models = [mixture.stored(np.clip(light_field, 0, 1, out=light_field))]
+    models.append(_rested_light(before.light_field, models[0], scene.surfaces.disparity, back))
+    carried_on = given.frames - psi.forward(mixture.values(models[1]))
+    residuals = [residual, carried_on, plain.plain_residual]
+    fits = Fits([*models, plain.plain], residuals, scene, False)
     moved = float(np.median(np.linalg.norm(there, axis=-1)))
     parameters = {"flow_px": moved, "new_share": new}
     return Followed(plain, fits, beliefs, earlier, parameters)
+
+
+def _rested_light(
+    before: NDArray[np.uint16], present: NDArray[np.uint16], disparity: Array, back: Array
+) -> NDArray[np.uint16]:
+    """Return the light field of the frame before where the scene rests, else the present one.
+
+    disparity: of the present rays (v, u, y, x). back: flow to the frame before, (y, x, 2).
+    """
+    own, views = at_places(back.shape[:2]), disparity.shape[:2]
+    rests = np.exp(-np.square(back).sum(axis=-1) / RESTING_PX**2)
+    out = np.empty_like(before)
+
+    def work(at: tuple[int, int]) -> None:
+        steps = np.array([n - of // 2 for n, of in zip(at, views, strict=True)], np.float32)
+        share = sampled(rests, own - disparity[at][..., None] * steps)[..., None]
+        out[at] = np.rint(share * before[at] + (1 - share) * present[at])
+
+    in_views(work, views)
+    return out
 
 
 def _seen(one: Earlier, centre: Array, texture: Array, nearer: int, misfit: float) -> Seen:
@@ -278,19 +304,22 @@ def _seen(one: Earlier, centre: Array, texture: Array, nearer: int, misfit: floa
 def _rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
     """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
     k = len(back) // len(rests)
-    rests = cv2.GaussianBlur(rests, (0, 0), REST_PX).repeat(k, axis=0).repeat(k, axis=1)
+    smooth = np.asarray(cv2.GaussianBlur(rests, (0, 0), REST_PX), dtype=np.float32)
+    rests = smooth.repeat(k, axis=0).repeat(k, axis=1)
     then = sampled(rests, at_places(rests.shape) + there)
     return there * (1 - then)[..., None], back * (1 - rests)[..., None]
 
 
-def _around(values: Array, used: NDArray[np.bool_], window_px: float = WINDOW_PX) -> Array:
+def _around(
+    values: Array, used: NDArray[np.bool_], window_px: float = WINDOW_PX
+) -> NDArray[np.floating]:
     """Return the mean over used pixels around, of (shot, pixel_y, pixel_x)."""
     weight = used.astype(np.float32)
     sums, counts = (
         np.stack([cv2.GaussianBlur(one, (0, 0), window_px) for one in part])
         for part in (np.where(used, values, 0).astype(np.float32), weight)
     )
-    return sums / np.maximum(counts, 1e-6)
+    return np.asarray(sums / np.maximum(counts, 1e-6))
 
 
 def _share_new(foretold: Array, plain: Plain) -> float:

@@ -22,23 +22,24 @@ def _codes(pictures: tuple[Array, Array]) -> list[NDArray[np.uint8]]:
     """Return the root of the brightness of pictures (y, x, c), as codes of one scale."""
     grey = [np.sqrt(np.maximum(picture.mean(axis=-1), 0)) for picture in pictures]
     white = max(float(np.percentile(np.stack(grey), WHITE)), 1e-6)
-    return [np.uint8(np.clip(one / white, 0, 1) * 255) for one in grey]
+    return [(np.clip(one / white, 0, 1) * 255).astype(np.uint8) for one in grey]
 
 
 def flow_between(first: Array, second: Array) -> tuple[Array, Array]:
     """Return the flows from the first of two pictures (y, x, c) to the second, and back."""
     codes = _codes((first, second))
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    there, back = (
-        np.ascontiguousarray(search.calc(one, other, None)[..., ::-1])
-        for one, other in (codes, codes[::-1])
-    )
-    return there, back
+
+    def flow(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Array:
+        across_first = search.calc(one, other, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        return np.ascontiguousarray(across_first[..., ::-1], dtype=np.float32)
+
+    return flow(*codes), flow(*codes[::-1])
 
 
 def at_places(shape: tuple[int, int]) -> Array:
     """Return the place of every sample, (y, x, 2)."""
-    return np.stack(np.indices(shape, dtype=np.float32), axis=-1)
+    return np.moveaxis(np.indices(shape, dtype=np.float32), 0, -1)
 
 
 def sampled(field: Array, places: Array, cubic: bool = False) -> Array:

@@ -105,7 +105,7 @@ def solve(
     on_step: Callable[[int], None] | None = None,
     again: Callable[[Array, Array, int], Array] | None = None,
     begun: Begun | None = None,
-    earlier: Callable[[Array], Sequence[Seen]] | None = None,
+    earlier: Sequence[Seen] = (),
     margin: int | None = None,
 ) -> FittedScene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
@@ -115,8 +115,7 @@ def solve(
     not usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the
     disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given its residual of
     the frames, and the margin. begun: of another fit of the same centre, from which to go on.
-    earlier: returns what other times saw of the texture, given the padded disparity. margin: of the
-    texture, instead of the least.
+    earlier: what other times saw of the texture. margin: of the texture, instead of the least.
     """
     if margin is None:
         margin = margin_of(psi, centre, settings.room_px)
@@ -125,7 +124,6 @@ def solve(
     colours = picture.shape[-1]
     surfaces = surfaces_of(psi, padded, margin, nearer, colours)
     rows_squared = np.einsum("ssyx->syx", psi.gram)
-    others = earlier(padded) if earlier is not None else ()
     now = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge").astype(np.float32)
     at = kept = begun or Begun(now, now, now)
     sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
@@ -152,7 +150,6 @@ def solve(
             )
             padded = searched
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
-            others = earlier(padded) if earlier is not None else ()
         left = settings.steps - 1 - step
         if step >= 2 and left < settings.refine_steps and left % 2 == 0:
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
@@ -162,7 +159,7 @@ def solve(
             )
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
-        fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps, others)
+        fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps, earlier)
         at = Begun(fit, now, clean)
         if on_step is not None:
             on_step(step + 1)

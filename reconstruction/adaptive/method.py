@@ -106,7 +106,7 @@ def reconstruct_adaptive(
         steps=total,
         seconds=time.perf_counter() - started,
         parameters=result.parameters | {"search_seconds": searched_s},
-        film=film and film.after(survey, fits.scene, believed),
+        film=film and film.after(survey, fits.scene, result.light_field, believed),
     )
 
 
@@ -145,7 +145,9 @@ def reconstruct_next(
         steps=total,
         seconds=time.perf_counter() - started,
         parameters=result.parameters | found.parameters,
-        film=film.after(found.plain, found.fits.scene, found.beliefs, found.earlier),
+        film=film.after(
+            found.plain, found.fits.scene, result.light_field, found.beliefs, found.earlier
+        ),
     )
 
 

@@ -127,7 +127,7 @@ def stored(light_field: Array) -> NDArray[np.uint16]:
     return levels
 
 
-def _values(levels: NDArray[np.uint16]) -> NDArray[np.float32]:
+def values(levels: NDArray[np.uint16]) -> NDArray[np.float32]:
     """Return what was stored."""
     return np.multiply(levels, np.float32(1 / LEVELS), dtype=np.float32)
 
@@ -166,7 +166,7 @@ def averaged(
         return np.einsum("yxc,yxc->yx", difference, difference) / np.float32(colours)
 
     def work(at: tuple[int, int]) -> None:
-        seen = [_values(one[at]).reshape(rows, -1) for one in models]
+        seen = [values(one[at]).reshape(rows, -1) for one in models]
         of_view = mean[at].reshape(rows, -1)
         np.multiply(wide[0], seen[0], out=of_view)
         for share, one in zip(wide[1:], seen[1:], strict=True):
@@ -174,7 +174,7 @@ def averaged(
         spread[at] = alone[0] * square(seen[0], of_view)
         for share, one in zip(alone[1:], seen[1:], strict=True):
             spread[at] += share * square(one, of_view)
-        apart[at] = square(_values(other[at]).reshape(rows, -1), of_view)
+        apart[at] = square(values(other[at]).reshape(rows, -1), of_view)
 
     in_views(work, mean.shape[:2])
     return Together(mean, spread, apart)

@@ -56,7 +56,7 @@ def test_flow_of_a_sliding_picture_is_its_motion():
 
 
 def test_a_flow_after_another_leads_where_both_lead():
-    first = np.broadcast_to(np.float32((1.5, -2)), (20, 30, 2))
+    first = np.broadcast_to(np.array((1.5, -2), np.float32), (20, 30, 2))
     second = 0.1 * at_places((20, 30))
     both = joined(first, second)
     assert np.allclose(
@@ -70,7 +70,7 @@ def test_an_earlier_frame_sees_the_present_texture_where_it_was(psi):
     margin, shape = 8, (SIZE[0] + 16, SIZE[1] + 16)
     texture = rng.random((3, *shape), dtype=np.float32)
     centre = np.full(shape, 0.75, np.float32)
-    there = np.zeros((*shape, 2), np.float32) + np.float32((2, -3))
+    there = np.zeros((*shape, 2), np.float32) + np.array((2, -3), np.float32)
     readings = Readings(
         psi,
         np.zeros(psi.frames_shape),
