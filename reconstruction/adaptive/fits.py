@@ -30,13 +30,15 @@ class Fits:
 
     light_fields: (v, u, y, x, c) of each, as `mixture.stored`; residuals: frames less what each
     predicts, (shot, pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's
-    scale. patched: whether the last are patches.
+    scale. patched: whether the last are patches. understated: by how much the spread of these
+    models understates the variance of their mean, beside that of a capture's.
     """
 
     light_fields: list[NDArray[np.uint16]]
     residuals: list[Array]
     scene: FittedScene
     patched: bool
+    understated: float = 1.0
 
 
 def fitted_models(
@@ -163,7 +165,7 @@ def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
     between = float(together.apart.mean(dtype=np.float64))
     of = features(of_samples, between, spread, disparity_sigma, light_field)
     times, reported = stated(of)
-    variance *= times
+    variance *= times * fits.understated
     return Mean(light_field, shares, np.sqrt(variance, out=variance), over_plain, reported)
 
 

@@ -17,7 +17,7 @@ from drivers.camera import CameraIdentity
 from drivers.clock import SYSTEM_CLOCK
 from drivers.dng import encode_dng
 from drivers.errors import CaptureError
-from drivers.raw import decode_raw
+from drivers.raw import RawFrame, decode_raw
 from emmc_rig.acquisition import film as films
 from emmc_rig.acquisition.command import estimated
 from emmc_rig.acquisition.control import Control
@@ -109,8 +109,12 @@ def test_a_film_of_a_still_mask_comes_from_the_cameras_stream_at_its_rate():
     assert run.go().complete
     assert verify(run.session).is_complete
     assert run.places == list(range(12))
-    np.testing.assert_allclose([one.film_s for one in run.lines], np.arange(12) / 10, atol=1e-6)
-    np.testing.assert_allclose(np.diff([one.camera_time_s for one in run.lines]), 0.1, atol=1e-6)
+    film_s, camera_s = (
+        np.array([getattr(one, name) for one in run.lines], dtype=float)
+        for name in ("film_s", "camera_time_s")
+    )
+    np.testing.assert_allclose(film_s, np.arange(12) / 10, atol=1e-6)
+    np.testing.assert_allclose(np.diff(camera_s), 0.1, atol=1e-6)
     assert [int(one.metadata["block_id"]) for one in run.lines] == list(range(12))
     assert [(one.segment, one.id, one.rate_hz) for one in run.segments] == [
         (0, "film-000000", 10.0)
@@ -120,9 +124,10 @@ def test_a_film_of_a_still_mask_comes_from_the_cameras_stream_at_its_rate():
 
 def test_the_camera_has_its_own_rate_back_after_a_film():
     run = Run()
-    before_hz = run.rig.camera.features.number("AcquisitionFrameRate")
+    features = run.rig.camera.features  # pyright: ignore[reportAttributeAccessIssue]
+    before_hz = features.number("AcquisitionFrameRate")
     run.go()
-    assert run.rig.camera.features.number("AcquisitionFrameRate") == before_hz != 10
+    assert features.number("AcquisitionFrameRate") == before_hz != 10
 
 
 def test_a_frame_shows_the_scene_as_it_was_when_its_exposure_began():
@@ -132,12 +137,13 @@ def test_a_frame_shows_the_scene_as_it_was_when_its_exposure_began():
     shown = decode_frame(run.session.read(entry.id), entry).mosaic.astype(float)
     run.bench.lamp = "white"
     then_s = entry.camera_time_s
+    assert then_s is not None
     # The camera sends 12 of the sensor's 14 bits.
     likeness = {
         at_s: np.corrcoef(shown.ravel(), run.bench.expose(entry.exposure_s, at_s).ravel())[0, 1]
         for at_s in (then_s - 0.3, then_s, then_s + 0.3)
     }
-    assert max(likeness, key=likeness.get) == then_s
+    assert max(likeness, key=lambda at_s: likeness[at_s]) == then_s
 
 
 def test_a_frame_that_the_camera_drops_is_named_with_its_place_and_stays_dropped():
@@ -262,9 +268,13 @@ class Stream(PreparedCamera):
     """A camera whose stream gives prepared frames at times of its own."""
 
     def __init__(self, times_s, values=None, on_frame=lambda place: None):
-        super().__init__(lambda exposure_s: None, SIZE, "rggb", CameraIdentity("EMMC", "s", "1"))
+        super().__init__(self._no_single_frame, SIZE, "rggb", CameraIdentity("EMMC", "s", "1"))
         self.times_s, self.on_frame, self.closed = times_s, on_frame, False
         self.values = values or range(100, 100 + len(times_s))
+
+    @staticmethod
+    def _no_single_frame(exposure_s: float) -> RawFrame:
+        raise AssertionError("a film takes the stream")
 
     def stream(self):
         try:
@@ -360,6 +370,7 @@ def test_micro_managers_stream_becomes_a_film_at_the_plans_rate():
     assert {*session.stored, *gone} == {frame.id for frame in session.frames}
     for name, entry in session.stored.items():
         # The camera sends some hundred a second.
+        assert entry.film_s is not None
         assert entry.film_s * 20 == pytest.approx(int(name[5:]), abs=0.51)
 
 
@@ -435,4 +446,5 @@ def test_a_new_plan_shows_how_a_film_is_asked_for():
     text = new_plan("rgbw-bayer-1shot", find_camera("rgbw-bayer-1shot"))
     line = next(one for one in text.splitlines() if one.startswith("# film:"))
     asked = Plan.model_validate(yaml.safe_load(text) | yaml.safe_load(line.removeprefix("# ")))
+    assert asked.film is not None
     assert (asked.film.frames, asked.film.rate) == (200, 10)

@@ -380,4 +380,6 @@ def test_a_film_restored_goes_on_as_the_film_it_was_of(psi):
         np.testing.assert_array_equal(result.light_field, again.light_field)
         for name, values in result.maps.items():
             np.testing.assert_array_equal(values, again.maps[name])
-    assert len(latest.shots) == len(latest.film.known.earlier)
+    known = latest.film.known
+    assert known is not None
+    assert len(latest.shots) == len(known.earlier)

@@ -102,7 +102,7 @@ def test_the_flow_of_a_rolling_ball_carries_its_colours(turn_rad_s):
     found = flow(moving, 0.4, 0.9, size)
     seen = np.isfinite(found).all(axis=-1)
     # At the limb the pixels of either time mix ball and wall.
-    inner = cv2.erode(seen.astype(np.uint8), np.ones((7, 7))).astype(bool)
+    inner = cv2.erode(np.asarray(seen, dtype=np.uint8), np.ones((7, 7))).astype(bool)
     error = np.abs(carried(views[1], found) - views[0])[inner]
     assert inner.mean() > 0.5
     # The light from above stays with the room, a quarter of it less per radius downwards.
