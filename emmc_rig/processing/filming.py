@@ -68,6 +68,10 @@ from reconstruction.verdict.rules import LEVELS
 from reconstruction.verdict.run import reconstruct_judged
 
 NEXT = "next.npz"
+DAMAGED = (
+    OSError, ValueError, LookupError, TypeError, EOFError, MemoryError, zlib.error, BadZipFile,
+)  # fmt: skip
+"""What reading a damaged file of arrays raises."""
 FILM_TAKES = "an array (t, pixel_y, pixel_x), or an iterable of Frames of one shot each"
 
 
@@ -122,12 +126,12 @@ class Latest:
         try:
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
-            about = json.loads(str(arrays["latest"]))
+            about = parse_json(str(arrays["latest"]), str(path), ValueError)
             if about.pop("fingerprint") != fingerprint:
                 return None
             shots, failed = tuple(about.pop("shots")), about.pop("failed")
             film = Film.restored(arrays, [_one_shot(psi, shot) for shot in shots])
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zlib.error, BadZipFile):
+        except (*DAMAGED, ReconstructionError):
             return None
         return cls(film, shots, failed={int(place): why for place, why in failed.items()}, **about)
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from emmc_rig.model.bands import in_views
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import mixture, search
@@ -160,7 +161,8 @@ class Film:
         """
         fitted = (checked(psi, np.zeros(psi.frames_shape), 1.0, None).psi for psi in psis)
         kinds = (cls, FilmSettings, Known, Earlier, Readings, search.Volume)
-        return put_together(json.loads(str(arrays["about"])), arrays, kinds, lambda: next(fitted))
+        about = parse_json(str(arrays["about"]), "a stored film", ReconstructionError)
+        return put_together(about, arrays, kinds, lambda: next(fitted))
 
     def after(
         self,

@@ -224,7 +224,7 @@ ONE = {"exposure_s": 0.01}
 STANDING = {"camera": "coded-aperture-random", "shots": [ONE]}
 PLAIN = {"views": [], "references": 2, "exposure_s": 0.02}
 CHANGING = {"camera": "coded-aperture-sequential-random"}
-FILM = {"frames": 3, "rate": 2}
+FILM = {"frames": 3, "rate": 1}
 PLACES = [{**ONE, "mask_um": [0, 0]}, {**ONE, "mask_um": [48, 0]}]
 PLANS = {
     "whiteboards.views: [": (boards(views=[[7, 2]]), boards(views=[[4, 2]])),

@@ -44,7 +44,8 @@ GUARDED = {
     "scipy.io": (CHILD,),
     "OpenEXR": (CHILD,),
     "zarr": ("emmc_rig/files/shards.py",),
-    "numpy.load": ("emmc_rig/pages/pictures.py", CHILD),  # what a study keeps for itself
+    # What a study and a film keep for themselves.
+    "numpy.load": ("emmc_rig/pages/pictures.py", "emmc_rig/processing/filming.py", CHILD),
     "torch.load": (),
     "pickle.load": (),
 }
