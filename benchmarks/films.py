@@ -2,12 +2,13 @@
 
 A window of a light field rests, slides by fractions of a pixel, or slides while a disc of the next
 light field passes before it at another speed and disparity; of a built-in scene that moves, the
-scene itself. The exact light field of every frame is known.
+scene itself, whatever the motion. The exact light field of every frame is known.
 """
 
 from __future__ import annotations
 
 import time
+from functools import lru_cache
 from itertools import pairwise
 
 import cv2
@@ -21,7 +22,7 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive.film import Film
 from reconstruction.verdict.run import reconstruct_judged
-from simulators.scenes import render
+from simulators.scenes import MOVING_SCENES, SCENES, render_at
 
 RESTS, PANS, PASSES = "rests", "pans", "passes"
 PAN_PX = {RESTS: (0.0, 0.0), PANS: (0.45, 1.4), PASSES: (0.2, -0.6)}
@@ -29,6 +30,7 @@ PAN_PX = {RESTS: (0.0, 0.0), PANS: (0.45, 1.4), PASSES: (0.2, -0.6)}
 DISC_PX, DISC_DISPARITY, DISC_RADIUS = (-0.3, 1.7), 1.5, 0.28
 """Of the disc: motion per frame, how much nearer it is, radius over the window's rows."""
 ROOM_PX = 16
+MOVING_HZ = 10
 Array = NDArray[np.floating]
 
 
@@ -54,6 +56,8 @@ def _window(whole: Array, size: tuple[int, int], move_px: Array, disparity: floa
 
 def frame_of(scene: str, other: str, motion: str, size: tuple[int, int], frame: int) -> Array:
     """Return the light field (v, u, y, x, c) before the camera at a frame."""
+    if scene in MOVING_SCENES:
+        return render_at(scene, (5, 5), size, 0, frame / MOVING_HZ).light_field
     whole, move = _opened(scene), np.array(PAN_PX[motion]) * frame
     out = _window(whole, size, move)
     if motion != PASSES:
@@ -70,11 +74,10 @@ def frame_of(scene: str, other: str, motion: str, size: tuple[int, int], frame: 
     return out
 
 
+@lru_cache(maxsize=2)
 def _opened(scene: str) -> Array:
-    try:
-        return np.asarray(open_scene(scene, None, (5, 5), 0).light_field, dtype=np.float32)
-    except ValueError:
-        return render(scene, (5, 5), (192, 256)).light_field
+    size = (192, 256) if scene in SCENES else None
+    return np.asarray(open_scene(scene, size, (5, 5), 0).light_field, dtype=np.float32)
 
 
 def measure(

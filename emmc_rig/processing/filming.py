@@ -62,7 +62,7 @@ from emmc_rig.session.session import Session
 from emmc_rig.version import __version__
 from reconstruction.adaptive.film import Film
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import DEFAULT_METHOD, METHODS, MethodSettings, find_method
+from reconstruction.methods import DEFAULT_METHOD, MethodSettings, film_methods, find_method
 from reconstruction.result import Progress
 from reconstruction.verdict.rules import LEVELS
 from reconstruction.verdict.run import reconstruct_judged
@@ -195,7 +195,7 @@ def reconstruct_film(
 
 def _refuse_without_films(method: str) -> None:
     if not find_method(method).films:
-        able = " or ".join(one.name for one in METHODS.values() if one.films)
+        able = " or ".join(film_methods())
         raise AppError(f"'{method}' takes no films: choose {able}, or a single frame by --frame")
 
 

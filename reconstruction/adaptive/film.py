@@ -41,7 +41,7 @@ from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Plain, Readings, checked, plain_of, unseen_by
-from reconstruction.adaptive.sweep import STRIDE, Swept, swept
+from reconstruction.adaptive.sweep import STRIDE, mean_around, swept
 from reconstruction.adaptive.visibility import carried
 from reconstruction.errors import ReconstructionError
 
@@ -86,12 +86,11 @@ class Earlier:
     """A frame of before, and where its points are now.
 
     readings: over the scale. used: those that count, (shot, pixel_y, pixel_x). there, back: flow
-    from its time to the present, and back, (y, x, 2), padded by `margin`.
+    from its time to the present, and back, (y, x, 2), padded as textures are.
     """
 
     readings: Readings
     used: NDArray[np.bool_]
-    margin: int
     there: Array
     back: Array
 
@@ -99,26 +98,22 @@ class Earlier:
         """Return the same one frame later; there, back: flows between these two frames, padded."""
         return replace(self, there=joined(self.there, there), back=joined(back, self.back))
 
-    def then(self, field: Array, cubic: bool = False) -> Array:
-        """Return a field of the present, padded (y, x), as it was at that time."""
-        return sampled(field, at_places(field.shape) + self.there, cubic)
-
-    def surfaces(self, centre: Array, nearer: int, colours: int) -> Surfaces:
+    def surfaces(self, centre: Array, margin: int, nearer: int, colours: int) -> Surfaces:
         """Return what it saw of the present texture.
 
-        centre: the present disparity of the centre view (y, x), padded. nearer: see `carried`.
+        centre: the present disparity of the centre view (y, x), padded by `margin`. nearer: see
+        `carried`.
         """
         psi = self.readings.psi
-        disparity, hidden = carried(
-            self.then(centre), self.margin, nearer, psi.light_field_shape[:4]
-        )
+        then = sampled(centre, at_places(centre.shape) + self.there)
+        disparity, hidden = carried(then, margin, nearer, psi.light_field_shape[:4])
         views, own = disparity.shape[:2], at_places(psi.size)
         moved = np.empty((2, *disparity.shape), dtype=np.float32)
         for v, u in np.ndindex(views):
             steps = np.array([v - views[0] // 2, u - views[1] // 2], dtype=np.float32)
-            met = own - disparity[v, u][..., None] * steps + np.float32(self.margin)
+            met = own - disparity[v, u][..., None] * steps + np.float32(margin)
             moved[:, v, u] = np.moveaxis(sampled(self.there, met), -1, 0)
-        return Surfaces(psi, disparity, hidden, self.margin, colours, moved=moved)
+        return Surfaces(psi, disparity, hidden, margin, colours, moved=moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +176,9 @@ class Film:
             texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")
         centre = np.pad(scene.centre, margin, mode="edge")
         still = np.zeros((*centre.shape, 2), dtype=np.float32)
-        this = Earlier(plain.bright, plain.given.usable & ~plain.held, margin, still, still)
+        this = Earlier(plain.bright, plain.given.usable & ~plain.held, still, still)
         kept = (*earlier, this)[-self.settings.earlier :]
-        seen = mixture.stored(np.clip(light_field, 0, 1))
+        seen = mixture.stored(light_field)
         known = Known(plain.scale, margin, seen, texture, centre, beliefs, plain.picture, kept)
         return replace(self, known=known)
 
@@ -231,22 +226,30 @@ def followed(
         return centre, texture, bright.frames - surfaces.forward(texture)
 
     there, back = flow_between(before.picture, plain.picture)
+    moving, resting = carried_by(back), carried_by(np.zeros_like(back))
     missed, missed_still = (
-        _around(np.square(carried_by(flow)[2]), used).sum(axis=0) for flow in (back, 0 * back)
+        mean_around(np.square(of), used.astype(np.float32), WINDOW_PX).sum(axis=0)
+        for *_, of in (moving, resting)
     )
-    there, back = _rested(there, back, (missed_still <= STILL * missed).astype(np.float32))
-    centre, texture, foretold = carried_by(back)
+    rests = missed_still <= STILL * missed
+    if rests.any():
+        there, back = _rested(there, back, rests.astype(np.float32))
+        moving = carried_by(back)
+    centre, texture, foretold = moving
     new = _share_new(foretold, plain)
     if new > NEW_SHARE:
         return None
-    earlier = [one.since(_padded(there, margin), _padded(back, margin)) for one in before.earlier]
-    seen = [_seen(one, centre, texture, nearer, own.misfit) for one in earlier]
+    flows = _padded(there, margin), _padded(back, margin)
+    earlier = [one.since(*flows) for one in before.earlier]
+    seen = [_seen(one, centre, margin, texture, nearer, own.misfit) for one in earlier]
     beliefs = _carried(before.beliefs, back, psi.binning)
 
     def again(texture: Array, residual: Array, margin: int) -> Array:
         nonlocal beliefs
-        present = Swept(psi, bright.frames, bright.noise, used, texture, residual)
-        beliefs = swept(beliefs, present, margin, settings.slope_px, settings.jump)
+        beliefs = swept(
+            beliefs, psi, bright.frames, bright.noise, used, texture, residual, margin,
+            settings.slope_px, settings.jump,
+        )  # fmt: skip
         return search.per_pixel(beliefs, psi.size, psi.binning)
 
     inner = np.s_[margin : margin + psi.size[0], margin : margin + psi.size[1]]
@@ -297,11 +300,14 @@ def _rested_light(
     return out
 
 
-def _seen(one: Earlier, centre: Array, texture: Array, nearer: int, misfit: float) -> Seen:
+def _seen(
+    one: Earlier, centre: Array, margin: int, texture: Array, nearer: int, misfit: float
+) -> Seen:
     """Return what an earlier frame saw; its readings count the less the more is missed around."""
-    surfaces = one.surfaces(centre, nearer, len(texture))
+    surfaces = one.surfaces(centre, margin, nearer, len(texture))
     missed = one.readings.frames - surfaces.forward(texture)
-    wrong = np.maximum(_around(np.square(missed), one.used) - one.readings.noise, 0)
+    around = mean_around(np.square(missed), one.used.astype(np.float32), WINDOW_PX)
+    wrong = np.maximum(around - one.readings.noise, 0)
     variance = one.readings.variance(misfit) + wrong
     precision = np.where(one.used, 1 / variance, 0).astype(np.float32)
     return Seen(surfaces, one.readings.frames, precision)
@@ -316,25 +322,13 @@ def _rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
     return there * (1 - then)[..., None], back * (1 - rests)[..., None]
 
 
-def _around(
-    values: Array, used: NDArray[np.bool_], window_px: float = WINDOW_PX
-) -> NDArray[np.floating]:
-    """Return the mean over used pixels around, of (shot, pixel_y, pixel_x)."""
-    weight = used.astype(np.float32)
-    sums, counts = (
-        np.stack([cv2.GaussianBlur(one, (0, 0), window_px) for one in part])
-        for part in (np.where(used, values, 0).astype(np.float32), weight)
-    )
-    return np.asarray(sums / np.maximum(counts, 1e-6))
-
-
 def _share_new(foretold: Array, plain: Plain) -> float:
     """Return the share of pixels around which held-out readings are foretold worse by what is
     carried than by total variation; foretold: residual, over the scale."""
     if not plain.held.any():
         return 0.0
     own, others = (
-        _around(np.square(one), plain.held, HELD_WINDOW_PX)
+        mean_around(np.square(one), plain.held.astype(np.float32), HELD_WINDOW_PX)
         for one in (foretold, plain.plain_residual / plain.scale)
     )
     return float(np.mean(own > others))

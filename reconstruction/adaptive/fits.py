@@ -15,7 +15,7 @@ from reconstruction.adaptive.joint import FittedScene, solve
 from reconstruction.adaptive.second import surfaces_fail
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Plain, Survey
-from reconstruction.adaptive.sweep import Swept, swept
+from reconstruction.adaptive.sweep import swept
 from reconstruction.adaptive.uncertainty import blur_views, features, stated, variance_of_mean
 
 Array = NDArray[np.floating]
@@ -64,10 +64,18 @@ def fitted_models(
     scale = np.float32(survey.scale)
 
     def again(volume: search.Volume, texture: Array, residual: Array, margin: int) -> Array:
-        seen = Swept(
-            given.psi, bright.frames, bright.noise, given.usable & ~held, texture, residual
+        beliefs = swept(
+            volume,
+            given.psi,
+            bright.frames,
+            bright.noise,
+            given.usable & ~held,
+            texture,
+            residual,
+            margin,
+            settings.slope_px,
+            settings.jump,
         )
-        beliefs = swept(volume, seen, margin, settings.slope_px, settings.jump)
         return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
 
     first, size, k = settings.misfits[0], given.psi.size, given.psi.binning

@@ -88,23 +88,19 @@ def reconstruct_adaptive(
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
-    whole = given = checked(psi, frames, noise_sigma, usable)
+    whole = checked(psi, frames, noise_sigma, usable)
     known = None if disparity is None else checked_disparity(disparity, psi)
-    edges = dark_edges(psi, given.frames, given.usable, settings.edges)
-    if edges is not None:
-        given = replace(given, usable=given.usable & ~edges.within)
+    given, edges = _without_edges(whole, settings)
     survey = surveyed(given, settings, known, report)
     second = searched_again(survey, settings) if known is None else None
     if second is not None:
         total = 2 * settings.texture.steps + 3
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second)
     believed = survey.volume if second is None else second
-    result = _put_together(survey, fits, survey.volume, believed, edges, whole)
+    result = _put_together(survey, fits, survey.volume, believed, edges, whole, total, started)
     report(total)
     return replace(
         result,
-        steps=total,
-        seconds=time.perf_counter() - started,
         parameters=result.parameters | {"search_seconds": searched_s},
         film=film and film.after(survey, fits.scene, result.light_field, believed),
     )
@@ -125,10 +121,8 @@ def reconstruct_next(
     what was seen before does not foretell the frame: it is a first frame then.
     """
     started = time.perf_counter()
-    whole = given = checked(psi, frames, noise_sigma, usable)
-    edges = dark_edges(psi, given.frames, given.usable, settings.edges)
-    if edges is not None:
-        given = replace(given, usable=given.usable & ~edges.within)
+    whole = checked(psi, frames, noise_sigma, usable)
+    given, edges = _without_edges(whole, settings)
     total = film.settings.texture.steps + 1
 
     def report(step: int) -> None:
@@ -138,17 +132,24 @@ def reconstruct_next(
     found = followed(film, given, settings, report)
     if found is None:
         return None
-    result = _put_together(found.plain, found.fits, found.beliefs, found.beliefs, edges, whole)
+    beliefs = found.beliefs
+    result = _put_together(found.plain, found.fits, beliefs, beliefs, edges, whole, total, started)
     report(total)
     return replace(
         result,
-        steps=total,
-        seconds=time.perf_counter() - started,
         parameters=result.parameters | found.parameters,
-        film=film.after(
-            found.plain, found.fits.scene, result.light_field, found.beliefs, found.earlier
-        ),
+        film=film.after(found.plain, found.fits.scene, result.light_field, beliefs, found.earlier),
     )
+
+
+def _without_edges(
+    whole: Readings, settings: AdaptiveSettings
+) -> tuple[Readings, DarkEdges | None]:
+    """Return the readings without dark edges, and these; None without any."""
+    edges = dark_edges(whole.psi, whole.frames, whole.usable, settings.edges)
+    if edges is None:
+        return whole, None
+    return replace(whole, usable=whole.usable & ~edges.within), edges
 
 
 def _put_together(
@@ -158,11 +159,13 @@ def _put_together(
     believed: search.Volume,
     edges: DarkEdges | None,
     whole: Readings,
+    steps: int,
+    started: float,
 ) -> Reconstruction:
-    """Return the mean of fits, with its maps; steps and seconds are left open.
+    """Return the mean of fits, with its maps.
 
     believed: the less sure of two searches, which knows better how sure to be. whole: the readings
-    with dark edges.
+    with dark edges. started: by `time.perf_counter`.
     """
     given, psi = survey.given, survey.given.psi
     size, k = psi.size, psi.binning
@@ -184,9 +187,9 @@ def _put_together(
         light_field=light_field,
         status=Status.CONVERGED,
         advice="",
-        steps=0,
+        steps=steps,
         objective=(),
-        seconds=0.0,
+        seconds=time.perf_counter() - started,
         parameters={
             "noise_sigma": given.typical,
             "lowest_px": float(fits.scene.centre.min()),

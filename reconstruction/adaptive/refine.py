@@ -129,14 +129,16 @@ def fitted(
     earlier: what other times saw of the same texture.
     """
     all_seen = [Seen(surfaces, frames, precision), *earlier]
+    dark = [np.zeros_like(one.frames) for one in all_seen]
 
     def subtract(texture: Array, sums: Array) -> None:
-        for seen in all_seen:
-            nothing = np.zeros_like(seen.frames)
-            seen.surfaces.add_missed(texture, nothing, seen.precision, sums)
+        for one, nothing in zip(all_seen, dark, strict=True):
+            one.surfaces.add_missed(texture, nothing, one.precision, sums)
 
-    rhs = np.sum([one.surfaces.missed(prior, one.frames, one.precision) for one in all_seen], 0)
-    return prior + conjugate_gradients(subtract, 1 / sigma**2, rhs, steps)
+    missed = surfaces.missed(prior, frames, precision)
+    for one in earlier:
+        missed += one.surfaces.missed(prior, one.frames, one.precision)
+    return prior + conjugate_gradients(subtract, 1 / sigma**2, missed, steps)
 
 
 def slopes(texture: Array) -> Array:

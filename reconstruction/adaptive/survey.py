@@ -160,42 +160,26 @@ def surveyed(
     disparity: of the centre view (y, x) where it is known. on_searched: called with 1 and 2 after
     the coarse and the fine search.
     """
-    flat = flat_psi(given.psi)
+    k, flat = given.psi.binning, flat_psi(given.psi)
     picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
     unseen = unseen_colour(flat, given.frames, given.usable, picture)
     own = settings.contrast or contrast_of(flat, given.frames, picture, given.noise, given.usable)
     scale = min(1.0, own / CONTRAST)
     bright = given.over(scale)
     picture = picture / np.float32(scale)
-    psi = given.psi
-    data, fine, rough, volume = searched(bright, picture, settings, on_searched)
-    centre = search.per_pixel(volume, psi.size, psi.binning) if disparity is None else disparity
-    begun = plain_of(given, scale, unseen, settings.start_steps)
-    return Survey(**vars(begun), data=data, prior=fine, rough=rough, volume=volume, centre=centre)
-
-
-def searched(
-    bright: Readings,
-    picture: Array,
-    settings: AdaptiveSettings,
-    on_searched: Callable[[int], None],
-) -> tuple[search.SearchData, TexturePrior, search.Volume, search.Volume]:
-    """Return the fine search's data and prior, and what the coarse and the fine one believe.
-
-    picture: a smooth one (y, x, c) that explains the readings' local means. Others: see `surveyed`.
-    """
-    k, grey = bright.psi.binning, picture.mean(axis=-1)
+    grey = picture.mean(axis=-1)
     data = search.SearchData(
-        bright.psi,
-        (bright.frames - flat_psi(bright.psi).forward(picture)).astype(np.float32),
+        given.psi,
+        (bright.frames - flat.forward(picture)).astype(np.float32),
         bright.variance(settings.misfit),
-        bright.usable,
+        given.usable,
         grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3)),
     )
     coarse, fine = (
         TexturePrior(length, tuple(finer), freedom=settings.freedom)
         for length, *finer in (COARSE_PX, settings.lengths_px)
     )
+    psi = given.psi
     smooth = settings.slope_px, settings.jump
     rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
     on_searched(1)
@@ -203,7 +187,9 @@ def searched(
         data, fine, rough, settings.stride, settings.step_px, *smooth, settings.interleaved
     )
     on_searched(2)
-    return data, fine, rough, volume
+    centre = search.per_pixel(volume, psi.size, k) if disparity is None else disparity
+    begun = plain_of(given, scale, unseen, settings.start_steps)
+    return Survey(**vars(begun), data=data, prior=fine, rough=rough, volume=volume, centre=centre)
 
 
 def contrast_of(

@@ -14,7 +14,7 @@ agree by belief propagation as in the search.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import floor
 from typing import Any
 
@@ -153,64 +153,43 @@ def _likelihood(residual: Array, variance: Array, used: Array, alike: Any) -> Ar
     return np.asarray(alike.filter(each), dtype=np.float32) * (2 * RADIUS_PX + 1) ** 2
 
 
-def _smooth(values: Array, used: Array) -> Array:
-    """Return the mean over the used pixels around, shots apart, of (shot, y, x)."""
+def mean_around(values: Array, used: Array, window_px: float = VARIANCE_PX) -> Array:
+    """Return the mean over the used pixels around, shots apart, of (shot, y, x).
+
+    used: 1 or 0, of the type of the values.
+    """
     blurred = [
-        cv2.GaussianBlur(a * b, (0, 0), VARIANCE_PX)
-        / np.maximum(cv2.GaussianBlur(b, (0, 0), VARIANCE_PX), 1e-6)
+        cv2.GaussianBlur(a * b, (0, 0), window_px)
+        / np.maximum(cv2.GaussianBlur(b, (0, 0), window_px), 1e-6)
         for a, b in zip(values, used, strict=True)
     ]
-    return np.stack(blurred).mean(axis=0)
-
-
-@dataclass(frozen=True, eq=False)
-class Swept:
-    """What is swept: Psi, frames, their variance `noise`, which are used, and the residual of the
-    present surfaces, (shot, pixel_y, pixel_x); texture: (c, y, x), padded."""
-
-    psi: ImagingMatrix
-    frames: Array
-    noise: Array
-    used: NDArray[np.bool_]
-    texture: Array
-    residual: Array
-
-    def likelihoods(self, disparities: Array, margin: int) -> NDArray[np.float32]:
-        """Return log-likelihoods (row, column, disparity) of every STRIDE-th pixel."""
-        psi, k = self.psi, self.psi.binning
-        weight = self.used.astype(np.float32)
-        variance = np.maximum(_smooth(np.square(self.residual), weight), self.noise.mean(axis=0))
-        inner = self.texture[:, margin : margin + psi.size[0], margin : margin + psi.size[1]]
-        blocks = inner.reshape(len(inner), psi.size[0] // k, k, psi.size[1] // k, k)
-        guide = np.moveaxis(blocks.mean(axis=(2, 4)), 0, -1)
-        guide = np.ascontiguousarray(guide.astype(np.float32))
-        shape = [len(range(0, length, STRIDE)) for length in psi.frames_shape[1:]]
-        out = np.empty((*shape, len(disparities)), dtype=np.float32)
-
-        def work(_: int, first: int, last: int) -> None:
-            alike = cv2.ximgproc.createGuidedFilter(guide, RADIUS_PX, EDGE)
-            for label in range(first, last):
-                of_plane = plane_frames(psi, self.texture, disparities[label], margin)
-                missed = self.frames - of_plane
-                every = _likelihood(missed, variance, weight, alike)
-                out[..., label] = every[::STRIDE, ::STRIDE]
-
-        in_bands(work, len(disparities))
-        return out
+    return np.stack(blurred)
 
 
 def swept(
     volume: Volume,
-    seen: Swept,
+    psi: ImagingMatrix,
+    frames: Array,
+    noise: Array,
+    used: NDArray[np.bool_],
+    texture: Array,
+    residual: Array,
     margin: int,
     slope_px: float,
     jump: float,
 ) -> Volume:
     """Return what to believe of every STRIDE-th pixel's disparity, given texture and patches.
 
-    volume: of the search. margin: of the texture.
+    volume: of the search. frames, their variance `noise`, which are used, and the residual
+    of the present surfaces: (shot, pixel_y, pixel_x). texture: (c, y, x), padded by a margin.
     """
-    psi = seen.psi
+    weight = used.astype(np.float32)
+    missed = mean_around(np.square(residual), weight).mean(axis=0)
+    variance = np.maximum(missed, noise.mean(axis=0))
+    k = psi.binning
+    inner = texture[:, margin : margin + psi.size[0], margin : margin + psi.size[1]]
+    pixels = inner.reshape(len(inner), psi.size[0] // k, k, psi.size[1] // k, k).mean(axis=(2, 4))
+    guide = np.ascontiguousarray(np.moveaxis(pixels, 0, -1).astype(np.float32))
     rows, columns = (np.arange(0, length, STRIDE) for length in psi.frames_shape[1:])
     at = places(volume, rows.astype(float), columns.astype(float))
     half = max(psi.light_field_shape[:2]) // 2
@@ -219,10 +198,18 @@ def swept(
     within = (volume.disparities >= low - BEYOND_PX) & (volume.disparities <= high + BEYOND_PX)
     within &= np.abs(volume.disparities) * half + TAPS <= margin
     labels = volume.disparities[within]
-    evidence = seen.likelihoods(labels, margin)
-    for label, known in enumerate(np.flatnonzero(within)):
-        believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
-        evidence[..., label] += np.log(believed + LEAST_BELIEF)
+    evidence = np.empty((len(rows), len(columns), len(labels)), dtype=np.float32)
+    all_known = np.flatnonzero(within)
+
+    def work(_: int, first: int, last: int) -> None:
+        alike = cv2.ximgproc.createGuidedFilter(guide, RADIUS_PX, EDGE)
+        for label, known in enumerate(all_known[first:last], first):
+            of_plane = frames - plane_frames(psi, texture, labels[label], margin)
+            likelihood = _likelihood(of_plane, variance, weight, alike)[::STRIDE, ::STRIDE]
+            believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
+            evidence[..., label] = likelihood + np.log(believed + LEAST_BELIEF)
+
+    in_bands(work, len(labels))
     chances = posteriors(evidence, compatibility(labels, slope_px * STRIDE, jump))
     return replace(
         volume,

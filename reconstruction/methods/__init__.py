@@ -92,6 +92,11 @@ def installed_methods() -> tuple[str, ...]:
     return tuple(name for name, method in METHODS.items() if method.installed)
 
 
+def film_methods() -> tuple[str, ...]:
+    """Return the names of the methods that go on from frame to frame of a film."""
+    return tuple(name for name, method in METHODS.items() if method.films)
+
+
 def find_method(name: str) -> Method:
     """Return a method by name; raises ReconstructionError naming the nearest."""
     if name in METHODS:
@@ -124,7 +129,7 @@ def reconstruct(
     """
     method = find_method(name)
     if film is not None and not method.films:
-        able = ", ".join(one.name for one in METHODS.values() if one.films)
+        able = ", ".join(film_methods())
         raise ReconstructionError(f"'{name}' takes no films: --method one of {able}")
     settings = settings or MethodSettings()
     given = Given(psi, frames, noise_sigma, usable, dictionary, on_step, estimates, film)

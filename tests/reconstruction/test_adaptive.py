@@ -38,7 +38,7 @@ from reconstruction.adaptive.search import (
 )
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import checked, surveyed
-from reconstruction.adaptive.sweep import Swept, plane_frames, swept
+from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.uncertainty import (
     FEATURES,
     features,
@@ -620,7 +620,6 @@ def test_a_sweep_with_the_right_texture_mends_a_wrong_disparity(bayer):
     volume = Volume(labels, at, beliefs, beliefs, np.zeros((3, 3), int), beliefs[..., 0] > 0)
     noise = np.full(frames.shape, 1e-5, np.float32)
     used = np.ones(frames.shape, bool)
-    seen = Swept(bayer, frames, noise, used, texture, missed)
-    found = swept(volume, seen, surfaces.margin, 0.04, 0.05)
+    found = swept(volume, bayer, frames, noise, used, texture, missed, surfaces.margin, 0.04, 0.05)
     disparity = per_pixel(found, bayer.size, 1)[4:-4, 26:-6]
     assert np.mean(np.abs(disparity - 0.75) < 0.13) > 0.9

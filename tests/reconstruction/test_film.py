@@ -1,5 +1,7 @@
 """Films: frames that follow are fitted with earlier ones, carried along by optical flow."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from reconstruction.methods import reconstruct
 from simulators.scenes import render
 
 SIZE = (48, 64)
+LEAST_GAIN_DB, MOST_LOSS_DB = 0.3, 0.2
 CAMERA = shipped_cameras()["scenario-ii-cfa"]
 
 
@@ -78,8 +81,8 @@ def test_an_earlier_frame_sees_the_present_texture_where_it_was(psi):
         np.ones(psi.frames_shape),
         np.ones(psi.frames_shape, bool),
     )
-    earlier = Earlier(readings, readings.usable, margin, there, -there)
-    seen = earlier.surfaces(centre, 1, 3).forward(texture)
+    earlier = Earlier(readings, readings.usable, there, -there)
+    seen = earlier.surfaces(centre, margin, 1, 3).forward(texture)
     then = np.roll(texture, (-2, 3), axis=(1, 2))
     expected = surfaces_of(psi, centre, margin, 1).forward(then)
     inner = np.s_[:, 8:-8, 8:-8]
@@ -96,6 +99,31 @@ def test_a_film_is_more_accurate_than_its_frames_alone(followed):
     ]
     assert np.mean(gains) > 0.5, gains
     assert all("new_share" in result.parameters for _, result, _ in followed[1:])
+
+
+def _last_psnr_db(psi, followed, of_earlier):
+    """Return the PSNR of the last frame, with the earlier frames that it goes on from changed."""
+    film = followed[-2][1].film
+    known = replace(film.known, earlier=tuple(of_earlier(film.known.earlier)))
+    shown = _readings(psi, followed[-1][0], len(followed) - 1)
+    given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    result = reconstruct(*given, film=replace(film, known=known))
+    return psnr_db(result.light_field, followed[-1][0])
+
+
+def test_earlier_frames_themselves_make_the_next_one_more_accurate(psi, followed):
+    alone_db = _last_psnr_db(psi, followed, lambda earlier: ())
+    assert psnr_db(followed[-1][1].light_field, followed[-1][0]) > alone_db + LEAST_GAIN_DB
+
+
+def test_earlier_frames_of_something_else_do_next_to_no_harm(psi, followed):
+    def of_something_else(earlier):
+        for one in earlier:
+            frames = np.ascontiguousarray(one.readings.frames[:, ::-1, ::-1])
+            yield replace(one, readings=replace(one.readings, frames=frames))
+
+    alone_db = _last_psnr_db(psi, followed, lambda earlier: ())
+    assert _last_psnr_db(psi, followed, of_something_else) > alone_db - MOST_LOSS_DB
 
 
 def test_the_flow_reported_is_the_motion(followed):

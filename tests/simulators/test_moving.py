@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from smooth_texture import SMOOTH, UNLIT
 
 from emmc_rig.files.scenes import fine_scene, open_scene
 from emmc_rig.model.lightfield import centre_view
@@ -11,17 +12,6 @@ from simulators.raycaster import Ball, CameraMotion, Card, Motion, World, tabula
 from simulators.scenes import MOVING_SCENES, flow_px, render, render_at, rendered
 
 SIZE_PX = (48, 64)
-UNLIT = np.zeros((256, 256, 4), np.float32)
-_q, _p = (np.indices((256, 256)) + 0.5) / 256
-SMOOTH = np.stack(
-    [
-        0.5 + 0.3 * np.sin(2 * np.pi * 2 * _p) * np.cos(2 * np.pi * _q),
-        0.5 + 0.3 * np.cos(2 * np.pi * (_p + 2 * _q)),
-        0.5 + 0.3 * np.sin(2 * np.pi * (2 * _p - _q)),
-        np.ones_like(_p),
-    ],
-    axis=-1,
-).astype(np.float32)
 PICTURE_PLANE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], dtype=float)
 WALL = Card(SMOOTH, -2.0, PICTURE_PLANE, tiled=True)
 # A square of a quarter of the width in the middle of the picture.

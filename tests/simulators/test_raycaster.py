@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from smooth_texture import SIDE, SMOOTH, UNLIT
 
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import centre_view, psnr_db
@@ -13,20 +14,7 @@ from simulators.raycaster import Ball, Card, World, tabulated
 from simulators.scenes import SCENES, Scene, render, rendered
 
 SIZE_PX = (48, 64)
-SIDE = 256
-UNLIT = np.zeros((SIDE, SIDE, 4), np.float32)
 _names = (f"test world {i}" for i in itertools.count())
-
-_q, _p = (np.indices((SIDE, SIDE)) + 0.5) / SIDE
-SMOOTH = np.stack(
-    [
-        0.5 + 0.3 * np.sin(2 * np.pi * 2 * _p) * np.cos(2 * np.pi * _q),
-        0.5 + 0.3 * np.cos(2 * np.pi * (_p + 2 * _q)),
-        0.5 + 0.3 * np.sin(2 * np.pi * (2 * _p - _q)),
-        np.ones_like(_p),
-    ],
-    axis=-1,
-).astype(np.float32)
 
 
 def smooth(p: np.ndarray, q: np.ndarray) -> np.ndarray:
