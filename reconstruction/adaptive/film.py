@@ -2,13 +2,15 @@
 
 Of the frame before, disparity, texture and beliefs about disparities are carried to the present by
 optical flow (`flow`). The present texture is then fitted not to the present frame alone, but to the
-last few: an earlier frame saw the present surfaces where the flow since then says (`Earlier`). In
+last few: an earlier frame saw the present surfaces where the flow since then says (`OtherTime`). In
 the next frame the same point of a surface meets other cells of the mask: time is a code.
 
 Nothing carried is believed further than readings go. A reading of an earlier frame counts with the
 variance that what is foretold misses around it, so that where flow is wrong, or something is hidden
 meanwhile, the present frame decides alone. Where the carried scene foretells the present frame no
-better than total variation does over more than NEW_SHARE of the picture, it is a first frame.
+better than total variation does over more than NEW_SHARE of the picture, it is a first frame. So is
+one that leaves more of its own readings where something moves than the first one did: detail finer
+than the pixels changes as it moves, and nothing carried is right of it.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -28,7 +29,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.fits import Fits
-from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
+from reconstruction.adaptive.flow import at_places, flow_between, sampled
 from reconstruction.adaptive.joint import (
     FittedScene,
     TextureSettings,
@@ -38,11 +39,16 @@ from reconstruction.adaptive.joint import (
 )
 from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Plain, Readings, checked, plain_of, unseen_by
 from reconstruction.adaptive.sweep import STRIDE, mean_around, swept
-from reconstruction.adaptive.visibility import carried
+from reconstruction.adaptive.times import (
+    HELD_WINDOW_PX,
+    WINDOW_PX,
+    OtherTime,
+    padded,
+    rested,
+)
 from reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
@@ -58,21 +64,25 @@ class FilmSettings(Settings):
         default=0.002, gt=0, description="deviation of readings that no texture explains"
     )
     earlier: int = Field(default=2, ge=1, description="frames before that are fitted, too")
+    together: int = Field(
+        default=4, ge=1, description="frames before, searched with the present one, of moving masks"
+    )
 
 
-WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0
-"""Deviation of the windows in which squared residuals of what is foretold are averaged; and of the
-few readings that are kept from every fit."""
 KEPT = 0.8
 """Part of the belief in a disparity that the next frame keeps; the rest is spread over all."""
 NEW_SHARE = 0.4
 """Share of the picture that is foretold worse than by total variation, from which on a frame is a
 first one."""
-STILL, REST_PX = 1.05, 2.0
+STILL = 1.05
 """Where what is carried without motion misses readings by no more than so many times what it misses
-with, the scene rests; and the deviation by which such places are blurred."""
+with, the scene rests."""
 RESTING_PX = 0.25
 """Flow up to which the light field of the frame before stands for that of the present one."""
+WORSE, MOVING_SHARE = 1.2, 0.02
+"""Times the residual of the first frame, over noise, from which on one that follows is a first one:
+of films of group A (96x128, `benchmarks/films.py`) PLACEHOLDER. And the share of the picture
+that moves without which it is not asked."""
 UNDERSTATED = 2.6
 """Of two fits of a capture the spread shows what closeness to the readings changes; a frame that
 follows has one. Films of group A (96x128, `benchmarks/films.py`) stated 3.2 to 5.4 dB more than
@@ -82,47 +92,13 @@ ROOM_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Earlier:
-    """A frame of before, and where its points are now.
-
-    readings: over the scale. used: those that count, (shot, pixel_y, pixel_x). there, back: flow
-    from its time to the present, and back, (y, x, 2), padded as textures are.
-    """
-
-    readings: Readings
-    used: NDArray[np.bool_]
-    there: Array
-    back: Array
-
-    def since(self, there: Array, back: Array) -> Earlier:
-        """Return the same one frame later; there, back: flows between these two frames, padded."""
-        return replace(self, there=joined(self.there, there), back=joined(back, self.back))
-
-    def surfaces(self, centre: Array, margin: int, nearer: int, colours: int) -> Surfaces:
-        """Return what it saw of the present texture.
-
-        centre: the present disparity of the centre view (y, x), padded by `margin`. nearer: see
-        `carried`.
-        """
-        psi = self.readings.psi
-        then = sampled(centre, at_places(centre.shape) + self.there)
-        disparity, hidden = carried(then, margin, nearer, psi.light_field_shape[:4])
-        views, own = disparity.shape[:2], at_places(psi.size)
-        moved = np.empty((2, *disparity.shape), dtype=np.float32)
-        for v, u in np.ndindex(views):
-            steps = np.array([v - views[0] // 2, u - views[1] // 2], dtype=np.float32)
-            met = own - disparity[v, u][..., None] * steps + np.float32(margin)
-            moved[:, v, u] = np.moveaxis(sampled(self.there, met), -1, 0)
-        return Surfaces(psi, disparity, hidden, margin, colours, moved=moved)
-
-
-@dataclass(frozen=True, eq=False)
 class Known:
     """What a frame leaves for the next one.
 
     scale: of the scene, see `Plain`. light_field: as `mixture.stored`. texture: (c, y, x), padded
     by `margin` as the centre view's disparity `centre` (y, x). beliefs: about disparities.
-    picture: centre view of the light field without surfaces, (y, x, c). earlier: the latest last.
+    missed: least root
+    mean square residual of first frames, over their noise. earlier: the latest last.
     """
 
     scale: float
@@ -131,8 +107,8 @@ class Known:
     texture: Array
     centre: Array
     beliefs: search.Volume
-    picture: Array
-    earlier: tuple[Earlier, ...]
+    missed: float
+    earlier: tuple[OtherTime, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +131,7 @@ class Film:
         psis: of each of the frames `known.earlier`, as `reconstruct` was given it, of one shot.
         """
         fitted = (checked(psi, np.zeros(psi.frames_shape), 1.0, None).psi for psi in psis)
-        kinds = (cls, FilmSettings, Known, Earlier, Readings, search.Volume)
+        kinds = (cls, FilmSettings, Known, OtherTime, Readings, search.Volume)
         about = parse_json(str(arrays["about"]), "a stored film", ReconstructionError)
         return put_together(about, arrays, kinds, lambda: next(fitted))
 
@@ -165,38 +141,60 @@ class Film:
         scene: FittedScene,
         light_field: Array,
         beliefs: search.Volume,
-        earlier: Sequence[Earlier] = (),
+        missed: float,
+        earlier: Sequence[OtherTime] = (),
     ) -> Film:
         """Return what is known after a frame; earlier: frames before, none of a first one."""
         margin, texture = scene.surfaces.margin, scene.clean
-        if not earlier:
-            room_px = ROOM_PX + self.settings.texture.room_px
-            wider = margin_of(plain.given.psi, scene.centre, room_px) - margin
-            margin += wider
-            texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")
+        if self.known is not None:
+            missed = min(missed, self.known.missed)
+        room_px = ROOM_PX + self.settings.texture.room_px
+        wider = max(margin_of(plain.given.psi, scene.centre, room_px) - margin, 0)
+        margin += wider
+        texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")
         centre = np.pad(scene.centre, margin, mode="edge")
-        still = np.zeros((*centre.shape, 2), dtype=np.float32)
-        this = Earlier(plain.bright, plain.given.usable & ~plain.held, still, still)
-        kept = (*earlier, this)[-self.settings.earlier :]
+        still = np.zeros((*scene.centre.shape, 2), dtype=np.float32)
+        used = plain.given.usable & ~plain.held
+        this = OtherTime(plain.bright, used, plain.picture, still, still)
+        kept = (*earlier, this)[-max(self.settings.earlier, self.settings.together) :]
         seen = mixture.stored(light_field)
-        known = Known(plain.scale, margin, seen, texture, centre, beliefs, plain.picture, kept)
+        known = Known(plain.scale, margin, seen, texture, centre, beliefs, missed, kept)
         return replace(self, known=known)
 
+    def shown(self, psi: ImagingMatrix) -> list[tuple[Readings, Array]]:
+        """Return frames before, each with its picture, where masks move; none of masks that rest.
 
-def _padded(flow: Array, margin: int) -> Array:
-    return np.pad(flow, ((margin, margin), (margin, margin), (0, 0)), mode="edge")
+        psi: of the present frame.
+        """
+        if self.known is None or np.array_equal(
+            self.known.earlier[-1].readings.psi.weights, psi.weights
+        ):
+            return []
+        latest, scale = self.known.earlier[-self.settings.together :], self.known.scale
+        return [(one.readings.over(1 / scale), np.float32(scale) * one.picture) for one in latest]
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
     """The models of a frame: see `Plain`, `Fits`; beliefs about disparities; earlier: frames, with
-    the flow to it; parameters: what is reported of it."""
+    the flow to it; moving: readings (shot, pixel_y, pixel_x) that were fitted where something
+    moves; parameters: what is reported of it."""
 
     plain: Plain
     fits: Fits
     beliefs: search.Volume
-    earlier: list[Earlier]
+    earlier: list[OtherTime]
+    moving: NDArray[np.bool_]
     parameters: dict[str, float]
+
+    def worse(self, before: Known, light_field: Array) -> bool:
+        """Return whether its light field leaves more where something moves than the first did."""
+        given, moving = self.plain.given, self.moving
+        if moving.mean() < MOVING_SHARE:
+            return False
+        left = given.frames - given.psi.forward(light_field)
+        relative = np.square(left[moving]) / given.noise[moving]
+        return float(relative.mean()) > (WORSE * before.missed) ** 2
 
 
 def followed(
@@ -209,9 +207,10 @@ def followed(
     before, own, psi = film.known, film.settings, given.psi
     assert before is not None
     margin = before.margin
-    if before.picture.shape[:2] != psi.size:
+    latest = before.earlier[-1]
+    if latest.picture.shape[:2] != psi.size:
         raise ReconstructionError(
-            f"frames before were of {'x'.join(map(str, before.picture.shape[:2]))} samples, this "
+            f"frames before were of {'x'.join(map(str, latest.picture.shape[:2]))} samples, this "
             f"Psi is of {'x'.join(map(str, psi.size))}"
         )
     plain = plain_of(given, before.scale, unseen_by(given), settings.start_steps)
@@ -219,13 +218,13 @@ def followed(
     nearer = 1 if settings.nearer == "larger" else -1
 
     def carried_by(back: Array) -> tuple[Array, Array, Array]:
-        at = at_places(before.centre.shape) + _padded(back, margin)
+        at = at_places(before.centre.shape) + padded(back, margin)
         centre = sampled(before.centre, at)
         texture = np.stack([sampled(one, at, cubic=True) for one in before.texture])
         surfaces = surfaces_of(psi, centre, margin, nearer, len(texture))
         return centre, texture, bright.frames - surfaces.forward(texture)
 
-    there, back = flow_between(before.picture, plain.picture)
+    there, back = flow_between(latest.picture, plain.picture)
     moving, resting = carried_by(back), carried_by(np.zeros_like(back))
     missed, missed_still = (
         mean_around(np.square(of), used.astype(np.float32), WINDOW_PX).sum(axis=0)
@@ -233,23 +232,20 @@ def followed(
     )
     rests = missed_still <= STILL * missed
     if rests.any():
-        there, back = _rested(there, back, rests.astype(np.float32))
+        there, back = rested(there, back, rests.astype(np.float32))
         moving = carried_by(back)
     centre, texture, foretold = moving
     new = _share_new(foretold, plain)
     if new > NEW_SHARE:
         return None
-    flows = _padded(there, margin), _padded(back, margin)
-    earlier = [one.since(*flows) for one in before.earlier]
-    seen = [_seen(one, centre, margin, texture, nearer, own.misfit) for one in earlier]
+    earlier = [one.since(there, back) for one in before.earlier[-own.earlier :]]
+    seen = [one.seen(centre, margin, texture, nearer, own.misfit) for one in earlier]
     beliefs = _carried(before.beliefs, back, psi.binning)
 
-    def again(texture: Array, residual: Array, margin: int) -> Array:
+    def again(texture: Array, surfaces: Surfaces) -> Array:
         nonlocal beliefs
-        beliefs = swept(
-            beliefs, psi, bright.frames, bright.noise, used, texture, residual, margin,
-            settings.slope_px, settings.jump,
-        )  # fmt: skip
+        seen = replace(bright, usable=used)
+        beliefs = swept(beliefs, seen, texture, surfaces, settings.slope_px, settings.jump)
         return search.per_pixel(beliefs, psi.size, psi.binning)
 
     inner = np.s_[margin : margin + psi.size[0], margin : margin + psi.size[1]]
@@ -263,7 +259,7 @@ def followed(
         own.texture,
         on_step=on_step,
         again=again,
-        earlier=seen,
+        others=lambda *_: seen,
         margin=margin,
     )
     scale = np.float32(before.scale)
@@ -277,7 +273,9 @@ def followed(
     fits = Fits([*models, plain.plain], residuals, scene, patched=False, understated=UNDERSTATED)
     moved = float(np.median(np.linalg.norm(there, axis=-1)))
     parameters = {"flow_px": moved, "new_share": new}
-    return Followed(plain, fits, beliefs, earlier, parameters)
+    k = psi.binning
+    moving = used & (np.linalg.norm(back[::k, ::k], axis=-1) > RESTING_PX)
+    return Followed(plain, fits, beliefs, earlier, moving, parameters)
 
 
 def _rested_light(
@@ -298,28 +296,6 @@ def _rested_light(
 
     in_views(work, views)
     return out
-
-
-def _seen(
-    one: Earlier, centre: Array, margin: int, texture: Array, nearer: int, misfit: float
-) -> Seen:
-    """Return what an earlier frame saw; its readings count the less the more is missed around."""
-    surfaces = one.surfaces(centre, margin, nearer, len(texture))
-    missed = one.readings.frames - surfaces.forward(texture)
-    around = mean_around(np.square(missed), one.used.astype(np.float32), WINDOW_PX)
-    wrong = np.maximum(around - one.readings.noise, 0)
-    variance = one.readings.variance(misfit) + wrong
-    precision = np.where(one.used, 1 / variance, 0).astype(np.float32)
-    return Seen(surfaces, one.readings.frames, precision)
-
-
-def _rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
-    """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
-    k = len(back) // len(rests)
-    smooth = np.asarray(cv2.GaussianBlur(rests, (0, 0), REST_PX), dtype=np.float32)
-    rests = smooth.repeat(k, axis=0).repeat(k, axis=1)
-    then = sampled(rests, at_places(rests.shape) + there)
-    return there * (1 - then)[..., None], back * (1 - rests)[..., None]
 
 
 def _share_new(foretold: Array, plain: Plain) -> float:

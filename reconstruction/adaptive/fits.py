@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_views
 from reconstruction.adaptive import mixture, search
 from reconstruction.adaptive.joint import FittedScene, solve
+from reconstruction.adaptive.rays import Surfaces
+from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.second import surfaces_fail
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Plain, Survey
 from reconstruction.adaptive.sweep import swept
+from reconstruction.adaptive.times import OtherTime
 from reconstruction.adaptive.uncertainty import blur_views, features, stated, variance_of_mean
 
 Array = NDArray[np.floating]
@@ -47,6 +50,7 @@ def fitted_models(
     on_step: Callable[[int], None],
     patches: Patches | None = None,
     second: search.Volume | None = None,
+    others: Sequence[OtherTime] = (),
 ) -> Fits:
     """Return a fit of surfaces for each of `settings.misfits`, and one without any.
 
@@ -62,26 +66,17 @@ def fitted_models(
     """
     given, bright, held = survey.given, survey.bright, survey.held
     scale = np.float32(survey.scale)
+    fitted = replace(bright, usable=given.usable & ~held)
 
-    def again(volume: search.Volume, texture: Array, residual: Array, margin: int) -> Array:
-        beliefs = swept(
-            volume,
-            given.psi,
-            bright.frames,
-            bright.noise,
-            given.usable & ~held,
-            texture,
-            residual,
-            margin,
-            settings.slope_px,
-            settings.jump,
-        )
+    def again(volume: search.Volume, texture: Array, surfaces: Surfaces) -> Array:
+        beliefs = swept(volume, fitted, texture, surfaces, settings.slope_px, settings.jump)
         return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
 
+    nearer = 1 if settings.nearer == "larger" else -1
     first, size, k = settings.misfits[0], given.psi.size, given.psi.binning
     if second is None:
-        *others, last = settings.misfits
-        planned = [(survey.volume, survey.centre, misfit, True) for misfit in others]
+        *firsts, last = settings.misfits
+        planned = [(survey.volume, survey.centre, misfit, True) for misfit in firsts]
         planned.append((survey.volume, survey.centre, last, False))
     else:
         planned = [
@@ -93,10 +88,15 @@ def fitted_models(
         # One layout of rays at a time: it is as large as the light field.
         scene = None
         done = fit * settings.texture.steps
+
+        def then(padded: Array, margin: int, texture: Array, misfit: float = misfit) -> list[Seen]:
+            at = padded, margin, texture, nearer, misfit, misfit / first
+            return [one.seen(*at) for one in others]
+
         scene = solve(
             given.psi,
             centre,
-            1 if settings.nearer == "larger" else -1,
+            nearer,
             bright.frames,
             bright.precision(held, misfit),
             survey.picture,
@@ -104,6 +104,7 @@ def fitted_models(
             on_step=lambda step, done=done: on_step(done + step),
             again=partial(again, volume) if sweeps else None,
             begun=begun,
+            others=then,
         )
         begun = scene.begun if second is None else None
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))

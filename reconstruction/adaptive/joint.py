@@ -103,9 +103,9 @@ def solve(
     picture: Array,
     settings: TextureSettings,
     on_step: Callable[[int], None] | None = None,
-    again: Callable[[Array, Array, int], Array] | None = None,
+    again: Callable[[Array, Surfaces], Array] | None = None,
     begun: Begun | None = None,
-    earlier: Sequence[Seen] = (),
+    others: Callable[[Array, int, Array], Sequence[Seen]] = lambda *_: (),
     margin: int | None = None,
 ) -> FittedScene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
@@ -113,9 +113,10 @@ def solve(
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
     disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
     not usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the
-    disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given its residual of
-    the frames, and the margin. begun: of another fit of the same centre, from which to go on.
-    earlier: what other times saw of the texture. margin: of the texture, instead of the least.
+    disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given the present
+    surfaces. begun: of another fit of the same centre, from which to go on.
+    others: returns what other times saw of a disparity (y, x) and its texture, padded by the margin
+    between the two. margin: instead of the least.
     """
     if margin is None:
         margin = margin_of(psi, centre, settings.room_px)
@@ -128,6 +129,7 @@ def solve(
     at = kept = begun or Begun(now, now, now)
     sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
     shared = min(settings.shared_steps, settings.steps - 1)
+    seen = others(padded, margin, at.clean)
     for step in range(0 if begun is None else shared, settings.steps):
         if step == shared:
             kept = at
@@ -145,11 +147,9 @@ def solve(
                 settings.reach,
             )
         if again is not None and step in settings.sweeps:
-            searched = np.pad(
-                again(clean, frames - surfaces.forward(clean), margin), around, "edge"
-            )
-            padded = searched
+            padded = searched = np.pad(again(clean, surfaces), around, "edge")
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
+            seen = others(padded, margin, clean)
         left = settings.steps - 1 - step
         if step >= 2 and left < settings.refine_steps and left % 2 == 0:
             doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
@@ -159,7 +159,7 @@ def solve(
             )
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
-        fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps, earlier)
+        fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps, seen)
         at = Begun(fit, now, clean)
         if on_step is not None:
             on_step(step + 1)

@@ -21,7 +21,7 @@ Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -41,8 +41,10 @@ from reconstruction.adaptive.survey import (
     Readings,
     checked,
     checked_disparity,
+    plain_of,
     surveyed,
 )
+from reconstruction.adaptive.times import moved, surveyed_together
 from reconstruction.adaptive.uncertainty import within_db
 from reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
@@ -102,7 +104,10 @@ def reconstruct_adaptive(
     return replace(
         result,
         parameters=result.parameters | {"search_seconds": searched_s},
-        film=film and film.after(survey, fits.scene, result.light_field, believed),
+        film=film
+        and film.after(
+            survey, fits.scene, result.light_field, believed, result.parameters["misfit"]
+        ),
     )
 
 
@@ -114,14 +119,17 @@ def reconstruct_next(
     settings: AdaptiveSettings,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
-) -> Reconstruction | None:
+) -> Reconstruction | Film:
     """Return the light field of the next frame of a film, from what the frames before showed.
 
-    film: after the frame before; others as those of `reconstruct_adaptive`, of one shot. None where
-    what was seen before does not foretell the frame: it is a first frame then.
+    film: after the frame before; others as those of `reconstruct_adaptive`, of one shot. Where what
+    was seen before does not foretell the frame, or misleads, it is a first one: of the film that is
+    returned.
     """
     started = time.perf_counter()
     whole = checked(psi, frames, noise_sigma, usable)
+    if shown := film.shown(whole.psi):
+        return _among(whole, shown, settings, on_step, film)
     given, edges = _without_edges(whole, settings)
     total = film.settings.texture.steps + 1
 
@@ -130,15 +138,71 @@ def reconstruct_next(
             on_step(Progress(step, None, None, total))
 
     found = followed(film, given, settings, report)
-    if found is None:
-        return None
+    known = film.known
+    if found is None or known is None:
+        return Film(film.settings)
     beliefs = found.beliefs
     result = _put_together(found.plain, found.fits, beliefs, beliefs, edges, whole, total, started)
+    if found.worse(known, result.light_field):
+        return film
     report(total)
+    seen = found.plain, found.fits.scene, result.light_field, beliefs
     return replace(
         result,
         parameters=result.parameters | found.parameters,
-        film=film.after(found.plain, found.fits.scene, result.light_field, beliefs, found.earlier),
+        film=film.after(*seen, known.missed, found.earlier),
+    )
+
+
+def reconstruct_moving(
+    psi: ImagingMatrix,
+    frames: Array,
+    noise_sigma: float | Array,
+    settings: AdaptiveSettings,
+    usable: NDArray[np.bool_] | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+) -> Reconstruction:
+    """Return the light field at the time of the first of several shots, of a scene that moves.
+
+    What the other shots saw is carried to that time, where it explains their readings. Others as
+    those of `reconstruct_adaptive`.
+    """
+    sigma = np.broadcast_to(np.asarray(noise_sigma), psi.frames_shape)
+    every = np.ones(psi.frames_shape, bool) if usable is None else usable
+    present, *others = (
+        checked(psi.of_shots([n]), frames[[n]], sigma[[n]], every[[n]]) for n in range(psi.shots)
+    )
+    nothing, steps = np.zeros(psi.size), settings.start_steps
+    shown = [(one, plain_of(one, 1.0, nothing, steps).picture) for one in others]
+    return _among(present, shown, settings, on_step)
+
+
+def _among(
+    whole: Readings,
+    shown: Sequence[tuple[Readings, Array]],
+    settings: AdaptiveSettings,
+    on_step: Callable[[Progress], None] | None,
+    film: Film | None = None,
+) -> Reconstruction:
+    """Return the light field of a frame, from frames of other times, too; shown: see `others_of`"""
+    started = time.perf_counter()
+    given, edges = _without_edges(whole, settings)
+    total = len(settings.misfits) * settings.texture.steps + 3
+
+    def report(step: int) -> None:
+        if on_step is not None:
+            on_step(Progress(step, None, None, total))
+
+    survey, others = surveyed_together(given, shown, settings, report)
+    fits = fitted_models(survey, settings, lambda step: report(2 + step), others=others)
+    beliefs, scene = survey.volume, fits.scene
+    result = _put_together(survey, fits, beliefs, beliefs, edges, whole, total, started)
+    report(total)
+    left = result.parameters["misfit"]
+    return replace(
+        result,
+        parameters=result.parameters | moved(others),
+        film=film and film.after(survey, scene, result.light_field, beliefs, left, others),
     )
 
 

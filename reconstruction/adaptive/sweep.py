@@ -26,6 +26,7 @@ from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.lanes import CUBIC, TAPS
+from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.search import (
     Volume,
     compatibility,
@@ -33,6 +34,7 @@ from reconstruction.adaptive.search import (
     places,
     posteriors,
 )
+from reconstruction.adaptive.survey import Readings
 
 Array = NDArray[np.floating]
 FREEDOM = 3.0
@@ -168,22 +170,20 @@ def mean_around(values: Array, used: Array, window_px: float = VARIANCE_PX) -> A
 
 def swept(
     volume: Volume,
-    psi: ImagingMatrix,
-    frames: Array,
-    noise: Array,
-    used: NDArray[np.bool_],
+    given: Readings,
     texture: Array,
-    residual: Array,
-    margin: int,
+    surfaces: Surfaces,
     slope_px: float,
     jump: float,
 ) -> Volume:
     """Return what to believe of every STRIDE-th pixel's disparity, given texture and patches.
 
-    volume: of the search. frames, their variance `noise`, which are used, and the residual
-    of the present surfaces: (shot, pixel_y, pixel_x). texture: (c, y, x), padded by a margin.
+    volume: of the search. given: readings over the scale; those usable count. texture: (c, y, x) of
+    the present surfaces, padded by their margin.
     """
-    weight = used.astype(np.float32)
+    psi, frames, noise, margin = given.psi, given.frames, given.noise, surfaces.margin
+    residual = frames - surfaces.forward(texture)
+    weight = given.usable.astype(np.float32)
     missed = mean_around(np.square(residual), weight).mean(axis=0)
     variance = np.maximum(missed, noise.mean(axis=0))
     k = psi.binning

@@ -69,15 +69,15 @@ def _solve(
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
         return solve_tv_dict(fitted, quick).light_field
 
-    result, film = None, given.film
-    if film is not None and film.known is not None:
+    result = given.film
+    if result is not None and result.known is not None:
         result = reconstruct_next(
-            psi, given.frames, given.noise_sigma, film, adaptive, given.usable, given.on_step
+            psi, given.frames, given.noise_sigma, result, adaptive, given.usable, given.on_step
         )
-    if result is None:
+    if not isinstance(result, Reconstruction):
         result = reconstruct_adaptive(
             psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step,
-            patches=patches if may_take_patches(psi, adaptive) else None, film=film,
+            patches=patches if may_take_patches(psi, adaptive) else None, film=result,
         )  # fmt: skip
     return dataclasses.replace(result, method=name)
 

@@ -1,0 +1,229 @@
+"""Frames of other times than the present: what each saw of its surfaces, through its own masks.
+
+By the flow between the times, a reading of another one saw the present texture elsewhere (`Seen`):
+so far as it explains the readings around it, it counts as one of the present. The disparity is
+searched in all frames at once, as in shots of one capture, each moved by whole pixels (`aligned`):
+there the fraction of a pixel is one of the errors that the search allows for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.adaptive import mixture
+from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
+from reconstruction.adaptive.rays import Surfaces
+from reconstruction.adaptive.refine import Seen
+from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.survey import (
+    Plain,
+    Readings,
+    Survey,
+    plain_of,
+    surveyed,
+    unseen_by,
+)
+from reconstruction.adaptive.sweep import mean_around
+from reconstruction.adaptive.visibility import carried
+
+Array = NDArray[np.floating]
+WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0
+"""Deviation of the windows in which squared residuals of what is foretold are averaged; and of the
+few readings that are kept from every fit."""
+ANOTHER = 4.0
+"""Times the mean square that total variation misses held-out readings by, from which on what it
+foretells of another time's is of another scene."""
+
+REST, REST_PX = 1.12, 2.0
+"""Where what total variation foretells without motion misses readings by no more than so many times
+what it misses with, the scene rests: by 0.95 to 1.12 at rest, by 1.2 to 2 of motions of 0.3 px.
+And the deviation by which such places are blurred."""
+RESTING, ALL_MOVES = np.float32(0.1), np.float32(1)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherTime:
+    """A frame of another time, and where its points are at present.
+
+    readings: over the scale. used: those that count, (shot, pixel_y, pixel_x). picture: centre view
+    of its light field without surfaces, (y, x, c). there, back: flow from its time to the present,
+    and back, (y, x, 2). moving: share of what is missed, by which readings are doubted, RESTING to
+    1 (pixel_y, pixel_x).
+    """
+
+    readings: Readings
+    used: NDArray[np.bool_]
+    picture: Array
+    there: Array
+    back: Array
+    moving: Array | np.float32 = ALL_MOVES
+
+    def since(self, there: Array, back: Array) -> OtherTime:
+        """Return the same one frame later; there, back: flows between these two frames."""
+        return replace(self, there=joined(self.there, there), back=joined(back, self.back))
+
+    def surfaces(self, centre: Array, margin: int, nearer: int, colours: int) -> Surfaces:
+        """Return what it saw of the present texture.
+
+        centre: the present disparity of the centre view (y, x), padded by `margin`. nearer: see
+        `carried`.
+        """
+        psi, there = self.readings.psi, padded(self.there, margin)
+        then = sampled(centre, at_places(centre.shape) + there)
+        disparity, hidden = carried(then, margin, nearer, psi.light_field_shape[:4])
+        views, own = disparity.shape[:2], at_places(psi.size)
+        moved = np.empty((2, *disparity.shape), dtype=np.float32)
+        for v, u in np.ndindex(views):
+            steps = np.array([v - views[0] // 2, u - views[1] // 2], dtype=np.float32)
+            met = own - disparity[v, u][..., None] * steps + np.float32(margin)
+            moved[:, v, u] = np.moveaxis(sampled(there, met), -1, 0)
+        return Surfaces(psi, disparity, hidden, margin, colours, moved=moved)
+
+    def seen(
+        self,
+        centre: Array,
+        margin: int,
+        texture: Array,
+        nearer: int,
+        misfit: float,
+        doubt: float = 1.0,
+    ) -> Seen:
+        """Return what it saw of the present texture; a reading counts the less the more is missed.
+
+        centre, texture (c, y, x): at present, padded by a margin. misfit: deviation of readings
+        that no texture explains. doubt: share of what is missed that counts.
+        """
+        surfaces = self.surfaces(centre, margin, nearer, len(texture))
+        missed = self.readings.frames - surfaces.forward(texture)
+        around = mean_around(np.square(missed), self.used.astype(np.float32), WINDOW_PX)
+        wrong = np.float32(doubt) * self.moving * np.maximum(around - self.readings.noise, 0)
+        variance = self.readings.variance(misfit) + wrong
+        precision = np.where(self.used, 1 / variance, 0).astype(np.float32)
+        return Seen(surfaces, self.readings.frames, precision)
+
+
+def padded(flow: Array, margin: int) -> Array:
+    """Return a flow (y, x, 2) padded as textures are."""
+    return np.pad(flow, ((margin, margin), (margin, margin), (0, 0)), mode="edge")
+
+
+def aligned(one: OtherTime, binning: int) -> Readings:
+    """Return a frame of another time moved by whole pixels, as of the present scene."""
+    k, theirs = binning, one.readings
+    moves = np.rint(one.back[k // 2 :: k, k // 2 :: k] / k).astype(np.intp)
+    at = np.indices(moves.shape[:2]) + np.moveaxis(moves, -1, 0)
+    last = np.array(moves.shape[:2])[:, None, None] - 1
+    inside, (y, x) = ((at >= 0) & (at <= last)).all(axis=0), np.clip(at, 0, last)
+    rows, columns = (
+        k * along.repeat(k, axis=0).repeat(k, axis=1) + within
+        for along, within in zip((y, x), np.indices(theirs.psi.size) % k, strict=True)
+    )
+    weights = np.moveaxis(theirs.psi.weights, 4, 3)[..., rows, columns]
+    colour = theirs.psi.colour
+    psi = replace(
+        theirs.psi,
+        weights=np.ascontiguousarray(np.moveaxis(weights, 3, 4)),
+        colour=None if colour is None else colour[:, rows, columns],
+    )
+    usable = one.used[:, y, x] & inside
+    return Readings(psi, theirs.frames[:, y, x], theirs.typical, theirs.noise[:, y, x], usable)
+
+
+def together(given: Readings, others: Sequence[Readings]) -> Readings:
+    """Return frames of one scene as shots of one capture."""
+    every = given, *others
+    psis = [one.psi for one in every]
+    colours = [psi.colour for psi in psis if psi.colour is not None]
+    psi = replace(
+        given.psi,
+        weights=np.concatenate([psi.weights for psi in psis]),
+        colour=np.concatenate(colours) if colours else None,
+        camera_json="",
+    )
+    frames, noise, usable = (
+        np.concatenate([getattr(one, name) for one in every])
+        for name in ("frames", "noise", "usable")
+    )
+    return Readings(psi, frames, given.typical, noise, usable)
+
+
+def others_of(plain: Plain, shown: Sequence[tuple[Readings, Array]]) -> list[OtherTime]:
+    """Return frames of other times with the flow from and to a present one.
+
+    plain: of the present. shown: readings, not over any scale, and the picture without surfaces
+    (y, x, c) of each. Readings are used where they may show the same scene: inside of the present
+    picture, and not far from what total variation foretells there.
+    """
+    given = plain.given
+    k, weight = given.psi.binning, plain.held.astype(np.float32)
+    allowed = mean_around(np.square(plain.plain_residual), weight, HELD_WINDOW_PX)[0]
+    light_field, found = mixture.values(plain.plain), []
+    for readings, picture in shown:
+        there, back = flow_between(picture, plain.picture)
+        at = at_places(there.shape[:2])
+        views = light_field.reshape(-1, *light_field.shape[2:])
+        then = np.stack([sampled(one, at + there) for one in views]).reshape(light_field.shape)
+        weight = readings.usable.astype(np.float32)
+        moves, still = (
+            mean_around(
+                np.square(readings.frames - readings.psi.forward(one)), weight, WINDOW_PX
+            ).sum(axis=0)
+            for one in (then, light_field)
+        )
+        rests = (still <= REST * moves).astype(np.float32)
+        there, back = rested(there, back, rests)
+        places = (at + there)[k // 2 :: k, k // 2 :: k] / k
+        same = (sampled(allowed, places) * ANOTHER >= np.minimum(moves, still)) & (
+            sampled(plain.held[0].astype(np.float32), places) < 0.5
+        )
+        inside = ((places >= 0) & (places <= np.array(same.shape) - 1)).all(axis=-1)
+        moving = 1 - (1 - RESTING) * cv2.GaussianBlur(rests, (0, 0), REST_PX)
+        used = readings.usable & same & inside
+        found.append(OtherTime(readings, used, picture, there, back, moving))
+    return found
+
+
+def rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
+    """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
+    k = len(back) // len(rests)
+    smooth = np.asarray(cv2.GaussianBlur(rests, (0, 0), REST_PX), dtype=np.float32)
+    rests = smooth.repeat(k, axis=0).repeat(k, axis=1)
+    then = sampled(rests, at_places(rests.shape) + there)
+    return there * (1 - then)[..., None], back * (1 - rests)[..., None]
+
+
+def surveyed_together(
+    given: Readings,
+    shown: Sequence[tuple[Readings, Array]],
+    settings: AdaptiveSettings,
+    on_searched: Callable[[int], None],
+) -> tuple[Survey, list[OtherTime]]:
+    """Return what is decided for a scene at present, from frames of other times, too; and these.
+
+    shown: see `others_of`. The frames returned are over the scene's scale.
+    """
+    others = others_of(plain_of(given, 1.0, unseen_by(given), settings.start_steps), shown)
+    whole = together(given, [aligned(one, given.psi.binning) for one in others])
+    survey = surveyed(whole, settings, None, on_searched)
+    own = replace(
+        survey,
+        given=given,
+        bright=given.over(survey.scale),
+        held=survey.held[:1],
+        plain_residual=given.frames - given.psi.forward(mixture.values(survey.plain)),
+    )
+    return own, [replace(one, readings=one.readings.over(survey.scale)) for one in others]
+
+
+def moved(others: Sequence[OtherTime]) -> dict[str, float]:
+    """Return by how much the scene moved to other times, pixels, and the share of it seen there."""
+    by = np.concatenate([np.linalg.norm(one.there[one.used[0]], axis=-1) for one in others])
+    return {
+        "moved_px": float(np.median(by)) if len(by) else 0.0,
+        "seen_share": float(np.mean([one.used.mean() for one in others])),
+    }
