@@ -32,7 +32,8 @@ class Given:
     frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
     one or of each. usable: pixels to fit (default all). dictionary: for methods that need one.
     estimates: what `estimate_patches` found from the same inputs, to go on from. film: that frames
-    are the next one of, see `reconstruction.adaptive.film`.
+    are the next one of, see `reconstruction.adaptive.film`. moving: whether the scene moved between
+    the shots; then the light field is that at the time of the first one.
     """
 
     psi: ImagingMatrix
@@ -43,6 +44,7 @@ class Given:
     on_step: Callable[[Progress], None] | None
     estimates: PatchEstimates | None = None
     film: Film | None = None
+    moving: bool = False
 
     @property
     def typical_noise(self) -> float:
@@ -78,7 +80,7 @@ class Method:
 
     assumes, cost, when: for people, cost in seconds. solve: from what is given and
     the settings of all methods. part, settings: the name and type of its own part of the settings.
-    films: whether it goes on from frame to frame of a film.
+    films: whether it takes scenes that move: films, frame after frame, and shots.
     package: what it needs beyond the core installation; it is then learned, for some views only.
     """
 

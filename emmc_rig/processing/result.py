@@ -122,9 +122,11 @@ class Result:
     def misfit(self) -> NDArray[np.float32]:
         """How far readings are missed around each place (y, x), in deviations: about 1 is right."""
         frames = self.frames
-        return missed_readings(
-            self.psi, self.light_field, frames.readings, frames.noise_sigma, frames.usable
-        )
+        # Where the scene moved it is the light field of the first shot's time.
+        shots = [0] if "moved_px" in self.solved.parameters else list(range(self.psi.shots))
+        readings, usable = frames.readings[shots], frames.usable[shots]
+        psi = self.psi if len(shots) == self.psi.shots else self.psi.of_shots(shots)
+        return missed_readings(psi, self.light_field, readings, frames.noise_sigma, usable)
 
     @property
     def method(self) -> str:

@@ -44,7 +44,7 @@ from reconstruction.adaptive.survey import (
     plain_of,
     surveyed,
 )
-from reconstruction.adaptive.times import moved, surveyed_together
+from reconstruction.adaptive.times import moved, of_present, surveyed_together
 from reconstruction.adaptive.uncertainty import within_db
 from reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
@@ -193,10 +193,14 @@ def _among(
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
-    survey, others = surveyed_together(given, shown, settings, report)
-    fits = fitted_models(survey, settings, lambda step: report(2 + step), others=others)
-    beliefs, scene = survey.volume, fits.scene
-    result = _put_together(survey, fits, beliefs, beliefs, edges, whole, total, started)
+    together, others = surveyed_together(given, shown, settings, report)
+    second = searched_again(together, settings)
+    survey = of_present(together, given)
+    fits = fitted_models(
+        survey, settings, lambda step: report(2 + step), second=second, others=others
+    )
+    beliefs, scene = survey.volume if second is None else second, fits.scene
+    result = _put_together(survey, fits, survey.volume, beliefs, edges, whole, total, started)
     report(total)
     left = result.parameters["misfit"]
     return replace(

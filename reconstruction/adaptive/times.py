@@ -203,21 +203,26 @@ def surveyed_together(
     settings: AdaptiveSettings,
     on_searched: Callable[[int], None],
 ) -> tuple[Survey, list[OtherTime]]:
-    """Return what is decided for a scene at present, from frames of other times, too; and these.
+    """Return what is decided for a scene at present, of all frames as shots; and the others of these.
 
     shown: see `others_of`. The frames returned are over the scene's scale.
     """
     others = others_of(plain_of(given, 1.0, unseen_by(given), settings.start_steps), shown)
     whole = together(given, [aligned(one, given.psi.binning) for one in others])
     survey = surveyed(whole, settings, None, on_searched)
-    own = replace(
+    return survey, [replace(one, readings=one.readings.over(survey.scale)) for one in others]
+
+
+def of_present(survey: Survey, given: Readings) -> Survey:
+    """Return a survey of several times, of the present frame alone."""
+    residual = given.frames - given.psi.forward(mixture.values(survey.plain))
+    return replace(
         survey,
         given=given,
         bright=given.over(survey.scale),
         held=survey.held[:1],
-        plain_residual=given.frames - given.psi.forward(mixture.values(survey.plain)),
+        plain_residual=residual,
     )
-    return own, [replace(one, readings=one.readings.over(survey.scale)) for one in others]
 
 
 def moved(others: Sequence[OtherTime]) -> dict[str, float]:

@@ -93,7 +93,7 @@ def installed_methods() -> tuple[str, ...]:
 
 
 def film_methods() -> tuple[str, ...]:
-    """Return the names of the methods that go on from frame to frame of a film."""
+    """Return the names of the methods that take scenes that move: films, and shots."""
     return tuple(name for name, method in METHODS.items() if method.films)
 
 
@@ -116,6 +116,7 @@ def reconstruct(
     on_step: Callable[[Progress], None] | None = None,
     estimates: PatchEstimates | None = None,
     film: Film | None = None,
+    moving: bool = False,
 ) -> Reconstruction:
     """Return the light field that the method called `name` estimates.
 
@@ -124,15 +125,16 @@ def reconstruct(
     methods that take one take the root mean square. usable: pixels to fit (default all).
     estimates: what `estimate_patches` found from the same inputs, for `dict-...` and `tv-dict` to
     go on from. film: that the frames, of one shot, are the next one of: `Film()` before the first,
-    then `film` of the result before. Raises ReconstructionError for a method that is not known or
-    takes no films, a dictionary that is missing, and inputs that do not fit each other.
+    then `film` of the result before. moving: see `Given`. Raises ReconstructionError for a method
+    that is not known or takes no films, a dictionary that is missing, and inputs that do not fit
+    each other.
     """
     method = find_method(name)
-    if film is not None and not method.films:
+    if (film is not None or moving) and not method.films:
         able = ", ".join(film_methods())
         raise ReconstructionError(f"'{name}' takes no films: --method one of {able}")
     settings = settings or MethodSettings()
-    given = Given(psi, frames, noise_sigma, usable, dictionary, on_step, estimates, film)
+    given = Given(psi, frames, noise_sigma, usable, dictionary, on_step, estimates, film, moving)
     if not settings.screening:
         return method.solve(given, settings)
     started = time.perf_counter()

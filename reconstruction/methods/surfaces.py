@@ -11,7 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.method import reconstruct_adaptive, reconstruct_next
+from reconstruction.adaptive.method import (
+    reconstruct_adaptive,
+    reconstruct_moving,
+    reconstruct_next,
+)
 from reconstruction.adaptive.settings import AdaptiveSettings, fast
 from reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
 from reconstruction.method import Given, Method, Sensitivity, cost_words
@@ -70,7 +74,11 @@ def _solve(
         return solve_tv_dict(fitted, quick).light_field
 
     result = given.film
-    if result is not None and result.known is not None:
+    if given.moving:
+        result = reconstruct_moving(
+            psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step
+        )
+    elif result is not None and result.known is not None:
         result = reconstruct_next(
             psi, given.frames, given.noise_sigma, result, adaptive, given.usable, given.on_step
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -101,7 +101,7 @@ class Evidence:
 
 
 REPORTED_PARAMETERS = (
-    "decided", "at_end", "over_plain", "misfit", "misfit_row", "misfit_column"
+    "decided", "at_end", "over_plain", "misfit", "misfit_row", "misfit_column", "moved_px"
 )  # fmt: skip
 """Parameters of a result that bear on whether it can be trusted."""
 
@@ -125,6 +125,14 @@ class Read:
     bad: float = 0.0
     short: float = 0.0
     gains: tuple[float, ...] = ()
+
+    def of_first_shot(self) -> Read:
+        """Return the same of the first shot alone."""
+        arrays = {
+            name: getattr(self, name)[:1] for name in ("frames", "usable", "kept", "excluded")
+        }
+        left_out = tuple(shot for shot in self.left_out if shot == 0)
+        return replace(self, **arrays, left_out=left_out, gains=self.gains[:1])
 
     @property
     def clipped(self) -> NDArray[np.bool_]:

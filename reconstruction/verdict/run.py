@@ -2,8 +2,9 @@
 
 A saturated reading says that there was at least so much light. The light field is fitted without
 them first; those that it falls short of join the readings, and it is fitted again (an active set,
-of one round: a second one changed 64x80 crops by 0.0 to 0.4 dB). Where a shot saw another scene
-than the others, its readings are left out, and it is fitted again, too.
+of one round: a second one changed 64x80 crops by 0.0 to 0.4 dB). Where one shot saw another scene
+than the others, its readings are left out, and it is fitted again, too. Where several did, the
+scene moved: what they saw is carried to the time of the first.
 """
 
 from __future__ import annotations
@@ -20,18 +21,19 @@ from emmc_rig.model.view_axes import shows_parallax
 from reconstruction.adaptive.film import Film
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs, checked_noise
-from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
 from reconstruction.verdict.evidence import Read, gathered
 from reconstruction.verdict.kept import kept_readings
-from reconstruction.verdict.rules import Verdict, verdict_from
+from reconstruction.verdict.rules import MOTION, Verdict, verdict_from
 from reconstruction.verdict.shadow import relief
-from reconstruction.verdict.shots import motion
+from reconstruction.verdict.shots import Motion, motion
 
 Array = NDArray[np.floating]
 FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""
+COLOURS = 3
 
 
 @one_blas_thread()
@@ -58,10 +60,13 @@ def reconstruct_judged(
     read, notes = _as_fitted(psi, frames, typical, usable, settings.screening)
     unscreened = settings.model_copy(update={"screening": False})
 
-    def solved(readings: Array, fitted: NDArray[np.bool_], before: float = 0.0) -> Reconstruction:
+    def solved(
+        readings: Array, fitted: NDArray[np.bool_], before: float = 0.0, moving: bool = False
+    ) -> Reconstruction:
         result = reconstruct(
-            name, psi, readings, noise_sigma, dictionary, unscreened, fitted, on_step, film=film
-        )
+            name, psi, readings, noise_sigma, dictionary, unscreened, fitted, on_step, film=film,
+            moving=moving,
+        )  # fmt: skip
         return dataclasses.replace(result, seconds=result.seconds + before)
 
     readings, fitted = read.frames, read.usable & ~read.kept
@@ -92,10 +97,23 @@ def reconstruct_judged(
             f"excluded {found.moved.mean():.1%} of the readings, where one shot saw another scene "
             "than the others",
         )
+    if found is not None and found.shot is None and _can_carry(name, psi, fitted, found):
+        took = result.seconds
+        del result
+        result = solved(readings, fitted, took, moving=True)
+        psi, read, shown, found = psi.of_shots([0]), read.of_first_shot(), shown[:1], None
+        seen = relief(psi, shown, typical, read.usable)
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
     verdict = verdict_from(gathered(psi, read, typical, result, seen, found))
     psi.even_unseen_colours(result.light_field)
     return result, verdict
+
+
+def _can_carry(name: str, psi: ImagingMatrix, fitted: NDArray[np.bool_], found: Motion) -> bool:
+    """Return whether a scene moved, and a method can carry shots to the time of the first one."""
+    colours = psi.colour is None or len(np.unique(psi.colour[0])) == COLOURS
+    moved = found.ratio > MOTION.doubt and find_method(name).films
+    return moved and colours and bool(fitted[0].any())
 
 
 def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDArray]:
