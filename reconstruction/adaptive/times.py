@@ -203,7 +203,7 @@ def surveyed_together(
     settings: AdaptiveSettings,
     on_searched: Callable[[int], None],
 ) -> tuple[Survey, list[OtherTime]]:
-    """Return what is decided for a scene at present, of all frames as shots; and the others of these.
+    """Return what is decided for a scene at present, from all frames as shots; and the others.
 
     shown: see `others_of`. The frames returned are over the scene's scale.
     """
