@@ -13,7 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.raycaster import QUOTED, Ball, Card, Motion, Tables, World, surfaces
+from simulators.raycaster import (
+    QUOTED,
+    Ball,
+    Card,
+    Motion,
+    World,
+    pixel_centres,
+    surfaces,
+    tabulated,
+)
 
 Array = NDArray[np.float64]
 _SAME_D = 1e-6
@@ -38,32 +47,27 @@ def world_at(world: World, time_s: float) -> World:
     )
 
 
-def flow_between(
-    world: World, size: tuple[int, int], times_s: tuple[float, float], tables: tuple[Tables, Tables]
-) -> Array:
+def flow_between(world: World, size: tuple[int, int], from_s: float, to_s: float) -> Array:
     """Return where each point that the central view sees goes, (y, x, 2): right and down, pixels.
 
-    tables: of the world at both times. NaN where there is no surface at the first time, and where
-    the point is hidden, or beside the picture, at the second. A point's surface is the first one
-    that is at least half opaque, as for disparities.
+    NaN where there is no surface at the first time, and where the point is hidden, or beside the
+    picture, at the second. A point's surface is the first one that is at least half opaque, as for
+    disparities.
     """
     height, width = size
-    y, x = np.indices(size)
-    from_px = np.stack([x, y], axis=-1)
-    corner = np.array([0.5 - width / 2, 0.5 - height / 2])
-    points = (from_px + corner) / width
-    d, objects = surfaces(points, 0.0, 0.0, tables[0])
-    seen = np.concatenate([points, d[..., np.newaxis] / QUOTED, np.ones((*size, 1))], axis=-1)
+    before, after = (tabulated(world_at(world, time_s)) for time_s in (from_s, to_s))
+    points = pixel_centres(size)
+    d, objects = surfaces(points, 0.0, 0.0, before)
+    moved = np.concatenate([points, d[..., np.newaxis] / QUOTED, np.ones((*size, 1))], axis=-1)
     for place, thing in enumerate((*world.cards, *world.balls)):
         there = objects == place
-        before, after = (_map_of(thing, world, time_s) for time_s in times_s)
-        seen[there] = seen[there] @ (after @ np.linalg.inv(before)).T
-    to_px = seen[..., :2] * width - corner
-    there_d, there_objects = surfaces(seen[..., :2], 0.0, 0.0, tables[1])
-    shown = (objects >= 0) & (there_objects == objects)
-    shown &= np.abs(there_d - seen[..., 2] * QUOTED) < _SAME_D
-    shown &= ((to_px >= -0.5) & (to_px < np.array([width, height]) - 0.5)).all(axis=-1)
-    return np.where(shown[..., np.newaxis], to_px - from_px, np.nan)
+        move = _map_of(thing, world, to_s) @ np.linalg.inv(_map_of(thing, world, from_s))
+        moved[there] = moved[there] @ move.T
+    ends, ends_d = moved[..., :2], moved[..., 2] * QUOTED
+    seen_d, seen_objects = surfaces(ends, 0.0, 0.0, after)
+    shown = (objects >= 0) & (seen_objects == objects) & (np.abs(seen_d - ends_d) < _SAME_D)
+    shown &= (np.abs(ends) < np.array([0.5, height / width / 2])).all(axis=-1)
+    return np.where(shown[..., np.newaxis], (ends - points) * width, np.nan)
 
 
 def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:
