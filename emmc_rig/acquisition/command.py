@@ -326,8 +326,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                 "of the stage, or leave focus out of the plan"
             )
         refuse_impossible(rig, frames)
-        film = [frame for frame in frames if frame.film is not None]
-        refuse_impossible_film(plan, rig, film)
+        refuse_impossible_film(plan, rig, frames)
         if session is not None:
             refuse_other_devices(session, rig, request.other_devices)
         expected = estimated(frames, plan, rig, session)

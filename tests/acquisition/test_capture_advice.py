@@ -269,9 +269,6 @@ PLANS = {
     "film: a frame is exposed once, leave brackets and repeats out": (
         {"film": FILM, "shots": [{**ONE, "repeats": 2}]}, {"film": FILM, "shots": [ONE]},
     ),
-    "film: an exposure of ": (
-        {"film": {**FILM, "rate": 200}, "shots": [ONE]}, {"film": FILM, "shots": [ONE]},
-    ),
     ": lower film.rate from ": (
         {"film": {**FILM, "rate": 8}, "shots": PLACES}, {"film": FILM, "shots": PLACES},
     ),
