@@ -412,17 +412,17 @@ def test_a_rate_that_camera_or_stage_cannot_reach_is_refused_in_one_line(text, c
 
 
 @pytest.mark.parametrize(
-    ("shots", "what"),
+    "edit",
     [
-        ("[{exposure_s: 0.01}, {exposure_s: 0.02}]", "exposed alike"),
-        ("[{exposure_s: [0.01, 0.02]}]", "exposed once"),
-        ("[{repeats: 2}]", "exposed once"),
+        "shots: [{exposure_s: 0.01}, {exposure_s: 0.02}]",
+        "shots: [{exposure_s: [0.01, 0.02]}]",
+        "shots: [{repeats: 2}]",
+        "metering: {alike: false}",
     ],
 )
-def test_the_frames_of_a_film_are_exposed_alike_and_once(shots, what):
-    data = yaml.safe_load(FILM) | {"shots": yaml.safe_load(shots)}
-    with pytest.raises(ValidationError, match=what):
-        Plan.model_validate(data)
+def test_the_frames_of_a_film_are_exposed_alike_and_once(edit):
+    with pytest.raises(ValidationError, match="exposed alike and once"):
+        Plan.model_validate(yaml.safe_load(FILM) | yaml.safe_load(edit))
 
 
 def test_time_and_disk_of_a_film_are_estimated_from_its_rate():
