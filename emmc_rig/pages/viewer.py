@@ -223,8 +223,8 @@ def _overlay(one: Overlay, shown: Array, encode: Callable[[NDArray], str]) -> di
     }  # fmt: skip
 
 
-def render_film(film: Film, on_frame: Callable[[], object]) -> str:
-    """Return the page of a film as text. on_frame: called after every frame.
+def render_film(film: Film) -> str:
+    """Return the page of a film as text.
 
     One frame in the middle gives all of them their brightness and scales of colour.
     """
@@ -241,7 +241,7 @@ def render_film(film: Film, on_frame: Callable[[], object]) -> str:
     metrics: dict[int, Mapping[str, object]] = {}
     small = reduced(like.light_field[:1, :1], SPRITE_PIXELS // count)
     centres = np.zeros((ceil(count / columns), columns, *small.shape[2:4], 3), np.uint8)
-    for place, export in film.each(on_frame):
+    for place, export in film.each():
         frames[place] = viewer_data(export, most_pixels=most_pixels, like=like, webp=quality)
         metrics[place] = export.metrics
         centre = reduced(centre_view(export.light_field)[None, None], SPRITE_PIXELS // count)
@@ -273,7 +273,7 @@ def render_film(film: Film, on_frame: Callable[[], object]) -> str:
         title=film.folder.resolve().name, about=[f"{about}."], caveats=(), sections=(), lead="",
         summary=_film_head(film, metrics), styles=("viewer.css",),
         scripts=("viewer.js", "film.js"), data={"film-data": data},
-        poster=poster(film.opened(places[0]), most_pixels, like), film=True,
+        poster=poster(film.first, most_pixels, like), film=True,
     )  # fmt: skip
 
 
@@ -299,8 +299,8 @@ def _write(folder: Path, export: Export) -> None:
     write_text(folder / "viewer.html", render_viewer(export))
 
 
-def _write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
-    write_text(folder / "viewer.html", render_film(film, on_frame))
+def _write_film(folder: Path, film: Film) -> None:
+    write_text(folder / "viewer.html", render_film(film))
 
 
 VIEWER = Format(

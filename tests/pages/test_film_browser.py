@@ -30,7 +30,7 @@ def film(tmp_path_factory):
 @pytest.fixture(scope="module")
 def written(film):
     path = film.folder.parent / "viewer.html"
-    path.write_text(render_film(film, lambda: None), encoding="utf-8")
+    path.write_text(render_film(film), encoding="utf-8")
     return path
 
 
