@@ -155,7 +155,7 @@ class Sequencer:
             except StopCapture as end:
                 assert self._between is not None
                 reason = f"{self._between.name} ended the capture: {one_line(end)}"
-                self._note(HaltEntry(kind="stopped", reason=reason, wall=self._wall()))
+                self._note(HaltEntry(kind="stopped", reason=reason))
                 self._watcher.tell(reason)
             left = self._close_session()
         return RunEnd(
@@ -184,7 +184,6 @@ class Sequencer:
         session.make_ready()
         session.note(
             RunEntry(
-                wall=self._wall(),
                 versions=versions(),
                 command=command_line(),
                 resumed=bool(session.stored),
@@ -323,13 +322,13 @@ class Sequencer:
         why = reason()
         if why and not control.stopping:
             began_s = self._now_s()
-            self._note(HaltEntry(kind="paused", reason=why, wall=self._wall()))
+            self._note(HaltEntry(kind="paused", reason=why))
             self._watcher.paused(why)
             while why and not control.stopping:
                 control.wait()
                 why = reason()
             seconds = self._now_s() - began_s
-            self._note(ResumedEntry(seconds=seconds, wall=self._wall()))
+            self._note(ResumedEntry(seconds=seconds))
             self._watcher.resumed(seconds)
         return not control.stopping
 
@@ -410,7 +409,6 @@ class Sequencer:
             fault=fault,
             at_s=began_s,
             seconds=round(self._now_s() - began_s, 6),
-            wall=self._wall(),
         )
         self._note(entry)
         self._watcher.tell(str(entry))
@@ -499,8 +497,8 @@ class Sequencer:
     def _begin_segment(self, planned: PlannedFrame) -> None:
         assert self._plan.film is not None
         self._segment, self._film_began_s = self._segment + 1, None
-        rate_hz, wall = self._plan.film.rate, self._wall()
-        self._note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=rate_hz, wall=wall))
+        rate_hz = self._plan.film.rate
+        self._note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=rate_hz))
 
     def _drop(self, left: list[PlannedFrame], end: int, why: Callable[[int], str]) -> None:
         """Take note that the frames left before a place are dropped; why: by place."""
@@ -508,7 +506,7 @@ class Sequencer:
         del left[: len(gone)]
         for reason, frames in groupby(gone, lambda frame: why(_place(frame))):
             ids = [frame.id for frame in frames]
-            entry = DroppedEntry(ids=ids, reason=reason, wall=self._wall())
+            entry = DroppedEntry(ids=ids, reason=reason)
             self._note(entry)
             self._watcher.tell(str(entry))
 
@@ -642,7 +640,6 @@ class Sequencer:
                     fault=fault,
                     at_s=began_s,
                     seconds=round(self._now_s() - began_s, 6),
-                    wall=self._wall(),
                 )
             )
         devices.look_again()
@@ -656,7 +653,7 @@ class Sequencer:
         for name in faults.keys() | self._silent.keys():
             fault = faults.get(name, "")
             if fault != self._silent.get(name, ""):
-                entry = SourceEntry(name=name, fault=fault, wall=self._wall())
+                entry = SourceEntry(name=name, fault=fault)
                 self._note(entry)
                 self._watcher.tell(f"environment, {name}: {fault or 'gives values again'}")
         self._silent = faults
@@ -817,7 +814,7 @@ class Sequencer:
         session = self._session
         left = len(session.missing())
         if not left and not session.is_complete:
-            session.note(CompleteEntry(frames=len(session.needed), wall=self._wall()))
+            session.note(CompleteEntry(frames=len(session.needed)))
         return left
 
     @contextmanager
@@ -832,7 +829,7 @@ class Sequencer:
                 if isinstance(error, Exception | KeyboardInterrupt):
                     with suppress(Exception):
                         reason = str(error) or "stopped at once by the user"
-                        self._note(HaltEntry(kind="stopped", reason=reason, wall=self._wall()))
+                        self._note(HaltEntry(kind="stopped", reason=reason))
             raise
         finally:
             with uninterrupted():
