@@ -98,8 +98,7 @@ Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 class Sequencer:
     """A run over a session; `run` once.
 
-    choose: by default all that is missing. between: the plan's hook. timer: seconds that never run
-    backwards, for the timeline; wall: the time of day, for people.
+    choose: by default all that is missing. between: the plan's hook. wall: the time of day.
     """
 
     def __init__(
@@ -111,7 +110,6 @@ class Sequencer:
         control: Control | None = None,
         choose: Choose | None = None,
         between: Between | None = None,
-        timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
@@ -122,7 +120,7 @@ class Sequencer:
         self._prepared: tuple[str, int] | None = None
         self._silent: dict[str, str] = {}
         self._focused_at: int | None = None
-        self._timer, self._wall = timer, wall
+        self._wall = wall
         self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
         self._devices = Devices(rig, plan, wall)
@@ -147,7 +145,7 @@ class Sequencer:
         Raises AppError with one line, a `DriverError` that mending cannot cure, `OSError` of the
         disk, or `KeyboardInterrupt`; what was stored until then is kept.
         """
-        self._began_s = self._timer()
+        self._began_s = time.perf_counter()
         with self._writer, self._bench_left_safe():
             self._open_session()
             try:
@@ -159,7 +157,7 @@ class Sequencer:
                 self._watcher.tell(reason)
             left = self._close_session()
         return RunEnd(
-            not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
+            not left, self._taken, left, self._budget.spent, time.perf_counter() - self._began_s
         )
 
     def _take_missing(self) -> None:
@@ -836,7 +834,7 @@ class Sequencer:
                 self._devices.make_safe()
 
     def _now_s(self) -> float:
-        return round(self._timer() - self._began_s, 6)
+        return round(time.perf_counter() - self._began_s, 6)
 
 
 def _place(frame: PlannedFrame) -> int:

@@ -167,14 +167,6 @@ def test_a_film_of_quilts_is_named_and_laid_out_as_one_quilt_is(tmp_path, film):
     assert np.abs(shown[4] - quilt).mean() < 6 < np.abs(shown[0] - quilt).mean()
 
 
-@pytest.mark.parametrize("name", ["png16", "tiff"])
-def test_pictures_lie_in_a_folder_a_frame_which_is_a_scene(tmp_path, film, name):
-    folder, _ = exported(tmp_path, film, name)
-    assert sorted(one.name for one in folder.iterdir()) == [f"{place:06d}" for place in film.frames]
-    light_field = open_scene(folder / "000004").light_field
-    np.testing.assert_allclose(light_field, light_field_at(4), atol=0.51 / 65535)
-
-
 def test_the_command_exports_a_film_and_says_what_a_film_is_not_for(tmp_path, monkeypatch, film):
     monkeypatch.chdir(tmp_path)
     code, _, err = program("export", film.folder, "--format", "hci", "--out", "hci")

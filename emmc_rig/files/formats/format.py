@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from emmc_rig.files.films import Film
 
 Array = NDArray[np.floating]
-WriteFilm = Callable[[Path, "Film"], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +62,7 @@ class Format:
     holds: Callable[[Path], bool] | None = None
     read: Callable[[Path], Array] | None = None
     parallax: bool = False
-    write_film: WriteFilm | None = None
+    write_film: Callable[[Path, Film], None] | None = None
 
     def write_whole(self, folder: Path, export: Export) -> None:
         """Write an export; raises AppError where its views have not what the format shows."""
@@ -87,18 +86,6 @@ class Format:
                 f"--format {self.name} shows parallax, and {export.title} has {named}s for views: "
                 "choose another format"
             )
-
-
-def each_frame(write: Callable[[Path, Export], None]) -> WriteFilm:
-    """Return what writes every frame of a film into a folder named by its place in time."""
-
-    def write_film(folder: Path, film: Film) -> None:
-        for place, export in film.each():
-            inside = folder / film.frames[place].name
-            inside.mkdir()
-            write(inside, export)
-
-    return write_film
 
 
 def extra_module(name: str, what: str) -> ModuleType:
