@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browsers import MARKS, complaints
+from browsers import MARKS, at_width, complaints, nameless
 
 from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
@@ -206,22 +206,10 @@ def test_without_webgl_views_and_refocus_are_drawn_by_canvas(browser, written, t
 
 
 @pytest.mark.parametrize("width", [1600, 800, 390])
-def test_it_fits_every_screen(page, width):
-    page.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride",
-        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
-    )
-    assert page.execute_script("return document.documentElement.scrollWidth") <= width
-    page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-
-
-def test_every_control_has_a_name_for_screen_readers(page):
-    nameless = page.execute_script(
-        "return [...document.querySelectorAll('#viewer input, #viewer button, #viewer canvas')]"
-        ".filter((e) => !(e.ariaLabel || e.textContent.trim() || e.labels?.length))"
-        ".map((e) => e.id)"
-    )
-    assert nameless == []
+def test_it_fits_every_screen_and_every_control_has_a_name(page, width):
+    with at_width(page, width):
+        assert page.execute_script("return document.documentElement.scrollWidth") <= width
+        assert nameless(page) == []
 
 
 def test_bands_are_called_so_and_have_no_focus(browser, tmp_path):
