@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from capture_rigs import begun, still_rig
+from capture_rigs import PreparedCamera, begun, still_rig
 from pydantic import ValidationError
 from simulated_disk import PowerCutError, SimulatedDisk
 
-from drivers.camera import CameraIdentity
 from drivers.clock import SYSTEM_CLOCK
 from drivers.dng import encode_dng
 from drivers.errors import CaptureError
@@ -34,7 +33,6 @@ from emmc_rig.session.journal import DroppedEntry, FilmEntry, RetryEntry, of_kin
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 from simulators.clock import ManualClock
-from simulators.still import PreparedCamera
 
 ROOT = Path("/disk")
 SIZE = (24, 32)
@@ -258,7 +256,7 @@ class Stream(PreparedCamera):
     """A camera whose stream gives prepared frames at times of its own."""
 
     def __init__(self, times_s, values=None, on_frame=lambda place: None):
-        super().__init__(self._no_single_frame, SIZE, "rggb", CameraIdentity("EMMC", "s", "1"))
+        super().__init__(self._no_single_frame)
         self.times_s, self.on_frame, self.closed = times_s, on_frame, False
         self.values = values or range(100, 100 + len(times_s))
 
