@@ -17,7 +17,6 @@ from simulators.raycaster import (
     QUOTED,
     Ball,
     Card,
-    Motion,
     World,
     pixel_centres,
     surfaces,
@@ -33,17 +32,8 @@ def world_at(world: World, time_s: float) -> World:
     """Return the world as it is at a time, in seconds."""
     return replace(
         world,
-        cards=tuple(_moved_card(card, _map_of(card, world, time_s)) for card in world.cards),
-        balls=tuple(
-            replace(
-                ball,
-                **dict(zip("st", centre, strict=False)),
-                disparity=centre[2],
-                turn=_turn(ball.motion, time_s),
-            )
-            for ball in world.balls
-            for centre in [(_map_of(ball, world, time_s) @ _centre(ball))[:3]]
-        ),
+        cards=tuple(_moved_card(one, _map_of(one, world, time_s)) for one in world.cards),
+        balls=tuple(_moved_ball(one, _map_of(one, world, time_s), time_s) for one in world.balls),
     )
 
 
@@ -74,7 +64,7 @@ def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:
     """Return the affine map (4, 4) of (S, T, D as quoted, 1) from time 0 to a time."""
     motion, centre = thing.motion, _centre(thing)
     swung = np.sin(2 * np.pi * time_s / motion.period_s)
-    turn = cv2.Rodrigues(np.array(_turn(motion, time_s)))[0]
+    turn = cv2.Rodrigues(time_s * np.array(motion.turn_rad_s, float))[0]
     if isinstance(thing, Ball):
         # Turned in the space in which the ball is round.
         radii = np.array([thing.radius, thing.radius, thing.depth])
@@ -92,11 +82,6 @@ def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:
         seen[0, 3] += seen[0, 2] * (own @ centre)[2]
         seen[0, 2] = 0.0
     return seen @ own
-
-
-def _turn(motion: Motion, time_s: float) -> tuple[float, float, float]:
-    about_s, about_t, about_d = (rate * time_s for rate in motion.turn_rad_s)
-    return about_s, about_t, about_d
 
 
 def _centre(thing: Card | Ball) -> Array:
@@ -122,3 +107,11 @@ def _moved_card(card: Card, moved: Array) -> Card:
         slope_t=slope_t,
         disparity=disparity,
     )
+
+
+def _moved_ball(ball: Ball, moved: Array, time_s: float) -> Ball:
+    """Return a ball whose centre went where a map sends it, turned as it is at a time."""
+    s, t, disparity, _ = moved @ _centre(ball)
+    about_s, about_t, about_d = ball.motion.turn_rad_s
+    turn = about_s * time_s, about_t * time_s, about_d * time_s
+    return replace(ball, s=s, t=t, disparity=disparity, turn=turn)
