@@ -478,8 +478,8 @@ class Sequencer:
         """
         self._writer.flush()
         session = self._session
-        stored = [frame for frame in session.frames if frame.id in session.stored]
-        last = max((frame.film for frame in stored if frame.film is not None), default=-1)
+        film = [frame for frame in session.frames if frame.film is not None]
+        last = max((_place(frame) for frame in film if frame.id in session.stored), default=-1)
         left = list(frames)
         self._drop(left, last + 1, lambda place: INTERRUPTED)
         is_streamed = streams(self._plan, self._devices.camera)
@@ -495,16 +495,15 @@ class Sequencer:
     def _begin_segment(self, planned: PlannedFrame) -> None:
         assert self._plan.film is not None
         self._segment, self._film_began_s = self._segment + 1, None
-        rate_hz = self._plan.film.rate
-        self._note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=rate_hz))
+        rate = self._plan.film.rate
+        self._note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=rate))
 
     def _drop(self, left: list[PlannedFrame], end: int, why: Callable[[int], str]) -> None:
         """Take note that the frames left before a place are dropped; why: by place."""
         gone = list(takewhile(lambda frame: _place(frame) < end, left))
         del left[: len(gone)]
         for reason, frames in groupby(gone, lambda frame: why(_place(frame))):
-            ids = [frame.id for frame in frames]
-            entry = DroppedEntry(ids=ids, reason=reason)
+            entry = DroppedEntry(ids=[frame.id for frame in frames], reason=reason)
             self._note(entry)
             self._watcher.tell(str(entry))
 
