@@ -32,7 +32,7 @@ def world_at(world: World, time_s: float) -> World:
     """Return the world as it is at a time, in seconds."""
     return replace(
         world,
-        cards=tuple(_moved_card(one, _map_of(one, world, time_s)) for one in world.cards),
+        cards=tuple(moved_card(one, _map_of(one, world, time_s)) for one in world.cards),
         balls=tuple(_moved_ball(one, _map_of(one, world, time_s), time_s) for one in world.balls),
     )
 
@@ -93,8 +93,8 @@ def _centre(thing: Card | Ball) -> Array:
     return np.array([s, t, thing.disparity + thing.slope_s * s + thing.slope_t * t, 1.0])
 
 
-def _moved_card(card: Card, moved: Array) -> Card:
-    """Return a card whose points went where a map sends them."""
+def moved_card(card: Card, moved: Array) -> Card:
+    """Return a card whose points went where a map (4, 4) of (S, T, D as quoted, 1) sends them."""
     plane = np.array([card.slope_s, card.slope_t, card.disparity])
     # From (S, T, 1) of the card's points to (S, T, D, 1) where they are.
     there = moved @ np.array([[1, 0, 0], [0, 1, 0], plane, [0, 0, 1]])
