@@ -89,8 +89,8 @@ class Overlay:
     colours: Sequence[tuple[int, int, int]] = HEAT
 
 
-def render_viewer(content: Export, lossless: bool = False) -> str:
-    """Return the page as text; lossless: pictures as PNG, for comparisons to the last code."""
+def render_viewer(content: Export) -> str:
+    """Return the page as text."""
     return fragment(
         "viewer_page.html",
         title=content.title,
@@ -98,7 +98,7 @@ def render_viewer(content: Export, lossless: bool = False) -> str:
         caveats=(), sections=(), lead="",
         summary=light_field_head(content.metrics, content.source, viewer=True),
         styles=("viewer.css",), scripts=("viewer.js",),
-        data={"viewer-data": viewer_data(content, lossless=lossless)}, poster=poster(content),
+        data={"viewer-data": viewer_data(content)}, poster=poster(content),
     )  # fmt: skip
 
 
@@ -125,7 +125,6 @@ def poster(
 
 def viewer_data(
     content: Export,
-    lossless: bool = False,
     most_pixels: int = SPRITE_PIXELS,
     like: Export | None = None,
     webp: int | None = None,
@@ -158,10 +157,9 @@ def viewer_data(
 
     def atlas(views: Array) -> str:
         picture = three_colours(curve.encode(views))
-        if lossless or webp is not None:
-            ordered = np.ascontiguousarray(tiled(picture)[..., ::-1])
-            return png_of(ordered) if webp is None else webp_of(ordered, webp)
-        return sprite(picture, int(BYTES_PER_PIXEL * picture.size / 3))
+        if webp is None:
+            return sprite(picture, int(BYTES_PER_PIXEL * picture.size / 3))
+        return webp_of(np.ascontiguousarray(tiled(picture)[..., ::-1]), webp)
 
     return {
         "views": {"rows": rows, "columns": columns, "height": height, "width": width},

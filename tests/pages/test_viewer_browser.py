@@ -12,6 +12,8 @@ from browsers import MARKS, at_width, complaints, nameless
 from emmc_rig.files.formats import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.novel_view import between, sampled
+from emmc_rig.pages import viewer
+from emmc_rig.pages.display import TILE_MULTIPLE_PX, png_of, tiled
 from emmc_rig.pages.viewer import render_viewer
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
@@ -21,6 +23,11 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
+
+
+def lossless(views, most_bytes, tile=TILE_MULTIPLE_PX):
+    """Return an atlas that every decoder reads alike, to the last code."""
+    return png_of(np.ascontiguousarray(tiled(views, tile)[..., ::-1]))
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +45,9 @@ def written(tmp_path_factory):
         sigma=np.full(scene.light_field.shape[:4], 0.03, np.float32),
         misfit=np.ones(scene.size, np.float32),
     )
-    path.write_text(render_viewer(content, lossless=True), encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(viewer, "sprite", lossless)
+        path.write_text(render_viewer(content), encoding="utf-8")
     return path
 
 
