@@ -22,7 +22,7 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive.film import Film
 from reconstruction.verdict.run import reconstruct_judged
-from simulators.scenes import MOVING_SCENES, SCENES, render_at
+from simulators.scenes import MOVING_SCENES, SCENES, render
 
 RESTS, PANS, PASSES = "rests", "pans", "passes"
 PAN_PX = {RESTS: (0.0, 0.0), PANS: (0.45, 1.4), PASSES: (0.2, -0.6)}
@@ -57,7 +57,7 @@ def _window(whole: Array, size: tuple[int, int], move_px: Array, disparity: floa
 def frame_of(scene: str, other: str, motion: str, size: tuple[int, int], frame: int) -> Array:
     """Return the light field (v, u, y, x, c) before the camera at a frame."""
     if scene in MOVING_SCENES:
-        return render_at(scene, (5, 5), size, 0, frame / MOVING_HZ).light_field
+        return render(scene, (5, 5), size, time_s=frame / MOVING_HZ).light_field
     whole, move = _opened(scene), np.array(PAN_PX[motion]) * frame
     out = _window(whole, size, move)
     if motion != PASSES:

@@ -20,7 +20,7 @@ from reconstruction.adaptive.uncertainty import (
     foretold_db,
 )
 from reconstruction.verdict.run import reconstruct_judged
-from simulators.scenes import SCENES
+from simulators.scenes import STILL_SCENES
 
 CAMERAS = "rgbw-bayer-1shot", "scenario-ii-cfa", "rgbw-bayer-2shots", "rgbw-bayer-3shots"
 NOISES = 0.003, 0.01
@@ -140,7 +140,7 @@ def summary(rows: pd.DataFrame) -> None:
 
 def main() -> None:
     """Measure every scene, and print what is true, or the constants that follow."""
-    parser = lab.arguments(__doc__, tuple(SCENES), camera="", size="96x96")
+    parser = lab.arguments(__doc__, tuple(STILL_SCENES), camera="", size="96x96")
     parser.add_argument("--method", default="adaptive")
     parser.add_argument("--fit", action="store_true", help="print constants from all rows kept")
     args = lab.parsed(parser)

@@ -70,7 +70,7 @@ class GrblStage(HostStage):
     the axes needs firmware that homes them one by one (option H of `$I`). The scale is the
     controller's `$100` and following; `steps_per_mm`, by name of an axis, states what they must
     be, without which the firmware's default counts as never set. Construction waits up to
-    `boot_s` for the controller to start; it moves nothing. Raises `ScaleError`, or
+    BOOT_S for the controller to start; it moves nothing. Raises `ScaleError`, or
     `TransportTimeoutError` when the controller does not answer.
     Source: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Configuration".
     """
@@ -81,7 +81,6 @@ class GrblStage(HostStage):
         axes: Mapping[str, str],
         clock: Clock = SYSTEM_CLOCK,
         settings: StageSettings = DEFAULT_SETTINGS,
-        boot_s: float = BOOT_S,
         steps_per_mm: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(axes, (transport,), clock, settings)
@@ -90,7 +89,6 @@ class GrblStage(HostStage):
                 raise ValueError(f"axis letter {letter!r}: use one of {', '.join(AXIS_LETTERS)}")
         self._transport = transport
         self._letters = dict(axes)
-        self._boot_s = boot_s
         self._stated_steps_per_mm = dict(steps_per_mm or {})
         for axis in self._stated_steps_per_mm:
             self._require_axis(axis)
@@ -117,7 +115,7 @@ class GrblStage(HostStage):
 
     def _configure(self) -> None:
         self._controller = _Controller(self._transport, self._clock, self._mark_all_unknown)
-        self._controller.wait_for_boot(self._boot_s)
+        self._controller.wait_for_boot()
         self._build = self._controller.command("$I")
         self._options = self._build.get("OPT", "").split(",")[0]
         self._controller.command("$$")
@@ -375,13 +373,13 @@ class _Controller:
             self._reset()
         self._alarm, self._restarted = None, False
 
-    def wait_for_boot(self, boot_s: float) -> None:
+    def wait_for_boot(self) -> None:
         """Return when the controller answers; one that stays silent is reset once."""
         try:
-            self.wait_for_status(boot_s)
+            self.wait_for_status()
         except (TransportTimeoutError, GarbledReplyError):
             self._reset()
-            self.wait_for_status(boot_s)
+            self.wait_for_status()
         self._alarm, self._restarted = None, False
 
     def raise_alarm(self) -> None:
@@ -403,9 +401,9 @@ class _Controller:
             self._homing_lines.clear()
             raise LostPositionError(ALL_AXES, "the controller restarted")
 
-    def wait_for_status(self, boot_s: float) -> None:
+    def wait_for_status(self) -> None:
         """Return when it answers and stands; one that moves on is left to be found out later."""
-        deadline_s = self._clock.now_s() + boot_s
+        deadline_s = self._clock.now_s() + BOOT_S
         while True:
             try:
                 self._alarm, self._restarted = None, False
@@ -479,13 +477,13 @@ class _Controller:
         return message
 
 
-def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK, boot_s: float = BOOT_S) -> str:
+def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> str:
     """Return version and options of the Grbl on a port; moves nothing, and resets nothing.
 
     Raises `TransportTimeoutError` or `GarbledReplyError` when no Grbl is there.
     """
     controller = _Controller(transport, clock, _log.info)
-    controller.wait_for_status(boot_s)
+    controller.wait_for_status()
     options = controller.command("$I")
     return f"version {options.get('VER', 'unknown')}, options {options.get('OPT', 'unknown')}"
 

@@ -195,8 +195,7 @@ class U3vCamera:
         if not self.features.is_writable(RATE):
             only = self.features.number(RATE)
             return only, only
-        low, high = self.features.limits(RATE)
-        return low, high
+        return self.features.limits(RATE)
 
     def stream_at(self, rate_hz: float) -> Generator[RawFrame, None, None]:
         """Yield frames as `stream` at a rate, where the camera can be told one; then as before."""

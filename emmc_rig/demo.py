@@ -51,7 +51,7 @@ from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.bench import Bench
-from simulators.scenes import built_in
+from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
 SIZE = (108, 144)
@@ -145,7 +145,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             settings.scene,
             APERTURE_FACTOR,
             PIXEL_FACTOR,
-            size=settings.size or (SIZE if settings.scene in built_in() else None),
+            size=settings.size or (SIZE if settings.scene in SCENES else None),
             views=camera.views,
             seed=settings.seed,
         )

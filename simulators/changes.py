@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from simulators import textures
+from simulators.moving import moved_card
 from simulators.raycaster import Card, World
 
 LEAF_LAYERS = 4
@@ -46,16 +47,13 @@ def moved(world: World, s: float, t: float, background: bool = False) -> World:
 
     background: whether what fills the picture (tiled cards) moves with them.
     """
-    back = np.array([[1, 0, -s], [0, 1, -t], [0, 0, 1]])
-
-    def card(one: Card) -> Card:
-        if one.tiled and not background:
-            return one
-        carried = one.disparity - one.slope_s * s - one.slope_t * t
-        return replace(one, disparity=carried, to_texture=one.to_texture @ back)
-
+    by = np.eye(4)
+    by[:2, 3] = s, t
+    cards = tuple(
+        card if card.tiled and not background else moved_card(card, by) for card in world.cards
+    )
     balls = tuple(replace(ball, s=ball.s + s, t=ball.t + t) for ball in world.balls)
-    return replace(world, cards=tuple(map(card, world.cards)), balls=balls)
+    return replace(world, cards=cards, balls=balls)
 
 
 def overgrown(world: World, share: float, nearest: float, rng: np.random.Generator) -> World:

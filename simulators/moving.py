@@ -13,7 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.raycaster import QUOTED, Ball, Card, Motion, Tables, World, surfaces
+from simulators.raycaster import (
+    QUOTED,
+    Ball,
+    Card,
+    World,
+    pixel_centres,
+    surfaces,
+    tabulated,
+)
 
 Array = NDArray[np.float64]
 _SAME_D = 1e-6
@@ -24,53 +32,39 @@ def world_at(world: World, time_s: float) -> World:
     """Return the world as it is at a time, in seconds."""
     return replace(
         world,
-        cards=tuple(_moved_card(card, _map_of(card, world, time_s)) for card in world.cards),
-        balls=tuple(
-            replace(
-                ball,
-                **dict(zip("st", centre, strict=False)),
-                disparity=centre[2],
-                turn=_turn(ball.motion, time_s),
-            )
-            for ball in world.balls
-            for centre in [(_map_of(ball, world, time_s) @ _centre(ball))[:3]]
-        ),
+        cards=tuple(moved_card(one, _map_of(one, world, time_s)) for one in world.cards),
+        balls=tuple(_moved_ball(one, _map_of(one, world, time_s), time_s) for one in world.balls),
     )
 
 
-def flow_between(
-    world: World, size: tuple[int, int], times_s: tuple[float, float], tables: tuple[Tables, Tables]
-) -> Array:
+def flow_between(world: World, size: tuple[int, int], from_s: float, to_s: float) -> Array:
     """Return where each point that the central view sees goes, (y, x, 2): right and down, pixels.
 
-    tables: of the world at both times. NaN where there is no surface at the first time, and where
-    the point is hidden, or beside the picture, at the second. A point's surface is the first one
-    that is at least half opaque, as for disparities.
+    NaN where there is no surface at the first time, and where the point is hidden, or beside the
+    picture, at the second. A point's surface is the first one that is at least half opaque, as for
+    disparities.
     """
     height, width = size
-    y, x = np.indices(size)
-    from_px = np.stack([x, y], axis=-1)
-    corner = np.array([0.5 - width / 2, 0.5 - height / 2])
-    points = (from_px + corner) / width
-    d, objects = surfaces(points, 0.0, 0.0, tables[0])
-    seen = np.concatenate([points, d[..., np.newaxis] / QUOTED, np.ones((*size, 1))], axis=-1)
+    before, after = (tabulated(world_at(world, time_s)) for time_s in (from_s, to_s))
+    points = pixel_centres(size)
+    d, objects = surfaces(points, 0.0, 0.0, before)
+    moved = np.concatenate([points, d[..., np.newaxis] / QUOTED, np.ones((*size, 1))], axis=-1)
     for place, thing in enumerate((*world.cards, *world.balls)):
         there = objects == place
-        before, after = (_map_of(thing, world, time_s) for time_s in times_s)
-        seen[there] = seen[there] @ (after @ np.linalg.inv(before)).T
-    to_px = seen[..., :2] * width - corner
-    there_d, there_objects = surfaces(seen[..., :2], 0.0, 0.0, tables[1])
-    shown = (objects >= 0) & (there_objects == objects)
-    shown &= np.abs(there_d - seen[..., 2] * QUOTED) < _SAME_D
-    shown &= ((to_px >= -0.5) & (to_px < np.array([width, height]) - 0.5)).all(axis=-1)
-    return np.where(shown[..., np.newaxis], to_px - from_px, np.nan)
+        move = _map_of(thing, world, to_s) @ np.linalg.inv(_map_of(thing, world, from_s))
+        moved[there] = moved[there] @ move.T
+    ends, ends_d = moved[..., :2], moved[..., 2] * QUOTED
+    seen_d, seen_objects = surfaces(ends, 0.0, 0.0, after)
+    shown = (objects >= 0) & (seen_objects == objects) & (np.abs(seen_d - ends_d) < _SAME_D)
+    shown &= (np.abs(ends) < np.array([0.5, height / width / 2])).all(axis=-1)
+    return np.where(shown[..., np.newaxis], (ends - points) * width, np.nan)
 
 
 def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:
     """Return the affine map (4, 4) of (S, T, D as quoted, 1) from time 0 to a time."""
     motion, centre = thing.motion, _centre(thing)
     swung = np.sin(2 * np.pi * time_s / motion.period_s)
-    turn = cv2.Rodrigues(np.array(_turn(motion, time_s)))[0]
+    turn = cv2.Rodrigues(time_s * np.array(motion.turn_rad_s, float))[0]
     if isinstance(thing, Ball):
         # Turned in the space in which the ball is round.
         radii = np.array([thing.radius, thing.radius, thing.depth])
@@ -90,11 +84,6 @@ def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:
     return seen @ own
 
 
-def _turn(motion: Motion, time_s: float) -> tuple[float, float, float]:
-    about_s, about_t, about_d = (rate * time_s for rate in motion.turn_rad_s)
-    return about_s, about_t, about_d
-
-
 def _centre(thing: Card | Ball) -> Array:
     """Return an object's centre at time 0: S, T, D as quoted, 1."""
     if isinstance(thing, Ball):
@@ -104,8 +93,8 @@ def _centre(thing: Card | Ball) -> Array:
     return np.array([s, t, thing.disparity + thing.slope_s * s + thing.slope_t * t, 1.0])
 
 
-def _moved_card(card: Card, moved: Array) -> Card:
-    """Return a card whose points went where a map sends them."""
+def moved_card(card: Card, moved: Array) -> Card:
+    """Return a card whose points went where a map (4, 4) of (S, T, D as quoted, 1) sends them."""
     plane = np.array([card.slope_s, card.slope_t, card.disparity])
     # From (S, T, 1) of the card's points to (S, T, D, 1) where they are.
     there = moved @ np.array([[1, 0, 0], [0, 1, 0], plane, [0, 0, 1]])
@@ -118,3 +107,11 @@ def _moved_card(card: Card, moved: Array) -> Card:
         slope_t=slope_t,
         disparity=disparity,
     )
+
+
+def _moved_ball(ball: Ball, moved: Array, time_s: float) -> Ball:
+    """Return a ball whose centre went where a map sends it, turned as it is at a time."""
+    s, t, disparity, _ = moved @ _centre(ball)
+    about_s, about_t, about_d = ball.motion.turn_rad_s
+    turn = about_s * time_s, about_t * time_s, about_d * time_s
+    return replace(ball, s=s, t=t, disparity=disparity, turn=turn)

@@ -132,7 +132,6 @@ class PtpCameraSimulator:
         *,
         exposures: tuple[int, ...] = THIRD_STOPS,
         span: tuple[int, int, int] | None = None,
-        isos: tuple[int, ...] = ISOS,
         quality: str = "raw",
         lacks: tuple[Operation, ...] = (Operation.GET_THUMB,),
         capacity_bytes: int = 1 << 36,
@@ -151,12 +150,12 @@ class PtpCameraSimulator:
         self._white_dn = white_level_dn
         self._lacks = frozenset(lacks)
         self._capacity_bytes = capacity_bytes
-        self._exposures, self._span, self._isos = exposures, span, isos
+        self._exposures, self._span = exposures, span
         self._values = {
             Property.BATTERY_LEVEL: 87,
             Property.EXPOSURE_PROGRAM: 1,
             Property.EXPOSURE_TIME: 100 if span else min(exposures, key=lambda v: abs(v - 100)),
-            Property.EXPOSURE_INDEX: min(isos),
+            Property.EXPOSURE_INDEX: min(ISOS),
         }
         self._last_handle = FOLDER
         self._shots = 0
@@ -364,7 +363,7 @@ class PtpCameraSimulator:
         if code == Property.EXPOSURE_PROGRAM:
             return PropertyDescription(code, UINT16, False, 1, now, choices=(1,))
         if code == Property.EXPOSURE_INDEX:
-            return PropertyDescription(code, UINT16, True, min(self._isos), now, self._isos)
+            return PropertyDescription(code, UINT16, True, min(ISOS), now, ISOS)
         if self._span:
             return PropertyDescription(code, UINT32, True, 100, now, span=self._span)
         return PropertyDescription(code, UINT32, True, 100, now, self._exposures)
@@ -396,7 +395,7 @@ class PtpCameraSimulator:
 
     def _amplified(self, mosaic: Array) -> Array:
         """Return the mosaic at the present ISO: signal and noise alike grow above the black."""
-        gain = self._values[Property.EXPOSURE_INDEX] / min(self._isos)
+        gain = self._values[Property.EXPOSURE_INDEX] / min(ISOS)
         if gain == 1:
             return mosaic
         black = np.tile(np.broadcast_to(self._black_dn, (2, 2)), (mosaic.shape[0] // 2 + 1, 1))

@@ -20,7 +20,7 @@ light that bounces between surfaces.
 Textures are (side, side, 4) RGBA in [0, 1], side a power of two.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -160,17 +160,12 @@ class Tables:
     lighting: np.ndarray
 
 
-def tabulated(world: World, like: Tables | None = None) -> Tables:
-    """Lay out a world for `paint_view`, `measure_disparity` and `surfaces`.
-
-    like: tables of the same objects at other places, whose textures are taken over.
-    """
+def tabulated(world: World) -> Tables:
+    """Lay out a world for `paint_view` and `surfaces`."""
     pool: dict[int, tuple[int, int]] = {}
     texels: list[np.ndarray] = []
 
     def placed(texture: np.ndarray) -> tuple[int, int]:
-        if like is not None:
-            return 0, 0
         if id(texture) not in pool:
             pool[id(texture)] = sum(t.size for t in texels), texture.shape[0]
             texels.append(texture.astype(np.float32).ravel())
@@ -201,10 +196,6 @@ def tabulated(world: World, like: Tables | None = None) -> Tables:
             row["offset"], row["side"] = placed(ball.texture)
     surroundings = placed(world.surroundings)
     lighting = np.array([*_LIGHT, world.ambient, world.brightness])
-    if like is not None:
-        for rows, known in ((cards, like.cards), (balls, like.balls)):
-            rows["offset"], rows["side"] = known["offset"], known["side"]
-        return replace(like, cards=cards, balls=balls, corners=corners)
     return Tables(cards, balls, corners, np.concatenate(texels), surroundings, lighting)
 
 
@@ -213,15 +204,11 @@ def paint_view(view: np.ndarray, a_s: float, a_t: float, tables: Tables) -> None
     _trace_colours(view, a_s, a_t, *_kernel_arguments(a_s, a_t, tables))
 
 
-def measure_disparity(disparity: np.ndarray, a_s: float, a_t: float, tables: Tables) -> None:
-    """Fill D (y, x), in widths per aperture, of the first surface that is at least half opaque.
-
-    A ball counts as opaque; D is 0 where there is no surface.
-    """
-    height, width = disparity.shape
-    y, x = np.indices(disparity.shape)
-    points = np.stack([(x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width], axis=-1)
-    disparity[:] = surfaces(points, a_s, a_t, tables)[0]
+def pixel_centres(size: tuple[int, int]) -> np.ndarray:
+    """Return the centres (y, x, X and Y) of a view's pixels, in widths from its middle."""
+    height, width = size
+    y, x = np.indices(size)
+    return np.stack([(x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width], axis=-1)
 
 
 def surfaces(
@@ -229,8 +216,9 @@ def surfaces(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what is seen at points (..., X and Y) of a view: D, and which object, as (...).
 
-    D as `measure_disparity` says. Objects: cards by their place in the tables, then balls; -1 where
-    there is no surface.
+    D is that of the first surface that is at least half opaque, in widths per aperture, 0 where
+    there is none; a ball counts as opaque. Objects: cards by their place in the tables, then balls;
+    -1 where there is no surface.
     """
     flat = np.ascontiguousarray(points, np.float64).reshape(-1, 2)
     d, objects = np.empty(len(flat)), np.empty(len(flat), np.int64)

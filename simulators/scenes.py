@@ -25,8 +25,9 @@ from simulators.raycaster import (
     Motion,
     Tables,
     World,
-    measure_disparity,
     paint_view,
+    pixel_centres,
+    surfaces,
     tabulated,
 )
 
@@ -61,15 +62,17 @@ def render(
     size: tuple[int, int] = (192, 256),
     seed: int = 0,
     change: Callable[[World], World] | None = None,
+    time_s: float = 0.0,
 ) -> RenderedScene:
     """Render a built-in scene.
 
     Args:
-        name: a key of `SCENES` or `MOVING_SCENES`; what moves is as at time 0.
+        name: a key of `SCENES`.
         views: rows and columns of views, 1 or more.
         size: rows and columns of pixels, 16 or more.
         seed: chooses the random textures and places; equal seeds give equal scenes on every grid.
         change: what becomes of the scene's world before it is rendered; see `simulators.changes`.
+        time_s: when a scene that moves is seen, without motion blur.
 
     Returns:
         light_field (v, u, y, x, 3) float32 in [0, 1]; disparity_px (y, x) float32.
@@ -78,24 +81,9 @@ def render(
         SceneError: unknown name, a size or number of views too small, or a negative seed.
     """
     _check(name, views, size, seed)
-    known = change is None
-    tables = _tables(name, seed) if known else tabulated(change(_world(name, seed)))
-    return rendered(tables, views, size)
-
-
-def render_at(
-    name: str,
-    views: tuple[int, int] = (5, 5),
-    size: tuple[int, int] = (192, 256),
-    seed: int = 0,
-    time_s: float = 0.0,
-) -> RenderedScene:
-    """Render a built-in scene as it is at a time, at once: without motion blur.
-
-    Args, Returns and Raises as of `render`; a scene that does not move is the same at any time.
-    """
-    _check(name, views, size, seed)
-    return rendered(_tables_at(name, seed, time_s), views, size)
+    if change is None:
+        return rendered(_tables(name, seed, time_s), views, size)
+    return rendered(tabulated(world_at(change(_world(name, seed)), time_s)), views, size)
 
 
 def flow_px(name: str, size: tuple[int, int], seed: int, from_s: float, to_s: float) -> np.ndarray:
@@ -112,14 +100,7 @@ def flow_px(name: str, size: tuple[int, int], seed: int, from_s: float, to_s: fl
         SceneError: as `render`.
     """
     _check(name, (1, 1), size, seed)
-    times_s = from_s, to_s
-    before, after = (_tables_at(name, seed, time_s) for time_s in times_s)
-    return flow_between(_world(name, seed), size, times_s, (before, after))
-
-
-def built_in() -> dict[str, Scene]:
-    """Return every built-in scene by its name, those that move last."""
-    return {**SCENES, **MOVING_SCENES}
+    return flow_between(_world(name, seed), size, from_s, to_s)
 
 
 def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> RenderedScene:
@@ -143,16 +124,15 @@ def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> R
 def rendered_disparity_px(
     name: str, views: tuple[int, int], size: tuple[int, int], seed: int, time_s: float = 0.0
 ) -> np.ndarray:
-    """Return the disparity alone of what `render_at` returns, (y, x) float32; raises SceneError."""
+    """Return the disparity alone of what `render` returns, (y, x) float32; raises SceneError."""
     _check(name, views, size, seed)
-    return _disparity_px(_tables_at(name, seed, time_s), views, size)
+    return _disparity_px(_tables(name, seed, time_s), views, size)
 
 
 def _check(name: str, views: tuple[int, int], size: tuple[int, int], seed: int) -> None:
-    known = built_in()
-    if name not in known:
-        hint = did_you_mean(name, known, 0.4)
-        raise SceneError(f"no built-in scene '{name}': {hint}built in are {', '.join(known)}")
+    if name not in SCENES:
+        hint = did_you_mean(name, SCENES, 0.4)
+        raise SceneError(f"no built-in scene '{name}': {hint}built in are {', '.join(SCENES)}")
     if min(views) < 1:
         raise SceneError(f"{views[0]}x{views[1]} views: needs 1x1 or more")
     if min(size) < _SMALLEST_PX:
@@ -163,27 +143,20 @@ def _check(name: str, views: tuple[int, int], size: tuple[int, int], seed: int) 
 
 def _disparity_px(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
     steps = max(views)
-    disparity = np.empty(size, np.float32)
     a_t, a_s = ((n // 2 - (n - 1) / 2) / steps for n in views)
-    measure_disparity(disparity, a_s, a_t, tables)
-    disparity *= size[1] / steps
-    return disparity
+    d, _ = surfaces(pixel_centres(size), a_s, a_t, tables)
+    return (d * (size[1] / steps)).astype(np.float32)
 
 
 @lru_cache(maxsize=2)
-def _tables(name: str, seed: int) -> Tables:
+def _tables(name: str, seed: int, time_s: float) -> Tables:
     """Build a scene into tables; its textures take longer to make than a small view to render."""
-    return tabulated(_world(name, seed))
-
-
-@lru_cache(maxsize=4)
-def _tables_at(name: str, seed: int, time_s: float) -> Tables:
-    return tabulated(world_at(_world(name, seed), time_s), like=_tables(name, seed))
+    return tabulated(world_at(_world(name, seed), time_s))
 
 
 @lru_cache(maxsize=2)
 def _world(name: str, seed: int) -> World:
-    return built_in()[name].build(np.random.default_rng([seed, *name.encode()]))
+    return SCENES[name].build(np.random.default_rng([seed, *name.encode()]))
 
 
 def _frame(s: float, t: float, width: float, height: float, turn_deg: float = 0.0) -> np.ndarray:
@@ -509,7 +482,7 @@ def _panning_desk(rng: np.random.Generator) -> World:
     return replace(_desk(rng), camera=CameraMotion((0.15, 0.05), slide=1.5, period_s=8.0))
 
 
-SCENES: dict[str, Scene] = {
+STILL_SCENES: dict[str, Scene] = {
     "near-planar": Scene("papers, a leaf and marbles on a tilted desk", (-0.3, 0.3), _desk),
     "deep-occlusions": Scene("a garden behind leaves and grass", (-2.0, 2.0), _garden),
     "non-lambertian": Scene("glass, mirror, gloss and clear film", (-1.6, 1.6), _still_life),
@@ -521,3 +494,4 @@ MOVING_SCENES: dict[str, Scene] = {
     "moving-toys": Scene("blocks that turn and balls that roll", (-2.0, 2.0), _moving_toys),
     "panning-desk": Scene("the desk before a camera that pans", (-0.4, 0.4), _panning_desk),
 }
+SCENES = STILL_SCENES | MOVING_SCENES

@@ -1,16 +1,14 @@
-"""Devices without physics: a stage that is where it is sent, a camera that gives prepared frames.
+"""A stage without physics, which is where it is sent.
 
-For what is measured or tested around devices: their own time is none, or exactly as asked for.
+For what is measured or tested around devices: its own time is none, or exactly as asked for.
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from typing import Self
 
-from drivers.camera import CameraIdentity, Limits
+from drivers.camera import Limits
 from drivers.clock import Clock
 from drivers.errors import LimitExceededError, NotHomedError
-from drivers.raw import RawFrame
 
 TRAVEL_UM = (0.0, 100_000.0)
 
@@ -97,37 +95,3 @@ class StillStage:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-class PreparedCamera:
-    """A `drivers.camera.Camera` that takes its frames from `give(exposure_s)`."""
-
-    exposure_limits_s: Limits = (1e-6, 3600.0)
-    gain_limits: Limits = (1.0, 1.0)
-    gain = 1.0
-
-    def __init__(
-        self,
-        give: Callable[[float], RawFrame],
-        shape: tuple[int, int],
-        cfa: str,
-        identity: CameraIdentity | None = None,
-    ) -> None:
-        self.identity = identity or CameraIdentity("EMMC", "prepared frames", "1")
-        self.shape, self.cfa = shape, cfa
-        self.exposure_s = 0.01
-        self._give = give
-
-    def set_exposure_s(self, exposure_s: float) -> None:
-        """Take any exposure."""
-        self.exposure_s = exposure_s
-
-    def set_gain(self, gain: float) -> None:
-        """Take no notice."""
-
-    def snap(self) -> RawFrame:
-        """Return the next frame."""
-        return replace(self._give(self.exposure_s), exposure_s=self.exposure_s, gain=self.gain)
-
-    def close(self) -> None:
-        """Keep nothing open."""

@@ -58,6 +58,7 @@ FAULTS = (
 VENDOR, PRODUCT = 0x1209, 0x0E3C
 COMMAND_OUT, ANSWER_IN, STREAM_IN = 0x01, 0x81, 0x82
 PACKET = 1024
+FRAME_RATE_HZ = 30.0
 
 ABRM, SBRM, SIRM, MANIFEST, FILE = 0x0, 0x10000, 0x20000, 0x30000, 0x40000
 RESPONSE_MS = 200
@@ -118,7 +119,6 @@ class U3vCameraSimulator(UsbFunction):
         zipped: bool = True,
         alignment_bits: int = 10,
         packet: int = PACKET,
-        frame_rate_hz: float = 30.0,
         serial: str = "U1",
         exposure_us: tuple[float, float] = (10.0, 10_000_000.0),
         gain_db: tuple[float, float] = (0.0, 24.0),
@@ -132,7 +132,6 @@ class U3vCameraSimulator(UsbFunction):
         self._bits = bits
         self._black_level_dn = black_level_dn
         self._alignment_bits = alignment_bits
-        self._frame_rate_hz = frame_rate_hz
         formats = tuple(COLOURS[cfa] + depth for depth in depths)
         ticks = tuple(round(us / xml.EXPOSURE_TICK_US) for us in exposure_us)
         steps = tuple(round(db / xml.GAIN_STEP_DB) for db in gain_db)
@@ -168,7 +167,7 @@ class U3vCameraSimulator(UsbFunction):
             (xml.AUTO, 0x3),
         ):
             self._write_u32(xml.BASE, offset, value)
-        struct.pack_into("<f", self._regions[xml.BASE], xml.FRAME_RATE, self._frame_rate_hz)
+        struct.pack_into("<f", self._regions[xml.BASE], xml.FRAME_RATE, FRAME_RATE_HZ)
         self._regions[xml.BASE][xml.SENSOR : xml.SENSOR + 4] = b"SIM1"
         self._update_sizes()
         self._answers: deque[tuple[float, bytes]] = deque()

@@ -1,10 +1,8 @@
-"""Wires to simulated firmware: in memory, on a pseudo-terminal that pyserial can open, on TCP."""
+"""Wires to simulated firmware: in memory, on a pseudo-terminal that pyserial can open."""
 
 import os
 import select
-import socket
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -17,7 +15,7 @@ from drivers.errors import (
     PortNotFoundError,
     TransportTimeoutError,
 )
-from drivers.transport import IN_USE, Transport
+from drivers.transport import Transport
 
 READ_SIZE = 4096
 TICK_S = 0.002
@@ -117,16 +115,17 @@ class MemoryTransport(Transport):
             raise PortGoneError(self.port)
 
 
-class _Server(ABC):
-    """Serves firmware in a thread while its `with` block lasts.
+class PtyServer:
+    """Serves firmware on a pseudo-terminal, in a thread, while its `with` block lasts.
 
     `port` is the name to open. Pulling the plug closes it under the reader's feet; plugging in
-    again opens a new one.
+    again opens a new one, whose name may be another, as a USB port's may. `link` is a path that
+    always leads to it, as /dev/serial/by-id does; it must be free, or an earlier link. POSIX only.
     """
 
-    def __init__(self, firmware: Firmware) -> None:
+    def __init__(self, firmware: Firmware, link: Path | None = None) -> None:
         self.port = ""
-        self._firmware = firmware
+        self._firmware, self._link = firmware, link
         self._wake_read, self._wake_write = os.pipe()
         self._opened = False
 
@@ -134,26 +133,6 @@ class _Server(ABC):
     def is_open(self) -> bool:
         """Whether the port can be opened now."""
         return self._opened
-
-    @abstractmethod
-    def _open(self) -> None:
-        """Make the port exist and note its name."""
-
-    @abstractmethod
-    def _close(self) -> None:
-        """Make the port go away."""
-
-    @abstractmethod
-    def _sources(self) -> list[Any]:
-        """Return what to wait on for bytes from the host."""
-
-    @abstractmethod
-    def _read(self, source: Any) -> bytes:
-        """Return bytes from the host, none when there are none after all."""
-
-    @abstractmethod
-    def _write(self, data: bytes) -> None:
-        """Send bytes to the host, if there is one."""
 
     def __enter__(self) -> Self:
         self._open()
@@ -208,18 +187,6 @@ class _Server(ABC):
             self._open()
             self._opened = True
 
-
-class PtyServer(_Server):
-    """Serves firmware on a pseudo-terminal; its name changes after an unplug, as a USB port's may.
-
-    `link` is a path that always leads to it, as /dev/serial/by-id does; it must be free, or an
-    earlier link. POSIX only.
-    """
-
-    def __init__(self, firmware: Firmware, link: Path | None = None) -> None:
-        super().__init__(firmware)
-        self._link = link
-
     def _open(self) -> None:
         # Windows has no pseudo-terminals; the wire in memory must import there too.
         import tty
@@ -249,58 +216,3 @@ class PtyServer(_Server):
 
     def _write(self, data: bytes) -> None:
         self._send(self._device, partial(os.write, self._device), data)
-
-
-class TcpServer(_Server):
-    """Serves firmware on TCP, to one client at a time; `port` is a URL that pyserial opens.
-
-    A second client gets a line that the port is in use, as ser2net does, and is closed.
-    """
-
-    def __init__(self, firmware: Firmware, host: str = "127.0.0.1", number: int = 0) -> None:
-        super().__init__(firmware)
-        self.address = (host, number)
-        self._client: socket.socket | None = None
-
-    def _open(self) -> None:
-        self._listener = socket.create_server(self.address)
-        self.address = self._listener.getsockname()[:2]
-        self.port = f"socket://{self.address[0]}:{self.address[1]}"
-
-    def _close(self) -> None:
-        self._hang_up()
-        self._listener.close()
-
-    def _sources(self) -> list[Any]:
-        return [self._listener] if self._client is None else [self._client, self._listener]
-
-    def _read(self, source: Any) -> bytes:
-        if source is self._listener and self._client is not None:
-            refused, _ = self._listener.accept()
-            with refused, suppress(OSError):
-                refused.sendall(IN_USE + b"\r\n")
-                refused.shutdown(socket.SHUT_WR)
-            return b""
-        if source is self._listener:
-            self._client, _ = self._listener.accept()
-            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._client.setblocking(False)
-            return b""
-        data = b""
-        with suppress(ConnectionError):
-            data = source.recv(READ_SIZE)
-        if not data:
-            self._hang_up()
-        return data
-
-    def _write(self, data: bytes) -> None:
-        if self._client is not None:
-            try:
-                self._send(self._client, self._client.send, data)
-            except ConnectionError:
-                self._hang_up()
-
-    def _hang_up(self) -> None:
-        if self._client is not None:
-            self._client.close()
-            self._client = None

@@ -87,7 +87,12 @@ def check(
     before: the mosaic of the frame before this one. may_saturate: a longer one of a bracket.
     """
     span = max(1.0, frame.white_level_dn - float(frame.black_level_dn.mean()))
-    refuse_repeated(planned, frame, before)
+    if before is not None and is_same(frame.mosaic, before):
+        raise FrameRefusedError(
+            planned.id,
+            "is identical to the frame before it",
+            "the camera sent its last frame again; if this repeats, switch it off and on",
+        )
     if planned.kind == "dark":
         if found.mean_dn > checks.largest_dark * span:
             raise FrameRefusedError(
@@ -112,18 +117,6 @@ def check(
         )
 
 
-def refuse_repeated(
-    planned: PlannedFrame, frame: RawFrame, before: NDArray[np.uint16] | None
-) -> None:
-    """Raise `FrameRefusedError` where a frame is the one before it, whose mosaic is `before`."""
-    if before is not None and _same(frame.mosaic, before):
-        raise FrameRefusedError(
-            planned.id,
-            "is identical to the frame before it",
-            "the camera sent its last frame again; if this repeats, switch it off and on",
-        )
-
-
 def exposure_setting(planned: PlannedFrame) -> str:
     """Return the key of the plan that sets a frame's exposure."""
     if planned.kind == "dark":
@@ -136,7 +129,7 @@ def exposure_setting(planned: PlannedFrame) -> str:
     return "whiteboards.exposure_s" if planned.metered_by is None else "whiteboards.level"
 
 
-def _same(one: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:
+def is_same(one: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:
     """Return whether two mosaics are equal, and not just equally empty."""
     if one.shape != other.shape or not np.array_equal(one[::256], other[::256]):
         return False

@@ -326,8 +326,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                 "of the stage, or leave focus out of the plan"
             )
         refuse_impossible(rig, frames)
-        film = [frame for frame in frames if frame.film is not None]
-        refuse_impossible_film(plan, rig, film)
+        refuse_impossible_film(plan, rig, frames)
         if session is not None:
             refuse_other_devices(session, rig, request.other_devices)
         expected = estimated(frames, plan, rig, session)
@@ -342,7 +341,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                 session = session.amend(_frozen(request, edit.frames), edit.changes)
             with way_on_named(request, session):
                 if request.until_db not in (None, session.target_db):
-                    session.note(UntilEntry(target_db=request.until_db, wall=wall_time()))
+                    session.note(UntilEntry(target_db=request.until_db))
                 choose = None if recording is None else there(session, recording)
                 if session.target_db is not None:
                     choose = Until(session, watcher)

@@ -37,8 +37,8 @@ class Estimate:
     """Seconds by what they are spent on, and bytes on the disk.
 
     by_hand: how often a person is asked to change something at the bench, which takes time of its
-    own. guessed: frames whose exposure is not metered yet. filming_s: of the frames of a film, so
-    many at their rate.
+    own. guessed: frames whose exposure is not metered yet. exposing_s: of a film's frames, their
+    periods.
     """
 
     frames: int
@@ -48,13 +48,11 @@ class Estimate:
     bytes: int
     by_hand: int
     guessed: int = 0
-    filmed: int = 0
-    filming_s: float = 0.0
 
     @property
     def seconds(self) -> float:
         """Total, without what is done by hand."""
-        return self.moving_s + self.exposing_s + self.downloading_s + self.filming_s
+        return self.moving_s + self.exposing_s + self.downloading_s
 
 
 class Pace:
@@ -110,6 +108,7 @@ class Pace:
             count += 1
             if frame.film is not None and self._waits:
                 filmed += 1
+                exposing_s += self._period_s
                 continue
             moving_s += self.moving_s(frame, here_um)
             here_um |= frame.bench.offsets_um
@@ -124,17 +123,8 @@ class Pace:
             moving_s = exposing_s = 0.0
         size = count * (self._bytes + JOURNAL_BYTES_PER_FRAME)
         frame_s = median(self._learnt_s) if self._learnt_s else self.usual_s
-        return Estimate(
-            count,
-            moving_s,
-            exposing_s,
-            (count - filmed) * frame_s,
-            size,
-            by_hand,
-            guessed,
-            filmed,
-            filmed * self._period_s,
-        )
+        downloading_s = (count - filmed) * frame_s
+        return Estimate(count, moving_s, exposing_s, downloading_s, size, by_hand, guessed)
 
 
 def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:

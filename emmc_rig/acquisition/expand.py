@@ -15,7 +15,7 @@ from calibration.openings import CENTRED, views_open, window_place_um
 from calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.acquisition.metering import BRACKET_STEP, MOST_STEPS
 from emmc_rig.acquisition.order import spread
-from emmc_rig.acquisition.plan import AUTO, METERING_EXPOSURE_S, Boards, Film, Plan
+from emmc_rig.acquisition.plan import AUTO, METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
@@ -340,10 +340,19 @@ def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFram
     meterings = _scene_meterings(plan, camera, window_um)
     yield from {frame.id: frame for frame in meterings.values()}.values()
     yield from _shot_darks(plan, camera, meterings)
-    if plan.film is not None:
-        yield from _film(plan, plan.film, camera, meterings, window_um)
+    shots = list(_exposed(plan, camera, meterings, window_um))
+    if plan.film is None:
+        yield from shots
         return
-    steps = MOST_STEPS if plan.metering.bracket else 0
+    for place in range(plan.film.frames):
+        yield replace(shots[place % len(shots)], id=f"film-{place:06d}", film=place)
+
+
+def _exposed(
+    plan: Plan, camera: Camera, meterings: Mapping[int, PlannedFrame], window_um: float
+) -> Iterator[PlannedFrame]:
+    """Yield the frames of each shot: its bracket and repeats; one of each for a film."""
+    steps = MOST_STEPS if plan.metering.bracket and plan.film is None else 0
     for place, (shot, bracket) in enumerate(
         zip(plan.shots, exposures_s(plan, camera), strict=True)
     ):
@@ -359,30 +368,6 @@ def _shots(plan: Plan, camera: Camera, window_um: float) -> Iterator[PlannedFram
                 f"shot-{place}-e{step}", "shot", bench, shot.repeats,
                 exposure_s=exposure_s, gain=shot.gain, metered_by=metered_by, light=light,
             )  # fmt: skip
-
-
-def _film(
-    plan: Plan,
-    film: Film,
-    camera: Camera,
-    meterings: Mapping[int, PlannedFrame],
-    window_um: float,
-) -> Iterator[PlannedFrame]:
-    """Yield the frames of a film in the order of time, the plan's shots in turn."""
-    benches = [_scene_bench(plan, camera, place, window_um) for place in range(len(plan.shots))]
-    brackets = exposures_s(plan, camera)
-    for place in range(film.frames):
-        shot = place % len(benches)
-        bracket = brackets[shot]
-        yield PlannedFrame(
-            f"film-{place:06d}",
-            "shot",
-            benches[shot],
-            None if bracket is None else bracket[0],
-            plan.shots[shot].gain,
-            metered_by=meterings[shot].id if bracket is None else None,
-            film=place,
-        )
 
 
 def fittings(camera: Camera) -> list[int]:

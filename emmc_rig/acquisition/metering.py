@@ -17,7 +17,7 @@ from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Metering
 from emmc_rig.session.journal import Figures, FrameEntry, MeteredEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.session import Session, wall_time
+from emmc_rig.session.session import Session
 
 METERING_TRIES = 8
 STEP = 4.0
@@ -104,7 +104,7 @@ def asked_of_scene(
         and frame.light * chosen_s[group_of[frame.bench.shot]] <= limits_s[1]
     ]
     exposures_s = {shot: chosen_s[group] for shot, group in group_of.items()}
-    return MeteredEntry(exposures_s=exposures_s, asked=asked, wall=wall_time())
+    return MeteredEntry(exposures_s=exposures_s, asked=asked)
 
 
 def _steps(figures: Figures) -> int:

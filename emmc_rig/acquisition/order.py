@@ -33,9 +33,7 @@ def ordered(
     # A film has its order in time.
     film = tuple(frame for frame in frames if frame.film is not None)
     groups: dict[object, list[PlannedFrame]] = {}
-    for frame in frames:
-        if frame.film is not None:
-            continue
+    for frame in (frame for frame in frames if frame.film is None):
         # The scene is metered, all of it, before the first shot and the darks of the shots.
         meters = frame.bench.target == "scene" and (
             frame.kind == "metering" or (frame.kind == "dark" and frame.is_exposed_as_shots)

@@ -281,20 +281,16 @@ class Plan(Settings):
 
     @model_validator(mode="after")
     def _filmed_alike(self) -> Plan:
-        shots = self.shots
-        if self.film is None:
-            return self
-        if len({(one.exposure_s, one.gain, one.lamp) for one in shots}) > 1:
-            raise ValueError("film: all frames are exposed alike, give its shots one exposure_s")
-        if any(one.repeats > 1 or len(_bracket(one)) > 1 for one in shots):
-            raise ValueError("film: a frame is exposed once, leave brackets and repeats out")
-        if not self.metering.alike:
-            raise ValueError("film: all frames are exposed alike, leave metering.alike out")
+        asked = {(shot.exposure_s, shot.gain, shot.lamp, shot.repeats) for shot in self.shots}
+        exposures = self.shots[0].exposure_s
+        bracket = isinstance(exposures, tuple) and len(exposures) > 1
+        alike = len(asked) == 1 and self.metering.alike
+        if self.film is not None and (bracket or not alike or self.shots[0].repeats > 1):
+            raise ValueError(
+                "film: its frames are exposed alike and once: give its shots one exposure_s, gain "
+                "and lamp, and leave brackets, repeats and metering.alike out"
+            )
         return self
-
-
-def _bracket(shot: PlannedShot) -> tuple[float, ...]:
-    return shot.exposure_s if isinstance(shot.exposure_s, tuple) else ()
 
 
 def load_plan(path: Path) -> Plan:

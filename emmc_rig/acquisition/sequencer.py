@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import groupby, takewhile
 from typing import Any
 
 import numpy as np
@@ -29,11 +30,10 @@ from emmc_rig.acquisition.by_hand import HandPlaces, WrongPlaceError
 from emmc_rig.acquisition.checks import (
     LEAST_LIKENESS,
     Figures,
-    FrameRefusedError,
     check,
     figures,
+    is_same,
     refuse_impossible,
-    refuse_repeated,
 )
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
@@ -42,6 +42,8 @@ from emmc_rig.acquisition.film import (
     ARRIVAL_POLL_S,
     INTERRUPTED,
     LATE,
+    SENT_TWICE,
+    Arrived,
     Ring,
     room_for,
     streams,
@@ -96,8 +98,7 @@ Choose = Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]
 class Sequencer:
     """A run over a session; `run` once.
 
-    choose: by default all that is missing. between: the plan's hook. timer: seconds that never run
-    backwards, for the timeline; wall: the time of day, for people.
+    choose: by default all that is missing. between: the plan's hook. wall: the time of day.
     """
 
     def __init__(
@@ -109,7 +110,6 @@ class Sequencer:
         control: Control | None = None,
         choose: Choose | None = None,
         between: Between | None = None,
-        timer: Callable[[], float] = time.perf_counter,
         wall: Callable[[], str] = wall_time,
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
@@ -120,7 +120,7 @@ class Sequencer:
         self._prepared: tuple[str, int] | None = None
         self._silent: dict[str, str] = {}
         self._focused_at: int | None = None
-        self._timer, self._wall = timer, wall
+        self._wall = wall
         self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
         self._devices = Devices(rig, plan, wall)
@@ -145,7 +145,7 @@ class Sequencer:
         Raises AppError with one line, a `DriverError` that mending cannot cure, `OSError` of the
         disk, or `KeyboardInterrupt`; what was stored until then is kept.
         """
-        self._began_s = self._timer()
+        self._began_s = time.perf_counter()
         with self._writer, self._bench_left_safe():
             self._open_session()
             try:
@@ -153,11 +153,11 @@ class Sequencer:
             except StopCapture as end:
                 assert self._between is not None
                 reason = f"{self._between.name} ended the capture: {one_line(end)}"
-                self._note(HaltEntry(kind="stopped", reason=reason, wall=self._wall()))
+                self._note(HaltEntry(kind="stopped", reason=reason))
                 self._watcher.tell(reason)
             left = self._close_session()
         return RunEnd(
-            not left, self._taken, left, self._budget.spent, self._timer() - self._began_s
+            not left, self._taken, left, self._budget.spent, time.perf_counter() - self._began_s
         )
 
     def _take_missing(self) -> None:
@@ -182,7 +182,6 @@ class Sequencer:
         session.make_ready()
         session.note(
             RunEntry(
-                wall=self._wall(),
                 versions=versions(),
                 command=command_line(),
                 resumed=bool(session.stored),
@@ -321,13 +320,13 @@ class Sequencer:
         why = reason()
         if why and not control.stopping:
             began_s = self._now_s()
-            self._note(HaltEntry(kind="paused", reason=why, wall=self._wall()))
+            self._note(HaltEntry(kind="paused", reason=why))
             self._watcher.paused(why)
             while why and not control.stopping:
                 control.wait()
                 why = reason()
             seconds = self._now_s() - began_s
-            self._note(ResumedEntry(seconds=seconds, wall=self._wall()))
+            self._note(ResumedEntry(seconds=seconds))
             self._watcher.resumed(seconds)
         return not control.stopping
 
@@ -408,7 +407,6 @@ class Sequencer:
             fault=fault,
             at_s=began_s,
             seconds=round(self._now_s() - began_s, 6),
-            wall=self._wall(),
         )
         self._note(entry)
         self._watcher.tell(str(entry))
@@ -480,10 +478,10 @@ class Sequencer:
         """
         self._writer.flush()
         session = self._session
-        stored = [frame for frame in session.frames if frame.id in session.stored]
-        last = max((frame.film for frame in stored if frame.film is not None), default=-1)
+        film = [frame for frame in session.frames if frame.film is not None]
+        last = max((_place(frame) for frame in film if frame.id in session.stored), default=-1)
         left = list(frames)
-        self._drop(left, last + 1, INTERRUPTED)
+        self._drop(left, last + 1, lambda place: INTERRUPTED)
         is_streamed = streams(self._plan, self._devices.camera)
         take = self._take_stream if is_streamed else self._take_steps
         while left and self._may_go_on():
@@ -497,18 +495,15 @@ class Sequencer:
     def _begin_segment(self, planned: PlannedFrame) -> None:
         assert self._plan.film is not None
         self._segment, self._film_began_s = self._segment + 1, None
-        rate_hz, wall = self._plan.film.rate, self._wall()
-        self._note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=rate_hz, wall=wall))
+        rate = self._plan.film.rate
+        self._note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=rate))
 
-    def _drop(self, left: list[PlannedFrame], end: int, why: str | Callable[[int], str]) -> None:
-        """Take note that the frames left before a place are dropped; why: by place, or of all."""
-        reasons: dict[str, list[str]] = {}
-        while left and _place(left[0]) < end:
-            frame = left.pop(0)
-            reason = why if isinstance(why, str) else why(_place(frame))
-            reasons.setdefault(reason, []).append(frame.id)
-        for reason, ids in reasons.items():
-            entry = DroppedEntry(ids=ids, reason=reason, wall=self._wall())
+    def _drop(self, left: list[PlannedFrame], end: int, why: Callable[[int], str]) -> None:
+        """Take note that the frames left before a place are dropped; why: by place."""
+        gone = list(takewhile(lambda frame: _place(frame) < end, left))
+        del left[: len(gone)]
+        for reason, frames in groupby(gone, lambda frame: why(_place(frame))):
+            entry = DroppedEntry(ids=[frame.id for frame in frames], reason=reason)
             self._note(entry)
             self._watcher.tell(str(entry))
 
@@ -532,28 +527,15 @@ class Sequencer:
             devices.settle()
         devices.set_camera(first, self._exposure_s(first))
         self._begin_segment(first)
-        rows, columns = devices.camera.shape
-        ids, end = {_place(frame): frame.id for frame in left}, _place(left[-1]) + 1
         read_s, beside = -STAGE_READ_INTERVAL_S, dict[str, Any]()
-        with Ring(
-            devices.camera,
-            film.rate,
-            range(_place(first), end),
-            room_for(2 * rows * columns),
-            rig.clock,
-            rig.clock is not SYSTEM_CLOCK,
-            lambda place: rig.about_to_expose(ids.get(place, "")),
-        ) as ring:
-            while left and not ring.over:
+        places = range(_place(first), _place(left[-1]) + 1)
+        with Ring(devices.camera, film.rate, places, room_for(devices.camera, rig.clock)) as ring:
+            for arrived in ring:
                 if self._halting:
                     ring.stop()
-                arrived = ring.next()
                 if arrived is None:
                     continue
-                place, film_s, frame = arrived
-                self._drop(left, place, ring.why_missing)
-                if _place(left[0]) != place:
-                    continue
+                self._drop(left, arrived.place, ring.why_missing)
                 if self._now_s() - read_s >= STAGE_READ_INTERVAL_S:
                     read_s = self._now_s()
                     beside = {
@@ -562,29 +544,27 @@ class Sequencer:
                         "environment": self._read_sources(),
                     }
                 devices.asked = self._wall(), rig.clock.now_s()
-                self._take_arrived(left, frame, film_s, **beside)
+                self._take_arrived(left, arrived, beside)
         if not self._halting:
-            self._drop(left, end, ring.why_missing)
+            self._drop(left, places.stop, ring.why_missing)
 
     def _take_arrived(
-        self, left: list[PlannedFrame], frame: RawFrame, film_s: float, **about: Any
+        self, left: list[PlannedFrame], arrived: Arrived, beside: Mapping[str, Any]
     ) -> None:
         """Store the next frame left of a film, or drop it where the camera sent one twice.
 
         A segment's first must pass every check; a flash or darkness later is the scene's own.
         """
-        planned, found = left[0], figures(frame)
+        planned, frame, found = left[0], arrived.frame, figures(arrived.frame)
         self._watcher.step("check", planned)
-        if film_s == 0:
+        if arrived.film_s == 0:
             check(planned, frame, found, self._before, self._plan.checks)
-        try:
-            refuse_repeated(planned, frame, self._before)
-        except FrameRefusedError as fault:
-            self._drop(left, _place(planned) + 1, fault.reason)
+        if self._before is not None and is_same(frame.mosaic, self._before):
+            self._drop(left, arrived.place + 1, lambda place: SENT_TWICE)
             return
         left.pop(0)
         self._watcher.taken(planned, frame, found)
-        self._hand_over(planned, frame, found, {}, film_s=film_s, **about)
+        self._hand_over(planned, frame, found, {}, film_s=arrived.film_s, **beside)
         self._before = frame.mosaic
         self._taken += 1
         self._report_remaining(planned)
@@ -601,7 +581,7 @@ class Sequencer:
             if self._film_began_s is not None and not rig.recorded_s:
                 passed = (rig.clock.now_s() - self._film_began_s) * film.rate
                 due = _place(first) + passed
-                self._drop(left, math.ceil(due - 0.5), LATE)
+                self._drop(left, math.ceil(due - 0.5), lambda place: LATE)
                 if left and _place(left[0]) > due:
                     # A hook is called before any axis moves.
                     if self._between is None and self._devices.move(left[0]):
@@ -657,7 +637,6 @@ class Sequencer:
                     fault=fault,
                     at_s=began_s,
                     seconds=round(self._now_s() - began_s, 6),
-                    wall=self._wall(),
                 )
             )
         devices.look_again()
@@ -671,7 +650,7 @@ class Sequencer:
         for name in faults.keys() | self._silent.keys():
             fault = faults.get(name, "")
             if fault != self._silent.get(name, ""):
-                entry = SourceEntry(name=name, fault=fault, wall=self._wall())
+                entry = SourceEntry(name=name, fault=fault)
                 self._note(entry)
                 self._watcher.tell(f"environment, {name}: {fault or 'gives values again'}")
         self._silent = faults
@@ -832,7 +811,7 @@ class Sequencer:
         session = self._session
         left = len(session.missing())
         if not left and not session.is_complete:
-            session.note(CompleteEntry(frames=len(session.needed), wall=self._wall()))
+            session.note(CompleteEntry(frames=len(session.needed)))
         return left
 
     @contextmanager
@@ -847,14 +826,14 @@ class Sequencer:
                 if isinstance(error, Exception | KeyboardInterrupt):
                     with suppress(Exception):
                         reason = str(error) or "stopped at once by the user"
-                        self._note(HaltEntry(kind="stopped", reason=reason, wall=self._wall()))
+                        self._note(HaltEntry(kind="stopped", reason=reason))
             raise
         finally:
             with uninterrupted():
                 self._devices.make_safe()
 
     def _now_s(self) -> float:
-        return round(self._timer() - self._began_s, 6)
+        return round(time.perf_counter() - self._began_s, 6)
 
 
 def _place(frame: PlannedFrame) -> int:

@@ -19,7 +19,7 @@ from emmc_rig.session.journal import DecidedEntry, ended, of_kind
 from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import scaled_readings
-from emmc_rig.session.session import Session, wall_time
+from emmc_rig.session.session import Session
 from reconstruction.methods import reconstruct
 from reconstruction.result import Progress, Reconstruction
 
@@ -130,7 +130,6 @@ class Until:
             method=METHOD,
             advice=advice,
             spans_s={"decide": (began_s, now_s())},
-            wall=wall_time(),
         )
         session.note(entry)
         self._watcher.tell(str(entry))

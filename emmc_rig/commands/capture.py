@@ -193,12 +193,8 @@ def _run(
                 if expected.guessed
                 else ""
             )
-            film = ""
-            if expected.filmed:
-                length = shown_seconds(expected.filming_s)
-                film = f", {expected.filmed} of them a film of {length}"
             watcher.tell(
-                f"{most}{expected.frames} frames to take{film}, about "
+                f"{most}{expected.frames} frames to take, about "
                 f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}{yet}"
             )
         return not dry_run

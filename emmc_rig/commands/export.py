@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,6 @@ import typer
 
 from emmc_rig.commands.options import ExportSizeOption
 from emmc_rig.commands.output import give_result, shown_progress, tell
-from emmc_rig.errors import AppError
 
 
 def export(
@@ -47,7 +47,7 @@ def export(
 ) -> None:
     """Export a light field or Psi to other programs, or as a viewer."""
     from emmc_rig.files.exports import LIGHT_FIELD, open_export
-    from emmc_rig.files.films import film_folder, is_film, open_film
+    from emmc_rig.files.films import film_of
     from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats import ALIASES, FORMATS
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
@@ -72,30 +72,19 @@ def export(
     if result is None:
         raise typer.BadParameter("name a result or a scene, or list the formats by --list")
     out = out or Path(f"emmc-{named}")
-    film = open_film(film_folder(result)) if is_film(film_folder(result)) else None
-    write_film = known[form].write_film
-    if film is not None:
-        one_frame = next(iter(film.frames.values()))
-        if write_film is None:
-            names = ", ".join(one.name for one in known.values() if one.write_film)
-            raise AppError(
-                f"--format {form} has no time: films are exported as {names}; a single frame by "
-                f"its folder, such as {one_frame}"
-            )
-        if truth is not None:
-            raise typer.BadParameter(f"--truth: export a single frame, such as {one_frame}")
-    facts: dict[str, object] = {}
+    film = film_of(result)
+    if film is not None and truth is not None:
+        raise typer.BadParameter(f"--truth: export a single frame, such as {film.first.source}")
     with result_folder(out, f"export --format {named}") as folder, shown_progress("read") as bars:
-        if film is not None and write_film is not None:
-            facts |= {"shape": list(film.shape), "missing_frames": film.missing}
-            known[form].refuse_without_parallax(film.opened(min(film.frames)))
-            bars.begin("write", len(film.frames))
-            write_film(folder, film, bars.step)
-        else:
+        if film is None:
             opened = open_export(result, truth, parse_size(size))
-            facts["shape"] = list(opened.light_field.shape)
+            facts: dict[str, object] = {"shape": list(opened.light_field.shape)}
             bars.begin("write")
             known[form].write_whole(folder, opened)
+        else:
+            facts = {"shape": list(film.shape), "missing_frames": film.missing}
+            bars.begin("write", len(film.frames))
+            known[form].write_whole_film(folder, replace(film, on_frame=bars.step))
         files = [path for path in folder.rglob("*") if path.is_file()]
         written = sum(path.stat().st_size for path in files)
         write_metrics(

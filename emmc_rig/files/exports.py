@@ -20,7 +20,7 @@ from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.lightfield import load_hdf5, load_view_axes
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxes, stored_as
-from simulators.scenes import built_in
+from simulators.scenes import SCENES
 
 LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"
 """Of a result's folder."""
@@ -45,8 +45,8 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
         caption = _caption(metrics)
     elif (folder / FRAMES).is_file():
         raise AppError(f"{spec}: holds frames, no light field; run: emmc-rig reconstruct {spec}")
-    elif not folder.exists() and spec not in built_in():
-        near = nearest_of(spec, built_in())
+    elif not folder.exists() and spec not in SCENES:
+        near = nearest_of(spec, SCENES)
         raise AppError(f"no folder or file '{spec}', and no built-in scene: {near}")
     else:
         scene = open_scene(spec, size)

@@ -30,7 +30,7 @@ class Film:
 
     rate: Hz. times_s: of every place in time, from the first. frames: by place in time, in that
     order, the folder of the result; places without one are missing. shape: of every light field,
-    (v, u, y, x, c).
+    (v, u, y, x, c). on_frame: called when one of `each` is done with.
     """
 
     folder: Path
@@ -38,43 +38,42 @@ class Film:
     times_s: tuple[float, ...]
     frames: Mapping[int, Path]
     shape: tuple[int, ...]
+    on_frame: Callable[[], object] = lambda: None
 
     @property
     def missing(self) -> list[int]:
         """Places in time that have no frame."""
         return [place for place in range(len(self.times_s)) if place not in self.frames]
 
+    @property
+    def first(self) -> Export:
+        """The first frame that there is."""
+        return self.opened(min(self.frames))
+
     def opened(self, place: int) -> Export:
         """Return the frame of a place in time; raises AppError, or KeyError where it is missing."""
         return open_export(str(self.frames[place]))
 
-    def each(self, on_frame: Callable[[], object]) -> Iterator[tuple[int, Export]]:
-        """Yield places in time with their frames, one in memory at once.
-
-        on_frame: called when the caller is done with one.
-        """
+    def each(self) -> Iterator[tuple[int, Export]]:
+        """Yield places in time with their frames, one in memory at once."""
         for place in self.frames:
             yield place, self.opened(place)
-            on_frame()
+            self.on_frame()
 
 
-def film_folder(spec: str) -> Path:
-    """Return the folder where a result of that name is a film, if it is: inside of a session."""
+def film_of(spec: str) -> Film | None:
+    """Return the film that a result, or that of a session, is; None for a single light field."""
     folder = path_in(spec)
-    return folder / SESSION_RECONSTRUCTION if is_session(folder) else folder
-
-
-def is_film(folder: Path) -> bool:
-    """Return whether a folder holds a film, whole or not."""
-    return (folder / METRICS).is_file() and (folder / FRAMES).is_dir() and not is_session(folder)
+    folder = folder / SESSION_RECONSTRUCTION if is_session(folder) else folder
+    holds = (folder / METRICS).is_file() and (folder / FRAMES).is_dir()
+    return open_film(folder) if holds else None
 
 
 def open_film(folder: Path) -> Film:
     """Open a film.
 
     Raises:
-        AppError: no film, one of which files are missing or cut short, or frames that differ in
-            shape.
+        AppError: no film, or one of which files are missing.
     """
     rate, times_s = _times(folder)
     listing = Listing.read(folder)
@@ -85,14 +84,8 @@ def open_film(folder: Path) -> Film:
     frames = {place: path for place, path in paths if path.is_dir()}
     if not frames:
         raise AppError(f"{folder}: a film without a frame; {REMEDY}")
-    shapes = {place: _shape(path / LIGHT_FIELD) for place, path in frames.items()}
-    first, shape = next(iter(shapes.items()))
-    for place, other in shapes.items():
-        if other != shape:
-            raise AppError(
-                f"{folder}: frame {place} has the shape {other}, frame {first} {shape}: no film; "
-                "reconstruct it again"
-            )
+    with stored_arrays(next(iter(frames.values())) / LIGHT_FIELD, AppError, REMEDY) as stored:
+        shape = tuple(stored.dataset("light_field").shape)
     return Film(folder, rate, times_s, frames, shape)
 
 
@@ -108,8 +101,3 @@ def _times(folder: Path) -> tuple[float, tuple[float, ...]]:
     except (OSError, ValueError, KeyError, TypeError) as fault:
         raise AppError(f"{path}: not that of a film ({one_line(fault)}); {REMEDY}") from fault
     return rate, times_s
-
-
-def _shape(path: Path) -> tuple[int, ...]:
-    with stored_arrays(path, AppError, REMEDY) as stored:
-        return tuple(stored.dataset("light_field").shape)

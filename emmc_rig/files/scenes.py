@@ -28,7 +28,7 @@ from emmc_rig.model.lightfield import (
 from emmc_rig.model.view_axes import ANGLES, shows_parallax
 from emmc_rig.model.view_order import ViewOrder, order_of
 from simulators.raycaster import World
-from simulators.scenes import built_in, render, render_at, rendered_disparity_px
+from simulators.scenes import SCENES, render, rendered_disparity_px
 
 APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 """How much finer the simulated rig sees a scene than it is reconstructed, along each axis."""
@@ -123,7 +123,7 @@ def open_scene(
         light_field, cut = _middle(check_light_field(values, "scene"), size, views, "scene")
         return Scene("array", light_field, None, f"an array{cut}")
     spec = os.fspath(spec)
-    if spec in built_in():
+    if spec in SCENES:
         shape = _asked_shape(size, views)
         rendered = render(spec, *shape, seed)
         return Scene(
@@ -155,7 +155,7 @@ def zoomed_scene(
     `simulators.changes`. Raises what `open_scene` does, and SceneError for a measured scene that
     is to be changed.
     """
-    if spec not in built_in():
+    if spec not in SCENES:
         if change is not None:
             raise SceneError(f"{spec}: only built-in scenes can be changed")
         return open_scene(spec, size, views, seed)
@@ -205,14 +205,14 @@ def fine_scene(
             f"{spec}: cannot refine by {aperture_factor} in the aperture and {pixel_factor} in "
             "the picture; factors are 1 or more"
         )
-    if spec not in built_in():
+    if spec not in SCENES:
         scene = open_scene(spec, size, views=views)
         return FineScene(scene, _interpolated(scene.light_field, pixel_factor), 1, pixel_factor)
     (height, width), (n_v, n_u) = _asked_shape(size, views)[::-1]
     fine_views = n_v * aperture_factor, n_u * aperture_factor
     fine_size = height * pixel_factor, width * pixel_factor
     disparity_px = rendered_disparity_px(spec, (n_v, n_u), (height, width), seed, time_s)
-    samples = render_at(spec, fine_views, fine_size, seed, time_s).light_field
+    samples = render(spec, fine_views, fine_size, seed, time_s=time_s).light_field
     truth = box_average(samples, aperture_factor, pixel_factor)
     provenance = (
         f"{_described(spec, (n_v, n_u), (height, width), seed)}, the average of "
@@ -267,7 +267,7 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
     else:
         raise SceneError(
             f"no scene '{spec}': no such folder or file, and no built-in scene; "
-            f"{did_you_mean(spec, built_in())}built in are {', '.join(built_in())}"
+            f"{did_you_mean(spec, SCENES)}built in are {', '.join(SCENES)}"
         )
     n_v, n_u, height, width, _ = light_field.shape
     described = f"{kind} {path.resolve()}, {n_v}x{n_u} views of {height}x{width} pixels"

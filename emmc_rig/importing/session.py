@@ -637,10 +637,8 @@ class _Import:
         shape = list(planned[0][1].read().shape)
         files = {str(item.listed.path): item.digest for _, item in planned}
         camera = {"maker": "", "model": "files of another program", "serial": "", "shape": shape}
-        session.note(
-            RunEntry(wall=wall_time(), versions=versions(), command=command_line(), camera=camera)
-        )
-        session.note(ImportedEntry(wall=wall_time(), files=files, notes=self._notes))
+        session.note(RunEntry(versions=versions(), command=command_line(), camera=camera))
+        session.note(ImportedEntry(files=files, notes=self._notes))
         for frame, item in planned:
             raw = self._raw(item, frame, scale, whole=True)
             entry = frame_entry(
@@ -650,7 +648,7 @@ class _Import:
             session.store(frame, frame_file(raw), lambda entry=entry: entry)
         for fault in verify_frames(session, session.stored.values()).values():
             raise AppError(f"{fault}; nothing was imported, test disk and memory")
-        session.note(CompleteEntry(frames=len(planned), wall=wall_time()))
+        session.note(CompleteEntry(frames=len(planned)))
 
     def _raw(self, item: _Item, frame: PlannedFrame, scale: int, whole: bool = False) -> RawFrame:
         """Return a frame as if from a camera; whole: with the bytes of its file."""

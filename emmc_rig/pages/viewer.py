@@ -89,8 +89,8 @@ class Overlay:
     colours: Sequence[tuple[int, int, int]] = HEAT
 
 
-def render_viewer(content: Export, lossless: bool = False) -> str:
-    """Return the page as text; lossless: pictures as PNG, for comparisons to the last code."""
+def render_viewer(content: Export) -> str:
+    """Return the page as text."""
     return fragment(
         "viewer_page.html",
         title=content.title,
@@ -98,7 +98,7 @@ def render_viewer(content: Export, lossless: bool = False) -> str:
         caveats=(), sections=(), lead="",
         summary=light_field_head(content.metrics, content.source, viewer=True),
         styles=("viewer.css",), scripts=("viewer.js",),
-        data={"viewer-data": viewer_data(content, lossless=lossless)}, poster=poster(content),
+        data={"viewer-data": viewer_data(content)}, poster=poster(content),
     )  # fmt: skip
 
 
@@ -125,7 +125,6 @@ def poster(
 
 def viewer_data(
     content: Export,
-    lossless: bool = False,
     most_pixels: int = SPRITE_PIXELS,
     like: Export | None = None,
     webp: int | None = None,
@@ -158,10 +157,9 @@ def viewer_data(
 
     def atlas(views: Array) -> str:
         picture = three_colours(curve.encode(views))
-        if lossless or webp is not None:
-            ordered = np.ascontiguousarray(tiled(picture)[..., ::-1])
-            return png_of(ordered) if webp is None else webp_of(ordered, webp)
-        return sprite(picture, int(BYTES_PER_PIXEL * picture.size / 3))
+        if webp is None:
+            return sprite(picture, int(BYTES_PER_PIXEL * picture.size / 3))
+        return webp_of(np.ascontiguousarray(tiled(picture)[..., ::-1]), webp)
 
     return {
         "views": {"rows": rows, "columns": columns, "height": height, "width": width},
@@ -223,8 +221,8 @@ def _overlay(one: Overlay, shown: Array, encode: Callable[[NDArray], str]) -> di
     }  # fmt: skip
 
 
-def render_film(film: Film, on_frame: Callable[[], object]) -> str:
-    """Return the page of a film as text. on_frame: called after every frame.
+def render_film(film: Film) -> str:
+    """Return the page of a film as text.
 
     One frame in the middle gives all of them their brightness and scales of colour.
     """
@@ -241,7 +239,7 @@ def render_film(film: Film, on_frame: Callable[[], object]) -> str:
     metrics: dict[int, Mapping[str, object]] = {}
     small = reduced(like.light_field[:1, :1], SPRITE_PIXELS // count)
     centres = np.zeros((ceil(count / columns), columns, *small.shape[2:4], 3), np.uint8)
-    for place, export in film.each(on_frame):
+    for place, export in film.each():
         frames[place] = viewer_data(export, most_pixels=most_pixels, like=like, webp=quality)
         metrics[place] = export.metrics
         centre = reduced(centre_view(export.light_field)[None, None], SPRITE_PIXELS // count)
@@ -273,7 +271,7 @@ def render_film(film: Film, on_frame: Callable[[], object]) -> str:
         title=film.folder.resolve().name, about=[f"{about}."], caveats=(), sections=(), lead="",
         summary=_film_head(film, metrics), styles=("viewer.css",),
         scripts=("viewer.js", "film.js"), data={"film-data": data},
-        poster=poster(film.opened(places[0]), most_pixels, like), film=True,
+        poster=poster(film.first, most_pixels, like), film=True,
     )  # fmt: skip
 
 
@@ -299,8 +297,8 @@ def _write(folder: Path, export: Export) -> None:
     write_text(folder / "viewer.html", render_viewer(export))
 
 
-def _write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
-    write_text(folder / "viewer.html", render_film(film, on_frame))
+def _write_film(folder: Path, film: Film) -> None:
+    write_text(folder / "viewer.html", render_film(film))
 
 
 VIEWER = Format(

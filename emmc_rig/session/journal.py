@@ -47,6 +47,12 @@ class Entry(BaseModel):
         return ""
 
 
+class TimedEntry(Entry):
+    """An entry that says when it was noted, by the time of day."""
+
+    wall: str = ""
+
+
 class CreatedEntry(Entry):
     """The session was begun: SHA-256 of the frozen files, frames taken whatever metering says."""
 
@@ -56,7 +62,7 @@ class CreatedEntry(Entry):
     frames: int
 
 
-class AmendedEntry(Entry):
+class AmendedEntry(TimedEntry):
     """Another plan holds from here on; kept: frames stored then."""
 
     kind: Literal["amended"] = "amended"
@@ -65,13 +71,12 @@ class AmendedEntry(Entry):
     frames: int
     kept: int = 0
     changes: list[str] = []
-    wall: str = ""
 
     def __str__(self) -> str:
         return f"{self.wall}: plan {self.plan} holds: {'; '.join(self.changes)}"
 
 
-class RunEntry(Entry):
+class RunEntry(TimedEntry):
     """A capture was started, on these devices.
 
     environment: units, by the names of what is read beside frames. between: the plan's hook, its
@@ -79,7 +84,6 @@ class RunEntry(Entry):
     """
 
     kind: Literal["run"] = "run"
-    wall: str = ""
     versions: dict[str, Any] = {}
     command: str = ""
     resumed: bool = False
@@ -93,7 +97,7 @@ class RunEntry(Entry):
         return f"{self.wall}: {self.command}"
 
 
-class ImportedEntry(Entry):
+class ImportedEntry(TimedEntry):
     """The frames are of files that another program wrote.
 
     files: by path, the SHA-256 of their bytes. notes: what was assumed that no file states.
@@ -102,7 +106,6 @@ class ImportedEntry(Entry):
     kind: Literal["imported"] = "imported"
     files: dict[str, str]
     notes: list[str] = []
-    wall: str = ""
 
     def __str__(self) -> str:
         return "; ".join((f"{self.wall}: {len(self.files)} files imported", *self.notes))
@@ -176,13 +179,12 @@ class DiscardedEntry(Entry):
         return f"{self.id}: {self.reason}"
 
 
-class MeteredEntry(Entry):
+class MeteredEntry(TimedEntry):
     """The scene was metered: exposure by shot, longer frames `asked` for."""
 
     kind: Literal["metered"] = "metered"
     exposures_s: dict[int, float]
     asked: list[str]
-    wall: str = ""
 
     def __str__(self) -> str:
         by_exposure: dict[float, list[str]] = {}
@@ -196,18 +198,17 @@ class MeteredEntry(Entry):
         return f"{exposures}{longer}"
 
 
-class UntilEntry(Entry):
+class UntilEntry(TimedEntry):
     """From here on shots are taken until this PSNR is stated."""
 
     kind: Literal["until"] = "until"
     target_db: float
-    wall: str = ""
 
     def __str__(self) -> str:
         return f"{self.wall}: shots are taken until the estimated accuracy is {self.target_db:g} dB"
 
 
-class DecidedEntry(Entry):
+class DecidedEntry(TimedEntry):
     """What the shots so far give, and which follows; next: None where no more are needed."""
 
     kind: Literal["decided"] = "decided"
@@ -223,7 +224,6 @@ class DecidedEntry(Entry):
     method: str = ""
     advice: str = ""
     spans_s: dict[str, tuple[float, float]] = {}
-    wall: str = ""
 
     def __str__(self) -> str:
         taken = ", ".join(str(shot + 1) for shot in self.shots)
@@ -237,23 +237,21 @@ class DecidedEntry(Entry):
         return f"{stated}; next shot {self.next + 1}{f', {self.why}' if self.why else ''}"
 
 
-class HaltEntry(Entry):
+class HaltEntry(TimedEntry):
     """The capture waits, or a run ended before all was taken."""
 
     kind: Literal["paused", "stopped"]
     reason: str = ""
-    wall: str = ""
 
     def __str__(self) -> str:
         return f"{self.wall}: {self.reason}"
 
 
-class ResumedEntry(Entry):
+class ResumedEntry(TimedEntry):
     """It goes on."""
 
     kind: Literal["resumed"] = "resumed"
     seconds: float
-    wall: str = ""
 
     def __str__(self) -> str:
         return f"{self.wall}: after {shown_seconds(self.seconds)}"
@@ -289,7 +287,7 @@ class ComparedEntry(Entry):
         )
 
 
-class HookEntry(Entry):
+class HookEntry(TimedEntry):
     """The plan's hook was called before frame `id`, "" after the last, and noted this.
 
     fault: what ended the capture there, "" where nothing did.
@@ -302,14 +300,13 @@ class HookEntry(Entry):
     fault: str = ""
     at_s: float = 0.0
     seconds: float = 0.0
-    wall: str = ""
 
     def __str__(self) -> str:
         when = f"before {self.id}" if self.id else "after the last frame"
         return f"{self.wall}: {self.name}, {when}: {self.fault}" if self.fault else ""
 
 
-class FocusEntry(Entry):
+class FocusEntry(TimedEntry):
     """The focus axis was brought to where the scene is sharpest, before frame `id`.
 
     place_um: where it is, to deviation_um; None where no peak was seen, see `fault`: then the axis
@@ -324,7 +321,6 @@ class FocusEntry(Entry):
     fault: str = ""
     at_s: float = 0.0
     seconds: float = 0.0
-    wall: str = ""
 
     def __str__(self) -> str:
         if self.place_um is None:
@@ -333,19 +329,18 @@ class FocusEntry(Entry):
         return f"before {self.id}: sharpest at {found}; it stood at {self.from_um:.1f} um"
 
 
-class SourceEntry(Entry):
+class SourceEntry(TimedEntry):
     """A source of the rig's environment failed, or gives values again (fault "")."""
 
     kind: Literal["source"] = "source"
     name: str
     fault: str = ""
-    wall: str = ""
 
     def __str__(self) -> str:
         return f"{self.wall}: {self.name}: {self.fault or 'gives values again'}"
 
 
-class FilmEntry(Entry):
+class FilmEntry(TimedEntry):
     """A segment of a film begins, from frame `id` on: time goes on within it without a break.
 
     segment: counted from 0. One begins with the film, and another wherever it was interrupted: the
@@ -356,31 +351,28 @@ class FilmEntry(Entry):
     segment: int
     id: str
     rate_hz: float
-    wall: str = ""
 
     def __str__(self) -> str:
         return f"{self.wall}: film, segment {self.segment + 1} begins with {self.id}"
 
 
-class DroppedEntry(Entry):
+class DroppedEntry(TimedEntry):
     """Frames of a film that were not stored at their time, which cannot be made up for."""
 
     kind: Literal["dropped"] = "dropped"
     ids: list[str]
     reason: str = ""
-    wall: str = ""
 
     def __str__(self) -> str:
         shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
         return f"{len(self.ids)} dropped ({self.reason}): {shown}"
 
 
-class CompleteEntry(Entry):
+class CompleteEntry(TimedEntry):
     """Every frame was read back and found good."""
 
     kind: Literal["complete"] = "complete"
     frames: int = 0
-    wall: str = ""
 
     def __str__(self) -> str:
         return f"{self.wall}: every frame verified"
@@ -388,7 +380,7 @@ class CompleteEntry(Entry):
 
 _KINDS = {
     kind: one
-    for one in Entry.__subclasses__()
+    for one in (*Entry.__subclasses__(), *TimedEntry.__subclasses__())
     for kind in get_args(one.model_fields["kind"].annotation)
 }
 _CHECK = ',"crc32":"'

@@ -64,6 +64,7 @@ from emmc_rig.session.journal import (
     HookEntry,
     Journal,
     RunEntry,
+    TimedEntry,
     UntilEntry,
     count_entry,
     count_stored,
@@ -172,7 +173,6 @@ class Session:
                 frames=_certain(frozen.frames),
                 kept=len(self.stored),
                 changes=list(changes),
-                wall=wall_time(),
             )
         )
         return Session(self.folder, self.disk)
@@ -383,7 +383,9 @@ class Session:
         self.note(entry().model_copy(update=held))
 
     def note(self, entry: Entry) -> None:
-        """Add a line to the journal; raises `OSError`."""
+        """Add a line to the journal, timed now where it is timed; raises `OSError`."""
+        if isinstance(entry, TimedEntry):
+            entry = entry.model_copy(update={"wall": wall_time()})
         self.journal.append(entry)
         count_entry(self.stored, entry)
 

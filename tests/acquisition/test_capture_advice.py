@@ -259,18 +259,8 @@ PLANS = {
     "so that camera_shot has no effect: leave it out": (
         {**CHANGING, "shots": [{**ONE, "camera_shot": 1}]}, {**CHANGING, "shots": [ONE]},
     ),
-    "film: all frames are exposed alike, give its shots one exposure_s": (
-        {"film": FILM}, {"film": FILM, "shots": [ONE, ONE]},
-    ),
-    "film: all frames are exposed alike, leave metering.alike out": (
-        {"film": FILM, "shots": [ONE], "metering": {"alike": False}},
-        {"film": FILM, "shots": [ONE]},
-    ),
-    "film: a frame is exposed once, leave brackets and repeats out": (
+    "film: its frames are exposed alike and once": (
         {"film": FILM, "shots": [{**ONE, "repeats": 2}]}, {"film": FILM, "shots": [ONE]},
-    ),
-    "film: an exposure of ": (
-        {"film": {**FILM, "rate": 200}, "shots": [ONE]}, {"film": FILM, "shots": [ONE]},
     ),
     ": lower film.rate from ": (
         {"film": {**FILM, "rate": 8}, "shots": PLACES}, {"film": FILM, "shots": PLACES},

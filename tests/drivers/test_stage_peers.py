@@ -10,13 +10,14 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import pytest
+from tcp_server import TcpServer
 
 from drivers import apt_codec
 from drivers.apt_codec import Id
 from drivers.clock import SYSTEM_CLOCK
 from simulators.apt import COUNTS_PER_UM, Z825, AptController
 from simulators.grbl import BENCH_AXES, GrblController
-from simulators.wire import PtyServer, TcpServer
+from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
 pytestmark = pytest.mark.peers

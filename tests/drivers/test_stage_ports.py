@@ -14,6 +14,7 @@ import pytest
 import serial
 from serial.tools import list_ports
 from stage_rigs import JumpingClock
+from tcp_server import TcpServer
 
 from drivers import ports
 from drivers.clock import SYSTEM_CLOCK
@@ -32,7 +33,7 @@ from drivers.zaber import ZaberStage
 from simulators.clock import ManualClock
 from simulators.faults import Faults
 from simulators.firmware import Occasion
-from simulators.wire import PtyServer, TcpServer
+from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
 HOLD_A_PORT = (

@@ -40,6 +40,24 @@ def complaints(driver):
 
 
 @contextmanager
+def at_width(driver, width):
+    """Show the page on a screen of that many pixels across."""
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    yield
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def nameless(driver):
+    """Return the controls of the viewer that have no name for screen readers."""
+    return driver.execute_script(
+        "return [...document.querySelectorAll('#viewer input, #viewer button, #viewer canvas')]"
+        ".filter((e) => !(e.ariaLabel || e.textContent.trim() || e.labels?.length))"
+        ".map((e) => e.id)"
+    )
+
+
+@contextmanager
 def open_browser(profile):
     """Yield a driver of a browser whose profile lies in that folder."""
     options = webdriver.ChromeOptions()

@@ -4,6 +4,7 @@ Every frame is made from its own name, so that two runs of one plan differ in no
 """
 
 import hashlib
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -54,6 +55,30 @@ def frame_bytes(name, exposure_s, size=SIZE):
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
     top = BLACK + 20 if name.startswith("dark") else WHITE - 400
     return encode_dng(rng.integers(BLACK, top, size, np.uint16), "rggb", BLACK, WHITE, exposure_s)
+
+
+class PreparedCamera:
+    """A camera that takes its frames from `give(exposure_s)`."""
+
+    exposure_limits_s = (1e-6, 3600.0)
+    gain_limits = (1.0, 1.0)
+    exposure_s, gain = 0.01, 1.0
+    identity = CameraIdentity("EMMC", "prepared frames", "1")
+
+    def __init__(self, give, cfa="rggb", shape=SIZE):
+        self.give, self.cfa, self.shape = give, cfa, shape
+
+    def set_exposure_s(self, exposure_s):
+        self.exposure_s = exposure_s
+
+    def set_gain(self, gain):
+        assert gain == 1
+
+    def snap(self):
+        return replace(self.give(self.exposure_s), exposure_s=self.exposure_s, gain=self.gain)
+
+    def close(self):
+        pass
 
 
 class QuietAttendant:

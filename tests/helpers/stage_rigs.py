@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import pytest
 from serial.urlhandler import protocol_socket
+from tcp_server import TcpServer
 
 from drivers import grbl_codec as codec
 from drivers.apt import ACTUATORS, AptAxis, AptStage
@@ -22,7 +23,7 @@ from simulators.apt import AptController
 from simulators.clock import ManualClock
 from simulators.firmware import Occasion, SimulatedController
 from simulators.grbl import GrblController
-from simulators.wire import PtyServer, TcpServer
+from simulators.wire import PtyServer
 from simulators.zaber import AxisSpec, ZaberChain
 
 WIRES = ("memory", "pty", "tcp")
@@ -91,7 +92,7 @@ class StageRig(ABC):
         self.timeout_on_clock_s = self.timeout_s * (1.0 if wire == "memory" else WIRE_PACE)
         self.device: Any = self.make_device()
         self.device.late_by_s = 1.5 * self.timeout_on_clock_s
-        self.server: PtyServer | TcpServer | None = None
+        self.server: PtyServer | None = None
         self.link = tmp_path / "stage"
         if wire == "pty":
             self.server = opened.enter_context(PtyServer(self.device, self.link))

@@ -6,7 +6,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browsers import MARKS, complaints
+from browsers import MARKS, at_width, complaints, nameless
 from filmed import SIZE, light_field_at, write_film
 
 from emmc_rig.files.films import open_film
@@ -30,7 +30,7 @@ def film(tmp_path_factory):
 @pytest.fixture(scope="module")
 def written(film):
     path = film.folder.parent / "viewer.html"
-    path.write_text(render_film(film, lambda: None), encoding="utf-8")
+    path.write_text(render_film(film), encoding="utf-8")
     return path
 
 
@@ -155,15 +155,6 @@ def test_a_row_of_pixels_is_drawn_over_time_and_a_click_on_it_goes_there(page, f
 
 @pytest.mark.parametrize("width", [1600, 390])
 def test_it_fits_every_screen_and_every_control_has_a_name(page, width):
-    page.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride",
-        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
-    )
-    assert page.execute_script("return document.documentElement.scrollWidth") <= width
-    page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    nameless = page.execute_script(
-        "return [...document.querySelectorAll('#viewer input, #viewer button, #viewer canvas')]"
-        ".filter((e) => !(e.ariaLabel || e.textContent.trim() || e.labels?.length))"
-        ".map((e) => e.id)"
-    )
-    assert nameless == []
+    with at_width(page, width):
+        assert page.execute_script("return document.documentElement.scrollWidth") <= width
+        assert nameless(page) == []

@@ -26,7 +26,7 @@ def film(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(film):
-    return render_film(film, lambda: None)
+    return render_film(film)
 
 
 def test_the_page_has_all_frames_and_loads_nothing(page):
@@ -54,7 +54,7 @@ def picture_bytes(text):
 
 def test_a_long_film_has_smaller_pictures_of_fewer_bytes(film, page, monkeypatch):
     monkeypatch.setattr(viewer, "FILM_BYTES", 6_000)
-    text = render_film(film, lambda: None)
+    text = render_film(film)
     (height, width), views = SIZE, page_data(text)["frames"][0]["views"]
     assert views["height"] < 0.8 * height
     assert views["height"] / views["width"] == pytest.approx(height / width, rel=0.1)
@@ -65,7 +65,7 @@ def test_a_long_film_has_smaller_pictures_of_fewer_bytes(film, page, monkeypatch
 def test_the_head_is_that_of_the_worst_frames_and_says_how_many(page, tmp_path):
     assert "There is reason to doubt this light field" in page
     assert "2 of 5 frames, the first at 0.00 s: a reason" in page
-    good = render_film(open_film(write_film(tmp_path / "good", frames=2)), lambda: None)
+    good = render_film(open_film(write_film(tmp_path / "good", frames=2)))
     assert "You can trust this light field" in good
     assert "frames, the first at" not in good
 
@@ -74,6 +74,6 @@ def test_a_film_whose_frames_have_no_disparity_gets_one(tmp_path, film):
     folder = write_film(tmp_path / "film", frames=2)
     for path in folder.rglob("maps.h5"):
         path.unlink()
-    data = page_data(render_film(open_film(folder), lambda: None))
+    data = page_data(render_film(open_film(folder)))
     assert data["frames"][0]["overlays"] == []
     assert data["frames"][0]["disparity"]["low"] < data["frames"][0]["disparity"]["high"]

@@ -111,7 +111,7 @@ def test_every_frame_has_its_result_at_its_time(session, whole):
     assert film.rate == RATE
     np.testing.assert_allclose(film.times_s, np.arange(FRAMES) / RATE, atol=1e-6)
     about, verdicts = film_metrics(whole), []
-    for place, frame in film.each(lambda: None):
+    for place, frame in film.each():
         metrics = json.loads((film.frames[place] / "metrics.json").read_text())
         verdicts.append(metrics["verdict"]["level"])
         assert metrics["frame"] == place

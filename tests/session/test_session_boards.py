@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_rigs import SIZE, StopsAfter, begun, still_rig
+from capture_rigs import SIZE, PreparedCamera, StopsAfter, begun, still_rig
 from simulated_disk import SimulatedDisk
 
 from emmc_rig.acquisition.control import Control
@@ -19,7 +19,6 @@ from emmc_rig.session import measured_psi
 from emmc_rig.session.board_sets import board_sets, sensor_pairs, whiteboards
 from emmc_rig.session.frame_means import mean_dark, mean_of, session_darks
 from emmc_rig.session.session import Session
-from simulators.still import PreparedCamera
 
 CHANNELS = np.full(SIZE, 3, np.uint8)
 PLAN = """
@@ -44,7 +43,7 @@ class Evenly(PreparedCamera):
     """A camera whose frames are as even as said above; its clock counts them."""
 
     def __init__(self, still):
-        super().__init__(self.frame, SIZE, "rggb")
+        super().__init__(self.frame)
         self.plain, self.count, self.name = still, 0, ""
 
     def announce(self, name):

@@ -14,7 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import PLAN_YAML, SIZE, begun, frame_bytes, plan_and_camera, still_rig
+from capture_rigs import (
+    PLAN_YAML,
+    SIZE,
+    PreparedCamera,
+    begun,
+    frame_bytes,
+    plan_and_camera,
+    still_rig,
+)
 from simulated_disk import PowerCutError, SimulatedDisk
 
 from drivers.raw import RawFrame
@@ -38,7 +46,6 @@ from emmc_rig.session.lock import held
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
-from simulators.still import PreparedCamera
 
 ROOT = Path("/disk")
 
@@ -114,7 +121,7 @@ def test_frames_that_only_a_plug_in_could_decode_are_read_back_without_it(tmp_pa
         taken.append(dumped(rng.integers(100, 150, SIZE, np.uint16), name, cfa))
         return taken[-1]
 
-    rig = replace(rig, camera=PreparedCamera(give, SIZE, cfa), about_to_expose=lambda name: None)
+    rig = replace(rig, camera=PreparedCamera(give, cfa), about_to_expose=lambda name: None)
     text = "{camera: rgbw-bayer-1shot, shots: [{exposure_s: 0.01}], whiteboards: null, "
     session, plan = begun(tmp_path, SYSTEM_DISK, rig, text + "darks: {repeats: 2}}")
     Sequencer(session, plan, rig).run()

@@ -9,7 +9,7 @@ from emmc_rig.files.scenes import fine_scene, open_scene
 from emmc_rig.model.lightfield import centre_view
 from simulators.moving import flow_between, world_at
 from simulators.raycaster import Ball, CameraMotion, Card, Motion, World, tabulated
-from simulators.scenes import MOVING_SCENES, flow_px, render, render_at, rendered
+from simulators.scenes import MOVING_SCENES, flow_px, render, rendered
 
 SIZE_PX = (48, 64)
 PICTURE_PLANE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], dtype=float)
@@ -25,11 +25,6 @@ def world(*things: Card | Ball, camera: CameraMotion = STANDING) -> World:
     return World(cards, balls, UNLIT, ambient=1.0, camera=camera)
 
 
-def flow(of: World, from_s: float, to_s: float, size: tuple[int, int] = SIZE_PX) -> np.ndarray:
-    tables = tabulated(world_at(of, from_s)), tabulated(world_at(of, to_s))
-    return flow_between(of, size, (from_s, to_s), tables)
-
-
 def carried(view: np.ndarray, by_px: np.ndarray) -> np.ndarray:
     """What every pixel's point looks like in a later view; 0 where it is not seen there."""
     y, x = np.indices(view.shape[:2], dtype=np.float32)
@@ -41,7 +36,7 @@ def test_a_card_swings_as_its_motion_says_and_hides_what_it_comes_before():
     swing = Motion((0.125, 0.0, 0.0), period_s=4.0)
     moving = world(WALL, Card(SMOOTH, 1.0, SQUARE, motion=swing))
     # A quarter of the period later it has gone an eighth of the width: 8 pixels to the right.
-    found = flow(moving, 0.0, 1.0)
+    found = flow_between(moving, SIZE_PX, 0.0, 1.0)
     np.testing.assert_allclose(found[16:32, 24:40], np.broadcast_to([8, 0], (16, 16, 2)))
     still = found[:, :24]
     np.testing.assert_allclose(still, np.zeros_like(still), atol=1e-12)
@@ -51,7 +46,7 @@ def test_a_card_swings_as_its_motion_says_and_hides_what_it_comes_before():
 
 def test_a_card_turns_about_its_centre_by_the_angle_of_its_rate():
     moving = world(WALL, Card(SMOOTH, 1.0, SQUARE, motion=Motion(turn_rad_s=(0, 0, 0.4))))
-    found = flow(moving, 0.0, 0.5)
+    found = flow_between(moving, SIZE_PX, 0.0, 0.5)
     y, x = np.indices(SIZE_PX)
     from_middle = np.stack([x + 0.5 - 32, y + 0.5 - 24], axis=-1)
     cos, sin = np.cos(0.2), np.sin(0.2)
@@ -89,7 +84,7 @@ def test_the_flow_of_a_rolling_ball_carries_its_colours(turn_rad_s):
         rendered(tabulated(world_at(moving, time_s)), (1, 1), size).light_field[0, 0]
         for time_s in (0.4, 0.9)
     ]
-    found = flow(moving, 0.4, 0.9, size)
+    found = flow_between(moving, size, 0.4, 0.9)
     seen = np.isfinite(found).all(axis=-1)
     # At the limb the pixels of either time mix ball and wall.
     inner = cv2.erode(np.asarray(seen, dtype=np.uint8), np.ones((7, 7))).astype(bool)
@@ -102,9 +97,7 @@ def test_the_flow_of_a_rolling_ball_carries_its_colours(turn_rad_s):
 
 @pytest.mark.parametrize("name", MOVING_SCENES)
 def test_a_built_in_scene_moves_and_its_flow_returns(name):
-    at_0 = render_at(name, (3, 3), SIZE_PX, 1, 0.0)
-    np.testing.assert_array_equal(at_0.light_field, render(name, (3, 3), SIZE_PX, 1).light_field)
-    later = render_at(name, (3, 3), SIZE_PX, 1, 0.5)
+    at_0, later = (render(name, (3, 3), SIZE_PX, 1, time_s=time_s) for time_s in (0.0, 0.5))
     still_error = np.abs(centre_view(later.light_field) - centre_view(at_0.light_field))
     found = flow_px(name, SIZE_PX, 1, 0.0, 0.5)
     seen = np.isfinite(found).all(axis=-1)
@@ -119,13 +112,13 @@ def test_a_built_in_scene_moves_and_its_flow_returns(name):
 
 def test_a_capture_is_simulated_of_the_scene_as_it_is_at_a_time():
     fine = fine_scene("moving-toys", 2, 1, size=SIZE_PX, views=(2, 2), seed=1, time_s=0.5)
-    samples = render_at("moving-toys", (4, 4), SIZE_PX, 1, 0.5).light_field
+    samples = render("moving-toys", (4, 4), SIZE_PX, 1, time_s=0.5).light_field
     np.testing.assert_array_equal(fine.samples, samples)
     assert not np.array_equal(samples, render("moving-toys", (4, 4), SIZE_PX, 1).light_field)
     assert open_scene("moving-toys", SIZE_PX, (2, 2)).light_field.shape == (2, 2, *SIZE_PX, 3)
 
 
 def test_a_scene_that_does_not_move_is_the_same_at_any_time():
-    still, later = (render_at("toy-table", (2, 2), SIZE_PX, 0, time_s) for time_s in (0.0, 3.0))
+    still, later = (render("toy-table", (2, 2), SIZE_PX, time_s=time_s) for time_s in (0.0, 3.0))
     np.testing.assert_array_equal(later.light_field, still.light_field)
     np.testing.assert_allclose(flow_px("toy-table", SIZE_PX, 0, 0.0, 3.0), 0, atol=1e-9)

@@ -8,7 +8,7 @@ FORMATS: dict[str, Format] = {
     for module in (pictures, hci, lytro, ome_zarr, displays, geometry)
     for form in module.FORMATS
 }
-ALIASES = {"video": "mp4", "quilt-film": "quilt"}
-"""Other names that --format takes: `video` is that of version 0.4."""
+ALIASES = {"video": "mp4"}
+"""Names of formats up to version 0.4, which --format still takes."""
 
 __all__ = ["ALIASES", "FORMATS", "Export", "Format"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import pairwise, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,10 +65,10 @@ def _write_quilt(folder: Path, export: Export) -> None:
     write_picture(folder / _quilt_name(export.light_field.shape, "png"), _quilt(export))
 
 
-def _write_quilt_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
+def _write_quilt_film(folder: Path, film: Film) -> None:
     """Write a video of quilts; VP8 is what Looking Glass names for 8 x 6 of them."""
     path = folder / _quilt_name(film.shape, "webm")
-    _encode(path, "VP80", film.rate, in_time(film, _quilt, on_frame))
+    _encode(path, "VP80", film.rate, in_time(film, _quilt))
 
 
 def walk(export: Export) -> Iterator[NDArray[np.uint8]]:
@@ -84,21 +85,14 @@ def _centre(export: Export) -> Codes:
     return codes_of(srgb_of(centre_view(export.light_field)))
 
 
-def in_time(
-    film: Film, picture_of: Callable[[Export], Codes], on_frame: Callable[[], object]
-) -> Iterator[Codes]:
+def in_time(film: Film, picture_of: Callable[[Export], Codes]) -> Iterator[Codes]:
     """Yield the picture (y, x, rgb) of every place in time; a missing one repeats the one before.
 
     Before the first frame that there is, it is that one.
     """
-    shown, due = None, 0
-    for place, export in film.each(on_frame):
-        picture = picture_of(export)
-        yield from [picture if shown is None else shown] * (place - due)
-        yield picture
-        shown, due = picture, place + 1
-    if shown is not None:
-        yield from [shown] * (len(film.times_s) - due)
+    begins = [0, *list(film.frames)[1:], len(film.times_s)]
+    for (_, export), (begin, end) in zip(film.each(), pairwise(begins), strict=True):
+        yield from repeat(picture_of(export), end - begin)
 
 
 def _encode(path: Path, codec: str, rate: float, pictures: Iterable[Codes]) -> None:
@@ -122,10 +116,8 @@ def _write_video(folder: Path, export: Export, ending: str, codec: str) -> None:
     _encode(folder / f"parallax.{ending}", codec, FRAMES_PER_S, walk(export))
 
 
-def _write_film(
-    folder: Path, film: Film, on_frame: Callable[[], object], ending: str, codec: str
-) -> None:
-    _encode(folder / f"film.{ending}", codec, film.rate, in_time(film, _centre, on_frame))
+def _write_film(folder: Path, film: Film, ending: str, codec: str) -> None:
+    _encode(folder / f"film.{ending}", codec, film.rate, in_time(film, _centre))
 
 
 def _write_gif(folder: Path, export: Export) -> None:

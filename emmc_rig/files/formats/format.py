@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from emmc_rig.files.films import Film
 
 Array = NDArray[np.floating]
-WriteFilm = Callable[[Path, "Film", Callable[[], object]], None]
-"""Writes a film into an existing folder; the last is called after every frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,33 +62,30 @@ class Format:
     holds: Callable[[Path], bool] | None = None
     read: Callable[[Path], Array] | None = None
     parallax: bool = False
-    write_film: WriteFilm | None = None
+    write_film: Callable[[Path, Film], None] | None = None
 
     def write_whole(self, folder: Path, export: Export) -> None:
         """Write an export; raises AppError where its views have not what the format shows."""
-        self.refuse_without_parallax(export)
+        self._refuse_without_parallax(export)
         self.write(folder, export)
 
-    def refuse_without_parallax(self, export: Export) -> None:
-        """Raise AppError where the views of an export have not what the format shows."""
+    def write_whole_film(self, folder: Path, film: Film) -> None:
+        """Write a film; raises AppError as `write_whole`, and where the format has no time."""
+        if self.write_film is None:
+            raise AppError(
+                f"--format {self.name} has no time: choose one that `emmc-rig export --list` marks "
+                f"films, or export a single frame, such as {film.first.source}"
+            )
+        self._refuse_without_parallax(film.first)
+        self.write_film(folder, film)
+
+    def _refuse_without_parallax(self, export: Export) -> None:
         if self.parallax and not shows_parallax(export.view_axes):
             named = picture_name(export.view_axes)
             raise AppError(
                 f"--format {self.name} shows parallax, and {export.title} has {named}s for views: "
                 "choose another format"
             )
-
-
-def each_frame(write: Callable[[Path, Export], None]) -> WriteFilm:
-    """Return what writes every frame of a film into a folder named by its place in time."""
-
-    def write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
-        for place, export in film.each(on_frame):
-            inside = folder / film.frames[place].name
-            inside.mkdir()
-            write(inside, export)
-
-    return write_film
 
 
 def extra_module(name: str, what: str) -> ModuleType:

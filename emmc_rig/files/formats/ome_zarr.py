@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,20 +36,18 @@ def _planes(light_field: Array) -> Array:
 
 
 def _write(folder: Path, export: Export) -> None:
-    planes = _planes(export.light_field)
-    _write_image(folder / NAME, planes, "czyx", export.light_field.shape, export)
+    _write_image(folder / NAME, _planes(export.light_field), export)
 
 
-def _write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> None:
+def _write_film(folder: Path, film: Film) -> None:
     """Write frame after frame: what is in memory is what ngff-zarr works on at once."""
-    rows, columns, height, width, colours = film.shape
-    shape = 1, colours, rows * columns, height, width
     dask, array = extra_module("dask", "OME-Zarr"), extra_module("dask.array", "OME-Zarr")
-    first = film.opened(next(iter(film.frames)))
+    first = film.first
+    shape = 1, *_planes(first.light_field).shape
 
     def frame(place: int) -> Array:
         planes = _planes(film.opened(place).light_field)[None]
-        on_frame()
+        film.on_frame()
         return planes
 
     def lazily(place: int) -> Any:
@@ -59,27 +56,26 @@ def _write_film(folder: Path, film: Film, on_frame: Callable[[], object]) -> Non
         return array.full(shape, np.nan, np.float32, chunks=shape)
 
     data = array.concatenate([lazily(place) for place in range(len(film.times_s))])
-    about = {"times_s": list(film.times_s), "missing": film.missing}
-    _write_image(
-        folder / FILM_NAME, data, "tczyx", film.shape, first, {"t": 1 / film.rate}, film=about
-    )
+    _write_image(folder / FILM_NAME, data, first, film)
 
 
-def _write_image(
-    path: Path, data: Any, axes: str, shape: Sequence[int], export: Export,
-    scale: dict[str, float] | None = None, **more: object,
-) -> None:  # fmt: skip
-    """Write an array of named axes. shape: of the light field. scale: seconds a step of time."""
+def _write_image(path: Path, data: Any, export: Export, film: Film | None = None) -> None:
+    """Write planes (c, z, y, x), or those of a film (t, c, z, y, x). export: its first frame."""
     ngff = extra_module("ngff_zarr", "OME-Zarr")
-    steps = {**dict.fromkeys(axes, 1.0), **(scale or {})}
-    units = {"t": "second"} if "t" in axes else {}
+    rows, columns, height, width, colours = export.light_field.shape
+    axes = "czyx" if film is None else "tczyx"
     image = ngff.to_ngff_image(
-        data, dims=tuple(axes), scale=steps, axes_units=units, name=export.title
+        data,
+        dims=tuple(axes),
+        scale=dict.fromkeys(axes, 1.0) | ({} if film is None else {"t": 1 / film.rate}),
+        axes_units={} if film is None else {"t": "second"},
+        name=export.title,
     )
-    scales = [2**k for k in range(1, SCALES) if min(shape[2:4]) >= 2 ** (k + 4)]
-    sides = {"t": 1, "c": shape[4], "y": CHUNK_PX, "x": CHUNK_PX}
-    chunks = {axis: min(sides.get(axis, 1), n) for axis, n in zip(axes, data.shape, strict=True)}
-    chunks["z"] = min(max(CHUNK_BYTES // (4 * math.prod(chunks.values())), 1), shape[0] * shape[1])
+    scales = [2**k for k in range(1, SCALES) if min(height, width) >= 2 ** (k + 4)]
+    plane = {"c": colours, "y": min(CHUNK_PX, height), "x": min(CHUNK_PX, width)}
+    views = max(CHUNK_BYTES // (4 * math.prod(plane.values())), 1)
+    sides = {"t": 1, "z": min(views, rows * columns), **plane}
+    chunks = {axis: sides[axis] for axis in axes}
     multiscales = ngff.to_multiscales(
         image,
         [{"z": 1, "y": s, "x": s} for s in scales],
@@ -90,11 +86,12 @@ def _write_image(
     ngff.to_ngff_zarr(str(path), multiscales, version="0.4")
     attributes = parse_json((path / ".zattrs").read_bytes(), ".zattrs", AppError)
     attributes["emmc_rig"] = {
-        "views": list(shape[:2]),
+        "views": [rows, columns],
         "view_axes": list(export.view_axes),
         "colour": "linear RGB, 1 is white",
-        **more,
     }
+    if film is not None:
+        attributes["emmc_rig"]["film"] = {"times_s": film.times_s, "missing": film.missing}
     (path / ".zattrs").write_text(json.dumps(attributes))
     # Where Zarr keeps its metadata together too, both must agree.
     (path / ".zmetadata").unlink(missing_ok=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,14 +17,7 @@ import numpy as np
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.child import read_in_child
-from emmc_rig.files.formats.format import (
-    Array,
-    Export,
-    Format,
-    each_frame,
-    extra_module,
-    write_picture,
-)
+from emmc_rig.files.formats.format import Array, Export, Format, extra_module, write_picture
 from emmc_rig.model.lightfield import grid_of_views
 from emmc_rig.model.srgb import codes_of
 
@@ -92,7 +84,7 @@ def _read(path: Path, ending: str) -> Array:
     return stacked.reshape(len(rows), len(columns), *stacked.shape[1:])
 
 
-SINGLE = (
+FORMATS = (
     Format("png8", "view_ROW_COL.png", "8 bits, linear, tagged so", partial(_write_png, bits=8)),
     Format("png16", "view_ROW_COL.png", "16 bits, linear, tagged so", partial(_write_png, bits=16)),
     Format(
@@ -104,4 +96,3 @@ SINGLE = (
         partial(_holds, ending="exr"), partial(_read, ending="exr"),
     ),
 )  # fmt: skip
-FORMATS = tuple(replace(one, write_film=each_frame(one.write)) for one in SINGLE)

@@ -17,7 +17,7 @@ from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.settings import Settings
 from emmc_rig.study.trial import Capture
 from reconstruction.methods import METHODS, MethodSettings, installed_methods
-from simulators.scenes import SCENES
+from simulators.scenes import STILL_SCENES
 
 FAST_SCENES = ("near-planar", "deep-occlusions")
 FAST_CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
@@ -114,7 +114,7 @@ def chart_settings(
     given = {"size": size, "repeats": repeats}
     chosen = {
         "fast": fast,
-        "scenes": tuple(scenes) or (FAST_SCENES if fast else tuple(SCENES)),
+        "scenes": tuple(scenes) or (FAST_SCENES if fast else tuple(STILL_SCENES)),
         "cameras": tuple(cameras) or (FAST_CAMERAS if fast else CAMERAS),
         **(FAST if fast else {}),
         **{key: value for key, value in given.items() if value is not None},

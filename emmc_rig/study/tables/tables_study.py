@@ -32,7 +32,7 @@ from reconstruction.inputs import checked_inputs
 from reconstruction.methods import MethodSettings
 from reconstruction.sparse import PatchEstimates, SparseSettings, estimate_patches
 from reconstruction.tv import TVSettings
-from simulators.scenes import SCENES
+from simulators.scenes import STILL_SCENES
 
 Size = tuple[int, int] | None
 VIEWS = (5, 5)
@@ -82,7 +82,7 @@ def scene_specs(folder: Path | None) -> dict[str, str]:
     Raises AppError for no such folder, one without scenes, and scenes of the same name.
     """
     if folder is None:
-        return {name: name for name in SCENES}
+        return {name: name for name in STILL_SCENES}
     if not folder.is_dir():
         raise AppError(f"--scenes {folder}: no such folder")
     if any(folder.glob("view_*_*.png")):
