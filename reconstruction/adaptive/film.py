@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from emmc_rig.model.bands import in_views
 from emmc_rig.model.json_text import parse_json
@@ -49,7 +49,10 @@ Array = NDArray[np.floating]
 
 
 class FilmSettings(Settings):
-    """Settings of the frames after the first."""
+    """Settings of films: of the frames after the first.
+
+    segment: frames after which one begins as a first frame does; 0: never.
+    """
 
     texture: TextureSettings = TextureSettings(
         steps=8, first_noise=0.1, refine_steps=4, shared_steps=0, sweeps=(0, 3)
@@ -58,6 +61,14 @@ class FilmSettings(Settings):
         default=0.002, gt=0, description="deviation of readings that no texture explains"
     )
     earlier: int = Field(default=2, ge=1, description="frames before that are fitted, too")
+    segment: int = Field(default=0, ge=0)
+
+    @field_validator("texture", mode="before")
+    @classmethod
+    def _rest_as_films_have_it(cls, given: object) -> object:
+        """Complete a part of the texture's settings by the defaults of films."""
+        own = cls.model_fields["texture"].default.model_dump()
+        return {**own, **given} if isinstance(given, dict) else given
 
 
 WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0
