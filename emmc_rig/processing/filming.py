@@ -77,11 +77,12 @@ from reconstruction.result import Progress
 from reconstruction.verdict.rules import LEVELS
 from reconstruction.verdict.run import reconstruct_judged
 
-SCALE, ABOUT = "scale.npz", "latest"
+SCALE, ABOUT = "scale.npz", "plain"
 DAMAGED = (
     OSError, ValueError, LookupError, TypeError, EOFError, MemoryError, zlib.error, BadZipFile,
+    ReconstructionError, SensingError,
 )  # fmt: skip
-"""What reading a damaged file of arrays raises."""
+"""What reading a damaged file of an earlier run raises, or one that is not there."""
 FILM_TAKES = "an array (t, pixel_y, pixel_x), or an iterable of Frames of one shot each"
 
 
@@ -244,7 +245,7 @@ class FilmJob:
         of_psi = given and given.checksum()
         what = stored, session.digests, of_psi, self.method, settings, __version__
         fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-        with suppress(*DAMAGED, SensingError):
+        with suppress(*DAMAGED):
             if _open(path)[0]["fingerprint"] == fingerprint:
                 open_psi(self.kept / PSI).verify()
                 done = len(list((self.kept / FRAMES).iterdir()))
@@ -301,7 +302,7 @@ def segment_task(
     job, session, scale = task.job, Session(task.job.session), task.job.scale()
     reasons = exposure_reasons(shot_exposures(session))
     latest = Latest(Film(job.settings.film), place=task.places.start - 1)
-    with suppress(*DAMAGED, ReconstructionError):
+    with suppress(*DAMAGED):
         latest = Latest.opened(task.path, scale.psi)
     for frame in film_frames(session, scale, range(latest.place + 1, task.places.stop)):
         latest = replace(latest, place=frame.place)

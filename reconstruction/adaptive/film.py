@@ -182,7 +182,8 @@ class Film:
         margin, texture = scene.surfaces.margin, scene.clean
         if not earlier:
             room_px = ROOM_PX + self.settings.texture.room_px
-            wider = margin_of(plain.given.psi, scene.centre, room_px) - margin
+            # Where disparities shrank as they were fitted, there is more margin than needed.
+            wider = max(margin_of(plain.given.psi, scene.centre, room_px) - margin, 0)
             margin += wider
             texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")
         centre = np.pad(scene.centre, margin, mode="edge")
