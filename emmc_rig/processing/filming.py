@@ -239,10 +239,10 @@ class FilmJob:
 
         Raises AppError, CalibrationError.
         """
-        given, path = psi_path and open_psi(psi_path).load(), self.kept / SCALE
+        path, given = self.kept / SCALE, None if psi_path is None else open_psi(psi_path).load()
         stored = [entry.model_dump(mode="json") for entry in session.stored.values()]
         settings = self.settings.model_dump(mode="json")
-        of_psi = given and given.checksum()
+        of_psi = None if given is None else given.checksum()
         what = stored, session.digests, of_psi, self.method, settings, __version__
         fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
         with suppress(*DAMAGED):
@@ -256,7 +256,7 @@ class FilmJob:
             path.unlink()  # before all else: without it nothing is gone on from
         emptied(self.kept)
         scale = session_scale(session)
-        psi = given or scale.psi
+        psi = scale.psi if given is None else given
         if psi.frames_shape != scale.psi.frames_shape:
             raise AppError(f"{psi_path}: is not of this session's shots and frames")
         if not is_one_block(psi.size, self.settings):
