@@ -176,7 +176,8 @@ def reconstruct_film(
             `Frames` of one shot each, (1, pixel_y, pixel_x).
         method: "adaptive" or "adaptive-fast".
         noise_sigma: standard deviation of the readings, as for `reconstruct`.
-        settings: of the methods, or a dict with the keys of a settings file.
+        settings: of the methods, or a dict with the keys of a settings file; with {"film":
+            {"segment": 50}} every 50th frame begins as the first does.
         on_step: is called with the progress after each step of a frame.
 
     Raises:
