@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
 from emmc_rig.commands.options import PARALLEL, ClusterOption, DictionaryOption, check_workers
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
-
-if TYPE_CHECKING:
-    from reconstruction.methods import MethodSettings
-
 
 DEFAULT = Path("emmc-reconstruction")
 """The folder that is written, unless it is in a session."""
@@ -39,7 +35,7 @@ def reconstruct(
     settings: Annotated[
         Path | None,
         typer.Option(
-            "--settings", help="YAML of settings of methods: tv, sparse, adaptive, blocks"
+            "--settings", help="YAML of settings of methods: tv, sparse, adaptive, film, blocks"
         ),
     ] = None,
     truth: Annotated[
@@ -58,7 +54,7 @@ def reconstruct(
         typer.Option(
             "--workers",
             min=1,
-            help="processes that share blocks and captures",
+            help="processes that share blocks, captures, and segments of a film",
             rich_help_panel=PARALLEL,
         ),
     ] = None,
@@ -112,15 +108,20 @@ def reconstruct(
     chosen, why = load_settings(settings), None
     if any(map(_is_film, frames)) and frame is None:
         others = {
-            "--truth": truth, "--without-shots": without_shots, "--workers": workers,
-            "--cluster": cluster, "--zarr": as_zarr, "--budget": budget, "--dictionary": dictionary,
+            "--truth": truth, "--without-shots": without_shots, "--zarr": as_zarr,
+            "--budget": budget, "--dictionary": dictionary,
         }  # fmt: skip
         if len(frames) > 1:
             raise typer.BadParameter("a film is reconstructed alone: name one session")
         for name, given in others.items():
             if given:
                 raise typer.BadParameter(f"{name}: not of a film; leave it out, or add --frame")
-        _film(frames[0], out, method or DEFAULT_METHOD, psi, chosen, memory, strict)
+        ((_, written),) = _places(frames, out)
+        _film(
+            frames[0], written, strict, method=method or DEFAULT_METHOD, psi_path=psi,
+            settings=chosen, memory=None if memory is None else parse_memory(memory),
+            workers=workers, cluster=cluster,
+        )  # fmt: skip
         return
     if frame is not None and not (len(frames) == 1 and _is_film(frames[0])):
         raise typer.BadParameter("--frame: is of a film; name one session that holds a film")
@@ -171,32 +172,21 @@ def _is_film(folder: Path) -> bool:
 
     if not is_session(folder):
         return False
-    from emmc_rig.processing.filming import holds_film
+    from emmc_rig.processing.filming import planned_frames
+    from emmc_rig.session.session import Session
 
-    return holds_film(folder)
+    return planned_frames(Session(folder)) > 0
 
 
-def _film(
-    session: Path,
-    out: Path | None,
-    method: str,
-    psi: Path | None,
-    settings: MethodSettings,
-    memory: str | None,
-    strict: bool,
-) -> None:
-    """Reconstruct a film, and say in a line how that went."""
+def _film(session: Path, out: Path, strict: bool, **given: Any) -> None:
+    """Reconstruct a film, and say in a line how that went; given: to `reconstruct_film_session`."""
     from emmc_rig.files.results import shown_seconds, stated_words
     from emmc_rig.processing.filming import reconstruct_film_session
-    from emmc_rig.processing.memory import parse_memory
 
-    ((_, out),) = _places([session], out)
-    limit = None if memory is None else parse_memory(memory)
-    with shown_progress(method) as bars:
+    with shown_progress(given["method"]) as bars:
         metrics = reconstruct_film_session(
-            session, out, method, psi, settings, limit,
-            on_step=bars.advance, on_note=lambda text: say("note", text),
-        )  # fmt: skip
+            session, out, on_step=bars.advance, on_note=lambda text: say("note", text), **given
+        )
     film = metrics["film"]
     if "assumed" in metrics:
         say("note", metrics["assumed"])
@@ -205,9 +195,9 @@ def _film(
     worst, count = film["worst"], sum(film["verdicts"].values())
     stated = stated_words(worst)
     tell(
-        f"{method}: {count} of {film['frames']} frames in {shown_seconds(metrics['seconds'])}, "
-        f"{film['seconds_per_frame']:.1f} s each; trusted: {film['verdicts']['trust']}; worst: "
-        f"frame {worst['frame']} at {worst['time_s']:.1f} s"
+        f"{metrics['method']}: {count} of {film['frames']} frames in "
+        f"{shown_seconds(metrics['seconds'])}, {film['seconds_per_frame']:.1f} s each; trusted: "
+        f"{film['verdicts']['trust']}; worst: frame {worst['frame']} at {worst['time_s']:.1f} s"
         + (f", estimated accuracy {stated}" if stated else "")
     )
     show_verdict(metrics["verdict"])

@@ -1,8 +1,12 @@
 """Films to light fields, frame after frame; of a session, each on the disk once it is done.
 
-KEPT/                see `emmc_rig.files.folders.kept_folder`
-    next.npz         what the next frame goes on from, and what all are of
-    frames/000007/   the result of frame 7, whole
+Segments of a film do not depend on each other: each is a task for a worker, which goes on after the
+last frame that was done.
+
+KEPT/                   see `emmc_rig.files.folders.kept_folder`
+    psi.h5, scale.npz   what readings are made by, and what all frames are of
+    next-001.npz        what the next frame of segment 1 goes on from
+    frames/000007/      the result of frame 7, whole
 """
 
 from __future__ import annotations
@@ -14,15 +18,18 @@ import shutil
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from calibration.frames import MeanFrame, SensorGain
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.films import FRAMES
 from emmc_rig.files.folders import (
@@ -38,14 +45,16 @@ from emmc_rig.model.arguments import refusal, required
 from emmc_rig.model.camera import camera_of, json_of_shots
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, SensingError
 from emmc_rig.processing.memory import (
+    BASE_BYTES,
     Ceiling,
     assumed_grid,
     own_bytes,
     peak_memory_mib,
     task_bytes,
 )
+from emmc_rig.processing.pool import opened_pool
 from emmc_rig.processing.reconstructing import (
     PSI_TAKES,
     OnStep,
@@ -57,21 +66,23 @@ from emmc_rig.processing.result import Result
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
 from emmc_rig.session.measured_psi import Scale, psi_is_assumed, session_scale
-from emmc_rig.session.readings import FilmFrame, film_frames
+from emmc_rig.session.readings import FilmFrame, FilmPlace, film_frames, film_places
 from emmc_rig.session.session import Session
 from emmc_rig.version import __version__
 from reconstruction.adaptive.film import Film
+from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, film_methods, find_method
 from reconstruction.result import Progress
 from reconstruction.verdict.rules import LEVELS
 from reconstruction.verdict.run import reconstruct_judged
 
-NEXT = "next.npz"
+SCALE, ABOUT = "scale.npz", "plain"
 DAMAGED = (
     OSError, ValueError, LookupError, TypeError, EOFError, MemoryError, zlib.error, BadZipFile,
+    ReconstructionError, SensingError,
 )  # fmt: skip
-"""What reading a damaged file of arrays raises."""
+"""What reading a damaged file of an earlier run raises, or one that is not there."""
 FILM_TAKES = "an array (t, pixel_y, pixel_x), or an iterable of Frames of one shot each"
 
 
@@ -80,14 +91,13 @@ class Latest:
     """What the next frame goes on from.
 
     film: what is known after the latest frame. shots: of Psi, of the frames that it carries.
-    place, segment: of the latest frame of a session, see `FilmFrame`. failed: why frames could not
-    be reconstructed, by place.
+    place: in time, of the latest frame of a session. failed: why frames could not be reconstructed,
+    by place.
     """
 
     film: Film = field(default_factory=Film)
     shots: tuple[int, ...] = ()
     place: int = -1
-    segment: int = -1
     failed: Mapping[int, str] = field(default_factory=dict)
 
     def next(
@@ -109,31 +119,35 @@ class Latest:
         result = Result(replace(solved, film=None), verdict, one, frames)
         return result, replace(self, film=solved.film, shots=shots)
 
-    def saved(self, path: Path, fingerprint: str, psi: ImagingMatrix) -> Latest:
+    def saved(self, path: Path, psi: ImagingMatrix) -> Latest:
         """Write it, whole and on the disk; return it as `opened` would."""
-        of_session = {"place": self.place, "segment": self.segment, "failed": self.failed}
-        about = json.dumps({"fingerprint": fingerprint, "shots": self.shots, **of_session})
-        arrays = {"latest": np.array(about), **self.film.arrays()}
-        partial = path.with_name("part.npz")
-        np.savez(partial, **arrays)  # pyright: ignore[reportArgumentType]
-        placed(partial, path)
+        arrays = self.film.arrays()
+        _save(path, {"shots": self.shots, "place": self.place, "failed": self.failed}, arrays)
         # As after a kill: what follows must not depend on how arrays lie in memory.
         return replace(self, film=Film.restored(arrays, [_one_shot(psi, s) for s in self.shots]))
 
     @classmethod
-    def opened(cls, path: Path, fingerprint: str, psi: ImagingMatrix) -> Latest | None:
-        """Return what was written there; None where that is damaged, or of another film."""
-        try:
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            about = parse_json(str(arrays["latest"]), str(path), ValueError)
-            if about.pop("fingerprint") != fingerprint:
-                return None
-            shots, failed = tuple(about.pop("shots")), about.pop("failed")
-            film = Film.restored(arrays, [_one_shot(psi, shot) for shot in shots])
-        except (*DAMAGED, ReconstructionError):
-            return None
-        return cls(film, shots, failed={int(place): why for place, why in failed.items()}, **about)
+    def opened(cls, path: Path, psi: ImagingMatrix) -> Latest:
+        """Return what was written there; raises one of DAMAGED."""
+        about, arrays = _open(path)
+        film = Film.restored(arrays, [_one_shot(psi, shot) for shot in about["shots"]])
+        failed = {int(place): why for place, why in about["failed"].items()}
+        return cls(film, tuple(about["shots"]), about["place"], failed)
+
+
+def _save(path: Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> None:
+    """Write plain data and arrays, whole and on the disk."""
+    partial = path.with_suffix(".part.npz")
+    named = {ABOUT: np.array(json.dumps(about)), **arrays}
+    np.savez(partial, **named)  # pyright: ignore[reportArgumentType]
+    placed(partial, path)
+
+
+def _open(path: Path) -> tuple[dict[str, Any], dict[str, NDArray]]:
+    """Return plain data and arrays; raises one of DAMAGED, also where there are none."""
+    with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    return parse_json(str(arrays[ABOUT]), str(path), ValueError), arrays
 
 
 def _one_shot(psi: ImagingMatrix, shot: int) -> ImagingMatrix:
@@ -162,7 +176,8 @@ def reconstruct_film(
             `Frames` of one shot each, (1, pixel_y, pixel_x).
         method: "adaptive" or "adaptive-fast".
         noise_sigma: standard deviation of the readings, as for `reconstruct`.
-        settings: of the methods, or a dict with the keys of a settings file.
+        settings: of the methods, or a dict with the keys of a settings file; with {"film":
+            {"segment": 50}} every 50th frame begins as the first does.
         on_step: is called with the progress after each step of a frame.
 
     Raises:
@@ -182,8 +197,10 @@ def reconstruct_film(
         raise refusal(frames, "frames", FILM_TAKES)
 
     def results() -> Iterator[Result]:
-        latest = Latest()
+        latest = first = Latest(Film(chosen.film))
         for place, frame in enumerate(frames):
+            if chosen.film.segment and place % chosen.film.segment == 0:
+                latest = first
             shot = place % psi.shots
             one = frame if isinstance(frame, Frames) else np.asarray(frame)[np.newaxis]
             taken = as_frames(_one_shot(psi, shot), one, noise_sigma, None)
@@ -199,9 +216,124 @@ def _refuse_without_films(method: str) -> None:
         raise AppError(f"'{method}' takes no films: choose {able}, or a single frame by --frame")
 
 
-def holds_film(folder: Path) -> bool:
-    """Return whether a session's plan is one of a film."""
-    return any(frame.film is not None for frame in Session(folder).frames)
+def planned_frames(session: Session) -> int:
+    """Return how many frames of a film a session's plan has."""
+    return sum(frame.film is not None for frame in session.frames)
+
+
+@dataclass(frozen=True)
+class FilmJob:
+    """What the frames of a session's film are computed from; picklable, so that workers get it.
+
+    session, kept: absolute, on a disk that all workers share.
+    """
+
+    session: Path
+    kept: Path
+    method: str
+    settings: MethodSettings
+
+    def settle(
+        self, session: Session, psi_path: Path | None, on_note: Callable[[str], None]
+    ) -> None:
+        """Write what all frames have alike, unless an earlier run of the same film did.
+
+        Raises AppError, CalibrationError.
+        """
+        path, given = self.kept / SCALE, None if psi_path is None else open_psi(psi_path).load()
+        stored = [entry.model_dump(mode="json") for entry in session.stored.values()]
+        settings = self.settings.model_dump(mode="json")
+        of_psi = None if given is None else given.checksum()
+        what = stored, session.digests, of_psi, self.method, settings, __version__
+        fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
+        with suppress(*DAMAGED):
+            if _open(path)[0]["fingerprint"] == fingerprint:
+                open_psi(self.kept / PSI).verify()
+                done = len(list((self.kept / FRAMES).iterdir()))
+                on_note(f"goes on with an earlier run; frames done: {done}")
+                return
+        if path.exists():
+            on_note("starts anew: an earlier run was of other frames, settings or version")
+            path.unlink()  # before all else: without it nothing is gone on from
+        emptied(self.kept)
+        scale = session_scale(session)
+        psi = scale.psi if given is None else given
+        if psi.frames_shape != scale.psi.frames_shape:
+            raise AppError(f"{psi_path}: is not of this session's shots and frames")
+        if not is_one_block(psi.size, self.settings):
+            raise AppError(
+                f"frames of {'x'.join(map(str, psi.size))} are more than one block, and films are "
+                "reconstructed as a whole: raise blocks: {whole: SAMPLES} by --settings"
+            )
+        psi.save(self.kept / PSI)
+        (self.kept / FRAMES).mkdir()
+        arrays: dict[str, NDArray] = {}
+        plain = taken_apart(scale, arrays)
+        _save(path, {"fingerprint": fingerprint, "scale": plain}, arrays)
+
+    def scale(self) -> Scale:
+        """Return what turns frames into readings, with the Psi that all are reconstructed by."""
+        psi = open_psi(self.kept / PSI).load()
+        about, arrays = _open(self.kept / SCALE)
+        return put_together(about["scale"], arrays, (Scale, MeanFrame, SensorGain), lambda: psi)
+
+
+@dataclass(frozen=True)
+class SegmentTask:
+    """A segment of a film: its number, and its places in time."""
+
+    job: FilmJob
+    number: int
+    places: range
+
+    @property
+    def path(self) -> Path:
+        """The file of what the next frame goes on from."""
+        return self.job.kept / f"next-{self.number:03d}.npz"
+
+
+def segment_task(
+    task: SegmentTask, on_frame: Callable[[], None] = lambda: None
+) -> Mapping[int, str]:
+    """Reconstruct the frames of a segment that are not done, each to the disk.
+
+    Returns why frames could not be reconstructed, by place. on_frame: called after each. Raises
+    AppError.
+    """
+    job, session, scale = task.job, Session(task.job.session), task.job.scale()
+    reasons = exposure_reasons(shot_exposures(session))
+    latest = Latest(Film(job.settings.film), place=task.places.start - 1)
+    with suppress(*DAMAGED):
+        latest = Latest.opened(task.path, scale.psi)
+    for frame in film_frames(session, scale, range(latest.place + 1, task.places.stop)):
+        latest = replace(latest, place=frame.place)
+        frames = Frames(frame.readings, frame.deviation, frame.usable)
+        try:
+            result, latest = latest.next(scale.psi, frame.shot, frames, job.method, job.settings)
+        except ReconstructionError as fault:
+            latest = replace(latest, failed={**latest.failed, frame.place: str(fault)})
+        else:
+            _write(replace(result, verdict=result.verdict.with_reasons(reasons)), frame, task)
+        latest = latest.saved(task.path, scale.psi)
+        on_frame()
+    return latest.failed
+
+
+def _write(result: Result, frame: FilmFrame, task: SegmentTask) -> None:
+    """Write the result of a frame, whole and on the disk."""
+    of_film = {
+        "frame": frame.place,
+        "time_s": frame.time_s,
+        "segment": task.number,
+        "shot": frame.shot + 1,
+        "peak_gib": peak_memory_mib() / 2**10,
+    }
+    partial = task.path.with_suffix(".part")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir()
+    result.write(partial, {**result.metrics(), **of_film})
+    placed(partial, task.job.kept / FRAMES / f"{frame.place:06d}")
 
 
 def reconstruct_film_session(
@@ -213,36 +345,107 @@ def reconstruct_film_session(
     memory: int | None = None,
     on_step: Callable[[Progress], None] = lambda progress: None,
     on_note: Callable[[str], None] = lambda text: None,
+    workers: int | None = None,
+    cluster: str | None = None,
 ) -> dict[str, Any]:
     """Reconstruct the film of a session into the folder `out`; return its metrics.
 
-    Goes on after the last frame that an earlier run finished, if it was of the same film, method,
+    Goes on after the frames that an earlier run finished, if it was of the same film, method,
     settings and version. psi_path: of another Psi than that of the session's whiteboards. memory:
-    bytes that must be enough. on_step: called with the frames done. on_note: called with what
-    becomes of an earlier run. Raises AppError, CalibrationError; StoppedError by Ctrl-C.
+    bytes that must be enough. on_step: called with the frames done, from any thread. on_note:
+    called with what becomes of an earlier run. workers, cluster: see `opened_pool`, for segments
+    beside each other; None of both: this process and its threads.
+    Raises AppError, CalibrationError; StoppedError by Ctrl-C.
     """
     _refuse_without_films(method)
     belongs = folder / SESSION_RECONSTRUCTION
     with result_folder(out, "reconstruct", belongs_to=belongs, resumes=True) as new:
-        kept = kept_folder(new)
-        film = _opened(Session(folder), kept, method, psi_path, settings or MethodSettings())
-        if memory is not None:
-            saved = open_psi(psi_path or kept / PSI)
-            ceiling = Ceiling(memory, own_bytes(saved, film.settings, False, False))
-            ceiling.workers(task_bytes(saved, assumed_grid(saved, film.settings)))
+        kept, session = kept_folder(new).absolute(), Session(folder)
+        job = FilmJob(session.folder, kept, method, settings or MethodSettings())
+        count, places = planned_frames(session), film_places(session)
+        job.settle(session, psi_path, on_note)
+        tasks = _segments(job, places)
+
+        def on_frame() -> None:
+            on_step(Progress(len(list((kept / FRAMES).iterdir())), None, None, count))
+
         try:
-            metrics = film.reconstructed(on_step, on_note)
+            failed = _computed(job, tasks, workers, cluster, memory, on_frame, on_note)
         except KeyboardInterrupt as stop:
             raise StoppedError(
                 f"stopped by Ctrl-C; frames that are done are kept in {out}, and the same command "
                 "goes on"
             ) from stop
+        times_s = {at.place: at.time_s for at in places}
+        metrics = _metrics(job, session, count, times_s, failed)
         shutil.copytree(kept / FRAMES, new / FRAMES, copy_function=_linked)
         if psi_path is None:
             _linked(kept / PSI, new / PSI)
-            metrics |= {"assumed": PSI_ASSUMED} if psi_is_assumed(film.session) else {}
+            metrics |= {"assumed": PSI_ASSUMED} if psi_is_assumed(session) else {}
         write_metrics(new, metrics)
     return metrics
+
+
+def _segments(job: FilmJob, places: Sequence[FilmPlace]) -> list[SegmentTask]:
+    """Return the capture's segments, cut after every so many frames as the settings say."""
+    found: list[range] = []
+    for _, within in groupby(places, key=lambda at: at.segment):
+        inside = [at.place for at in within]
+        whole = range(inside[0], inside[-1] + 1)
+        length = job.settings.film.segment or len(whole)
+        found += (whole[at : at + length] for at in range(0, len(whole), length))
+    return [SegmentTask(job, number, among) for number, among in enumerate(found)]
+
+
+def _computed(
+    job: FilmJob,
+    tasks: Sequence[SegmentTask],
+    workers: int | None,
+    cluster: str | None,
+    memory: int | None,
+    on_frame: Callable[[], None],
+    on_note: Callable[[str], None],
+) -> dict[int, str]:
+    """Do all segments by workers, or by this process where none are asked for.
+
+    Returns why frames could not be reconstructed, by place.
+    """
+    if len(tasks) == 1 and (cluster is not None or (workers or 1) > 1):
+        on_note(
+            "one segment, which workers cannot share: film: {segment: 50} by --settings makes "
+            "segments of 50 frames, the first of each without those before it"
+        )
+    shared = cluster is not None or (workers is not None and len(tasks) > 1)
+    count, ceiling = workers or 1, None
+    if memory is not None:
+        saved, settings = open_psi(job.kept / PSI), job.settings
+        own = own_bytes(saved, settings, False, False)
+        ceiling = Ceiling(memory, BASE_BYTES + own if shared else own)
+        count = min(count, ceiling.workers(task_bytes(saved, assumed_grid(saved, settings))))
+    if not shared:
+        failed = [segment_task(task, on_frame) for task in tasks]
+    else:
+        with opened_pool(count, cluster, ceiling) as pool, _repeated(on_frame):
+            failed = [why for _, why in pool.run(segment_task, tasks)]
+    return dict(sorted(one for why in failed for one in why.items()))
+
+
+@contextmanager
+def _repeated(call: Callable[[], None], every_s: float = 1.0) -> Iterator[None]:
+    """Call a function again and again in a thread, until the block ends."""
+    ended = Event()
+
+    def work() -> None:
+        while not ended.wait(every_s):
+            call()
+
+    thread = Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def _linked(path: str | Path, place: str | Path) -> None:
@@ -253,123 +456,47 @@ def _linked(path: str | Path, place: str | Path) -> None:
         os.replace(path, place)
 
 
-def _opened(
-    session: Session, kept: Path, method: str, psi_path: Path | None, settings: MethodSettings
-) -> _SessionFilm:
-    scale = session_scale(session)
-    if psi_path is None:
-        psi = scale.psi
-        psi.save(kept / PSI)
-    else:
-        psi = open_psi(psi_path).load()
-    if psi.frames_shape != scale.psi.frames_shape:
-        raise AppError(f"{psi_path}: is not of this session's shots and frames")
-    if not is_one_block(psi.size, settings):
-        raise AppError(
-            f"frames of {'x'.join(map(str, psi.size))} are more than one block, and films are "
-            "reconstructed as a whole: raise blocks: {whole: SAMPLES} by --settings"
-        )
-    return _SessionFilm(session, kept, method, settings, scale, psi)
-
-
-@dataclass(frozen=True, eq=False)
-class _SessionFilm:
-    """A film on its way from a session to results in the folder `kept`."""
-
-    session: Session
-    kept: Path
-    method: str
-    settings: MethodSettings
-    scale: Scale
-    psi: ImagingMatrix
-
-    def fingerprint(self) -> str:
-        """Return a SHA-256 of all that the light fields follow from."""
-        stored = [entry.model_dump(mode="json") for entry in self.session.stored.values()]
-        settings = self.settings.model_dump(mode="json")
-        what = stored, self.psi.checksum(), self.method, settings, __version__
-        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
-
-    def reconstructed(
-        self, on_step: Callable[[Progress], None], on_note: Callable[[str], None]
-    ) -> dict[str, Any]:
-        """Reconstruct all frames that are not done; return the metrics of the film."""
-        fingerprint, path = self.fingerprint(), self.kept / NEXT
-        latest = Latest.opened(path, fingerprint, self.psi)
-        if latest is not None:
-            on_note(f"goes on after frame {latest.place} of an earlier run")
-        elif path.exists():
-            on_note("starts anew: an earlier run was of other frames, settings or version")
-        (self.kept / FRAMES).mkdir(exist_ok=True)
-        if latest is None:
-            emptied(self.kept / FRAMES)
-        latest = latest or Latest()
-        planned = [frame for frame in self.session.frames if frame.film is not None]
-        reasons = exposure_reasons(shot_exposures(self.session))
-        times_s: dict[int, float] = {}
-        for frame in film_frames(self.session, self.scale):
-            times_s[frame.place] = frame.time_s
-            if frame.place > latest.place:
-                if frame.segment != latest.segment:
-                    latest = Latest(failed=latest.failed)
-                latest = self._after(latest, frame, reasons).saved(path, fingerprint, self.psi)
-            on_step(Progress(frame.place + 1, None, None, len(planned)))
-        return self._metrics(len(planned), times_s, latest.failed)
-
-    def _after(self, latest: Latest, frame: FilmFrame, reasons: Sequence) -> Latest:
-        """Write the result of a frame, if it can be reconstructed; return what follows from it."""
-        latest = replace(latest, place=frame.place, segment=frame.segment)
-        frames = Frames(frame.readings, frame.deviation, frame.usable)
-        try:
-            result, latest = latest.next(self.psi, frame.shot, frames, self.method, self.settings)
-        except ReconstructionError as fault:
-            return replace(latest, failed={**latest.failed, frame.place: str(fault)})
-        result = replace(result, verdict=result.verdict.with_reasons(reasons))
-        of_film = {"frame": frame.place, "time_s": frame.time_s, "segment": frame.segment}
-        partial = self.kept / "part"
-        if partial.exists():
-            shutil.rmtree(partial)
-        partial.mkdir()
-        result.write(partial, {**result.metrics(), **of_film, "shot": frame.shot + 1})
-        placed(partial, self.kept / FRAMES / f"{frame.place:06d}")
-        return latest
-
-    def _metrics(
-        self, count: int, times_s: Mapping[int, float], failed: Mapping[int, str]
-    ) -> dict[str, Any]:
-        done = [_figures(path / METRICS) for path in sorted((self.kept / FRAMES).iterdir())]
-        if not done:
-            raise AppError(f"{self.session.folder}: {next(iter(failed.values()), 'no frame')}")
-        rate = of_kind(self.session.journal.entries, FilmEntry)[0].rate_hz
-        places = {one["frame"] for one in done}
-        anew = [
-            one["frame"]
-            for before, one in pairwise(done)
-            if one["segment"] == before["segment"] and "new_share" not in one["parameters"]
-        ]
-        took_s = sum(one["seconds"] for one in done)
-        levels = Counter(one["verdict"]["level"] for one in done)
-        worst = max(done, key=_doubt)
-        shown = ("frame", "time_s", "stated_db", "stated_interval_db")
-        return {
-            "method": self.method,
-            "film": {
-                "frames": count,
-                "rate": rate,
-                "times_s": _all_times(times_s, count, rate),
-                "missing": sorted(set(range(count)) - places),
-                "failed": {str(place): why for place, why in failed.items()},
-                "begun_anew": anew,
-                "verdicts": {level: levels[level] for level in LEVELS},
-                "trusted_share": levels["trust"] / len(done),
-                "seconds_per_frame": took_s / len(done),
-                "worst": {name: worst[name] for name in shown},
-            },
-            "seconds": took_s,
-            "verdict": worst["verdict"],
-            "psi_sha256": self.psi.checksum(),
-            "program_peak_gib": peak_memory_mib() / 2**10,
-        }
+def _metrics(
+    job: FilmJob,
+    session: Session,
+    count: int,
+    times_s: Mapping[int, float],
+    failed: Mapping[int, str],
+) -> dict[str, Any]:
+    """Return the metrics of a film of which all frames are done."""
+    done = [_figures(path / METRICS) for path in sorted((job.kept / FRAMES).iterdir())]
+    if not done:
+        raise AppError(f"{session.folder}: {next(iter(failed.values()), 'no frame')}")
+    rate = of_kind(session.journal.entries, FilmEntry)[0].rate_hz
+    anew = [
+        one["frame"]
+        for before, one in pairwise(done)
+        if one["segment"] == before["segment"] and "new_share" not in one["parameters"]
+    ]
+    took_s = sum(one["seconds"] for one in done)
+    levels = Counter(one["verdict"]["level"] for one in done)
+    worst = max(done, key=_doubt)
+    shown = ("frame", "time_s", "stated_db", "stated_interval_db")
+    return {
+        "method": job.method,
+        "film": {
+            "frames": count,
+            "rate": rate,
+            "times_s": _all_times(times_s, count, rate),
+            "missing": sorted(set(range(count)) - {one["frame"] for one in done}),
+            "failed": {str(place): why for place, why in failed.items()},
+            "begun_anew": anew,
+            "verdicts": {level: levels[level] for level in LEVELS},
+            "trusted_share": levels["trust"] / len(done),
+            "seconds_per_frame": took_s / len(done),
+            "worst": {name: worst[name] for name in shown},
+        },
+        "seconds": took_s,
+        "verdict": worst["verdict"],
+        "psi_sha256": open_psi(job.kept / PSI).checksum,
+        "peak_gib": max(one["peak_gib"] for one in done),
+        "program_peak_gib": peak_memory_mib() / 2**10,
+    }
 
 
 def _figures(path: Path) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +24,8 @@ from emmc_rig.session.session import Session
 SHOWN_FAULTS = 5
 SAME_EXPOSURE = 0.01
 """By how much the exposures of a film's frames may differ: by less than cameras state them."""
+EVERY = range(sys.maxsize)
+"""All places of a film."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,32 +126,44 @@ def _normalised(linear: LinearFrame, scale: Scale, shot: int) -> tuple[NDArray, 
 
 
 @dataclass(frozen=True, eq=False)
-class FilmFrame:
-    """One frame of a film, normalised as Psi is; readings, deviation, usable: (1, y, x).
+class FilmPlace:
+    """When a frame of a film was exposed.
 
     place: in time, from 0; places that were dropped are left out. time_s: seconds from the film's
     first frame; what passed between two segments is not known, and counts as one period for each
-    place. segment: within one, time went on without a break. shot: which of Psi's shots it is.
-    deviation: of the readings, infinite where not usable. entry: its line of the journal.
+    place. segment: within one, time went on without a break. planned, entry: the frame of the plan,
+    and its line of the journal.
     """
 
     place: int
     time_s: float
     segment: int
-    shot: int
+    planned: PlannedFrame
+    entry: FrameEntry
+
+    @property
+    def shot(self) -> int:
+        """Which of Psi's shots it is."""
+        return self.planned.bench.shot
+
+
+@dataclass(frozen=True, eq=False)
+class FilmFrame(FilmPlace):
+    """One frame of a film, normalised as Psi is; readings, deviation, usable: (1, y, x).
+
+    deviation: of the readings, infinite where not usable.
+    """
+
     readings: NDArray[np.float32]
     deviation: NDArray[np.float32]
     usable: NDArray[np.bool_]
-    entry: FrameEntry
 
 
-def film_frames(session: Session, scale: Scale | None = None) -> Iterator[FilmFrame]:
-    """Yield the film that a session holds, frame by frame in the order of time.
+def film_places(session: Session) -> list[FilmPlace]:
+    """Return when the frames of a session's film were exposed, in the order of time.
 
-    One frame is in memory at a time. scale: what `session_scale` returns, which it is by default.
-    Raises AppError, before the first frame, naming frames that are out of order, doubled, exposed
-    unlike the first, or whose mask did not step; later for one that shows the same as the frame
-    before it; CalibrationError.
+    Raises AppError naming frames that are out of order, doubled, exposed unlike the first, or whose
+    mask did not step.
     """
     film = _film(session)
     if not film:
@@ -157,8 +172,8 @@ def film_frames(session: Session, scale: Scale | None = None) -> Iterator[FilmFr
         shown = "; ".join(faults[:SHOWN_FAULTS]) + ("; ..." if len(faults) > SHOWN_FAULTS else "")
         raise AppError(f"{session.folder}: no film to reconstruct: {shown}")
     rates = {one.segment: one.rate_hz for one in of_kind(session.journal.entries, FilmEntry)}
-    scale = session_scale(session) if scale is None else scale
-    segment, before, began_s, time_s, place = -1, np.zeros(0), 0.0, 0.0, 0
+    places: list[FilmPlace] = []
+    segment, began_s, time_s, place = -1, 0.0, 0.0, 0
     for frame, entry in film:
         assert frame.film is not None
         assert entry.segment is not None
@@ -167,22 +182,38 @@ def film_frames(session: Session, scale: Scale | None = None) -> Iterator[FilmFr
             segment = entry.segment
             began_s = time_s + (frame.film - place) / rates[segment] - entry.film_s
         time_s, place = began_s + entry.film_s, frame.film
-        shot = frame.bench.shot
-        linear = fused_shot(session, [frame], scale.darks, scale.gain)
+        places.append(FilmPlace(place, time_s, segment, frame, entry))
+    return places
+
+
+def film_frames(
+    session: Session, scale: Scale | None = None, only: Container[int] = EVERY
+) -> Iterator[FilmFrame]:
+    """Yield the film that a session holds, frame by frame in the order of time.
+
+    One frame is in memory at a time. scale: what `session_scale` returns, which it is by default.
+    only: places to yield (default: all). Raises AppError, before the first frame, as `film_places`;
+    later for one that shows the same as the frame before it; CalibrationError.
+    """
+    places = film_places(session)
+    scale = session_scale(session) if scale is None else scale
+    before = np.zeros(0)
+    for at in places:
+        # One before what is wanted is read, too, to be compared with.
+        if at.place not in only and at.place + 1 not in only:
+            continue
+        linear = fused_shot(session, [at.planned], scale.darks, scale.gain)
         if np.array_equal(linear.dn_per_s, before):
-            raise AppError(f"{session.folder}: {frame.id} shows the same as the frame before it")
+            raise AppError(f"{session.folder}: {at.entry.id} shows the same as the frame before it")
         before = linear.dn_per_s
-        readings, variance, usable = _normalised(linear, scale, shot)
-        yield FilmFrame(
-            place,
-            time_s,
-            segment,
-            shot,
-            readings[np.newaxis].astype(np.float32),
-            np.sqrt(variance)[np.newaxis].astype(np.float32),
-            usable[np.newaxis],
-            entry,
-        )
+        if at.place in only:
+            readings, variance, usable = _normalised(linear, scale, at.shot)
+            yield FilmFrame(
+                **vars(at),
+                readings=readings[np.newaxis].astype(np.float32),
+                deviation=np.sqrt(variance)[np.newaxis].astype(np.float32),
+                usable=usable[np.newaxis],
+            )
 
 
 def _film(session: Session) -> list[tuple[PlannedFrame, FrameEntry]]:
@@ -244,8 +275,7 @@ def film_readings(session: Session, place: int) -> SessionReadings:
     Raises AppError, as `film_frames` and for a place without a frame, or CalibrationError.
     """
     scale = session_scale(session)
-    for one in film_frames(session, scale):
-        if one.place == place:
-            psi = scale.psi.of_shots([one.shot], json_of_shots(camera_of(session), [one.shot]))
-            return SessionReadings(psi, one.readings, np.square(one.deviation), one.usable)
+    for one in film_frames(session, scale, [place]):
+        psi = scale.psi.of_shots([one.shot], json_of_shots(camera_of(session), [one.shot]))
+        return SessionReadings(psi, one.readings, np.square(one.deviation), one.usable)
     raise AppError(f"{session.folder}: no frame {place}; frames are counted from 0")

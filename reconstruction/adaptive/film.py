@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from emmc_rig.model.bands import in_views
 from emmc_rig.model.json_text import parse_json
@@ -55,7 +55,10 @@ Array = NDArray[np.floating]
 
 
 class FilmSettings(Settings):
-    """Settings of the frames after the first."""
+    """Settings of films: of the frames after the first.
+
+    segment: frames after which one begins as a first frame does; 0: never.
+    """
 
     texture: TextureSettings = TextureSettings(
         steps=8, first_noise=0.1, refine_steps=4, shared_steps=0, sweeps=(0, 3)
@@ -67,6 +70,14 @@ class FilmSettings(Settings):
     together: int = Field(
         default=4, ge=1, description="frames before, searched with the present one, of moving masks"
     )
+    segment: int = Field(default=0, ge=0)
+
+    @field_validator("texture", mode="before")
+    @classmethod
+    def _rest_as_films_have_it(cls, given: object) -> object:
+        """Complete a part of the texture's settings by the defaults of films."""
+        own = cls.model_fields["texture"].default.model_dump()
+        return {**own, **given} if isinstance(given, dict) else given
 
 
 KEPT = 0.8
@@ -149,6 +160,7 @@ class Film:
         if self.known is not None:
             missed = min(missed, self.known.missed)
         room_px = ROOM_PX + self.settings.texture.room_px
+        # Where disparities shrank as they were fitted, there is more margin than needed.
         wider = max(margin_of(plain.given.psi, scene.centre, room_px) - margin, 0)
         margin += wider
         texture = np.pad(texture, ((0, 0), (wider, wider), (wider, wider)), mode="edge")

@@ -22,7 +22,7 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
-from reconstruction.adaptive.film import Film
+from reconstruction.adaptive.film import Film, FilmSettings
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
@@ -73,6 +73,7 @@ class ShippedSettings(Settings):
     tv: TVSettings = Field(default_factory=TVSettings)
     sparse: SparseSettings = Field(default_factory=SparseSettings)
     adaptive: AdaptiveSettings = Field(default_factory=AdaptiveSettings)
+    film: FilmSettings = Field(default_factory=FilmSettings)
 
     def of(self, kind: type[Part]) -> Part:
         """Return the part of a type: a method's own, which no field above names."""

@@ -9,10 +9,13 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from pools import Here, Posting, children
 from programs import one_line, program
 
 import emmc_rig as emmc
@@ -24,7 +27,8 @@ from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.processing import filming
 from emmc_rig.processing.filming import reconstruct_film_session
 from emmc_rig.processing.reconstructing import sensor_deviation
-from reconstruction.adaptive.film import Film
+from emmc_rig.session.readings import film_places
+from reconstruction.adaptive.film import Film, FilmSettings
 from reconstruction.methods import MethodSettings
 
 FRAMES, RATE, METHOD = 6, 10, "adaptive-fast"
@@ -35,7 +39,14 @@ film: {{frames: {FRAMES}, rate: {RATE}}}
 whiteboards: null
 darks: {{repeats: 2}}
 """
-TIMES = {"seconds", "search_seconds", "seconds_per_frame", "program_peak_gib", "command"}
+TIMES = {
+    "seconds",
+    "search_seconds",
+    "seconds_per_frame",
+    "peak_gib",
+    "program_peak_gib",
+    "command",
+}
 """What differs from run to run."""
 PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
 
@@ -140,7 +151,7 @@ def test_after_a_kill_the_same_command_goes_on_to_the_same_bytes(session, whole,
     before = {path: path.stat().st_mtime_ns for path in kept.rglob("light_field.h5")}
     assert len(before) == done
     reconstruct_film_session(session, out, METHOD, on_note=notes.append)
-    assert notes == [f"goes on after frame {done - 1} of an earlier run"]
+    assert notes == [f"goes on with an earlier run; frames done: {done}"]
     after = {path.stat().st_mtime_ns for path in out.rglob("light_field.h5")}
     assert set(before.values()) < after or done == FRAMES
     assert content(out) == content(whole)
@@ -168,25 +179,31 @@ def test_a_frame_after_which_nothing_was_noted_is_made_again(
     with pytest.raises(KilledError):
         reconstruct_film_session(session, out, METHOD)
     monkeypatch.undo()
-    notes = []
-    reconstruct_film_session(session, out, METHOD, on_note=notes.append)
-    assert notes == ["goes on after frame 1 of an earlier run"]
+    reconstruct_film_session(session, out, METHOD)
     assert content(out) == content(whole)
 
 
-@pytest.mark.parametrize("what", ["settings", "damage"])
-def test_what_an_earlier_run_left_of_another_film_is_not_gone_on_from(
-    session, whole, tmp_path, what
+@pytest.mark.parametrize(
+    ("damaged", "note"),
+    [
+        (None, "starts anew"),  # of other settings
+        ("next-000.npz", "goes on with an earlier run; frames done"),
+        ("scale.npz", "starts anew"),
+        ("psi.h5", "starts anew"),
+    ],
+)
+def test_what_an_earlier_run_left_damaged_or_of_another_film_is_not_gone_on_from(
+    session, whole, tmp_path, damaged, note
 ):
     out, notes = tmp_path / "out", []
-    other = MethodSettings(screening=what != "settings")
+    other = MethodSettings(screening=damaged is not None)
     with pytest.raises(KilledError):
         reconstruct_film_session(session, out, METHOD, settings=other, on_step=kill_after(1))
-    if what == "damage":
-        path = out / ".emmc-rig.partial/kept/next.npz"
+    if damaged is not None:
+        path = out / ".emmc-rig.partial/kept" / damaged
         path.write_bytes(path.read_bytes()[:-1000])
     reconstruct_film_session(session, out, METHOD, on_note=notes.append)
-    assert [note.split(":")[0] for note in notes] == ["starts anew"]
+    assert [one.split(":")[0] for one in notes] == [note]
     assert content(out) == content(whole)
 
 
@@ -202,7 +219,7 @@ def test_killed_by_the_system_the_same_command_goes_on_to_the_same_bytes(session
     running.wait()
     assert not (out / "metrics.json").exists()
     again = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "goes on after frame" in again.stderr
+    assert "goes on with an earlier run" in again.stderr
     assert content(out) == content(whole)
 
 
@@ -246,10 +263,10 @@ def test_a_film_without_a_usable_frame_is_one_line(session, tmp_path, monkeypatc
 def test_a_segments_first_frame_is_that_of_a_capture_of_its_own(
     session, tmp_path, monkeypatch, run
 ):
-    def broken(frame):
-        return replace(frame, segment=int(frame.place >= 3))
+    def broken(session):
+        return [replace(at, segment=int(at.place >= 3)) for at in film_places(session)]
 
-    changed_frames(monkeypatch, broken)
+    monkeypatch.setattr(filming, "film_places", broken)
     reconstruct_film_session(session, tmp_path / "out", METHOD)
     assert 3 not in film_metrics(tmp_path / "out")["begun_anew"]
     code, _, err = run("reconstruct", session, "--frame", 3, "--method", METHOD, "--out", "alone")
@@ -274,7 +291,7 @@ def test_the_command_says_how_a_film_went_and_where_it_is_worst(session, run):
     [
         (["--method", "tv"], "'tv' takes no films: choose adaptive or adaptive-fast, or a single"),
         (["--truth", "moving-toys"], "--truth: not of a film"),
-        (["--workers", "2"], "--workers: not of a film"),
+        (["--zarr"], "--zarr: not of a film"),
         (["--frame", "99"], "no frame 99"),
         (["--memory", "100MiB"], "--memory of 100 MiB"),
         (["--psi", "absent.h5"], "absent.h5"),
@@ -284,6 +301,104 @@ def test_what_a_film_does_not_take_is_refused_in_a_line(session, run, options, w
     code, _, err = run("reconstruct", session, "--out", "out", *options)
     assert code in (1, 2)
     assert what in (one_line(err) if code == 1 else " ".join(err.split()))
+
+
+TWO = MethodSettings.model_validate({"film": {"segment": 4}})
+
+
+@pytest.fixture(scope="module")
+def in_two(session):
+    """The film's result in segments of four frames and two, computed one after the other."""
+    out = session.parent / "in-two"
+    reconstruct_film_session(session, out, METHOD, settings=TWO)
+    return out
+
+
+def shared(session, out, pool, monkeypatch, **more):
+    """Reconstruct the film in two segments by the workers of a pool."""
+    monkeypatch.setattr(filming, "opened_pool", lambda *_: nullcontext(pool))
+    reconstruct_film_session(session, out, METHOD, settings=TWO, workers=2, **more)
+
+
+def test_a_segment_begins_as_a_first_frame_does(session, whole, in_two, tmp_path, run):
+    assert film_metrics(in_two)["begun_anew"] == film_metrics(whole)["begun_anew"]
+    code, _, err = run("reconstruct", session, "--frame", 4, "--method", METHOD, "--out", tmp_path)
+    assert code == 0, err
+    names = [f"frames/{place:06d}/light_field.h5" for place in (3, 4, 5)]
+    alone = load_hdf5(tmp_path / "light_field.h5")
+    np.testing.assert_array_equal(load_hdf5(in_two / names[1]), alone)
+    before, _, last = ((in_two / one, whole / one) for one in names)
+    assert before[0].read_bytes() == before[1].read_bytes()
+    assert last[0].read_bytes() != last[1].read_bytes()
+
+
+def test_workers_do_segments_in_any_order_to_the_same_bytes(session, in_two, tmp_path, monkeypatch):
+    pool = Posting(backwards=True)
+    shared(session, tmp_path / "out", pool, monkeypatch)
+    assert [task.places for task in pool.done] == [range(4, 6), range(4)]
+    assert content(tmp_path / "out") == content(in_two)
+
+
+def test_killed_within_the_second_segment_each_goes_on_where_it_was(
+    session, in_two, tmp_path, monkeypatch
+):
+    out, saved, notes = tmp_path / "out", filming.Latest.saved, []
+
+    def killed(latest, *given):
+        if latest.place == 5:
+            raise KilledError
+        return saved(latest, *given)
+
+    monkeypatch.setattr(filming.Latest, "saved", killed)
+    with pytest.raises(KilledError):
+        shared(session, out, Here(backwards=True), monkeypatch)
+    monkeypatch.setattr(filming.Latest, "saved", saved)
+    kept = out / ".emmc-rig.partial/kept/frames"
+    assert sorted(path.name for path in kept.iterdir()) == ["000004", "000005"]
+    before = (kept / "000004/light_field.h5").stat().st_mtime_ns
+    shared(session, out, Here(), monkeypatch, on_note=notes.append)
+    assert notes == ["goes on with an earlier run; frames done: 2"]
+    assert (out / "frames/000004/light_field.h5").stat().st_mtime_ns == before
+    assert content(out) == content(in_two)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
+def test_a_worker_that_is_killed_is_replaced_and_its_segment_goes_on(session, in_two, tmp_path):
+    (tmp_path / "two.yaml").write_text("film: {segment: 4}\n")
+    out, own = tmp_path / "out", tmp_path / "out/.emmc-rig.partial/kept"
+    command = (
+        *PROGRAM, "reconstruct", str(session), "--method", METHOD, "--workers", "2", "--memory",
+        "4GiB", "--settings", str(tmp_path / "two.yaml"), "--out", str(out),
+    )  # fmt: skip
+    running = subprocess.Popen(command)
+    while not (own / "next-001.npz").exists():
+        assert running.poll() is None
+        time.sleep(0.01)
+    os.kill(children(running.pid)[-1], signal.SIGKILL)
+    assert running.wait() == 0
+    assert content(out) == content(in_two)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_does_segments_to_the_bytes_of_this_machine(session, in_two, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None,
+        protocol="tcp", host="127.0.0.1",
+    ) as cluster:  # fmt: skip
+        reconstruct_film_session(
+            session, tmp_path / "out", METHOD, settings=TWO, cluster=cluster.scheduler_address
+        )
+    assert content(tmp_path / "out") == content(in_two)
+
+
+def test_workers_that_one_segment_leaves_idle_are_named_with_what_to_set(session, whole, tmp_path):
+    notes = []
+    reconstruct_film_session(session, tmp_path / "out", METHOD, workers=2, on_note=notes.append)
+    assert ["film: {segment: 50}" in note for note in notes] == [True]
+    assert content(tmp_path / "out") == content(whole)
 
 
 def test_one_frame_is_of_a_film_only(session, run):
@@ -351,6 +466,48 @@ def test_what_is_no_film_is_refused(psi, wrong):
         emmc.reconstruct_film(psi, wrong, METHOD)
     with pytest.raises(AppError, match="'tv' takes no films"):
         emmc.reconstruct_film(psi, readings(psi, 2), "tv")
+
+
+@pytest.mark.parametrize(
+    "changed", [{"earlier": 1}, {"misfit": 0.02}, {"texture": {"steps": 5}}, {"segment": 2}]
+)
+def test_settings_of_films_reach_the_frames_after_the_first(psi, changed):
+    shown = readings(psi, 3)
+    usual, other = (
+        [one.light_field for one in emmc.reconstruct_film(psi, shown, METHOD, settings=settings)]
+        for settings in ({"film": {"earlier": 2}}, {"film": changed})
+    )
+    np.testing.assert_array_equal(usual[0], other[0])
+    assert not np.array_equal(usual[2], other[2])
+
+
+def test_a_segment_of_readings_begins_as_a_first_frame_does(psi):
+    shown, settings = readings(psi, 3), {"film": {"segment": 2}}
+    *_, last = emmc.reconstruct_film(psi, shown, METHOD, noise_sigma=0.003, settings=settings)
+    alone = emmc.reconstruct(psi.of_shots([0]), shown[2:], METHOD, noise_sigma=0.003)
+    np.testing.assert_array_equal(last.light_field, alone.light_field)
+
+
+def test_a_part_of_the_textures_settings_leaves_the_rest_as_films_have_it():
+    given = MethodSettings.model_validate({"film": {"texture": {"steps": 5}}})
+    assert given.film.texture == FilmSettings().texture.model_copy(update={"steps": 5})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"earlier": 0}, "film.earlier: input should be greater than or equal to 1"),
+        ({"segment": -1}, "film.segment: input should be greater than or equal to 0"),
+        ({"misfit": 0}, "film.misfit: input should be greater than 0"),
+        ({"segmnt": 50}, "unknown key 'film.segmnt': did you mean 'segment'?"),
+        ({"texture": {"step": 5}}, "unknown key 'film.texture.step'"),
+        ({"texture": 5}, "film.texture: input should be a mapping"),
+    ],
+)
+def test_settings_of_films_that_cannot_be_are_refused_in_a_line(psi, wrong, what):
+    with pytest.raises(AppError) as refused:
+        emmc.reconstruct_film(psi, readings(psi, 1), METHOD, settings={"film": wrong})
+    assert what in str(refused.value)
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(psi):

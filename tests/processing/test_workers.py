@@ -14,7 +14,7 @@ import numba
 import numpy as np
 import pytest
 import yaml
-from pools import Here, StoppedHereError
+from pools import Here, StoppedHereError, children
 from programs import program
 
 from emmc_rig.commands.simulate import simulate_into
@@ -143,11 +143,6 @@ def command(place, out, *more):
 
 def kept(place, out):
     return place / out / ".emmc-rig.partial/kept"
-
-
-def children(process):
-    task = Path(f"/proc/{process}/task/{process}/children")
-    return [int(one) for one in task.read_text().split()] if task.exists() else []
 
 
 def wait_for(condition, process, steps=6000):

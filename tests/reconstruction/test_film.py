@@ -92,6 +92,19 @@ def test_an_earlier_frame_sees_the_present_texture_where_it_was(psi):
     )
 
 
+def test_a_film_goes_on_where_disparities_shrank_as_they_were_fitted(psi, monkeypatch):
+    after, shown = Film.after, _readings(psi, _sliding(0), 0)
+
+    def shrunk(film, plain, scene, *more):
+        return after(film, plain, replace(scene, centre=0 * scene.centre), *more)
+
+    monkeypatch.setattr(Film, "after", shrunk)
+    given = psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    known = reconstruct("adaptive-fast", *given, film=Film()).film.known
+    assert known.texture.shape[1:] == known.centre.shape
+    assert known.centre.shape == tuple(length + 2 * known.margin for length in SIZE)
+
+
 def test_a_film_is_more_accurate_than_its_frames_alone(followed):
     gains = [
         psnr_db(result.light_field, truth) - psnr_db(alone.light_field, truth)
