@@ -1,15 +1,19 @@
-"""The light field while the camera watches: coarse at once, `reconstruct`'s own when nothing moves.
+"""The light field while the camera watches: coarse at once, then as `reconstruct` gives it.
 
-Every frame moves a preview on (`reconstruction.preview`). Once the scene has stood still, a
-reconstruction of the frame that it stands still at runs beside, by the same call as
-`emmc-rig reconstruct` makes, and is dropped as soon as something changes.
+A preview follows every frame (`reconstruction.preview`), while a reconstruction runs beside it.
+Methods that take films, with a Psi of one shot, reconstruct while the scene moves: when one frame
+is done, the newest is the film's next one, and frames between are left out. Other methods begin
+once the scene has stood still, and are dropped as soon as something changes. Of a scene that stands
+still one frame is reconstructed, once.
 """
 
 from __future__ import annotations
 
 import json
+import statistics
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,8 +42,9 @@ from emmc_rig.pages.display import PART_PIXELS
 from emmc_rig.pages.viewer import viewer_data
 from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.session import Session
+from reconstruction.adaptive.film import Film
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import DEFAULT_METHOD
+from reconstruction.methods import DEFAULT_METHOD, find_method
 from reconstruction.preview import Preview
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.verdict.kept import missed_readings
@@ -52,7 +57,11 @@ FACTOR = 4
 STEPS = 3
 """Of the preview for each frame."""
 STILL_S = 1.5
-"""How long nothing changes before the reconstruction begins."""
+"""How long nothing changes before a scene is taken to stand still."""
+SETTLING = 15
+"""Frames of a scene that stands still after which its preview is final: STILL_S at 10 frames/s."""
+RECENT = 5
+"""Reconstructions whose median time is stated: one of them, a first frame's, takes longer."""
 CHANGED = 4.0
 """Mean square of the difference of two frames in a block, over its variance, from which on the
 scene changed: 1 of noise alone, with a deviation of 0.09 over BLOCK_PX^2 pixels."""
@@ -94,14 +103,18 @@ class LiveLightField:
         self._reading_per_rate = np.divide(1, white, where=usable, out=np.zeros(white.shape))
         self._reading_per_rate = self._reading_per_rate.astype(np.float32)
         self._held: dict[int, RawFrame] = {}
-        self._since_s = clock()
+        self._since_s, self._unsettled = clock(), SETTLING
         self.preview: Preview | None = None
         self._level = 0.0
         self._pictures: Pictures | None = None
         self._numbers = 0
-        self._lock = threading.Lock()
+        films = scale.psi.shots == 1 and find_method(method).films
+        self._film = Film() if films else None
         self._run: _Refinement | None = None
-        self._drawn: _Refinement | None = None
+        self._done: dict[int, RawFrame] = {}
+        self._refined: tuple[Reconstruction, Verdict] | None = None
+        self._fault = ""
+        self._periods: deque[tuple[float, float]] = deque(maxlen=RECENT)
 
     @property
     def psi(self) -> ImagingMatrix:
@@ -109,21 +122,23 @@ class LiveLightField:
         return self._scale.psi
 
     def close(self) -> None:
-        """Give up a reconstruction under way."""
-        self._give_up()
+        """Give up a reconstruction under way; `update` is not called any more."""
+        if self._run is not None:
+            self._run.give_up()
 
     def pictures(self) -> Pictures | None:
         """Return what was drawn last; None before the first."""
         return self._pictures
 
     def refined(self) -> tuple[Reconstruction, Verdict] | None:
-        """Return the finished reconstruction of what stands still; None while there is none."""
-        return None if self._run is None else self._run.result
+        """Return the reconstruction that is shown; None while it is the preview."""
+        return self._refined
 
-    def update(self, frame: RawFrame, shot: int | None = 0) -> dict[str, Any]:
+    def update(self, frame: RawFrame, shot: int | None = 0, number: int = 0) -> dict[str, Any]:
         """Take a frame of a shot (None: of no shot of Psi), and return what there is to say.
 
-        Raises AppError for frames that do not fit Psi.
+        number: of the frame among all that the camera sent. Raises AppError for frames that do not
+        fit Psi.
         """
         expected = self.psi.frames_shape[1:]
         if frame.mosaic.shape != expected:
@@ -137,31 +152,45 @@ class LiveLightField:
             if shot in self._held:
                 self._held.clear()
             self._held[shot] = frame
-            self._since_s = self._clock()
-            self._give_up()
+            self._since_s, self._unsettled = self._clock(), SETTLING
+            if self._film is None:
+                self.close()
+                self._run, self._refined, self._fault = None, None, ""
+        if self._run is not None and self._run.ended:
+            self._take(self._run, number)
+        elif self._run is not None and self._run.anew:
+            self._refined = None
         try:
-            if self._run is None:
+            if self._refined is None and self._unsettled:
                 self._go_on()
-            if self._run is None and self._clock() - self._since_s >= STILL_S:
-                self._run = _Refinement(*self._problem(), self._method, self._solve)
+                self._unsettled -= 1
+            begins = self._film is not None or self._still()
+            if self._run is None and self._done != self._held and begins:
+                self._run = _Refinement(
+                    *self._problem(), self._method, self._solve, self._film, dict(self._held),
+                    self._clock(), number,
+                )  # fmt: skip
         except (SensingError, ReconstructionError, CalibrationError) as fault:
             return self._report(str(fault))
-        run = self._run
-        if run is not None and run.result is not None and self._drawn is not run:
-            self._drawn = run
-            found = run.result[0]
-            taken = run.frames
-            missed = missed_readings(
-                run.psi, found.light_field, taken.readings, taken.noise_sigma, taken.usable
-            )
-            axes = self.psi.view_axes
-            self._draw(export_of(found.light_field, found.maps, missed, axes))
-        return self._report("")
+        return self._report(self._fault)
 
-    def _give_up(self) -> None:
-        run, self._run = self._run, None
-        if run is not None:
-            run.give_up()
+    def _still(self) -> bool:
+        return self._clock() - self._since_s >= STILL_S
+
+    def _take(self, run: _Refinement, number: int) -> None:
+        """Show what a reconstruction that ended gave, and let the next one go on from it."""
+        self._run, self._done = None, run.of
+        self._refined, self._fault = run.result, run.fault
+        if run.result is None:
+            return
+        found, frames = run.result[0], run.frames
+        self._film = found.film
+        if self._film is not None:
+            self._periods.append((self._clock() - run.begun_s, number - run.number))
+        missed = missed_readings(
+            run.psi, found.light_field, frames.readings, frames.noise_sigma, frames.usable
+        )
+        self._draw(export_of(found.light_field, found.maps, missed, self.psi.view_axes))
 
     def _changed(self, shot: int, frame: RawFrame) -> bool:
         """Return whether a frame differs from the held one of its shot by more than noise."""
@@ -252,19 +281,24 @@ class LiveLightField:
         """Return what the page says: what is shown, how far a reconstruction is, the verdict."""
         pictures, run = self._pictures, self._run
         stage, verdict = "preview", None
-        if run is not None and run.result is not None:
-            found, judged = run.result
+        if self._refined is not None:
+            found, judged = self._refined
             stage = (
                 f"{found.method}: {found.status} in {found.seconds:.1f} s, as emmc-rig reconstruct"
             )
             verdict = {"level": judged.level, "words": judged.words}
-        elif run is not None and run.fault:
-            why = run.fault
         elif run is not None:
-            seconds = time.monotonic() - run.begun_s
+            seconds = self._clock() - run.begun_s
             stage = f"preview; {self._method} at work for {seconds:.0f} s, step {run.step}"
             if run.step == 0 and seconds > COMPILING_S:
                 stage += ": the first time on a computer it is compiled, for up to a minute or two"
+        if len(self._periods) > 1 and not self._still():
+            every_s = statistics.median_low(took_s for took_s, _ in self._periods)
+            sent = sum(sent for _, sent in self._periods) / sum(took for took, _ in self._periods)
+            stage += (
+                f"; a light field every {every_s:.1f} s ({1 / every_s:.2g} frames/s); the camera "
+                f"sends {sent:.2g}"
+            )
         return {
             "stage": stage,
             "why": why,
@@ -275,15 +309,36 @@ class LiveLightField:
 
 
 class _Refinement:
-    """A reconstruction in a thread of its own, which can be given up between two steps."""
+    """A reconstruction in a thread of its own, which can be given up between two steps.
 
-    def __init__(self, psi: ImagingMatrix, frames: Frames, method: str, solve: Solve) -> None:
+    film: that the frames are the next one of, None: of none. of: the frames by shot. begun_s,
+    number: when it begins, and the number of the newest frame then. anew: whether it goes on from
+    no frame before.
+    """
+
+    def __init__(
+        self,
+        psi: ImagingMatrix,
+        frames: Frames,
+        method: str,
+        solve: Solve,
+        film: Film | None,
+        of: dict[int, RawFrame],
+        begun_s: float,
+        number: int,
+    ) -> None:
         self.result: tuple[Reconstruction, Verdict] | None = None
         self.fault = ""
-        self.step, self.begun_s = 0, time.monotonic()
+        self.step, self.anew = 0, False
         self._given_up = threading.Event()
         self.psi, self.frames, self._method, self._solve = psi, frames, method, solve
+        self._film, self.of, self.begun_s, self.number = film, of, begun_s, number
         threading.Thread(target=self._run, name="live reconstruction", daemon=True).start()
+
+    @property
+    def ended(self) -> bool:
+        """Whether there is a result, or a fault."""
+        return self.result is not None or self.fault != ""
 
     def give_up(self) -> None:
         """End at the next step."""
@@ -301,6 +356,7 @@ class _Refinement:
                 None,
                 frames.usable,
                 self._on_step,
+                self._film,
             )
         except _ChangedError:
             return
@@ -311,6 +367,9 @@ class _Refinement:
         if self._given_up.is_set():
             raise _ChangedError
         self.step = progress.step
+        # A frame that follows another has fewer steps than one that goes on from none.
+        steps = 0 if self._film is None else self._film.settings.texture.steps + 1
+        self.anew = progress.total is not None and progress.total > steps
 
 
 def _exposure_s(frame: RawFrame) -> float:
