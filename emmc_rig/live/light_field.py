@@ -65,10 +65,10 @@ RECENT = 5
 CHANGED = 4.0
 """Mean square of the difference of two frames in a block, over its variance, from which on the
 scene changed: 1 of noise alone, with a deviation of 0.09 over BLOCK_PX^2 pixels."""
-CUT = 0.7
-"""Mean square of the difference of two frames' blocks, over the sum of their variances, from which
-on they show different scenes: 1 of scenes that have nothing in common. `moving-toys` comes to 0.3
-within 8 s, `panning-desk` to 0.8 within 2 s, different built-in scenes to 0.9 to 1.2 (96x128)."""
+CUT = 0.5
+"""Variance of the difference of two frames' blocks, over the sum of their variances, from which on
+they are not of one scene: 1 where they have nothing in common. `panning-desk` comes to 0.01 within
+0.1 s and 0.25 within 0.5 s, different built-in scenes to 0.65 and more (96x128)."""
 BLOCK_PX = 16
 ANOTHER_BRIGHTNESS = 1.2
 COMPILING_S = 5.0
@@ -117,7 +117,7 @@ class LiveLightField:
         self._run: _Refinement | None = None
         self._done: dict[int, RawFrame] = {}
         self._refined: tuple[Reconstruction, Verdict] | None = None
-        self._fault = ""
+        self._fault, self._dropped = "", False
         self._periods: deque[tuple[float, float]] = deque(maxlen=RECENT)
 
     @property
@@ -152,18 +152,19 @@ class LiveLightField:
             )
         if shot is None:
             return self._report("the mask is at the place of no shot of this Psi")
-        if shot not in self._held or self._changed(shot, frame):
-            if shot in self._held:
+        known = shot in self._held
+        if not known or self._changed(shot, frame):
+            # What began after a cut is not dropped at the next: a slow camera sees only cuts.
+            cut = known and self._film is not None and not self._dropped and self._cut(frame)
+            if known:
                 self._held.clear()
             self._held[shot] = frame
             self._since_s, self._unsettled = self._clock(), SETTLING
-            if self._film is None:
+            if cut or self._film is None:
                 self.close()
-                self._run, self._refined, self._fault = None, None, ""
+                self._run, self._refined, self._fault, self._dropped = None, None, "", cut
         if self._run is not None and self._run.ended:
             self._take(self._run, number)
-        if self._refined is not None and self._cut():
-            self._refined = None
         try:
             if self._refined is None and self._unsettled:
                 self._go_on()
@@ -183,7 +184,7 @@ class LiveLightField:
 
     def _take(self, run: _Refinement, number: int) -> None:
         """Show what a reconstruction that ended gave, and let the next one go on from it."""
-        self._run, self._done = None, run.of
+        self._run, self._done, self._dropped = None, run.of, False
         self._refined, self._fault = run.result, run.fault
         if run.result is None:
             return
@@ -209,15 +210,13 @@ class LiveLightField:
         square = np.where(self._scale.good, (one - other) ** 2 / variance, 1.0)
         return bool(cv2.blur(square, (BLOCK_PX, BLOCK_PX)).max() > CHANGED)
 
-    def _cut(self) -> bool:
-        """Return whether the frames held show another scene than those reconstructed last."""
-        if self._held == self._done:
-            return False
+    def _cut(self, frame: RawFrame) -> bool:
+        """Return whether a frame is not of the scene of the one held, moved on or not."""
         one, other = (
-            cv2.blur(self._rate(of[0]) * self._reading_per_rate[0], (BLOCK_PX, BLOCK_PX))
-            for of in (self._held, self._done)
+            cv2.blur(self._rate(of) * self._reading_per_rate[0], (BLOCK_PX, BLOCK_PX))
+            for of in (frame, self._held[0])
         )
-        return bool(np.mean((one - other) ** 2) > CUT * (one.var() + other.var()))
+        return bool((one - other).var() > CUT * (one.var() + other.var()))
 
     def _rate(self, frame: RawFrame) -> NDArray[np.float32]:
         """Return DN per second above the dark, (y, x)."""

@@ -402,15 +402,26 @@ def test_the_preview_is_shown_before_the_first_light_field_and_after_a_cut_only(
     for _ in range(2):
         assert live.update(moved)["verdict"] is not None
         assert live.pictures().block == 1
+    until(lambda: len(solver.asked) == 2)
     assert live.update(frames[0])["stage"].startswith("preview; adaptive at work")
     assert live.pictures().block == 4
-    # What ends after the cut is of a frame before it.
-    solver.end()
-    assert live.update(frames[0])["verdict"] is None
-    assert live.pictures().block == 4
+    # The frame at work was of before the cut: it is given up, and the new scene begins at once.
+    until(lambda: len(solver.asked) == 3)
     solver.end()
     assert live.update(frames[0])["verdict"] is not None
     assert live.pictures().block == 1
+    assert solver.before == [None, 1, 1]
+
+
+def test_where_every_frame_is_a_cut_one_is_reconstructed_all_the_same(filmed, one_shot):
+    live, solver, _, frames = filmed
+    camera, psi, scene = one_shot
+    (other,) = live_frames(camera, psi, scene)
+    for frame in (frames[0], other) * 3:
+        live.update(frame)
+    solver.end()
+    assert live.update(other)["verdict"] is not None
+    assert len(solver.asked) == 2
 
 
 def test_a_frame_that_cannot_be_reconstructed_is_reported_and_the_next_goes_on(filmed):
