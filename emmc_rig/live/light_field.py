@@ -1,10 +1,11 @@
 """The light field while the camera watches: coarse at once, then as `reconstruct` gives it.
 
-A preview follows every frame (`reconstruction.preview`), while a reconstruction runs beside it.
-Methods that take films, with a Psi of one shot, reconstruct while the scene moves: when one frame
-is done, the newest is the film's next one, and frames between are left out. Other methods begin
-once the scene has stood still, and are dropped as soon as something changes. Of a scene that stands
-still one frame is reconstructed, once.
+A preview follows every frame (`reconstruction.preview`), until a reconstruction that runs beside it
+takes its place. Methods that take films, with a Psi of one shot, reconstruct while the scene moves:
+when a frame is done, the newest one is the next of the film, and those between are left out. After
+a cut the preview is shown again, and the new scene is begun at once. Other methods begin once the
+scene has stood still, and what they do is dropped as soon as something changes. While the scene
+stands still it is reconstructed once.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ class LiveLightField:
         return self._scale.psi
 
     def close(self) -> None:
-        """Give up a reconstruction under way; `update` is not called any more."""
+        """Give up a reconstruction under way."""
         if self._run is not None:
             self._run.give_up()
 
@@ -154,7 +155,8 @@ class LiveLightField:
             return self._report("the mask is at the place of no shot of this Psi")
         known = shot in self._held
         if not known or self._changed(shot, frame):
-            # What began after a cut is not dropped at the next: a slow camera sees only cuts.
+            # What began after a cut is not dropped at the next one: with a slow camera every frame
+            # of a scene that moves may be a cut, and none would ever be shown.
             cut = known and self._film is not None and not self._dropped and self._cut(frame)
             if known:
                 self._held.clear()
