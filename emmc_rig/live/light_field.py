@@ -70,10 +70,12 @@ CUT = 0.5
 """Variance of the difference of two frames' blocks, over the sum of their variances, from which on
 they are not of one scene: 1 where they have nothing in common. `panning-desk` comes to 0.01 within
 0.1 s and 0.25 within 0.5 s, different built-in scenes to 0.65 and more (96x128)."""
+CUT_S = 0.5
+"""Frames farther apart may differ as much because the scene moves."""
 BLOCK_PX = 16
 ANOTHER_BRIGHTNESS = 1.2
 COMPILING_S = 5.0
-"""Without a step, from when on the page says why."""
+"""From when on the page says what the next light field is at; without a step, why."""
 
 Solve = Callable[..., tuple[Reconstruction, Verdict]]
 SURE_PX = 0.15
@@ -108,7 +110,7 @@ class LiveLightField:
         self._reading_per_rate = np.divide(1, white, where=usable, out=np.zeros(white.shape))
         self._reading_per_rate = self._reading_per_rate.astype(np.float32)
         self._held: dict[int, RawFrame] = {}
-        self._since_s, self._unsettled = clock(), SETTLING
+        self._since_s, self._seen_s, self._unsettled = clock(), clock(), SETTLING
         self.preview: Preview | None = None
         self._level = 0.0
         self._pictures: Pictures | None = None
@@ -118,7 +120,7 @@ class LiveLightField:
         self._run: _Refinement | None = None
         self._done: dict[int, RawFrame] = {}
         self._refined: tuple[Reconstruction, Verdict] | None = None
-        self._fault, self._dropped = "", False
+        self._fault = ""
         self._periods: deque[tuple[float, float]] = deque(maxlen=RECENT)
 
     @property
@@ -153,18 +155,17 @@ class LiveLightField:
             )
         if shot is None:
             return self._report("the mask is at the place of no shot of this Psi")
+        quick, self._seen_s = self._clock() - self._seen_s < CUT_S, self._clock()
         known = shot in self._held
         if not known or self._changed(shot, frame):
-            # What began after a cut is not dropped at the next one: with a slow camera every frame
-            # of a scene that moves may be a cut, and none would ever be shown.
-            cut = known and self._film is not None and not self._dropped and self._cut(frame)
+            begins_anew = self._film is None or (known and quick and self._cut(frame))
             if known:
                 self._held.clear()
             self._held[shot] = frame
             self._since_s, self._unsettled = self._clock(), SETTLING
-            if cut or self._film is None:
+            if begins_anew:
                 self.close()
-                self._run, self._refined, self._fault, self._dropped = None, None, "", cut
+                self._run, self._refined, self._fault = None, None, ""
         if self._run is not None and self._run.ended:
             self._take(self._run, number)
         try:
@@ -186,7 +187,7 @@ class LiveLightField:
 
     def _take(self, run: _Refinement, number: int) -> None:
         """Show what a reconstruction that ended gave, and let the next one go on from it."""
-        self._run, self._done, self._dropped = None, run.of, False
+        self._run, self._done = None, run.of
         self._refined, self._fault = run.result, run.fault
         if run.result is None:
             return
@@ -302,9 +303,10 @@ class LiveLightField:
                 f"{found.method}: {found.status} in {found.seconds:.1f} s, as emmc-rig reconstruct"
             )
             verdict = {"level": judged.level, "words": judged.words}
-        elif run is not None:
-            seconds = self._clock() - run.begun_s
-            stage = f"preview; {self._method} at work for {seconds:.0f} s, step {run.step}"
+        seconds = 0 if run is None else self._clock() - run.begun_s
+        if run is not None and (verdict is None or seconds > COMPILING_S):
+            at_work = self._method if verdict is None else "the next one"
+            stage += f"; {at_work} at work for {seconds:.0f} s, step {run.step}"
             if run.step == 0 and seconds > COMPILING_S:
                 stage += ": the first time on a computer it is compiled, for up to a minute or two"
         if len(self._periods) > 1 and not self._still():
