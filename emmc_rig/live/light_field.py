@@ -32,6 +32,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
 from emmc_rig.files.psi import PSI
+from emmc_rig.live.alignment import is_dark
 from emmc_rig.live.server import Picture, Pictured, Query
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.errors import SensingError
@@ -82,6 +83,7 @@ SURE_PX = 0.15
 """Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
 WINDOW_PX = 7
 CALIBRATION = "calibration.h5"
+DARK = "the picture is dark: no light field to see"
 MANY = 1_000_000
 """Frames that an average stands for whose own noise is not known, and is left out."""
 
@@ -156,9 +158,9 @@ class LiveLightField:
         if shot is None:
             return self._report("the mask is at the place of no shot of this Psi")
         quick, self._seen_s = self._clock() - self._seen_s < CUT_S, self._clock()
-        known = shot in self._held
+        known, dark = shot in self._held, is_dark(frame)
         if not known or self._changed(shot, frame):
-            begins_anew = self._film is None or (known and quick and self._cut(frame))
+            begins_anew = self._film is None or dark or (known and quick and self._cut(frame))
             if known:
                 self._held.clear()
             self._held[shot] = frame
@@ -166,6 +168,8 @@ class LiveLightField:
             if begins_anew:
                 self.close()
                 self._run, self._refined, self._fault = None, None, ""
+        if dark:
+            return self._report(DARK)
         if self._run is not None and self._run.ended:
             self._take(self._run, number)
         try:
@@ -214,7 +218,7 @@ class LiveLightField:
         return bool(cv2.blur(square, (BLOCK_PX, BLOCK_PX)).max() > CHANGED)
 
     def _cut(self, frame: RawFrame) -> bool:
-        """Return whether a frame is not of the scene of the one held, moved on or not."""
+        """Return whether a frame shows another scene than the one held, not the same in motion."""
         one, other = (
             cv2.blur(self._rate(of) * self._reading_per_rate[0], (BLOCK_PX, BLOCK_PX))
             for of in (frame, self._held[0])
@@ -244,7 +248,7 @@ class LiveLightField:
         seen = share > 0
         level = float(readings.mean() / max(seen.mean(), 1e-12))
         if level <= 0:
-            raise ReconstructionError("the picture is dark: no light field to see")
+            raise ReconstructionError(DARK)
         factor = max(self._level / level, level / max(self._level, 1e-12))
         if self.preview is None or factor > ANOTHER_BRIGHTNESS or len(shots) != self._shots:
             psi = self._of_shots()[1]

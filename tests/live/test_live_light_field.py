@@ -445,6 +445,20 @@ def test_a_frame_that_cannot_be_reconstructed_is_reported_and_the_next_goes_on(f
     assert solver.before == [None, 1, 1]
 
 
+def test_a_dark_frame_drops_what_is_at_work_and_is_not_reconstructed(filmed):
+    live, solver, clock, frames = filmed
+    live.update(frames[0])
+    until(lambda: len(solver.asked) == 1)
+    clock.now += 5
+    noise = np.random.default_rng(0).normal(257, 1, SIZE).round().astype(np.uint16)
+    for _ in range(2):
+        reported = live.update(replace(frames[0], mosaic=noise))
+        assert (reported["why"][:19], reported["verdict"]) == ("the picture is dark", None)
+    until(lambda: not threads_at_work())
+    live.update(frames[1])
+    until(lambda: len(solver.asked) == 2)
+
+
 def test_closing_ends_a_film_within_a_step(filmed):
     live, solver, _, frames = filmed
     live.update(frames[0])
