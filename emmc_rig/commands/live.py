@@ -54,7 +54,7 @@ def live(
     ] = None,
     method: Annotated[
         str | None,
-        typer.Option("--method", help="reconstructs the light field while nothing moves"),
+        typer.Option("--method", help="reconstructs the light field beside the preview"),
     ] = None,
     plan: Annotated[
         Path | None,

@@ -1,15 +1,20 @@
-"""The light field while the camera watches: coarse at once, `reconstruct`'s own when nothing moves.
+"""The light field while the camera watches: coarse at once, then as `reconstruct` gives it.
 
-Every frame moves a preview on (`reconstruction.preview`). Once the scene has stood still, a
-reconstruction of the frame that it stands still at runs beside, by the same call as
-`emmc-rig reconstruct` makes, and is dropped as soon as something changes.
+A preview follows every frame (`reconstruction.preview`), until a reconstruction that runs beside it
+takes its place. Methods that take films, with a Psi of one shot, reconstruct while the scene moves:
+when a frame is done, the newest one is the next of the film, and those between are left out. After
+a cut the preview is shown again, and the new scene is begun at once. Other methods begin once the
+scene has stood still, and what they do is dropped as soon as something changes. While the scene
+stands still it is reconstructed once.
 """
 
 from __future__ import annotations
 
 import json
+import statistics
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +32,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
 from emmc_rig.files.psi import PSI
+from emmc_rig.live.alignment import is_dark
 from emmc_rig.live.server import Picture, Pictured, Query
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.errors import SensingError
@@ -38,8 +44,9 @@ from emmc_rig.pages.display import PART_PIXELS
 from emmc_rig.pages.viewer import viewer_data
 from emmc_rig.session.measured_psi import Scale, session_scale
 from emmc_rig.session.session import Session
+from reconstruction.adaptive.film import Film
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import DEFAULT_METHOD
+from reconstruction.methods import DEFAULT_METHOD, find_method
 from reconstruction.preview import Preview
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.verdict.kept import missed_readings
@@ -52,20 +59,31 @@ FACTOR = 4
 STEPS = 3
 """Of the preview for each frame."""
 STILL_S = 1.5
-"""How long nothing changes before the reconstruction begins."""
+"""How long nothing changes before a scene is taken to stand still."""
+SETTLING = 15
+"""Frames of a scene that stands still after which its preview is final: STILL_S at 10 frames/s."""
+RECENT = 5
+"""Reconstructions whose median time is stated: one of them, a first frame's, takes longer."""
 CHANGED = 4.0
 """Mean square of the difference of two frames in a block, over its variance, from which on the
 scene changed: 1 of noise alone, with a deviation of 0.09 over BLOCK_PX^2 pixels."""
+CUT = 0.5
+"""Variance of the difference of two frames' blocks, over the sum of their variances, from which on
+they are not of one scene: 1 where they have nothing in common. `panning-desk` comes to 0.01 within
+0.1 s and 0.25 within 0.5 s, different built-in scenes to 0.65 and more (96x128)."""
+CUT_S = 0.5
+"""Frames farther apart may differ as much because the scene moves."""
 BLOCK_PX = 16
 ANOTHER_BRIGHTNESS = 1.2
 COMPILING_S = 5.0
-"""Without a step, from when on the page says why."""
+"""From when on the page says what the next light field is at; without a step, why."""
 
 Solve = Callable[..., tuple[Reconstruction, Verdict]]
 SURE_PX = 0.15
 """Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
 WINDOW_PX = 7
 CALIBRATION = "calibration.h5"
+DARK = "the picture is dark: no light field to see"
 MANY = 1_000_000
 """Frames that an average stands for whose own noise is not known, and is left out."""
 
@@ -94,14 +112,18 @@ class LiveLightField:
         self._reading_per_rate = np.divide(1, white, where=usable, out=np.zeros(white.shape))
         self._reading_per_rate = self._reading_per_rate.astype(np.float32)
         self._held: dict[int, RawFrame] = {}
-        self._since_s = clock()
+        self._since_s, self._seen_s, self._unsettled = clock(), clock(), SETTLING
         self.preview: Preview | None = None
         self._level = 0.0
         self._pictures: Pictures | None = None
         self._numbers = 0
-        self._lock = threading.Lock()
+        films = scale.psi.shots == 1 and find_method(method).films
+        self._film = Film() if films else None
         self._run: _Refinement | None = None
-        self._drawn: _Refinement | None = None
+        self._done: dict[int, RawFrame] = {}
+        self._refined: tuple[Reconstruction, Verdict] | None = None
+        self._fault = ""
+        self._periods: deque[tuple[float, float]] = deque(maxlen=RECENT)
 
     @property
     def psi(self) -> ImagingMatrix:
@@ -110,20 +132,22 @@ class LiveLightField:
 
     def close(self) -> None:
         """Give up a reconstruction under way."""
-        self._give_up()
+        if self._run is not None:
+            self._run.give_up()
 
     def pictures(self) -> Pictures | None:
         """Return what was drawn last; None before the first."""
         return self._pictures
 
     def refined(self) -> tuple[Reconstruction, Verdict] | None:
-        """Return the finished reconstruction of what stands still; None while there is none."""
-        return None if self._run is None else self._run.result
+        """Return the reconstruction that is shown; None while it is the preview."""
+        return self._refined
 
-    def update(self, frame: RawFrame, shot: int | None = 0) -> dict[str, Any]:
+    def update(self, frame: RawFrame, shot: int | None = 0, number: int = 0) -> dict[str, Any]:
         """Take a frame of a shot (None: of no shot of Psi), and return what there is to say.
 
-        Raises AppError for frames that do not fit Psi.
+        number: of the frame among all that the camera sent. Raises AppError for frames that do not
+        fit Psi.
         """
         expected = self.psi.frames_shape[1:]
         if frame.mosaic.shape != expected:
@@ -133,35 +157,52 @@ class LiveLightField:
             )
         if shot is None:
             return self._report("the mask is at the place of no shot of this Psi")
-        if shot not in self._held or self._changed(shot, frame):
-            if shot in self._held:
+        quick, self._seen_s = self._clock() - self._seen_s < CUT_S, self._clock()
+        known, dark = shot in self._held, is_dark(frame)
+        if not known or self._changed(shot, frame):
+            begins_anew = self._film is None or dark or (known and quick and self._cut(frame))
+            if known:
                 self._held.clear()
             self._held[shot] = frame
-            self._since_s = self._clock()
-            self._give_up()
+            self._since_s, self._unsettled = self._clock(), SETTLING
+            if begins_anew:
+                self.close()
+                self._run, self._refined, self._fault = None, None, ""
+        if dark:
+            return self._report(DARK)
+        if self._run is not None and self._run.ended:
+            self._take(self._run, number)
         try:
-            if self._run is None:
+            if self._refined is None and self._unsettled:
                 self._go_on()
-            if self._run is None and self._clock() - self._since_s >= STILL_S:
-                self._run = _Refinement(*self._problem(), self._method, self._solve)
+                self._unsettled -= 1
+            begins = self._film is not None or self._still()
+            if self._run is None and self._done != self._held and begins:
+                self._run = _Refinement(
+                    *self._problem(), self._method, self._solve, self._film, dict(self._held),
+                    self._clock(), number,
+                )  # fmt: skip
         except (SensingError, ReconstructionError, CalibrationError) as fault:
             return self._report(str(fault))
-        run = self._run
-        if run is not None and run.result is not None and self._drawn is not run:
-            self._drawn = run
-            found = run.result[0]
-            taken = run.frames
-            missed = missed_readings(
-                run.psi, found.light_field, taken.readings, taken.noise_sigma, taken.usable
-            )
-            axes = self.psi.view_axes
-            self._draw(export_of(found.light_field, found.maps, missed, axes))
-        return self._report("")
+        return self._report(self._fault)
 
-    def _give_up(self) -> None:
-        run, self._run = self._run, None
-        if run is not None:
-            run.give_up()
+    def _still(self) -> bool:
+        return self._clock() - self._since_s >= STILL_S
+
+    def _take(self, run: _Refinement, number: int) -> None:
+        """Show what a reconstruction that ended gave, and let the next one go on from it."""
+        self._run, self._done = None, run.of
+        self._refined, self._fault = run.result, run.fault
+        if run.result is None:
+            return
+        found, frames = run.result[0], run.frames
+        self._film = found.film
+        if self._film is not None:
+            self._periods.append((self._clock() - run.begun_s, number - run.number))
+        missed = missed_readings(
+            run.psi, found.light_field, frames.readings, frames.noise_sigma, frames.usable
+        )
+        self._draw(export_of(found.light_field, found.maps, missed, self.psi.view_axes))
 
     def _changed(self, shot: int, frame: RawFrame) -> bool:
         """Return whether a frame differs from the held one of its shot by more than noise."""
@@ -175,6 +216,14 @@ class LiveLightField:
         )
         square = np.where(self._scale.good, (one - other) ** 2 / variance, 1.0)
         return bool(cv2.blur(square, (BLOCK_PX, BLOCK_PX)).max() > CHANGED)
+
+    def _cut(self, frame: RawFrame) -> bool:
+        """Return whether a frame shows another scene than the one held, not the same in motion."""
+        one, other = (
+            cv2.blur(self._rate(of) * self._reading_per_rate[0], (BLOCK_PX, BLOCK_PX))
+            for of in (frame, self._held[0])
+        )
+        return bool((one - other).var() > CUT * (one.var() + other.var()))
 
     def _rate(self, frame: RawFrame) -> NDArray[np.float32]:
         """Return DN per second above the dark, (y, x)."""
@@ -199,7 +248,7 @@ class LiveLightField:
         seen = share > 0
         level = float(readings.mean() / max(seen.mean(), 1e-12))
         if level <= 0:
-            raise ReconstructionError("the picture is dark: no light field to see")
+            raise ReconstructionError(DARK)
         factor = max(self._level / level, level / max(self._level, 1e-12))
         if self.preview is None or factor > ANOTHER_BRIGHTNESS or len(shots) != self._shots:
             psi = self._of_shots()[1]
@@ -252,19 +301,25 @@ class LiveLightField:
         """Return what the page says: what is shown, how far a reconstruction is, the verdict."""
         pictures, run = self._pictures, self._run
         stage, verdict = "preview", None
-        if run is not None and run.result is not None:
-            found, judged = run.result
+        if self._refined is not None:
+            found, judged = self._refined
             stage = (
                 f"{found.method}: {found.status} in {found.seconds:.1f} s, as emmc-rig reconstruct"
             )
             verdict = {"level": judged.level, "words": judged.words}
-        elif run is not None and run.fault:
-            why = run.fault
-        elif run is not None:
-            seconds = time.monotonic() - run.begun_s
-            stage = f"preview; {self._method} at work for {seconds:.0f} s, step {run.step}"
+        seconds = 0 if run is None else self._clock() - run.begun_s
+        if run is not None and (verdict is None or seconds > COMPILING_S):
+            at_work = self._method if verdict is None else "the next one"
+            stage += f"; {at_work} at work for {seconds:.0f} s, step {run.step}"
             if run.step == 0 and seconds > COMPILING_S:
                 stage += ": the first time on a computer it is compiled, for up to a minute or two"
+        if len(self._periods) > 1 and not self._still():
+            every_s = statistics.median_low(took_s for took_s, _ in self._periods)
+            sent = sum(sent for _, sent in self._periods) / sum(took for took, _ in self._periods)
+            stage += (
+                f"; a light field every {every_s:.1f} s ({1 / every_s:.2g} frames/s); the camera "
+                f"sends {sent:.2g}"
+            )
         return {
             "stage": stage,
             "why": why,
@@ -275,15 +330,35 @@ class LiveLightField:
 
 
 class _Refinement:
-    """A reconstruction in a thread of its own, which can be given up between two steps."""
+    """A reconstruction in a thread of its own, which can be given up between two steps.
 
-    def __init__(self, psi: ImagingMatrix, frames: Frames, method: str, solve: Solve) -> None:
+    film: that the frames are the next one of, None: of none. of: the frames by shot. begun_s,
+    number: when it begins, and the number of the newest frame then.
+    """
+
+    def __init__(
+        self,
+        psi: ImagingMatrix,
+        frames: Frames,
+        method: str,
+        solve: Solve,
+        film: Film | None,
+        of: dict[int, RawFrame],
+        begun_s: float,
+        number: int,
+    ) -> None:
         self.result: tuple[Reconstruction, Verdict] | None = None
         self.fault = ""
-        self.step, self.begun_s = 0, time.monotonic()
+        self.step = 0
         self._given_up = threading.Event()
         self.psi, self.frames, self._method, self._solve = psi, frames, method, solve
+        self._film, self.of, self.begun_s, self.number = film, of, begun_s, number
         threading.Thread(target=self._run, name="live reconstruction", daemon=True).start()
+
+    @property
+    def ended(self) -> bool:
+        """Whether there is a result, or a fault."""
+        return self.result is not None or self.fault != ""
 
     def give_up(self) -> None:
         """End at the next step."""
@@ -301,6 +376,7 @@ class _Refinement:
                 None,
                 frames.usable,
                 self._on_step,
+                self._film,
             )
         except _ChangedError:
             return

@@ -172,11 +172,11 @@ class Watch:
             self._news.notify_all()
         if self._driving is not None:
             self._driving.close()
-        if self.light_field is not None:
-            self.light_field.close()
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(PATIENCE_S)
+        if self.light_field is not None:
+            self.light_field.close()
         self._publish()
 
     def newest(self) -> Shown | None:
@@ -657,7 +657,7 @@ class Watch:
             self._ending.wait(POLL_S)
             return
         try:
-            shown = self.light_field.update(newest.frame, self._shot())
+            shown = self.light_field.update(newest.frame, self._shot(), newest.number)
         except AppError as fault:
             self._publish(**{"light field": str(fault)})
             self._ending.wait(RETRY_S)

@@ -1,7 +1,10 @@
-"""The light field while the camera watches: coarse at once, `reconstruct`'s own once all stands."""
+"""The light field while the camera watches: coarse at once, then as `reconstruct` gives it."""
 
 import json
+import threading
 import time
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,10 +14,14 @@ import emmc_rig as emmc
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.live.light_field import LiveLightField, designed_scale, disparity_of, open_scale
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import psnr_db, shifted
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
 from reconstruction.preview import Preview, coarser
+from reconstruction.result import Progress, Reconstruction, Status
+from reconstruction.verdict.rules import Verdict
+from reconstruction.verdict.run import reconstruct_judged
 
 SIZE = (48, 64)
 PATIENCE_S = 60.0
@@ -202,9 +209,7 @@ def test_noise_is_no_change_and_a_changed_scene_ends_the_reconstruction(one_shot
     other = open_scene("deep-occlusions", size=SIZE, views=camera.views).light_field
     clock, given_up = Seconds(), []
 
-    def endless(method, psi, readings, noise, dictionary, settings, usable, on_step):
-        from reconstruction.result import Progress
-
+    def endless(method, psi, readings, noise, dictionary, settings, usable, on_step, film):
         try:
             for step in range(10**6):
                 on_step(Progress(step, None, None))
@@ -276,3 +281,215 @@ def test_a_solver_that_fails_is_reported(one_shot):
     live.update(frame)
     clock.now = 5.0
     until(lambda: live.update(frame)["why"] == "no luck")
+
+
+class Solver:
+    """In place of a solver: it notes what it is given, and ends a frame when `end` is called.
+
+    Each frame becomes the same light field; what it leaves to the next one is its number, from 1.
+    """
+
+    def __init__(self, light_field, clock):
+        self.light_field, self._clock = light_field, clock
+        self.fault = ""
+        self.asked, self.before, self.left = [], [], 0
+        self._ends = threading.Semaphore(0)
+
+    def __call__(self, method, psi, readings, noise, dictionary, settings, usable, on_step, film):
+        self.before.append(film.known)
+        self.asked.append(readings)
+        try:
+            while not self._ends.acquire(timeout=0.005):
+                on_step(Progress(1, None, None))
+        finally:
+            self.left += 1
+        if self.fault:
+            raise ReconstructionError(self.fault)
+        film = replace(film, known=cast(Any, len(self.asked)))
+        status = Status.CONVERGED
+        result = Reconstruction(method, self.light_field, status, "", 9, (), 1.2, {}, film=film)
+        return result, Verdict("trust", (), cast(Any, None))
+
+    def end(self, took_s=1.25):
+        """End the frame at work, once it is, so much later."""
+        until(lambda: len(self.asked) > self.left)
+        self._clock.now += took_s
+        self._ends.release()
+        until(lambda: not threads_at_work())
+
+
+def threads_at_work():
+    return [one for one in threading.enumerate() if one.name == "live reconstruction"]
+
+
+@pytest.fixture(scope="module")
+def scenes(one_shot):
+    """A frame of each of five scenes."""
+    camera, psi, _ = one_shot
+    seen = (
+        open_scene("deep-occlusions", size=SIZE, views=camera.views, seed=seed).light_field
+        for seed in range(5)
+    )
+    return [live_frames(camera, psi, scene)[0] for scene in seen]
+
+
+@pytest.fixture
+def filmed(one_shot, scenes):
+    """A live light field by a method that takes films; its solver and clock; frames that differ."""
+    psi, clock = one_shot[1], Seconds()
+    solver = Solver(np.full(psi.light_field_shape, 0.5, np.float32), clock)
+    live = LiveLightField(designed_scale(psi), "adaptive", solver, clock)
+    yield live, solver, clock, scenes
+    live.close()
+
+
+def readings_of(camera, frame):
+    return camera.sensor.noise.normalise(frame.mosaic[None], frame.exposure_s, 1.0)
+
+
+def test_while_the_scene_moves_the_newest_frame_goes_on_from_the_last_one_done(filmed, one_shot):
+    live, solver, _, frames = filmed
+    for frame in frames[:3]:
+        assert live.update(frame)["verdict"] is None
+    for frame in frames[3:]:
+        solver.end()
+        assert live.update(frame)["verdict"]["level"] == "trust"
+        assert live.pictures().export.light_field is solver.light_field
+    until(lambda: len(solver.asked) == 3)
+    assert solver.before == [None, 1, 2]
+    for readings, frame in zip(solver.asked, (frames[0], *frames[3:]), strict=True):
+        assert readings == pytest.approx(readings_of(one_shot[0], frame), abs=1e-5)
+
+
+def test_the_page_says_how_often_there_is_a_light_field_and_how_often_a_frame(filmed):
+    live, solver, clock, frames = filmed
+    live.update(frames[0], 0, 7)
+    for frame, took_s in zip(frames[1:], (8, 1.3, 1.3), strict=False):
+        solver.end(took_s)
+        reported = live.update(frame, 0, 7 + round(10 * clock.now))
+    said = "; a light field every 1.3 s (0.77 frames/s); the camera sends 10"
+    assert reported["stage"].endswith(said)
+    clock.now += 2
+    assert "every" not in live.update(frames[3], 0, 130)["stage"]
+
+
+def test_of_a_scene_that_stands_still_one_frame_is_reconstructed_until_it_changes(filmed):
+    live, solver, clock, frames = filmed
+    live.update(frames[0])
+    solver.end()
+    for second in range(5):
+        clock.now += 1
+        reported = live.update(replace(frames[0], mosaic=frames[0].mosaic + second % 2))
+        assert reported["stage"] == "adaptive: converged in 1.2 s, as emmc-rig reconstruct"
+    assert len(solver.asked) == 1
+    drawn = live.pictures().number
+    live.update(frames[1])
+    solver.end()
+    assert live.update(frames[1])["pictures"]["number"] == drawn + 1
+    assert solver.before == [None, 1]
+    assert not threads_at_work()
+
+
+def test_the_preview_is_shown_before_the_first_light_field_and_after_a_cut_only(filmed, one_shot):
+    live, solver, _, frames = filmed
+    camera, psi, scene = one_shot
+    (still,), (moved,) = (
+        live_frames(camera, psi, np.roll(scene, by_px, axis=3)) for by_px in (0, 2)
+    )
+    live.update(still)
+    assert live.pictures().block == 4
+    solver.end()
+    for _ in range(2):
+        assert live.update(moved)["verdict"] is not None
+        assert live.pictures().block == 1
+    until(lambda: len(solver.asked) == 2)
+    assert live.update(frames[0])["stage"].startswith("preview; adaptive at work")
+    assert live.pictures().block == 4
+    # The frame at work was of before the cut: it is given up, and the new scene begins at once.
+    until(lambda: len(solver.asked) == 3)
+    solver.end()
+    assert live.update(frames[0])["verdict"] is not None
+    assert live.pictures().block == 1
+    assert solver.before == [None, 1, 1]
+
+
+def test_frames_far_apart_are_of_one_scene_that_moves_however_they_differ(filmed, one_shot):
+    live, solver, clock, frames = filmed
+    camera, psi, scene = one_shot
+    live.update(*live_frames(camera, psi, scene))
+    solver.end()
+    live.update(frames[0])
+    until(lambda: live._run.step)
+    clock.now += 6
+    assert "; the next one at work for 6 s, step 1" in live.update(frames[1])["stage"]
+    assert live.pictures().block == 1
+    assert len(solver.asked) == 2
+
+
+def test_a_frame_that_cannot_be_reconstructed_is_reported_and_the_next_goes_on(filmed):
+    live, solver, _, frames = filmed
+    live.update(frames[0])
+    solver.end()
+    live.update(frames[1])
+    until(lambda: len(solver.asked) == 2)
+    solver.fault = "no luck"
+    solver.end()
+    reported = live.update(frames[2])
+    assert (reported["why"], reported["verdict"]) == ("no luck", None)
+    assert live.pictures().block == 4
+    until(lambda: len(solver.asked) == 3)
+    solver.fault = ""
+    solver.end()
+    reported = live.update(frames[2])
+    assert (reported["why"], reported["verdict"]["level"]) == ("", "trust")
+    assert solver.before == [None, 1, 1]
+
+
+def test_a_dark_frame_drops_what_is_at_work_and_is_not_reconstructed(filmed):
+    live, solver, clock, frames = filmed
+    live.update(frames[0])
+    until(lambda: len(solver.asked) == 1)
+    clock.now += 5
+    noise = np.random.default_rng(0).normal(257, 1, SIZE).round().astype(np.uint16)
+    for _ in range(2):
+        reported = live.update(replace(frames[0], mosaic=noise))
+        assert (reported["why"][:19], reported["verdict"]) == ("the picture is dark", None)
+    until(lambda: not threads_at_work())
+    live.update(frames[1])
+    until(lambda: len(solver.asked) == 2)
+
+
+def test_closing_ends_a_film_within_a_step(filmed):
+    live, solver, _, frames = filmed
+    live.update(frames[0])
+    until(lambda: len(solver.asked) == 1)
+    live.close()
+    until(lambda: not threads_at_work())
+    assert solver.left == 1
+    assert live.refined() is None
+
+
+def test_a_live_film_is_what_reconstruct_film_gives_of_its_frames_a_cut_included(one_shot, scenes):
+    camera, psi, scene = one_shot
+    given = []
+
+    def noted(*taken):
+        given.append(taken)
+        return reconstruct_judged(*taken)
+
+    live = LiveLightField(designed_scale(psi), "adaptive-fast", noted)
+    moved = np.roll(scene, 1, axis=3)
+    shown = []
+    for frame in (*live_frames(camera, psi, scene), *live_frames(camera, psi, moved), scenes[0]):
+        live.update(frame)
+        until(lambda frame=frame: live.update(frame) and live._run is None)
+        shown.append(live.refined())
+    film = (
+        Frames(readings, np.full(readings.shape, noise), usable)
+        for _, _, readings, noise, _, _, usable, *_ in given
+    )
+    expected = list(emmc.reconstruct_film(psi, film, "adaptive-fast"))
+    for (found, verdict), result in zip(shown, expected, strict=True):
+        np.testing.assert_allclose(found.light_field, result.light_field, atol=1e-4)
+        assert verdict.level == result.verdict.level
+    assert ["new_share" in found.parameters for found, _ in shown] == [False, True, False]
