@@ -176,13 +176,19 @@ class Film:
     def shown(self, psi: ImagingMatrix) -> list[tuple[Readings, Array]]:
         """Return frames before, each with its picture, where masks move; none of masks that rest.
 
-        psi: of the present frame.
+        psi: of the present frame; raises ReconstructionError where it is of another size.
         """
-        if self.known is None or np.array_equal(
-            self.known.earlier[-1].readings.psi.weights, psi.weights
-        ):
+        if self.known is None:
             return []
         latest, scale = self.known.earlier[-self.settings.together :], self.known.scale
+        before = latest[-1].readings.psi
+        if before.size != psi.size:
+            raise ReconstructionError(
+                f"frames before were of {'x'.join(map(str, before.size))} samples, this Psi is of "
+                f"{'x'.join(map(str, psi.size))}"
+            )
+        if np.array_equal(before.weights, psi.weights):
+            return []
         return [(one.readings.over(1 / scale), np.float32(scale) * one.picture) for one in latest]
 
 
@@ -219,12 +225,6 @@ def followed(
     before, own, psi = film.known, film.settings, given.psi
     assert before is not None
     margin = before.margin
-    latest = before.earlier[-1]
-    if latest.picture.shape[:2] != psi.size:
-        raise ReconstructionError(
-            f"frames before were of {'x'.join(map(str, latest.picture.shape[:2]))} samples, this "
-            f"Psi is of {'x'.join(map(str, psi.size))}"
-        )
     plain = plain_of(given, before.scale, unseen_by(given), settings.start_steps)
     bright, used = plain.bright, given.usable & ~plain.held
     nearer = 1 if settings.nearer == "larger" else -1
@@ -236,7 +236,7 @@ def followed(
         surfaces = surfaces_of(psi, centre, margin, nearer, len(texture))
         return centre, texture, bright.frames - surfaces.forward(texture)
 
-    there, back = flow_between(latest.picture, plain.picture)
+    there, back = flow_between(before.earlier[-1].picture, plain.picture)
     moving, resting = carried_by(back), carried_by(np.zeros_like(back))
     missed, missed_still = (
         mean_around(np.square(of), used.astype(np.float32), WINDOW_PX).sum(axis=0)

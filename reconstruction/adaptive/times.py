@@ -38,6 +38,8 @@ few readings that are kept from every fit."""
 ANOTHER = 4.0
 """Times the mean square that total variation misses held-out readings by, from which on what it
 foretells of another time's is of another scene."""
+LEAST_SEEN = 0.3
+"""Share of another time's readings that must be of this scene, without which none counts."""
 
 REST, REST_PX = 1.12, 2.0
 """Where what total variation foretells without motion misses readings by no more than so many times
@@ -120,7 +122,7 @@ def aligned(one: OtherTime, binning: int) -> Readings:
     last = np.array(moves.shape[:2])[:, None, None] - 1
     inside, (y, x) = ((at >= 0) & (at <= last)).all(axis=0), np.clip(at, 0, last)
     rows, columns = (
-        k * along.repeat(k, axis=0).repeat(k, axis=1) + within
+        k * _of_samples(along, one.back) + within
         for along, within in zip((y, x), np.indices(theirs.psi.size) % k, strict=True)
     )
     weights = np.moveaxis(theirs.psi.weights, 4, 3)[..., rows, columns]
@@ -184,15 +186,15 @@ def others_of(plain: Plain, shown: Sequence[tuple[Readings, Array]]) -> list[Oth
         inside = ((places >= 0) & (places <= np.array(same.shape) - 1)).all(axis=-1)
         moving = 1 - (1 - RESTING) * cv2.GaussianBlur(rests, (0, 0), REST_PX)
         used = readings.usable & same & inside
+        used &= used.mean() >= LEAST_SEEN
         found.append(OtherTime(readings, used, picture, there, back, moving))
     return found
 
 
 def rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
     """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
-    k = len(back) // len(rests)
     smooth = np.asarray(cv2.GaussianBlur(rests, (0, 0), REST_PX), dtype=np.float32)
-    rests = smooth.repeat(k, axis=0).repeat(k, axis=1)
+    rests = _of_samples(smooth, back)
     then = sampled(rests, at_places(rests.shape) + there)
     return there * (1 - then)[..., None], back * (1 - rests)[..., None]
 
@@ -225,10 +227,18 @@ def of_present(survey: Survey, given: Readings) -> Survey:
     )
 
 
+def _of_samples(pixels: NDArray, of: Array) -> NDArray:
+    """Return values of pixels at each of their samples; of: an array (y, x, ...) of these."""
+    k = len(of) // len(pixels)
+    return pixels.repeat(k, axis=0).repeat(k, axis=1)
+
+
 def moved(others: Sequence[OtherTime]) -> dict[str, float]:
-    """Return by how much the scene moved to other times, pixels, and the share of it seen there."""
-    by = np.concatenate([np.linalg.norm(one.there[one.used[0]], axis=-1) for one in others])
+    """Return by how much the scene moved to the furthest time, pixels, and what share is seen."""
+    steps = (
+        np.linalg.norm(one.there[_of_samples(one.used[0], one.there)], axis=-1) for one in others
+    )
     return {
-        "moved_px": float(np.median(by)) if len(by) else 0.0,
+        "moved_px": max((float(np.median(by)) for by in steps if by.size), default=0.0),
         "seen_share": float(np.mean([one.used.mean() for one in others])),
     }

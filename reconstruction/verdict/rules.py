@@ -54,8 +54,6 @@ MOTION = Limits(1.0, 5.0)
 """Ratio by which shots saw different scenes; refused only where nobody knows which shots, as that
 cannot be mended: where they are 7 dB or more worse for it, it is 2 to 13 (built-in scenes, 64x80,
 two and three shots, `tv`)."""
-LEAST_MOTION_PX = 0.1
-"""Median motion between shots from which on it is said."""
 OFF = Limits(0.0215, 0.05)
 """Share of readings that differ from all their neighbours. In clean frames of fine soil and leaves
 it is up to 2 %."""
@@ -248,16 +246,6 @@ def _shots(e: Evidence) -> Iterator[Reason]:
             e.motion,
             remedy,
             MOTION.level(e.motion) if shot is None else "doubt",
-        )
-
-    moved_px = e.parameters.get("moved_px", 0.0)
-    if moved_px >= LEAST_MOTION_PX:
-        yield Reason(
-            f"the scene moved by about {moved_px:.1f} pixels: what other shots saw is carried to "
-            "the time of this light field",
-            moved_px,
-            "hold scene and camera still",
-            "trust",
         )
 
 

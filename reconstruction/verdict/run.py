@@ -101,6 +101,12 @@ def reconstruct_judged(
         took = result.seconds
         del result
         result = solved(readings, fitted, took, moving=True)
+        moved_px, seen = (result.parameters[name] for name in ("moved_px", "seen_share"))
+        notes = (
+            *notes,
+            f"the scene moved by up to {moved_px:.1f} pixels between the shots: the light field is "
+            f"that of shot 1, to whose time {seen:.0%} of the other shots are carried",
+        )
         psi, read, shown, found = psi.of_shots([0]), read.of_first_shot(), shown[:1], None
         seen = relief(psi, shown, typical, read.usable)
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))

@@ -37,7 +37,7 @@ from reconstruction.adaptive.search import (
     variance_per_pixel,
 )
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import checked, surveyed
+from reconstruction.adaptive.survey import Readings, checked, surveyed
 from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.uncertainty import (
     FEATURES,
@@ -610,7 +610,6 @@ def test_a_sweep_with_the_right_texture_mends_a_wrong_disparity(bayer):
     truth, surfaces = plane_scene(bayer, 0.75)
     frames = bayer.forward(truth.astype(np.float32))
     texture = textured(surfaces.texture_shape[1:])
-    missed = frames - plane_frames(bayer, texture, 0.0, surfaces.margin)
     labels = np.arange(-1, 1.1, 0.25)
     # All patches but one in the even part believe in 0, though not firmly.
     beliefs = np.full((3, 3, len(labels)), 0.05, np.float32)
@@ -620,6 +619,8 @@ def test_a_sweep_with_the_right_texture_mends_a_wrong_disparity(bayer):
     volume = Volume(labels, at, beliefs, beliefs, np.zeros((3, 3), int), beliefs[..., 0] > 0)
     noise = np.full(frames.shape, 1e-5, np.float32)
     used = np.ones(frames.shape, bool)
-    found = swept(volume, bayer, frames, noise, used, texture, missed, surfaces.margin, 0.04, 0.05)
+    rays = np.zeros_like(surfaces.disparity)
+    wrong = Surfaces(bayer, rays, np.zeros(rays.shape, np.uint8), surfaces.margin)
+    found = swept(volume, Readings(bayer, frames, 0.003, noise, used), texture, wrong, 0.04, 0.05)
     disparity = per_pixel(found, bayer.size, 1)[4:-4, 26:-6]
     assert np.mean(np.abs(disparity - 0.75) < 0.13) > 0.9

@@ -7,10 +7,11 @@ import pytest
 
 from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.film import Earlier, Film
+from reconstruction.adaptive.film import Film
 from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
 from reconstruction.adaptive.joint import surfaces_of
 from reconstruction.adaptive.survey import Readings
+from reconstruction.adaptive.times import OtherTime
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import reconstruct
 from simulators.scenes import render
@@ -73,7 +74,7 @@ def test_an_earlier_frame_sees_the_present_texture_where_it_was(psi):
     margin, shape = 8, (SIZE[0] + 16, SIZE[1] + 16)
     texture = rng.random((3, *shape), dtype=np.float32)
     centre = np.full(shape, 0.75, np.float32)
-    there = np.zeros((*shape, 2), np.float32) + np.array((2, -3), np.float32)
+    there = np.zeros((*SIZE, 2), np.float32) + np.array((2, -3), np.float32)
     readings = Readings(
         psi,
         np.zeros(psi.frames_shape),
@@ -81,7 +82,7 @@ def test_an_earlier_frame_sees_the_present_texture_where_it_was(psi):
         np.ones(psi.frames_shape),
         np.ones(psi.frames_shape, bool),
     )
-    earlier = Earlier(readings, readings.usable, there, -there)
+    earlier = OtherTime(readings, readings.usable, np.zeros((*SIZE, 3)), there, -there)
     seen = earlier.surfaces(centre, margin, 1, 3).forward(texture)
     then = np.roll(texture, (-2, 3), axis=(1, 2))
     expected = surfaces_of(psi, centre, margin, 1).forward(then)
@@ -117,25 +118,28 @@ def test_a_film_is_more_accurate_than_its_frames_alone(followed):
 def _last_psnr_db(psi, followed, of_earlier):
     """Return the PSNR of the last frame, with the earlier frames that it goes on from changed."""
     film = followed[-2][1].film
-    known = replace(film.known, earlier=tuple(of_earlier(film.known.earlier)))
+    known = replace(film.known, earlier=tuple(of_earlier(one) for one in film.known.earlier))
     shown = _readings(psi, followed[-1][0], len(followed) - 1)
     given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
     result = reconstruct(*given, film=replace(film, known=known))
     return psnr_db(result.light_field, followed[-1][0])
 
 
+def _unused(one):
+    return replace(one, used=np.zeros_like(one.used))
+
+
 def test_earlier_frames_themselves_make_the_next_one_more_accurate(psi, followed):
-    alone_db = _last_psnr_db(psi, followed, lambda earlier: ())
+    alone_db = _last_psnr_db(psi, followed, _unused)
     assert psnr_db(followed[-1][1].light_field, followed[-1][0]) > alone_db + LEAST_GAIN_DB
 
 
 def test_earlier_frames_of_something_else_do_next_to_no_harm(psi, followed):
-    def of_something_else(earlier):
-        for one in earlier:
-            frames = np.ascontiguousarray(one.readings.frames[:, ::-1, ::-1])
-            yield replace(one, readings=replace(one.readings, frames=frames))
+    def of_something_else(one):
+        frames = np.ascontiguousarray(one.readings.frames[:, ::-1, ::-1])
+        return replace(one, readings=replace(one.readings, frames=frames))
 
-    alone_db = _last_psnr_db(psi, followed, lambda earlier: ())
+    alone_db = _last_psnr_db(psi, followed, _unused)
     assert _last_psnr_db(psi, followed, of_something_else) > alone_db - MOST_LOSS_DB
 
 
@@ -163,6 +167,19 @@ def test_after_a_cut_a_frame_is_a_first_one(psi, followed):
     result = reconstruct(*given, film=followed[-1][1].film)
     assert "new_share" not in result.parameters
     assert np.array_equal(result.light_field, reconstruct(*given).light_field)
+
+
+def test_a_frame_that_earlier_ones_mislead_is_a_first_one(psi, followed):
+    truth, result, alone = followed[-1]
+    film = followed[-2][1].film
+    easier = replace(film, known=replace(film.known, missed=0.5 * film.known.missed))
+    shown = _readings(psi, truth, len(followed) - 1)
+    given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    found = reconstruct(*given, film=easier)
+    assert "new_share" in result.parameters
+    assert "new_share" not in found.parameters
+    assert np.array_equal(found.light_field, alone.light_field)
+    assert found.film.known.missed == easier.known.missed
 
 
 def test_what_rests_has_no_flow(psi):
