@@ -34,7 +34,7 @@ MOVING_HZ = 10
 Array = NDArray[np.floating]
 
 
-def _window(whole: Array, size: tuple[int, int], move_px: Array, disparity: float = 0.0) -> Array:
+def window(whole: Array, size: tuple[int, int], move_px: Array, disparity: float = 0.0) -> Array:
     """Return a window of a light field whose content is moved, and nearer by a disparity."""
     middle = [(length - side) // 2 for length, side in zip(whole.shape[2:4], size, strict=True)]
     steps = np.floor(move_px).astype(int)
@@ -58,12 +58,12 @@ def frame_of(scene: str, other: str, motion: str, size: tuple[int, int], frame: 
     """Return the light field (v, u, y, x, c) before the camera at a frame."""
     if scene in MOVING_SCENES:
         return render(scene, (5, 5), size, time_s=frame / MOVING_HZ).light_field
-    whole, move = _opened(scene), np.array(PAN_PX[motion]) * frame
-    out = _window(whole, size, move)
+    whole, move = opened(scene), np.array(PAN_PX[motion]) * frame
+    out = window(whole, size, move)
     if motion != PASSES:
         return out
     passed = np.array(DISC_PX) * frame
-    disc = _window(_opened(other), size, passed, DISC_DISPARITY)
+    disc = window(opened(other), size, passed, DISC_DISPARITY)
     rows, columns = np.indices(size, dtype=np.float32)
     radius = DISC_RADIUS * size[0]
     for v, u in np.ndindex(out.shape[:2]):
@@ -75,7 +75,8 @@ def frame_of(scene: str, other: str, motion: str, size: tuple[int, int], frame: 
 
 
 @lru_cache(maxsize=2)
-def _opened(scene: str) -> Array:
+def opened(scene: str) -> Array:
+    """Return the whole light field of a scene that stands still."""
     size = (192, 256) if scene in SCENES else None
     return np.asarray(open_scene(scene, size, (5, 5), 0).light_field, dtype=np.float32)
 

@@ -83,6 +83,8 @@ DAMAGED = (
     ReconstructionError, SensingError,
 )  # fmt: skip
 """What reading a damaged file of an earlier run raises, or one that is not there."""
+FOLLOWS = {"new_share", "moved_px"}
+"""Parameters of frames that go on from those before, by masks that rest and that step."""
 FILM_TAKES = "an array (t, pixel_y, pixel_x), or an iterable of Frames of one shot each"
 
 
@@ -471,7 +473,7 @@ def _metrics(
     anew = [
         one["frame"]
         for before, one in pairwise(done)
-        if one["segment"] == before["segment"] and "new_share" not in one["parameters"]
+        if one["segment"] == before["segment"] and not FOLLOWS & one["parameters"].keys()
     ]
     took_s = sum(one["seconds"] for one in done)
     levels = Counter(one["verdict"]["level"] for one in done)
