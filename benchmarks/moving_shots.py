@@ -7,6 +7,7 @@ At rest the shots are a film, too: its last frame against all shots of one captu
 from __future__ import annotations
 
 import time
+from functools import lru_cache
 
 import lab
 import numpy as np
@@ -21,7 +22,7 @@ from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import MOVING_SCENES
 
-STEPS_PX = (0.0, 0.3, 1.0, 2.5, 5.0)
+STEPS_PX = (0.3, 1.0, 2.5, 5.0)
 """By which a shot's content moves on from the one before."""
 DIRECTION = np.array([0.3, 0.954])
 WITHOUT_PATCHES = MethodSettings(adaptive=AdaptiveSettings(patches=None))
@@ -34,64 +35,73 @@ def _seen(scene: str, size: tuple[int, int], step_px: float, shot: int) -> np.nd
     return window(opened(scene), size, step_px * shot * DIRECTION)
 
 
-def measure(
+def _captured(
     scene: str, camera: str, shots: int, size: tuple[int, int], seed: int, step_px: float
-) -> dict:
-    """Return the PSNR of the first shot's light field, and of a film's last frame at rest.
-
-    rest_db, cpu_s: of shots at rest, and the time of the reconstruction; alone_db: of the first
-    shot alone; moved_db, moved_cpu_s: of the shots as they moved; verdict, inside: of the latter,
-    and whether its PSNR lies in the interval stated. Of a step of 0: film_db, of the last frame of
-    the shots as a film; together_db: of all shots at once without patches, which films do not have.
-    """
+):
+    """Return Psi, and the frames of shots between which the scene moves."""
     described = find_camera(camera).with_shots(shots)
     psi = build_imaging_matrix(described, size)
-    truth = _seen(scene, size, step_px, 0)
+    clean = [
+        psi.of_shots([shot]).forward(_seen(scene, size, step_px, shot)) for shot in range(shots)
+    ]
+    return psi, described.read_out(np.maximum(np.concatenate(clean), 0), seed)
 
-    def captured(step_px: float):
-        clean = [
-            psi.of_shots([shot]).forward(_seen(scene, size, step_px, shot)) for shot in range(shots)
-        ]
-        return described.read_out(np.maximum(np.concatenate(clean), 0), seed)
 
-    def judged(shown):
-        started = time.process_time()
-        found = reconstruct_judged(
-            "adaptive", psi, shown.readings, shown.noise_sigma, usable=shown.usable
-        )
-        return *found, time.process_time() - started
+def _judged(psi, shown):
+    """Return the reconstruction, the verdict, and the processor time of both."""
+    started, given = time.process_time(), (psi, shown.readings, shown.noise_sigma)
+    found = reconstruct_judged("adaptive", *given, usable=shown.usable)
+    return *found, time.process_time() - started
 
-    rest, moved = captured(0.0), captured(step_px)
-    (at_rest, _, cpu_s), (result, verdict, moved_cpu_s) = judged(rest), judged(moved)
-    found_db = psnr_db(result.light_field, truth)
-    low_db, high_db = result.stated["stated_interval_db"] or (np.nan, np.nan)
+
+@lru_cache(maxsize=1)
+def _at_rest(scene: str, camera: str, shots: int, size: tuple[int, int], seed: int) -> dict:
+    """Return what is reached without motion, see `measure`."""
+    psi, rest = _captured(scene, camera, shots, size, seed, 0.0)
+    truth = _seen(scene, size, 0.0, 0)
 
     def one(shot: int, film: Film | None = None):
         given = rest.readings[[shot]], rest.noise_sigma, None, None, rest.usable[[shot]]
         return reconstruct("adaptive", psi.of_shots([shot]), *given, film=film)
 
-    out = {
+    last = one(0, Film())
+    alone = last.light_field
+    for shot in range(1, shots):
+        last = one(shot, last.film)
+    given = psi, rest.readings, rest.noise_sigma, None, WITHOUT_PATCHES, rest.usable
+    together = reconstruct("adaptive", *given)
+    at_rest, _, cpu_s = _judged(psi, rest)
+    return {
         "rest_db": psnr_db(at_rest.light_field, truth),
-        "alone_db": psnr_db(one(0).light_field, truth),
-        "moved_db": found_db,
+        "alone_db": psnr_db(alone, truth),
+        "film_db": psnr_db(last.light_field, truth),
+        "together_db": psnr_db(together.light_field, truth),
         "cpu_s": cpu_s,
-        "moved_cpu_s": moved_cpu_s,
+    }
+
+
+def measure(
+    scene: str, camera: str, shots: int, size: tuple[int, int], seed: int, step_px: float
+) -> dict:
+    """Return the PSNR of the light field before the first shot.
+
+    moved_db, moved_cpu_s: of shots as they moved, and the time of their reconstruction; moved_px:
+    what it states; verdict, inside: whether it is trusted, and its PSNR in the interval stated.
+    rest_db, cpu_s: of shots at rest; alone_db: of the first alone; film_db: of the last, of a film
+    of the shots at rest; together_db: of all these without patches, which films do not have.
+    """
+    psi, moved = _captured(scene, camera, shots, size, seed, step_px)
+    result, verdict, cpu_s = _judged(psi, moved)
+    found_db = psnr_db(result.light_field, _seen(scene, size, step_px, 0))
+    low_db, high_db = result.stated["stated_interval_db"] or (np.nan, np.nan)
+    return {
+        "moved_db": found_db,
+        "moved_cpu_s": cpu_s,
         "verdict": verdict.level,
         "moved_px": result.parameters.get("moved_px", np.nan),
         "inside": low_db <= found_db <= high_db,
-        "film_db": np.nan,
-        "together_db": np.nan,
+        **_at_rest(scene, camera, shots, size, seed),
     }
-    if step_px == 0:
-        film = Film()
-        for shot in range(shots):
-            last = one(shot, film)
-            film = last.film
-        given = psi, rest.readings, rest.noise_sigma, None, WITHOUT_PATCHES, rest.usable
-        together = reconstruct("adaptive", *given)
-        out["film_db"] = psnr_db(last.light_field, truth)
-        out["together_db"] = psnr_db(together.light_field, truth)
-    return out
 
 
 def main() -> None:
@@ -100,7 +110,7 @@ def main() -> None:
     parser.add_argument("--shots", type=int, default=3)
     parser.add_argument("--step", action="append", type=float, help=f"default: {STEPS_PX}")
     args = lab.parsed(parser)
-    steps = args.step or ((0.0, 1.0) if args.smallest else STEPS_PX)
+    steps = args.step or (STEPS_PX[:1] if args.smallest else STEPS_PX)
     points = [
         {
             "scene": scene, "camera": args.camera, "shots": args.shots, "size": args.size,

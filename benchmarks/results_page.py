@@ -234,11 +234,10 @@ def moving_shots() -> Section:
         (row["scene"], number(row, "step_px")): number(row, "moved_db") - number(row, "rest_db")
         for row in rows
     }
-    moving = [step for step in steps if step]
-    dots = {f"{step:g} px": [over[scene, step] for scene in scenes] for step in moving}
-    loss = mean(over[scene, step] for scene in scenes for step in moving)
+    dots = {f"{step:g} px": [over[scene, step] for scene in scenes] for step in steps}
+    loss = mean(over.values())
     table = [("motion a shot", "over rest", "least", "over one shot alone", "trusted", "inside")]
-    for step in moving:
+    for step in steps:
         of = [row for row in rows if number(row, "step_px") == step]
         own = [over[row["scene"], step] for row in of]
         alone = mean(number(row, "moved_db") - number(row, "alone_db") for row in of)
@@ -250,14 +249,14 @@ def moving_shots() -> Section:
                 f"{trusted} of {len(of)}", f"{inside} of {len(of)}",
             )
         )  # fmt: skip
-    rest = [number(row, "film_db") - number(row, "together_db") for row in rows if row["film_db"]]
+    film = {row["scene"]: number(row, "film_db") - number(row, "together_db") for row in rows}
     return Section(
         "Does a capture survive motion between its shots?",
-        f"Three shots of a scene that moves by {min(moving):g} to {max(moving):g} pixels a shot "
+        f"Three shots of a scene that moves by {min(steps):g} to {max(steps):g} pixels a shot "
         f"have {loss:+.1f} dB over the same at rest.",
         f"To the right is better. {len(scenes)} light fields slide before the camera, 96x128. At "
         f"rest, the last of three frames of a film has {mean(rest):+.1f} dB over all shots of one "
-        "capture, without patches.",
+        "one capture, without patches.",
         ("moving-shots",),
         {
             "moving-shots": svg_charts.dots(

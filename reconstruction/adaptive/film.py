@@ -68,7 +68,7 @@ class FilmSettings(Settings):
     )
     earlier: int = Field(default=2, ge=1, description="frames before that are fitted, too")
     together: int = Field(
-        default=4, ge=1, description="frames before, searched with the present one, of moving masks"
+        default=4, ge=1, description="frames before that are searched, too, of masks that step"
     )
     segment: int = Field(default=0, ge=0)
 

@@ -40,12 +40,12 @@ ANOTHER = 4.0
 foretells of another time's is of another scene."""
 LEAST_SEEN = 0.3
 """Share of another time's readings that must be of this scene, without which none counts."""
-
 REST, REST_PX = 1.12, 2.0
 """Where what total variation foretells without motion misses readings by no more than so many times
 what it misses with, the scene rests: by 0.95 to 1.12 at rest, by 1.2 to 2 of motions of 0.3 px.
 And the deviation by which such places are blurred."""
 RESTING, ALL_MOVES = np.float32(0.1), np.float32(1)
+"""Share of what is missed by which readings are doubted: where the scene rests, and elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,13 +161,13 @@ def others_of(plain: Plain, shown: Sequence[tuple[Readings, Array]]) -> list[Oth
     (y, x, c) of each. Readings are used where they may show the same scene: inside of the present
     picture, and not far from what total variation foretells there.
     """
-    given = plain.given
-    k, weight = given.psi.binning, plain.held.astype(np.float32)
+    psi = plain.given.psi
+    k, weight = psi.binning, plain.held.astype(np.float32)
     allowed = mean_around(np.square(plain.plain_residual), weight, HELD_WINDOW_PX)[0]
     light_field, found = mixture.values(plain.plain), []
     for readings, picture in shown:
         there, back = flow_between(picture, plain.picture)
-        at = at_places(there.shape[:2])
+        at = at_places(psi.size)
         views = light_field.reshape(-1, *light_field.shape[2:])
         then = np.stack([sampled(one, at + there) for one in views]).reshape(light_field.shape)
         weight = readings.usable.astype(np.float32)
@@ -179,7 +179,7 @@ def others_of(plain: Plain, shown: Sequence[tuple[Readings, Array]]) -> list[Oth
         )
         rests = (still <= REST * moves).astype(np.float32)
         there, back = rested(there, back, rests)
-        places = (at + there)[k // 2 :: k, k // 2 :: k] / k
+        places = at_places(allowed.shape) + there[k // 2 :: k, k // 2 :: k] / np.float32(k)
         same = (sampled(allowed, places) * ANOTHER >= np.minimum(moves, still)) & (
             sampled(plain.held[0].astype(np.float32), places) < 0.5
         )

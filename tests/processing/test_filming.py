@@ -321,7 +321,8 @@ def shared(session, out, pool, monkeypatch, **more):
 
 
 def test_a_segment_begins_as_a_first_frame_does(session, whole, in_two, tmp_path, run):
-    assert film_metrics(in_two)["begun_anew"] == film_metrics(whole)["begun_anew"]
+    anew = [film_metrics(one)["begun_anew"] for one in (in_two, whole)]
+    assert [place for place in anew[0] if place < 4] == [place for place in anew[1] if place < 4]
     code, _, err = run("reconstruct", session, "--frame", 4, "--method", METHOD, "--out", tmp_path)
     assert code == 0, err
     names = [f"frames/{place:06d}/light_field.h5" for place in (3, 4, 5)]
@@ -419,13 +420,15 @@ def psi():
     return emmc.camera("rgbw-bayer-2shots").psi((24, 32))
 
 
-def readings(psi, count):
-    """Return noisy readings (t, y, x) of a scene that slides by a pixel a frame."""
+def readings(psi, count, step=1):
+    """Return noisy readings (t, y, x) of a scene that slides by `step` pixels a frame."""
     rng, shots = np.random.default_rng(0), psi.shots
     scene = np.asarray(emmc.scene("near-planar", size=(24, 32 + count)))
     film = []
     for place in range(count):
-        moved = np.ascontiguousarray(scene[:, :, :, place : place + 32], dtype=np.float32)
+        moved = np.ascontiguousarray(
+            scene[:, :, :, step * place : step * place + 32], dtype=np.float32
+        )
         film.append((psi @ moved)[place % shots])
     return np.stack(film) + rng.normal(0, 0.003, (count, 24, 32)).astype(np.float32)
 
@@ -472,7 +475,7 @@ def test_what_is_no_film_is_refused(psi, wrong):
     "changed", [{"earlier": 1}, {"misfit": 0.02}, {"texture": {"steps": 5}}, {"segment": 2}]
 )
 def test_settings_of_films_reach_the_frames_after_the_first(psi, changed):
-    shown = readings(psi, 3)
+    shown = readings(psi, 3, step=0)
     usual, other = (
         [one.light_field for one in emmc.reconstruct_film(psi, shown, METHOD, settings=settings)]
         for settings in ({"film": {"earlier": 2}}, {"film": changed})
