@@ -472,12 +472,20 @@ def test_what_is_no_film_is_refused(psi, wrong):
 
 
 @pytest.mark.parametrize(
-    "changed", [{"earlier": 1}, {"misfit": 0.02}, {"texture": {"steps": 5}}, {"segment": 2}]
+    ("steps", "changed"),
+    [
+        (False, {"earlier": 1}),
+        (False, {"misfit": 0.02}),
+        (False, {"texture": {"steps": 5}}),
+        (False, {"segment": 2}),
+        (True, {"together": 1}),
+    ],
 )
-def test_settings_of_films_reach_the_frames_after_the_first(psi, changed):
-    shown = readings(psi, 3, step=0)
+def test_settings_of_films_reach_the_frames_after_the_first(psi, steps, changed):
+    masks = psi if steps else psi.of_shots([0])
+    shown = readings(masks, 3, step=0)
     usual, other = (
-        [one.light_field for one in emmc.reconstruct_film(psi, shown, METHOD, settings=settings)]
+        [one.light_field for one in emmc.reconstruct_film(masks, shown, METHOD, settings=settings)]
         for settings in ({"film": {"earlier": 2}}, {"film": changed})
     )
     np.testing.assert_array_equal(usual[0], other[0])
