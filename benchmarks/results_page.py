@@ -255,8 +255,8 @@ def moving_shots() -> Section:
         f"Three shots of a scene that moves by {min(steps):g} to {max(steps):g} pixels a shot "
         f"have {loss:+.1f} dB over the same at rest.",
         f"To the right is better. {len(scenes)} light fields slide before the camera, 96x128. At "
-        f"rest, the last of three frames of a film has {mean(film.values()):+.1f} dB over all shots of "
-        "one capture, without patches.",
+        f"rest, the last of three frames of a film has {mean(film.values()):+.1f} dB over all "
+        "shots of one capture, without patches.",
         ("moving-shots",),
         {
             "moving-shots": svg_charts.dots(

@@ -483,9 +483,12 @@ def test_what_is_no_film_is_refused(psi, wrong):
 )
 def test_settings_of_films_reach_the_frames_after_the_first(psi, steps, changed):
     masks = psi if steps else psi.of_shots([0])
-    shown = readings(masks, 3, step=0)
+    given = masks, readings(masks, 3, step=0), METHOD
     usual, other = (
-        [one.light_field for one in emmc.reconstruct_film(masks, shown, METHOD, settings=settings)]
+        [
+            one.light_field
+            for one in emmc.reconstruct_film(*given, noise_sigma=0.003, settings=settings)
+        ]
         for settings in ({"film": {"earlier": 2}}, {"film": changed})
     )
     np.testing.assert_array_equal(usual[0], other[0])
