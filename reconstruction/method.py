@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -45,6 +45,15 @@ class Given:
     estimates: PatchEstimates | None = None
     film: Film | None = None
     moving: bool = False
+
+    def of_first_shot(self) -> Given:
+        """Return the same of the first shot alone."""
+        sigma = np.broadcast_to(np.asarray(self.noise_sigma), self.psi.frames_shape)
+        usable = None if self.usable is None else self.usable[:1]
+        return replace(
+            self, psi=self.psi.of_shots([0]), frames=self.frames[:1], noise_sigma=sigma[:1],
+            usable=usable,
+        )  # fmt: skip
 
     @property
     def typical_noise(self) -> float:

@@ -161,11 +161,12 @@ def reconstruct_moving(
     settings: AdaptiveSettings,
     usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
+    patches: Patches | None = None,
 ) -> Reconstruction:
     """Return the light field at the time of the first of several shots, of a scene that moves.
 
-    What the other shots saw is carried to that time, where it explains their readings. Others as
-    those of `reconstruct_adaptive`.
+    What the other shots saw is carried to that time, where it explains their readings. patches: of
+    the first shot; others as those of `reconstruct_adaptive`.
     """
     sigma = np.broadcast_to(np.asarray(noise_sigma), psi.frames_shape)
     every = np.ones(psi.frames_shape, bool) if usable is None else usable
@@ -174,7 +175,7 @@ def reconstruct_moving(
     )
     nothing, steps = np.zeros(psi.size), settings.start_steps
     shown = [(one, plain_of(one, 1.0, nothing, steps).picture) for one in others]
-    return _among(present, shown, settings, on_step)
+    return _among(present, shown, settings, on_step, patches=patches)
 
 
 def _among(
@@ -183,6 +184,7 @@ def _among(
     settings: AdaptiveSettings,
     on_step: Callable[[Progress], None] | None,
     film: Film | None = None,
+    patches: Patches | None = None,
 ) -> Reconstruction:
     """Return the light field of a frame, from frames of other times, too; shown: see `others_of`"""
     started = time.perf_counter()
@@ -196,9 +198,7 @@ def _among(
     together, others = surveyed_together(given, shown, settings, report)
     second = searched_again(together, settings)
     survey = of_present(together, given)
-    fits = fitted_models(
-        survey, settings, lambda step: report(2 + step), second=second, others=others
-    )
+    fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second, others)
     beliefs, scene = survey.volume if second is None else second, fits.scene
     result = _put_together(survey, fits, survey.volume, beliefs, edges, whole, total, started)
     report(total)

@@ -64,19 +64,20 @@ def _solve(
     settings: MethodSettings,
 ) -> Reconstruction:
     adaptive, psi = chosen(settings.adaptive), given.psi
+    present = given.of_first_shot() if given.moving else given
 
     def patches(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
         atoms = _dictionary(psi.light_field_shape[:2], psi.binning)
-        fitted = dataclasses.replace(given, usable=usable, dictionary=atoms, on_step=None)
+        fitted = dataclasses.replace(present, usable=usable, dictionary=atoms, on_step=None)
         sparse = sparse_patches(settings.sparse, psi.binning)
         unseen = settings.tv.model_copy(update={"objective_every": settings.tv.max_steps + 1})
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
         return solve_tv_dict(fitted, quick).light_field
 
-    result = given.film
+    result, taken = given.film, patches if may_take_patches(present.psi, adaptive) else None
     if given.moving:
         result = reconstruct_moving(
-            psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step
+            psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step, taken
         )
     elif result is not None and result.known is not None:
         result = reconstruct_next(
@@ -85,7 +86,7 @@ def _solve(
     if not isinstance(result, Reconstruction):
         result = reconstruct_adaptive(
             psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step,
-            patches=patches if may_take_patches(psi, adaptive) else None, film=result,
+            patches=taken, film=result,
         )  # fmt: skip
     return dataclasses.replace(result, method=name)
 
