@@ -129,6 +129,7 @@ def test_a_film_at_rest_before_a_mask_that_steps_gains_by_each_frame(psi):
         found_db.append(psnr_db(result.light_field, _window(0)))
     assert found_db[2] > found_db[0] + LEAST_GAIN_DB
     assert result.parameters["moved_px"] < 0.1
+    assert film.known is not None
     assert len(film.known.earlier) == psi.shots
 
 
