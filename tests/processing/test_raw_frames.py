@@ -8,7 +8,7 @@ import pytest
 
 import emmc_rig as emmc
 from emmc_rig.model.camera import shipped_cameras
-from simulators.scenes import SCENES
+from simulators.scenes import STILL_SCENES
 
 RAW = Path(os.environ.get("EMMC_PEER_FILES", "")) / "raw"
 
@@ -218,7 +218,7 @@ def test_linear_values_are_not_taken_for_codes(linear, smooth):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", STILL_SCENES)
 def test_no_camera_s_frames_of_a_built_in_scene_look_like_codes(name):
     for camera in shipped_cameras().values():
         scene = emmc.scene(name, size=(96, 128), views=camera.views)
