@@ -121,11 +121,11 @@ class Result:
     @cached_property
     def misfit(self) -> NDArray[np.float32]:
         """How far readings are missed around each place (y, x), in deviations: about 1 is right."""
-        frames = self.frames
-        # Where the scene moved it is the light field of the first shot's time.
-        shots = [0] if "moved_px" in self.solved.parameters else list(range(self.psi.shots))
-        readings, usable = frames.readings[shots], frames.usable[shots]
-        psi = self.psi if len(shots) == self.psi.shots else self.psi.of_shots(shots)
+        psi, frames, count = self.psi, self.frames, self.psi.shots
+        if "moved_px" in self.solved.parameters and count > 1:
+            # The scene moved: it is the light field of the first shot's time.
+            psi, count = psi.of_shots([0]), 1
+        readings, usable = frames.readings[:count], frames.usable[:count]
         return missed_readings(psi, self.light_field, readings, frames.noise_sigma, usable)
 
     @property

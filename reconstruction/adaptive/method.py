@@ -186,7 +186,7 @@ def _among(
     film: Film | None = None,
     patches: Patches | None = None,
 ) -> Reconstruction:
-    """Return the light field of a frame, from frames of other times, too; shown: see `others_of`"""
+    """Return the light field of a frame, from other times, too; shown: see `others_of`."""
     started = time.perf_counter()
     given, edges = _without_edges(whole, settings)
     total = len(settings.misfits) * settings.texture.steps + 3

@@ -87,7 +87,19 @@ def reconstruct_judged(
     found = None
     if psi.shots > 1:
         found = motion(seen, shown - psi.forward(result.light_field), typical)
-    if found is not None and found.moved.any():
+    if found is not None and found.shot is None and _can_carry(name, psi, fitted, found):
+        took = result.seconds
+        del result
+        result = solved(readings, fitted, took, moving=True)
+        moved_px, share = (result.parameters[key] for key in ("moved_px", "seen_share"))
+        notes = (
+            *notes,
+            f"the scene moved by up to {moved_px:.1f} pixels between the shots: the light field is "
+            f"that of shot 1, to whose time {share:.0%} of the other shots are carried",
+        )
+        psi, read, shown, found = psi.of_shots([0]), read.of_first_shot(), shown[:1], None
+        seen = relief(psi, shown, typical, read.usable)
+    elif found is not None and found.moved.any():
         took = result.seconds
         del result
         result = solved(readings, fitted & ~found.moved, took)
@@ -97,18 +109,6 @@ def reconstruct_judged(
             f"excluded {found.moved.mean():.1%} of the readings, where one shot saw another scene "
             "than the others",
         )
-    if found is not None and found.shot is None and _can_carry(name, psi, fitted, found):
-        took = result.seconds
-        del result
-        result = solved(readings, fitted, took, moving=True)
-        moved_px, seen = (result.parameters[name] for name in ("moved_px", "seen_share"))
-        notes = (
-            *notes,
-            f"the scene moved by up to {moved_px:.1f} pixels between the shots: the light field is "
-            f"that of shot 1, to whose time {seen:.0%} of the other shots are carried",
-        )
-        psi, read, shown, found = psi.of_shots([0]), read.of_first_shot(), shown[:1], None
-        seen = relief(psi, shown, typical, read.usable)
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
     verdict = verdict_from(gathered(psi, read, typical, result, seen, found))
     psi.even_unseen_colours(result.light_field)
