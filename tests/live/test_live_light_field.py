@@ -311,8 +311,8 @@ class Solver:
         return result, Verdict("trust", (), cast(Any, None))
 
     def end(self, took_s=1.25):
-        """End the frame at work, once it is, so much later."""
-        until(lambda: len(self.asked) > self.left)
+        """End the frame at work, once it is alone (one given up may still end), so much later."""
+        until(lambda: len(self.asked) == self.left + 1)
         self._clock.now += took_s
         self._ends.release()
         until(lambda: not threads_at_work())
