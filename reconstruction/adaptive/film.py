@@ -7,7 +7,9 @@ the next frame the same point of a surface meets other cells of the mask: time i
 
 Nothing carried is believed further than readings go. A reading of an earlier frame counts with the
 variance that what is foretold misses around it, so that where flow is wrong, or something is hidden
-meanwhile, the present frame decides alone. Where the carried scene foretells the present frame no
+meanwhile, the present frame decides alone. Where readings stay what they were, within their noise,
+the scene rests: nothing is learnt there but less noise, and every fit begins as the first one did,
+as fits that go on from each other drift. Where the carried scene foretells the present frame no
 better than total variation does over more than NEW_SHARE of the picture, it is a first frame. So is
 one that leaves more of its own readings where something moves than the first one did: detail finer
 than the pixels changes as it moves, and nothing carried is right of it.
@@ -46,6 +48,7 @@ from reconstruction.adaptive.times import (
     HELD_WINDOW_PX,
     WINDOW_PX,
     OtherTime,
+    of_samples,
     padded,
     rested,
 )
@@ -87,9 +90,18 @@ NEW_SHARE = 0.4
 first one."""
 STILL = 1.05
 """Where what is carried without motion misses readings by no more than so many times what it misses
-with, the scene rests."""
+with, nothing flows."""
+UNCHANGED = 1.4, 2.5
+"""Times the mean square that noise changes readings by, up to which the scene rests: where it flows
+and where it does not. Alone by noise they are 0.5 to 1.4, and up to 2 where one deviation is given
+for bright and dark readings; where a pan moves texture by 1.5 pixels, 13 and more."""
+CAMERA_RESTS = 0.75
+"""Share of the picture that must rest for the scene to: 0.98 to 1 do at rest, up to 0.6 while
+smooth scenes pan."""
 RESTING_PX = 0.25
 """Flow up to which the light field of the frame before stands for that of the present one."""
+LONGEST = 8
+"""Frames at rest over which light fields are averaged, about."""
 WORSE, MOVING_SHARE = 1.2, 0.02
 """Times the residual of first frames, over noise, from which on one that follows is a first one: by
 it films of group A that pan lose 0.01 dB, and `panning-desk` 4.9 dB less (96x128,
@@ -103,17 +115,31 @@ ROOM_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
+class Rest:
+    """What stands as long as the scene rests.
+
+    first: light field of the frame since which it rests; mean: of about `count` fits since, both as
+    `mixture.stored`. readings: of that frame, over the scale, (1, pixel_y, pixel_x).
+    """
+
+    first: NDArray[np.uint16]
+    mean: NDArray[np.uint16]
+    readings: Array
+    count: int = 1
+
+
+@dataclass(frozen=True, eq=False)
 class Known:
     """What a frame leaves for the next one.
 
-    scale: of the scene, see `Plain`. light_field: as `mixture.stored`. texture: (c, y, x), padded
-    by `margin` as the centre view's disparity `centre` (y, x). beliefs: about disparities. missed:
-    least root mean square residual of first frames, over their noise. earlier: the latest last.
+    scale: of the scene, see `Plain`. texture: (c, y, x), padded by `margin` as the centre view's
+    disparity `centre` (y, x). beliefs: about disparities. missed: least root mean square residual
+    of first frames, over their noise. earlier: the latest last.
     """
 
     scale: float
     margin: int
-    light_field: NDArray[np.uint16]
+    rest: Rest
     texture: Array
     centre: Array
     beliefs: search.Volume
@@ -141,7 +167,7 @@ class Film:
         psis: of each of the frames `known.earlier`, as `reconstruct` was given it, of one shot.
         """
         fitted = (checked(psi, np.zeros(psi.frames_shape), 1.0, None).psi for psi in psis)
-        kinds = (cls, FilmSettings, Known, OtherTime, Readings, search.Volume)
+        kinds = (cls, FilmSettings, Known, Rest, OtherTime, Readings, search.Volume)
         about = parse_json(str(arrays["about"]), "a stored film", ReconstructionError)
         return put_together(about, arrays, kinds, lambda: next(fitted))
 
@@ -153,8 +179,12 @@ class Film:
         beliefs: search.Volume,
         missed: float,
         earlier: Sequence[OtherTime] = (),
+        rest: Rest | None = None,
     ) -> Film:
-        """Return what is known after a frame; earlier: frames before, none of a first one."""
+        """Return what is known after a frame; earlier: frames before, none of a first one.
+
+        rest: what stands at rest, None where nothing is known to.
+        """
         margin, texture = scene.surfaces.margin, scene.clean
         if self.known is not None:
             missed = min(missed, self.known.missed)
@@ -168,8 +198,10 @@ class Film:
         used = plain.given.usable & ~plain.held
         this = OtherTime(plain.bright, used, plain.picture, still, still)
         kept = (*earlier, this)[-max(self.settings.earlier, self.settings.together) :]
-        seen = mixture.stored(light_field)
-        known = Known(plain.scale, margin, seen, texture, centre, beliefs, missed, kept)
+        if rest is None:
+            seen = mixture.stored(light_field)
+            rest = Rest(seen, seen, plain.bright.frames)
+        known = Known(plain.scale, margin, rest, texture, centre, beliefs, missed, kept)
         return replace(self, known=known)
 
     def shown(self, psi: ImagingMatrix) -> list[tuple[Readings, Array]]:
@@ -195,7 +227,8 @@ class Film:
 class Followed:
     """The models of a frame: see `Plain`, `Fits`; beliefs about disparities; earlier: frames, with
     the flow to it; moving: readings (shot, pixel_y, pixel_x) that were fitted where something
-    moves; parameters: what is reported of it."""
+    moves; parameters: what is reported of it; scene_left, beliefs_left: to the next frame; mean:
+    of what rests, see `Rest`; still: share by which the centre view does (y, x)."""
 
     plain: Plain
     fits: Fits
@@ -203,6 +236,10 @@ class Followed:
     earlier: list[OtherTime]
     moving: NDArray[np.bool_]
     parameters: dict[str, float]
+    scene_left: FittedScene
+    beliefs_left: search.Volume
+    mean: NDArray[np.uint16]
+    still: Array
 
     def worse(self, before: Known, light_field: Array) -> bool:
         """Return whether its light field leaves more where something moves than the first did."""
@@ -212,6 +249,14 @@ class Followed:
         left = given.frames - given.psi.forward(light_field)
         relative = np.square(left[moving]) / given.noise[moving]
         return float(relative.mean()) > (WORSE * before.missed) ** 2
+
+    def rest(self, before: Known, light_field: Array) -> Rest:
+        """Return what stands at rest for the next frame, from the frame's light field."""
+        disparity, seen = self.fits.scene.surfaces.disparity, mixture.stored(light_field)
+        first = _standing(before.rest.first, seen, disparity, self.still)
+        still = self.still[:: self.plain.given.psi.binning, :: self.plain.given.psi.binning] == 1
+        readings = np.where(still, before.rest.readings, self.plain.bright.frames)
+        return Rest(first, self.mean, readings, _count(before.rest))
 
 
 def followed(
@@ -241,7 +286,13 @@ def followed(
         mean_around(np.square(of), used.astype(np.float32), WINDOW_PX).sum(axis=0)
         for *_, of in (by_flow, by_rest)
     )
-    rests = missed_still <= STILL * missed
+    flows = missed_still > STILL * missed
+    changed = _change(bright, before.rest.readings, used & before.earlier[-1].used)
+    still = changed <= np.where(flows, *UNCHANGED)
+    # While the camera moves, places without texture change as little.
+    camera_rests = float(np.mean(still | ~flows)) >= CAMERA_RESTS
+    still &= camera_rests
+    rests = still | ~flows
     if rests.any():
         there, back = rested(there, back, rests.astype(np.float32))
         by_flow = carried_by(back)
@@ -251,7 +302,8 @@ def followed(
         return None
     earlier = [one.since(there, back) for one in before.earlier[-own.earlier :]]
     seen = [one.seen(centre, margin, texture, nearer, own.misfit) for one in earlier]
-    beliefs, fitted = _carried(before.beliefs, back, psi.binning), replace(bright, usable=used)
+    carried_on = beliefs = _carried(before.beliefs, back, still, psi.binning)
+    fitted = replace(bright, usable=used)
 
     def again(texture: Array, surfaces: Surfaces) -> Array:
         nonlocal beliefs
@@ -273,35 +325,61 @@ def followed(
         margin=margin,
     )
     scale = np.float32(before.scale)
-    residual = scale * (bright.frames - scene.surfaces.forward(scene.texture))
     scene.surfaces.release()
     light_field = scene.surfaces.light_field(scale * scene.texture)
-    models = [mixture.stored(np.clip(light_field, 0, 1, out=light_field))]
-    models.append(_rested_light(before.light_field, models[0], scene.surfaces.disparity, back))
-    carried_on = given.frames - psi.forward(mixture.values(models[1]))
-    residuals = [residual, carried_on, plain.plain_residual]
-    fits = Fits([*models, plain.plain], residuals, scene, patched=False, understated=UNDERSTATED)
+    own_fit = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
+    k, disparity = psi.binning, scene.surfaces.disparity
+    resting = of_samples(still, light_field[0, 0]).astype(np.float32)
+    stands = resting if camera_rests else np.exp(-np.square(back / RESTING_PX).sum(axis=-1))
+    models = [
+        _standing(before.rest.mean, own_fit, disparity, resting * (1 - 1 / _count(before.rest))),
+        _standing(before.rest.first, own_fit, disparity, stands),
+    ]
+    residuals = [given.frames - psi.forward(mixture.values(one)) for one in models]
+    models.append(plain.plain)
+    residuals.append(plain.plain_residual)
+    fits = Fits(models, residuals, scene, patched=False, understated=UNDERSTATED)
     moved = float(np.median(np.linalg.norm(there, axis=-1)))
-    parameters = {"flow_px": moved, "new_share": new}
-    k = psi.binning
+    parameters = {"flow_px": moved, "new_share": new, "still_share": float(still.mean())}
     moving = used & (np.linalg.norm(back[::k, ::k], axis=-1) > RESTING_PX)
-    return Followed(plain, fits, beliefs, earlier, moving, parameters)
+    stays = resting == 1
+    scene_left = replace(
+        scene,
+        clean=np.where(np.pad(stays, margin, mode="edge"), texture, scene.clean),
+        centre=np.where(stays, centre[inner], scene.centre),
+    )
+    beliefs_left = _kept(carried_on, beliefs, still[::STRIDE, ::STRIDE])
+    left = scene_left, beliefs_left, models[0], resting
+    return Followed(plain, fits, beliefs, earlier, moving, parameters, *left)
 
 
-def _rested_light(
-    before: NDArray[np.uint16], present: NDArray[np.uint16], disparity: Array, back: Array
+def _change(bright: Readings, before: Array, used: NDArray[np.bool_]) -> Array:
+    """Return the mean square change of readings over that by noise, (pixel_y, pixel_x)."""
+    weight = used.astype(np.float32)
+    changed, noise = (
+        mean_around(one, weight, WINDOW_PX)[0]
+        for one in (np.square(bright.frames - before), 2 * bright.noise)
+    )
+    return changed / np.maximum(noise, np.float32(1e-20))
+
+
+def _count(rest: Rest) -> int:
+    return min(rest.count + 1, LONGEST)
+
+
+def _standing(
+    before: NDArray[np.uint16], present: NDArray[np.uint16], disparity: Array, still: Array
 ) -> NDArray[np.uint16]:
-    """Return the light field of the frame before where the scene rests, else the present one.
+    """Return the light field before by the share of it that stands, the present one by the rest.
 
-    disparity: of the present rays (v, u, y, x). back: flow to the frame before, (y, x, 2).
+    disparity: of the present rays (v, u, y, x). still: share of the centre view (y, x).
     """
-    own, views = at_places(back.shape[:2]), disparity.shape[:2]
-    rests = np.exp(-np.square(back).sum(axis=-1) / RESTING_PX**2)
+    own, views = at_places(still.shape), disparity.shape[:2]
     out = np.empty_like(before)
 
     def work(at: tuple[int, int]) -> None:
         steps = np.array([n - of // 2 for n, of in zip(at, views, strict=True)], np.float32)
-        share = sampled(rests, own - disparity[at][..., None] * steps)[..., None]
+        share = sampled(still, own - disparity[at][..., None] * steps)[..., None]
         out[at] = np.rint(share * before[at] + (1 - share) * present[at])
 
     in_views(work, views)
@@ -320,8 +398,20 @@ def _share_new(foretold: Array, plain: Plain) -> float:
     return float(np.mean(own > others))
 
 
-def _carried(beliefs: search.Volume, back: Array, binning: int) -> search.Volume:
-    """Return beliefs of the frame before, on every STRIDE-th pixel of the present one."""
+def _kept(before: search.Volume, now: search.Volume, still: NDArray[np.bool_]) -> search.Volume:
+    """Return beliefs as before where the scene rests (row, column of patches), elsewhere now's."""
+    among, rests = np.isin(before.disparities, now.disparities), still[..., None]
+    chances = np.where(rests, before.probability[..., among], now.probability)
+    return replace(now, probability=chances, evidence=np.log(np.maximum(chances, 1e-20)))
+
+
+def _carried(
+    beliefs: search.Volume, back: Array, still: NDArray[np.bool_], binning: int
+) -> search.Volume:
+    """Return beliefs of the frame before, on every STRIDE-th pixel of the present one.
+
+    still: where the scene rests (pixel_y, pixel_x), and nothing becomes less sure.
+    """
     rows, columns = (
         np.arange(0, length // binning, STRIDE, dtype=float) for length in back.shape[:2]
     )
@@ -344,7 +434,9 @@ def _carried(beliefs: search.Volume, back: Array, binning: int) -> search.Volume
         axis=-1,
     )
     chances /= np.maximum(chances.sum(axis=-1, keepdims=True), 1e-20)
-    chances = np.float32(KEPT) * chances + np.float32((1 - KEPT) / chances.shape[-1])
+    kept = np.where(still[::STRIDE, ::STRIDE], np.float32(1), np.float32(KEPT))[..., None]
+    chances = kept * chances + (1 - kept) / np.float32(chances.shape[-1])
+    chances = np.maximum(chances, np.float32(1e-20))
     nearest = tuple(np.rint(part).astype(int) for part in places[0][::-1])
     return replace(
         beliefs, centres=(rows, columns), probability=chances, evidence=np.log(chances),

@@ -146,11 +146,12 @@ def reconstruct_next(
     if found.worse(known, result.light_field):
         return film
     report(total)
-    seen = found.plain, found.fits.scene, result.light_field, beliefs
+    seen = found.plain, found.scene_left, result.light_field, found.beliefs_left
+    rest = found.rest(known, result.light_field)
     return replace(
         result,
         parameters=result.parameters | found.parameters,
-        film=film.after(*seen, known.missed, found.earlier),
+        film=film.after(*seen, known.missed, found.earlier, rest),
     )
 
 

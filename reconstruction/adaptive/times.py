@@ -122,7 +122,7 @@ def aligned(one: OtherTime, binning: int) -> Readings:
     last = np.array(moves.shape[:2])[:, None, None] - 1
     inside, (y, x) = ((at >= 0) & (at <= last)).all(axis=0), np.clip(at, 0, last)
     rows, columns = (
-        k * _of_samples(along, one.back) + within
+        k * of_samples(along, one.back) + within
         for along, within in zip((y, x), np.indices(theirs.psi.size) % k, strict=True)
     )
     weights = np.moveaxis(theirs.psi.weights, 4, 3)[..., rows, columns]
@@ -194,7 +194,7 @@ def others_of(plain: Plain, shown: Sequence[tuple[Readings, Array]]) -> list[Oth
 def rested(there: Array, back: Array, rests: Array) -> tuple[Array, Array]:
     """Return flows that are 0 where the scene rests, (pixel_y, pixel_x) at the present time."""
     smooth = np.asarray(cv2.GaussianBlur(rests, (0, 0), REST_PX), dtype=np.float32)
-    rests = _of_samples(smooth, back)
+    rests = of_samples(smooth, back)
     then = sampled(rests, at_places(rests.shape) + there)
     return there * (1 - then)[..., None], back * (1 - rests)[..., None]
 
@@ -227,7 +227,7 @@ def of_present(survey: Survey, given: Readings) -> Survey:
     )
 
 
-def _of_samples(pixels: NDArray, of: Array) -> NDArray:
+def of_samples(pixels: NDArray, of: Array) -> NDArray:
     """Return values of pixels at each of their samples; of: an array (y, x, ...) of these."""
     k = len(of) // len(pixels)
     return pixels.repeat(k, axis=0).repeat(k, axis=1)
@@ -236,7 +236,7 @@ def _of_samples(pixels: NDArray, of: Array) -> NDArray:
 def moved(others: Sequence[OtherTime]) -> dict[str, float]:
     """Return by how much the scene moved to the furthest time, pixels, and what share is seen."""
     steps = (
-        np.linalg.norm(one.there[_of_samples(one.used[0], one.there)], axis=-1) for one in others
+        np.linalg.norm(one.there[of_samples(one.used[0], one.there)], axis=-1) for one in others
     )
     return {
         "moved_px": max((float(np.median(by)) for by in steps if by.size), default=0.0),
