@@ -19,6 +19,7 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import shows_parallax
 from reconstruction.adaptive.film import Film
+from reconstruction.choices import choose_mu
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import checked_inputs, checked_noise
 from reconstruction.methods import MethodSettings, find_method, reconstruct
@@ -27,13 +28,18 @@ from reconstruction.screening import screened
 from reconstruction.verdict.evidence import Read, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import MOTION, Verdict, verdict_from
-from reconstruction.verdict.shadow import relief
+from reconstruction.verdict.shadow import Relief, relief
 from reconstruction.verdict.shots import Motion, motion
+from reconstruction.wave import few_steps
 
 Array = NDArray[np.floating]
 FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""
 COLOURS = 3
+COARSE_STEPS, CLEARLY_MOVED = 15, 1.6
+"""Of total variation; and the ratio of `Motion` from which on what it shows is certain: at rest it
+is 0.3 to 1.3 (group A at 96x128, two to six shots), at 1 to 5 pixels between three shots 1.5 to 12.
+What moved by less the light field itself shows, a fit later."""
 
 
 @one_blas_thread()
@@ -70,27 +76,29 @@ def reconstruct_judged(
         return dataclasses.replace(result, seconds=result.seconds + before)
 
     readings, fitted = read.frames, read.usable & ~read.kept
-    result = solved(readings, fitted)
+    shown = np.where(read.usable, read.frames, 0)
+    seen = relief(psi, shown, typical, read.usable)
+    moving = psi.shots > 1 and find_method(name).films and _moved(psi, read, typical, seen)
+    result = solved(readings, fitted, moving=moving)
     short = _short(psi, read, result)
     if short is not None:
         took = result.seconds
         del result
         readings, fitted = np.where(short, read.excluded, readings), fitted | short
-        result = solved(readings, fitted, took)
+        result = solved(readings, fitted, took, moving)
         read = dataclasses.replace(read, short=float(short.mean()))
         notes = (
             *notes,
             f"{read.short:.1%} of the readings are saturated, and taken as lower bounds",
         )
-    shown = np.where(read.usable, read.frames, 0)
-    seen = relief(psi, shown, typical, read.usable)
     found = None
-    if psi.shots > 1:
+    if psi.shots > 1 and not moving:
         found = motion(seen, shown - psi.forward(result.light_field), typical)
-    if found is not None and found.shot is None and _can_carry(name, psi, fitted, found):
-        took = result.seconds
-        del result
-        result = solved(readings, fitted, took, moving=True)
+        if found is not None and find_method(name).films and _carries(psi, fitted, found):
+            took, moving = result.seconds, True
+            del result
+            result = solved(readings, fitted, took, moving)
+    if moving:
         moved_px, share = (result.parameters[key] for key in ("moved_px", "seen_share"))
         notes = (
             *notes,
@@ -115,11 +123,21 @@ def reconstruct_judged(
     return result, verdict
 
 
-def _can_carry(name: str, psi: ImagingMatrix, fitted: NDArray[np.bool_], found: Motion) -> bool:
-    """Return whether a scene moved, and a method can carry shots to the time of the first one."""
+def _moved(psi: ImagingMatrix, read: Read, noise_sigma: float, seen: Relief) -> bool:
+    """Return whether a scene moved so much that a coarse light field of all shots shows it."""
+    fitted = read.usable & ~read.kept
+    mu = choose_mu(psi, read.frames[fitted], noise_sigma)
+    coarse = few_steps(psi, read.frames, fitted, mu, COARSE_STEPS)
+    found = motion(seen, np.where(read.usable, read.frames - psi.forward(coarse), 0), noise_sigma)
+    return found is not None and _carries(psi, fitted, found, CLEARLY_MOVED)
+
+
+def _carries(
+    psi: ImagingMatrix, fitted: NDArray[np.bool_], found: Motion, least: float = MOTION.doubt
+) -> bool:
+    """Return whether a scene moved, in nobody knows which shots, and the first sees all colours."""
     colours = psi.colour is None or len(np.unique(psi.colour[0])) == COLOURS
-    moved = found.ratio > MOTION.doubt and find_method(name).films
-    return moved and colours and bool(fitted[0].any())
+    return found.shot is None and found.ratio > least and colours and bool(fitted[0].any())
 
 
 def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDArray]:

@@ -190,6 +190,33 @@ def test_what_rests_has_no_flow(psi):
         result = reconstruct(*given, usable=shown.usable, film=film)
         film = result.film
     assert result.parameters["flow_px"] < 0.1
+    assert result.parameters["still_share"] > 0.95
+
+
+def test_nothing_drifts_where_the_scene_rests(psi):
+    film, truth = Film(), render("toy-table", (5, 5), SIZE).light_field
+    moved, found = truth.copy(), []
+    moved[:, :, 36:42, 50:56] = 1 - truth[:, :, 36:42, 50:56]
+    for frame, seen in enumerate((truth, truth, truth, moved)):
+        shown = _readings(psi, seen, frame)
+        given = "adaptive-fast", psi, shown.readings, shown.noise_sigma
+        film = reconstruct(*given, usable=shown.usable, film=film).film
+        found.append(film.known)
+    first, second, third, last = found
+    still = np.s_[:, :, :20, :24]
+    for known in (second, third, last):
+        assert np.array_equal(known.rest.first[still], first.rest.first[still])
+        assert np.array_equal(known.centre[: 20 + known.margin], first.centre[: 20 + first.margin])
+    # The average over its frames has less noise, and what moved is as the last frame shows it.
+    noise = [np.std(known.rest.mean[still] - 65535.0 * truth[still]) for known in (first, third)]
+    assert noise[1] < noise[0]
+    changed = np.s_[:, :, 37:41, 51:55]
+    assert not (last.rest.first[changed] == first.rest.first[changed]).any()
+    assert last.rest.count == 4
+
+
+def test_a_camera_that_moves_sees_nothing_rest(followed):
+    assert all(result.parameters["still_share"] == 0 for _, result, _ in followed[1:])
 
 
 def test_a_film_of_another_size_is_refused(psi, followed):
