@@ -287,11 +287,7 @@ def followed(
         for *_, of in (by_flow, by_rest)
     )
     flows = missed_still > STILL * missed
-    changed = _change(bright, before.rest.readings, used & before.earlier[-1].used)
-    still = changed <= np.where(flows, *UNCHANGED)
-    # While the camera moves, places without texture change as little.
-    camera_rests = float(np.mean(still | ~flows)) >= CAMERA_RESTS
-    still &= camera_rests
+    still = _still(bright, before.rest.readings, used & before.earlier[-1].used, flows)
     rests = still | ~flows
     if rests.any():
         there, back = rested(there, back, rests.astype(np.float32))
@@ -330,7 +326,8 @@ def followed(
     own_fit = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
     k, disparity = psi.binning, scene.surfaces.disparity
     resting = of_samples(still, light_field[0, 0]).astype(np.float32)
-    stands = resting if camera_rests else np.exp(-np.square(back / RESTING_PX).sum(axis=-1))
+    slow = np.exp(-np.square(back / RESTING_PX).sum(axis=-1))
+    stands = resting if still.any() else slow
     models = [
         _standing(before.rest.mean, own_fit, disparity, resting * (1 - 1 / _count(before.rest))),
         _standing(before.rest.first, own_fit, disparity, stands),
@@ -353,14 +350,21 @@ def followed(
     return Followed(plain, fits, beliefs, earlier, moving, parameters, *left)
 
 
-def _change(bright: Readings, before: Array, used: NDArray[np.bool_]) -> Array:
-    """Return the mean square change of readings over that by noise, (pixel_y, pixel_x)."""
+def _still(
+    bright: Readings, before: Array, used: NDArray[np.bool_], flows: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return where the scene rests, (pixel_y, pixel_x): nowhere while the camera moves.
+
+    There places without texture change as little. before: readings since which it may rest. flows:
+    where what is carried without motion misses more.
+    """
     weight = used.astype(np.float32)
     changed, noise = (
         mean_around(one, weight, WINDOW_PX)[0]
         for one in (np.square(bright.frames - before), 2 * bright.noise)
     )
-    return changed / np.maximum(noise, np.float32(1e-20))
+    still = changed <= np.where(flows, *UNCHANGED) * noise
+    return still & (np.mean(still | ~flows) >= CAMERA_RESTS)
 
 
 def _count(rest: Rest) -> int:
