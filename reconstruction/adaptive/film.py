@@ -332,7 +332,7 @@ def followed(
         _standing(before.rest.mean, own_fit, disparity, resting * (1 - 1 / _count(before.rest))),
         _standing(before.rest.first, own_fit, disparity, stands),
     ]
-    residuals = [given.frames - psi.forward(mixture.values(one)) for one in models]
+    residuals: list[Array] = [given.frames - psi.forward(mixture.values(one)) for one in models]
     models.append(plain.plain)
     residuals.append(plain.plain_residual)
     fits = Fits(models, residuals, scene, patched=False, understated=UNDERSTATED)
