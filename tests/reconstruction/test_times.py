@@ -10,6 +10,7 @@ from reconstruction.adaptive.survey import Readings
 from reconstruction.adaptive.times import OtherTime, aligned, rested
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import reconstruct
+from reconstruction.verdict import run
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import flow_px, render
 
@@ -112,8 +113,22 @@ def test_shots_of_another_scene_do_next_to_no_harm(psi):
     assert found_db > alone_db - 0.3
 
 
-def test_the_verdict_trusts_what_was_carried_and_says_how_far(psi, slid):
+@pytest.fixture
+def fits(monkeypatch):
+    """Of every fit, whether it was of a scene that moves."""
+    made, fit = [], run.reconstruct
+
+    def noted(*given, moving, **more):
+        made.append(moving)
+        return fit(*given, moving=moving, **more)
+
+    monkeypatch.setattr(run, "reconstruct", noted)
+    return made
+
+
+def test_the_verdict_trusts_what_was_carried_and_says_how_far(psi, slid, fits):
     result, verdict = reconstruct_judged(*_given(psi, slid))
+    assert fits == [True]
     assert psnr_db(result.light_field, _window(0)) > psnr_db(
         _first_alone(psi, slid).light_field, _window(0)
     )
@@ -124,9 +139,10 @@ def test_the_verdict_trusts_what_was_carried_and_says_how_far(psi, slid):
     assert low <= psnr_db(result.light_field, _window(0)) <= high
 
 
-def test_at_rest_shots_are_one_capture_as_ever(psi):
+def test_at_rest_shots_are_one_capture_as_ever(psi, fits):
     shown = _captured(psi, [_window(0)] * psi.shots)
     result, verdict = reconstruct_judged(*_given(psi, shown))
+    assert fits == [False]
     assert "moved_px" not in result.parameters
     assert verdict.level == "trust"
 
