@@ -146,13 +146,11 @@ def reconstruct_next(
     if found.worse(known, result.light_field):
         return film
     report(total)
-    seen = found.plain, found.scene_left, result.light_field, found.beliefs_left
-    rest = found.rest(known, result.light_field)
-    return replace(
-        result,
-        parameters=result.parameters | found.parameters,
-        film=film.after(*seen, known.missed, found.earlier, rest),
-    )
+    if not found.slow:
+        seen = found.plain, found.scene_left, result.light_field, found.beliefs_left
+        rest = found.rest(known, result.light_field)
+        film = film.after(*seen, known.missed, found.earlier, rest)
+    return replace(result, parameters=result.parameters | found.parameters, film=film)
 
 
 def reconstruct_moving(

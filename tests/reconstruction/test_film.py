@@ -219,6 +219,21 @@ def test_a_camera_that_moves_sees_nothing_rest(followed):
     assert all(result.parameters["still_share"] == 0 for _, result, _ in followed[1:])
 
 
+def test_of_a_camera_that_moves_slowly_frames_follow_from_the_same_one(psi):
+    film, known = Film(), []
+    for seed, px in enumerate((0, 0.15, 0.6)):
+        moved = px * _sliding(1, (0, 1)) + (1 - px) * _sliding(0)
+        shown = _readings(psi, moved, seed)
+        given = "adaptive-fast", psi, shown.readings, shown.noise_sigma
+        result = reconstruct(*given, usable=shown.usable, film=film)
+        film = result.film
+        known.append(film.known)
+    assert known[1] is known[0]
+    # The motion since that frame, not since the last one.
+    assert result.parameters["flow_px"] > 0.4
+    assert known[2] is not known[0]
+
+
 def test_a_film_of_another_size_is_refused(psi, followed):
     small = build_imaging_matrix(CAMERA, (40, 48))
     frames = np.full(small.frames_shape, 0.2, np.float32)
