@@ -24,8 +24,8 @@ from reconstruction.adaptive.film import Film
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.scenes import MOVING_SCENES, SCENES, render
 
-RESTS, PANS, PASSES = "rests", "pans", "passes"
-PAN_PX = {RESTS: (0.0, 0.0), PANS: (0.45, 1.4), PASSES: (0.2, -0.6)}
+RESTS, CREEPS, PANS, PASSES = "rests", "creeps", "pans", "passes"
+PAN_PX = {RESTS: (0.0, 0.0), CREEPS: (0.03, 0.1), PANS: (0.45, 1.4), PASSES: (0.2, -0.6)}
 """By how much the window's content moves per frame, along y and x."""
 DISC_PX, DISC_DISPARITY, DISC_RADIUS = (-0.3, 1.7), 1.5, 0.28
 """Of the disc: motion per frame, how much nearer it is, radius over the window's rows."""

@@ -191,7 +191,12 @@ def whole_speed() -> Section:
 def films() -> Section:
     """Films against their frames alone."""
     rows = rows_of("films")
-    words = {"rests": "at rest", "pans": "camera pans", "passes": "an object passes"}
+    words = {
+        "rests": "at rest",
+        "creeps": "0.1 pixels a frame",
+        "pans": "camera pans",
+        "passes": "an object passes",
+    }
     scenes = sorted({row["scene"] for row in rows})
     gain = {(row["scene"], row["motion"]): number(row, "gain_db") for row in rows}
     dots = {text: [gain[scene, motion] for scene in scenes] for motion, text in words.items()}
