@@ -228,7 +228,7 @@ class Followed:
     """The models of a frame: see `Plain`, `Fits`; beliefs about disparities; earlier: frames, with
     the flow to it; moving: readings (shot, pixel_y, pixel_x) that were fitted where something
     moves; parameters: what is reported of it; scene_left, beliefs_left: to the next frame; mean:
-    of what rests, see `Rest`; still: share by which the centre view does (y, x)."""
+    of what rests, see `Rest`; still: where the scene does (pixel_y, pixel_x)."""
 
     plain: Plain
     fits: Fits
@@ -239,7 +239,7 @@ class Followed:
     scene_left: FittedScene
     beliefs_left: search.Volume
     mean: NDArray[np.uint16]
-    still: Array
+    still: NDArray[np.bool_]
 
     def worse(self, before: Known, light_field: Array) -> bool:
         """Return whether its light field leaves more where something moves than the first did."""
@@ -262,9 +262,9 @@ class Followed:
     def rest(self, before: Known, light_field: Array) -> Rest:
         """Return what stands at rest for the next frame, from the frame's light field."""
         disparity, seen = self.fits.scene.surfaces.disparity, mixture.stored(light_field)
-        first = _standing(before.rest.first, seen, disparity, self.still)
-        still = self.still[:: self.plain.given.psi.binning, :: self.plain.given.psi.binning] == 1
-        readings = np.where(still, before.rest.readings, self.plain.bright.frames)
+        resting = of_samples(self.still, light_field[0, 0]).astype(np.float32)
+        first = _standing(before.rest.first, seen, disparity, resting)
+        readings = np.where(self.still, before.rest.readings, self.plain.bright.frames)
         return Rest(first, self.mean, readings, _count(before.rest))
 
 
@@ -334,7 +334,8 @@ def followed(
     light_field = scene.surfaces.light_field(scale * scene.texture)
     own_fit = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
     k, disparity = psi.binning, scene.surfaces.disparity
-    resting = of_samples(still, light_field[0, 0]).astype(np.float32)
+    stays = of_samples(still, light_field[0, 0])
+    resting = stays.astype(np.float32)
     slow = np.exp(-np.square(back / RESTING_PX).sum(axis=-1))
     stands = resting if still.any() else slow
     models = [
@@ -348,14 +349,13 @@ def followed(
     moved = float(np.median(np.linalg.norm(there, axis=-1)))
     parameters = {"flow_px": moved, "new_share": new, "still_share": float(still.mean())}
     moving = used & (np.linalg.norm(back[::k, ::k], axis=-1) > RESTING_PX)
-    stays = resting == 1
     scene_left = replace(
         scene,
         clean=np.where(np.pad(stays, margin, mode="edge"), texture, scene.clean),
         centre=np.where(stays, centre[inner], scene.centre),
     )
     beliefs_left = _kept(carried_on, beliefs, still[::STRIDE, ::STRIDE])
-    left = scene_left, beliefs_left, models[0], resting
+    left = scene_left, beliefs_left, models[0], still
     return Followed(plain, fits, beliefs, earlier, moving, parameters, *left)
 
 

@@ -28,7 +28,7 @@ from reconstruction.screening import screened
 from reconstruction.verdict.evidence import Read, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import MOTION, Verdict, verdict_from
-from reconstruction.verdict.shadow import Relief, relief
+from reconstruction.verdict.shadow import relief
 from reconstruction.verdict.shots import Motion, motion
 from reconstruction.wave import few_steps
 
@@ -78,7 +78,15 @@ def reconstruct_judged(
     readings, fitted = read.frames, read.usable & ~read.kept
     shown = np.where(read.usable, read.frames, 0)
     seen = relief(psi, shown, typical, read.usable)
-    moving = psi.shots > 1 and find_method(name).films and _moved(psi, read, typical, seen)
+
+    def differing(light_field: Array) -> Motion | None:
+        return motion(seen, shown - psi.forward(light_field), typical)
+
+    can_carry, moving = _can_carry(name, psi, fitted), False
+    if can_carry:
+        mu = choose_mu(psi, readings[fitted], typical)
+        coarse = few_steps(psi, readings, fitted, mu, COARSE_STEPS)
+        moving = _moved(differing(coarse), CLEARLY_MOVED)
     result = solved(readings, fitted, moving=moving)
     short = _short(psi, read, result)
     if short is not None:
@@ -93,8 +101,8 @@ def reconstruct_judged(
         )
     found = None
     if psi.shots > 1 and not moving:
-        found = motion(seen, shown - psi.forward(result.light_field), typical)
-        if found is not None and find_method(name).films and _carries(psi, fitted, found):
+        found = differing(result.light_field)
+        if can_carry and _moved(found, MOTION.doubt):
             took, moving = result.seconds, True
             del result
             result = solved(readings, fitted, took, moving)
@@ -123,21 +131,15 @@ def reconstruct_judged(
     return result, verdict
 
 
-def _moved(psi: ImagingMatrix, read: Read, noise_sigma: float, seen: Relief) -> bool:
-    """Return whether a scene moved so much that a coarse light field of all shots shows it."""
-    fitted = read.usable & ~read.kept
-    mu = choose_mu(psi, read.frames[fitted], noise_sigma)
-    coarse = few_steps(psi, read.frames, fitted, mu, COARSE_STEPS)
-    found = motion(seen, np.where(read.usable, read.frames - psi.forward(coarse), 0), noise_sigma)
-    return found is not None and _carries(psi, fitted, found, CLEARLY_MOVED)
-
-
-def _carries(
-    psi: ImagingMatrix, fitted: NDArray[np.bool_], found: Motion, least: float = MOTION.doubt
-) -> bool:
-    """Return whether a scene moved, in nobody knows which shots, and the first sees all colours."""
+def _can_carry(name: str, psi: ImagingMatrix, fitted: NDArray[np.bool_]) -> bool:
+    """Return whether a method can carry shots to the time of the first one, which sees all."""
     colours = psi.colour is None or len(np.unique(psi.colour[0])) == COLOURS
-    return found.shot is None and found.ratio > least and colours and bool(fitted[0].any())
+    return psi.shots > 1 and find_method(name).films and colours and bool(fitted[0].any())
+
+
+def _moved(found: Motion | None, least: float) -> bool:
+    """Return whether a scene moved in nobody knows which shots."""
+    return found is not None and found.shot is None and found.ratio > least
 
 
 def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDArray]:
