@@ -62,9 +62,9 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
 from emmc_rig.progress import Silent
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry, frame_file
-from emmc_rig.session.frame_means import decoded
+from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.readings import session_readings, shot_frames
+from emmc_rig.session.readings import session_frames, shot_readings
 from emmc_rig.session.session import Frozen, Session
 from reconstruction.methods import DEFAULT_METHOD
 from reconstruction.tv import TVSettings, reconstruct_tv
@@ -226,7 +226,7 @@ def check_session(size: Size, seed: int) -> Iterator[Row]:
     fine = fine_scene(BUILT_IN[1], 2, 2, size=size.pixels, views=camera.views, seed=seed)
     rig, bench = rig_to_calibrate(settings, fine.samples)
     with simulated_session(simulated_plan(settings), camera, rig, Silent()) as session:
-        found, seen = emmc.calibrate(session), session_readings(session)
+        found, (_, seen) = emmc.calibrate(session), session_frames(session)
     true, known, good = true_psi(camera, rig, bench), found.calibration, found.outcome.good
     error, stated = true_error(known.psi, true, good), stated_error(known, good)
     yield Row("session: true error of Psi", error, min(STATED_TRUE * stated, TRUE_ERROR))
@@ -275,12 +275,9 @@ def captured_scene(spec: str, settings: CalibrateSettings, known: Calibration) -
     checks = Checks(largest_saturated_share=1.0)
     plan = Plan(camera=settings.camera_name, shots=shots, whiteboards=None, checks=checks)
     with simulated_session(plan, camera, rig, Silent()) as session:
-        every = [frame for of_shot in shot_frames(session).values() for frame in of_shot]
-        frames, exposures_s = zip(*decoded(session, every), strict=True)
-    given = np.stack([one.mosaic for one in frames]), np.array(exposures_s)
-    usable = known.usable(given[0], camera.sensor.noise.white_level_dn)
-    variance = known.reading_variance(*given)
-    return Captured(known.readings(*given), variance, usable, fine.scene.light_field)
+        frames = shot_readings(session, scale_of(known, session))
+    variance = np.square(frames.deviation)
+    return Captured(frames.readings, variance, frames.usable, fine.scene.light_field)
 
 
 @cache

@@ -9,7 +9,6 @@ reason whether a longer exposure saturates is predicted from the shorter ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,32 +29,23 @@ QUANTISATION_DN2 = 1 / 12
 """Least variance of a frame: a sensor without any noise still rounds."""
 
 
-@dataclass(frozen=True, eq=False)
-class LinearFrame:
-    """A frame in DN per second above the dark, all (y, x).
-
-    dn_per_s: where the shortest exposure is saturated, the least that it can be. variance: of
-    `dn_per_s`, (DN/s)^2; infinite where nothing is usable. usable: at least one exposure was
-    neither saturated nor predicted to be.
-    """
-
-    dn_per_s: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    usable: NDArray[np.bool_]
-
-
 def fuse(
     frames_dn: Sequence[NDArray[np.uint16]],
     exposures_s: Sequence[float],
     darks: Sequence[MeanFrame],
     gain: SensorGain,
     white_level_dn: int,
-) -> LinearFrame:
-    """Return the linear frame of a bracket: frames (y, x), repeats of one exposure too.
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the light rate of a bracket, its variance, and which pixels are usable, each (y, x).
 
-    darks: of one exposure or more; each frame's own is subtracted, see `dark_shares`. Where all are
-    of another exposure, what dark current adds is not known: the deviation counts
-    DARK_ELECTRONS_PER_S. gain: its variance in the dark is that of the shortest dark.
+    The rate is in DN per second above the dark; where the shortest exposure is saturated, the least
+    that it can be. The variance is in (DN/s)^2, infinite where nothing is usable. A pixel is usable
+    where at least one exposure is neither saturated nor predicted to be.
+
+    frames_dn: (y, x) each, repeats of one exposure too. darks: of one exposure or more; each
+    frame's own is subtracted, see `dark_shares`. Where all are of another exposure, the added dark
+    current is not known: the deviation counts DARK_ELECTRONS_PER_S. gain: its variance in the dark
+    is that of the shortest dark.
 
     Raises CalibrationError for no frame, or for frames of another size than the dark one.
     """
@@ -93,9 +83,7 @@ def fuse(
     variance = variance + sum(dn * lever for dn, lever in zip(unknown_dn, levers, strict=True)) ** 2
     clipped = ~(seen | unclipped[0])
     rate = np.where(clipped, np.maximum(signals[0], 0) / times_s[0], rate)
-    return LinearFrame(
-        rate.astype(np.float32), np.where(seen, variance, np.inf).astype(np.float32), seen
-    )
+    return rate.astype(np.float32), np.where(seen, variance, np.inf).astype(np.float32), seen
 
 
 def _unknown_dn(darks: Sequence[MeanFrame], exposure_s: float, gain: SensorGain) -> float:

@@ -32,7 +32,6 @@ from calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 Array = NDArray[np.floating]
-Frames = NDArray[np.floating] | NDArray[np.integer]
 LARGEST_DARK_SHARE = 0.01
 IDEAL_DN = 1e6
 NewArray = Callable[[str, tuple[int, ...]], Any]
@@ -78,21 +77,6 @@ class Calibration:
             missed += float(np.sum(np.square(self.deviation[place]), dtype=np.float64))
             total += float(np.sum(np.square(self.psi.weights[place]), dtype=np.float64))
         return float(np.sqrt(missed / max(total, 1e-300)))
-
-    def usable(self, frames_dn: Frames, white_level_dn: int) -> NDArray[np.bool_]:
-        """Return which readings to use, (shot, y, x): of good pixels, and not saturated."""
-        unsaturated = np.asarray(frames_dn) < white_level_dn
-        return unsaturated if self.good is None else unsaturated & self.good
-
-    def readings(self, frames_dn: Frames, exposures_s: Array) -> NDArray[np.float32]:
-        """Return normalised readings of frames in DN, both (shot, y, x); exposures (shot,)."""
-        scale = self.white_dn_per_s * np.asarray(exposures_s)[:, None, None]
-        return ((frames_dn - self.dark_dn) / scale).astype(np.float32)
-
-    def reading_variance(self, frames_dn: Frames, exposures_s: Array) -> NDArray[np.float64]:
-        """Return the variance of the readings of frames in DN, (shot, y, x)."""
-        scale = self.white_dn_per_s * np.asarray(exposures_s, dtype=np.float64)[:, None, None]
-        return self.gain.variance_dn2(frames_dn - self.dark_dn) / scale**2
 
 
 def in_memory(name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:

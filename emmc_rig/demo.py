@@ -40,10 +40,10 @@ from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import whiteboards
-from emmc_rig.session.frame_means import decoded, session_darks
-from emmc_rig.session.measured_psi import Scale
+from emmc_rig.session.frame_means import decoded
+from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.readings import scaled_readings, shot_frames
+from emmc_rig.session.readings import shot_frames, shot_readings
 from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
@@ -173,12 +173,10 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         exact = measure_psi(ideal_boards(_noise_free(session, rig, bench), lamps, design), design)
         psi_error = calibration.psi.relative_difference(exact.psi)
         design_error = design.relative_difference(exact.psi)
-        darks, good = session_darks(session), np.ones(design.frames_shape[1:], dtype=bool)
-        scale = Scale(calibration.psi, calibration.white_dn_per_s, darks, calibration.gain, good)
-        taken = scaled_readings(session, scale, range(design.shots))
+        taken = shot_readings(session, scale_of(calibration, session))
         of_shots = [some[0] for some in shot_frames(session).values()]
-        shots_dn, shots_s = zip(*decoded(session, of_shots), strict=True)
-        frames_dn, exposures_s = np.stack([one.mosaic for one in shots_dn]), np.array(shots_s)
+        frames_dn = np.stack([raw.mosaic for raw in decoded(session, of_shots)])
+        exposures_s = np.array([exposure.exposures_s[0] for exposure in taken.exposures])
     with stages("reconstruct"):
         readings, usable, sigma = taken.readings, taken.usable, taken.noise_sigma
 
@@ -245,7 +243,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             frames_dn,
             readings,
             exposures_s,
-            deviation=np.sqrt(taken.variance),
+            deviation=taken.deviation,
             usable=usable,
         )
         calibration.psi.save(folder / "psi.h5")

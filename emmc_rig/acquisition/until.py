@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from calibration.scale import Scale
 from calibration.shadow import shadow_mask
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.session.journal import DecidedEntry, ended, of_kind
-from emmc_rig.session.measured_psi import Scale, session_scale
+from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.readings import scaled_readings
+from emmc_rig.session.readings import shot_readings
 from emmc_rig.session.session import Session
 from reconstruction.methods import reconstruct
 from reconstruction.result import Progress, Reconstruction
@@ -160,7 +161,9 @@ def light_field_so_far(
 
     Raises AppError, CalibrationError or ReconstructionError.
     """
-    taken = scaled_readings(session, scale, shots)
+    scale = scale.of_shots(shots)
+    frames = shot_readings(session, scale)
     return reconstruct(
-        METHOD, taken.psi, taken.readings, taken.noise_sigma, usable=taken.usable, on_step=on_step
-    )
+        METHOD, scale.psi, frames.readings, frames.noise_sigma, usable=frames.usable,
+        on_step=on_step,
+    )  # fmt: skip

@@ -17,10 +17,10 @@ from emmc_rig.commands.output import say, shown_progress, tell
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
+    from calibration.scale import Scale
     from emmc_rig.live.light_field import LiveLightField
     from emmc_rig.live.watch import Watch
     from emmc_rig.model.camera import Camera
-    from emmc_rig.session.measured_psi import Scale
 
 DESIGN = "design"
 
@@ -183,9 +183,9 @@ def _scale(psi: str | None) -> Scale | None:
     """Return what --psi names; None where nothing, or the design, which needs the camera's size."""
     if psi is None or psi == DESIGN:
         return None
-    from emmc_rig.live.light_field import open_scale
+    from emmc_rig.live.light_field import live_scale
 
-    return open_scale(Path(psi))
+    return live_scale(Path(psi))
 
 
 def _light_field(
@@ -198,7 +198,8 @@ def _light_field(
     """Return what reconstructs while the camera watches; None without a Psi."""
     if psi is None:
         return None
-    from emmc_rig.live.light_field import LiveLightField, designed_scale
+    from calibration.scale import designed_scale
+    from emmc_rig.live.light_field import LiveLightField
     from reconstruction.methods import DEFAULT_METHOD, find_method
 
     chosen = method or DEFAULT_METHOD

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from emmc_rig.commands.options import PARALLEL, ClusterOption, DictionaryOption, check_workers
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.commands.verdict import show_verdict
+
+if TYPE_CHECKING:
+    from emmc_rig.processing.captures import Capture
 
 DEFAULT = Path("emmc-reconstruction")
 """The folder that is written, unless it is in a session."""
@@ -91,6 +95,7 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct light fields from frames, or a film of them, with a verdict."""
+    from emmc_rig.processing.captures import opened_capture
     from emmc_rig.processing.memory import parse_memory
     from emmc_rig.processing.reconstructing import load_settings, reconstruct_captures
     from reconstruction.methods import DEFAULT_METHOD, find_method
@@ -106,7 +111,9 @@ def reconstruct(
     if memory is not None and cluster is not None:
         raise typer.BadParameter("--memory is for this machine only: leave it out with --cluster")
     chosen, why = load_settings(settings), None
-    if any(map(_is_film, frames)) and frame is None:
+    captures = [opened_capture(folder) for folder in frames]
+    films = [capture for capture in captures if capture.planned_frames]
+    if films and frame is None:
         others = {
             "--truth": truth, "--without-shots": without_shots, "--zarr": as_zarr,
             "--budget": budget, "--dictionary": dictionary,
@@ -116,14 +123,14 @@ def reconstruct(
         for name, given in others.items():
             if given:
                 raise typer.BadParameter(f"{name}: not of a film; leave it out, or add --frame")
-        ((_, written),) = _places(frames, out)
+        ((_, written),) = _places(captures, out)
         _film(
-            frames[0], written, strict, method=method or DEFAULT_METHOD, psi_path=psi,
+            films[0], written, strict, method=method or DEFAULT_METHOD, psi_path=psi,
             settings=chosen, memory=None if memory is None else parse_memory(memory),
             workers=workers, cluster=cluster,
         )  # fmt: skip
         return
-    if frame is not None and not (len(frames) == 1 and _is_film(frames[0])):
+    if frame is not None and not (films and len(frames) == 1):
         raise typer.BadParameter("--frame: is of a film; name one session that holds a film")
     if budget is not None:
         if method is not None or settings is not None:
@@ -131,14 +138,13 @@ def reconstruct(
                 "--budget chooses method and settings: leave --method and --settings out"
             )
         from emmc_rig.processing.budget import method_within
-        from emmc_rig.processing.reconstructing import open_frames
 
-        method, why = method_within(*open_frames(frames[0], psi, frame), budget)
+        method, why = method_within(*captures[0].loaded(psi, frame), budget)
         say("chosen", why, "cyan")
     method = method or DEFAULT_METHOD
     if dictionary is not None and not find_method(method).needs_dictionary:
         raise typer.BadParameter(f"--dictionary: no effect on --method {method}; leave it out")
-    places = _places(frames, out if frame is None else out or DEFAULT)
+    places = _places(captures, out if frame is None else out or DEFAULT)
     limit = None if memory is None else parse_memory(memory)
     failed, refused = False, False
     with shown_progress() as bars:
@@ -148,13 +154,14 @@ def reconstruct(
             places, workers, cluster, limit, lambda step: bars.advance(step),
             method=method, psi_path=psi, dictionary_spec=dictionary, settings=chosen, truth=truth,
             chosen=why, as_zarr=as_zarr, without_shots=without_shots or (), frame=frame,
+            on_note=lambda text: say("note", text),
         ):  # fmt: skip
             if isinstance(outcome, Exception) and len(places) == 1:
                 raise outcome
             done.append((place, outcome))
-    for (folder, written), outcome in done:
+    for (capture, written), outcome in done:
         if len(places) > 1:
-            tell(f"{folder}:")
+            tell(f"{capture.folder}:")
         if isinstance(outcome, Exception):
             tell(f"failed: {outcome}", "red")
             failed = True
@@ -167,25 +174,17 @@ def reconstruct(
         raise typer.Exit(1)
 
 
-def _is_film(folder: Path) -> bool:
-    from emmc_rig.files.folders import is_session
+def _film(capture: Any, out: Path, strict: bool, **given: Any) -> None:
+    """Reconstruct a film, and say in a line how that went; given: to `reconstruct_film_session`.
 
-    if not is_session(folder):
-        return False
-    from emmc_rig.processing.filming import planned_frames
-    from emmc_rig.session.session import Session
-
-    return planned_frames(Session(folder)) > 0
-
-
-def _film(session: Path, out: Path, strict: bool, **given: Any) -> None:
-    """Reconstruct a film, and say in a line how that went; given: to `reconstruct_film_session`."""
+    capture: a `SessionCapture`.
+    """
     from emmc_rig.files.results import shown_seconds, stated_words
     from emmc_rig.processing.filming import reconstruct_film_session
 
     with shown_progress(given["method"]) as bars:
         metrics = reconstruct_film_session(
-            session, out, on_step=bars.advance, on_note=lambda text: say("note", text), **given
+            capture, out, on_step=bars.advance, on_note=lambda text: say("note", text), **given
         )
     film = metrics["film"]
     if "assumed" in metrics:
@@ -201,30 +200,26 @@ def _film(session: Path, out: Path, strict: bool, **given: Any) -> None:
         + (f", estimated accuracy {stated}" if stated else "")
     )
     show_verdict(metrics["verdict"])
-    tell(f"emmc-rig export {session if out.parent == session else out} shows it")
+    shown = capture.folder if out == capture.own_place else out
+    tell(f"emmc-rig export {shown} shows it")
     give_result(out)
     if strict and film["verdicts"]["do not use"]:
         raise typer.Exit(1)
 
 
-def _places(frames: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
-    """Return each folder of frames with the folder to write."""
-    from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session
-
-    if len(frames) == 1:
-        place = frames[0] / SESSION_RECONSTRUCTION if is_session(frames[0]) else DEFAULT
-        return [(frames[0], out or place)]
-    names = [folder.resolve().name for folder in frames]
+def _places(captures: Sequence[Capture], out: Path | None) -> list[tuple[Capture, Path]]:
+    """Return each capture with the folder to write."""
+    if len(captures) == 1:
+        return [(captures[0], out or captures[0].own_place or DEFAULT)]
+    names = [capture.folder.resolve().name for capture in captures]
     twice = sorted({name for name in names if names.count(name) > 1})
-    if twice and not (out is None and all(map(is_session, frames))):
+    if twice and not (out is None and all(capture.own_place for capture in captures)):
         raise typer.BadParameter(
             f"several captures are named {twice[0]}, and --out has a folder a name: rename one"
         )
     return [
-        (folder, folder / SESSION_RECONSTRUCTION)
-        if out is None and is_session(folder)
-        else (folder, (out or DEFAULT) / name)
-        for folder, name in zip(frames, names, strict=True)
+        (capture, (out is None and capture.own_place) or (out or DEFAULT) / name)
+        for capture, name in zip(captures, names, strict=True)
     ]
 
 

@@ -24,25 +24,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bracket import fuse
 from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, dark_at
+from calibration.scale import Scale, exposure_of
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats import Export
-from emmc_rig.files.psi import PSI
+from emmc_rig.files.scales import open_scale
 from emmc_rig.live.alignment import is_dark
 from emmc_rig.live.server import Picture, Pictured, Query
-from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.pages.display import PART_PIXELS
 from emmc_rig.pages.viewer import viewer_data
-from emmc_rig.session.measured_psi import Scale, session_scale
+from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.session import Session
 from reconstruction.adaptive.film import Film
 from reconstruction.errors import ReconstructionError
@@ -82,10 +79,7 @@ Solve = Callable[..., tuple[Reconstruction, Verdict]]
 SURE_PX = 0.15
 """Deviation of a disparity, coarse pixels per view step, above which it is not shown."""
 WINDOW_PX = 7
-CALIBRATION = "calibration.h5"
 DARK = "the picture is dark: no light field to see"
-MANY = 1_000_000
-"""Frames that an average stands for whose own noise is not known, and is left out."""
 
 
 class _ChangedError(Exception):
@@ -207,43 +201,31 @@ class LiveLightField:
     def _changed(self, shot: int, frame: RawFrame) -> bool:
         """Return whether a frame differs from the held one of its shot by more than noise."""
         held = self._held[shot]
-        one, other = self._rate(frame), self._rate(held)
-        gain = self._scale.gain
-        mean = np.maximum((one + other) / 2, 0)
-        variance = sum(
-            (gain.gain_dn_per_electron * mean + gain.dark_variance_dn2 / exposure_s) / exposure_s
-            for exposure_s in (_exposure_s(frame), _exposure_s(held))
-        )
-        square = np.where(self._scale.good, (one - other) ** 2 / variance, 1.0)
+        scale = self._scale
+        rate, held_rate = scale.rate(frame), scale.rate(held)
+        mean = np.maximum((rate + held_rate) / 2, 0)
+        variance = sum(scale.rate_variance(mean, exposure_of(of)) for of in (frame, held))
+        square = np.where(scale.good, (rate - held_rate) ** 2 / variance, 1.0)
         return bool(cv2.blur(square, (BLOCK_PX, BLOCK_PX)).max() > CHANGED)
 
     def _cut(self, frame: RawFrame) -> bool:
         """Return whether a frame shows another scene than the one held, not the same in motion."""
         one, other = (
-            cv2.blur(self._rate(of) * self._reading_per_rate[0], (BLOCK_PX, BLOCK_PX))
+            cv2.blur(self._scale.rate(of) * self._reading_per_rate[0], (BLOCK_PX, BLOCK_PX))
             for of in (frame, self._held[0])
         )
         return bool((one - other).var() > CUT * (one.var() + other.var()))
 
-    def _rate(self, frame: RawFrame) -> NDArray[np.float32]:
-        """Return DN per second above the dark, (y, x)."""
-        exposure_s = _exposure_s(frame)
-        dark = dark_at(self._scale.darks, exposure_s)
-        rate = frame.mosaic - np.asarray(dark.mean_dn, np.float32)
-        rate /= np.float32(exposure_s)
-        return rate
-
-    def _of_shots(self) -> tuple[list[int], ImagingMatrix]:
-        shots = sorted(self._held)
-        whole = shots == list(range(self.psi.shots))
-        return shots, self.psi if whole else self.psi.of_shots(shots)
+    def _scale_of_held(self) -> Scale:
+        """Return the scale of the shots of which a frame is held."""
+        return self._scale.of_shots([self._scale.shots[place] for place in sorted(self._held)])
 
     def _go_on(self) -> None:
         """Move the preview on by the frames held."""
         shots = sorted(self._held)
         # 0 where a pixel is not to be used, so that nothing is chosen among the readings.
         share = self._reading_per_rate[shots]
-        readings = np.stack([self._rate(self._held[shot]) for shot in shots])
+        readings = np.stack([self._scale.rate(self._held[shot]) for shot in shots])
         readings *= share
         seen = share > 0
         level = float(readings.mean() / max(seen.mean(), 1e-12))
@@ -251,10 +233,11 @@ class LiveLightField:
             raise ReconstructionError(DARK)
         factor = max(self._level / level, level / max(self._level, 1e-12))
         if self.preview is None or factor > ANOTHER_BRIGHTNESS or len(shots) != self._shots:
-            psi = self._of_shots()[1]
+            scale = self._scale_of_held()
+            psi = scale.psi
             self._shots, self._level = len(shots), level
             step = FACTOR // np.gcd(FACTOR, psi.binning) * psi.binning
-            noise = self._noise(shots, readings)
+            noise = self._noise(scale, readings)
             self.preview = Preview(psi, int(step), readings, noise, seen)
         self.preview.follow(readings, STEPS)
         coarse = self.preview.light_field
@@ -265,33 +248,22 @@ class LiveLightField:
 
     _shots = 0
 
-    def _noise(self, shots: list[int], readings: Array) -> float:
-        """Return the typical deviation of readings."""
-        white = self._scale.white_dn_per_s[shots]
-        exposures_s = np.array([_exposure_s(self._held[shot]) for shot in shots])[:, None, None]
-        full = np.where(white > 0, white, np.inf) * exposures_s
-        dn = np.maximum(readings, 0) * np.where(np.isfinite(full), full, 0)
-        variance = self._scale.gain.gain_dn_per_electron * dn + self._scale.gain.dark_variance_dn2
-        return float(np.sqrt(np.mean(variance / full**2)))
+    def _noise(self, scale: Scale, readings: Array) -> float:
+        """Return the typical deviation of the readings of the frames held."""
+        variances = [
+            scale.rate_variance(np.maximum(reading, 0) * white, exposure_of(self._held[place]))
+            / np.where(white > 0, white, np.inf) ** 2
+            for place, reading, white in zip(
+                sorted(self._held), readings, scale.white_dn_per_s, strict=True
+            )
+        ]
+        return float(np.sqrt(np.mean(variances)))
 
     def _problem(self) -> tuple[ImagingMatrix, Frames]:
         """Return Psi and the frames held, as `emmc-rig reconstruct` takes them of a session."""
-        shots, psi = self._of_shots()
-        scale = self._scale
-        readings, deviation = np.empty(psi.frames_shape, np.float32), np.empty(psi.frames_shape)
-        usable = np.empty(psi.frames_shape, bool)
-        for place, shot in enumerate(shots):
-            held = self._held[shot]
-            linear = fuse(
-                [held.mosaic], [_exposure_s(held)], scale.darks, scale.gain, held.white_level_dn
-            )
-            seen = scale.white_dn_per_s[shot] > 0
-            white = np.where(seen, scale.white_dn_per_s[shot], 1.0)
-            readings[place] = linear.dn_per_s / white
-            deviation[place] = np.sqrt(linear.variance / white**2)
-            usable[place] = linear.usable & seen & scale.good
-            readings[place] *= seen & scale.good
-        return psi, Frames(readings, deviation, usable)
+        scale = self._scale_of_held()
+        places = {shot: place for place, shot in enumerate(self._scale.shots)}
+        return scale.psi, scale.frames(lambda shot: [self._held[places[shot]]])
 
     def _draw(self, export: Export, block: int = 1) -> None:
         self._numbers += 1
@@ -389,12 +361,6 @@ class _Refinement:
         self.step = progress.step
 
 
-def _exposure_s(frame: RawFrame) -> float:
-    if not frame.exposure_s:
-        raise AppError("the camera does not say how long its frames were exposed")
-    return float(frame.exposure_s)
-
-
 @dataclass(frozen=True, eq=False)
 class Pictures:
     """A light field and its maps; each has another number.
@@ -469,50 +435,9 @@ def disparity_of(light_field: Array) -> NDArray[np.float32]:
     return np.where(sure, found, np.nan).astype(np.float32)
 
 
-def open_scale(place: Path) -> Scale:
-    """Return Psi and what turns frames into readings.
+def live_scale(place: Path) -> Scale:
+    """Return the scale of a session, of a folder of `emmc-rig calibrate`, or of the file of a Psi.
 
-    place: a session, a folder of `emmc-rig calibrate`, or the file of a Psi. Without the frames of
-    a calibration beside it a Psi is scaled by its camera's noise model, which is coarser. Raises
-    AppError, SensingError or CalibrationError.
+    Raises AppError, ModelError or CalibrationError.
     """
-    if is_session(place):
-        return session_scale(Session(place))
-    file = place / PSI if place.is_dir() else place
-    if not file.is_file():
-        raise AppError(
-            f"{place}: no Psi; name a session, a folder of `emmc-rig calibrate` or psi.h5"
-        )
-    psi = ImagingMatrix.load(file)
-    if not (file.parent / CALIBRATION).is_file():
-        return designed_scale(psi)
-    with stored_arrays(file.parent / CALIBRATION, AppError, "calibrate again") as stored:
-        gain = SensorGain(
-            float(np.asarray(stored.attributes["gain_dn_per_electron"])),
-            float(np.asarray(stored.attributes["dark_variance_dn2"])),
-        )
-        dark_dn, white = stored.array("dark_dn"), stored.array("white_dn_per_s")
-        good = stored.array("good").astype(bool) if "good" in stored else None
-    if white.shape != psi.frames_shape:
-        raise AppError(f"{file}: does not fit the {CALIBRATION} beside it; calibrate again")
-    dark = MeanFrame(dark_dn, gain.dark_variance_dn2, MANY, 0.0)
-    everywhere = np.ones(dark_dn.shape, dtype=bool)
-    return Scale(psi, white, (dark,), gain, everywhere if good is None else good)
-
-
-def designed_scale(psi: ImagingMatrix) -> Scale:
-    """Return the scale of a Psi by its camera's noise model; raises AppError without a camera."""
-    if not psi.camera_json:
-        raise AppError("this Psi does not know its camera: name the folder of its calibration")
-    camera = camera_of(psi)
-    noise, shape = camera.sensor.noise, psi.frames_shape[1:]
-    read_variance = (noise.gain_dn_per_electron * noise.read_noise_electrons) ** 2
-    black = np.full(shape, noise.black_level_dn, dtype=np.float32)
-    white = noise.gain_dn_per_electron * noise.electrons_per_s * pixel_light(camera, psi.size)
-    return Scale(
-        psi,
-        white,
-        (MeanFrame(black, read_variance, MANY, 0.0),),
-        SensorGain(noise.gain_dn_per_electron, read_variance),
-        np.ones(shape, dtype=bool),
-    )
+    return session_scale(Session(place)) if is_session(place) else open_scale(place)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calibration.errors import CalibrationError
+from calibration.scale import Scale
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.control import Control
@@ -24,7 +25,7 @@ from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.pages.session_sheet import HEADINGS, small_jpeg, stored_jpeg
-from emmc_rig.session.measured_psi import Scale, session_scale
+from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 from reconstruction.errors import ReconstructionError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +11,34 @@ from emmc_rig.model.arguments import required
 from emmc_rig.model.errors import SensingError
 
 
+@dataclass(frozen=True)
+class Exposure:
+    """How a shot was exposed.
+
+    shot: number of the camera's shot, from 0. exposures_s: of its frames, seconds. gain: linear, 1
+    at the sensor's base sensitivity. time_s: seconds since the first frame of a film.
+    """
+
+    shot: int
+    exposures_s: tuple[float, ...]
+    gain: float = 1.0
+    time_s: float | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Frames:
     """What a reconstruction is given; all arrays (shot, pixel_y, pixel_x).
 
     readings: 1 is what the fully open camera reads from a white light field; of a saturated pixel
     the least that it can be, of any other that is not usable 0. deviation: the standard deviation
-    of each reading. usable: neither saturated nor a bad pixel.
-    NumPy takes frames as their readings.
+    of each reading. usable: neither saturated nor a bad pixel. exposures: of each shot, where they
+    are known. NumPy takes frames as their readings.
     """
 
     readings: NDArray[np.floating]
     deviation: NDArray[np.floating]
     usable: NDArray[np.bool_]
+    exposures: tuple[Exposure, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         arrays = {"readings": self.readings, "deviation": self.deviation, "usable": self.usable}

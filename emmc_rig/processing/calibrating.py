@@ -14,6 +14,7 @@ from pydantic import Field
 
 from calibration.boards import BoardFrame, BoardSet
 from calibration.frames import MeanFrame, average
+from calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.model.arguments import numbers_of, refusal, required
 from emmc_rig.model.blas import one_blas_thread
@@ -187,7 +188,10 @@ def _of_arrays(
     where = "poses: they have", "capture them, and give their arrays and poses"
     outcome = boards_outcome(camera, (k * rows, k * columns), boards, where)
     metrics = calibration_metrics(outcome, camera.title, "", "auto", started)
-    return outcome.calibration.psi, SessionCalibration(outcome, outcome.calibration, metrics)
+    chosen = outcome.calibration
+    good = outcome.good if chosen.good is None else chosen.good
+    scale = Scale(chosen.psi, chosen.white_dn_per_s, dark, chosen.gain, good)
+    return chosen.psi, SessionCalibration(outcome, chosen, scale, metrics)
 
 
 def _mean(

@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.frames import MeanFrame, SensorGain
+from calibration.scale import Scale
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.films import FRAMES
 from emmc_rig.files.folders import (
-    SESSION_RECONSTRUCTION,
     emptied,
     kept_folder,
     placed,
@@ -63,10 +63,10 @@ from emmc_rig.processing.reconstructing import (
     settings_of,
 )
 from emmc_rig.processing.result import Result
+from emmc_rig.processing.session_capture import SessionCapture
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
-from emmc_rig.session.measured_psi import Scale, psi_is_assumed, session_scale
-from emmc_rig.session.readings import FilmFrame, FilmPlace, film_frames, film_places
+from emmc_rig.session.readings import FilmPlace, film_frames, film_places
 from emmc_rig.session.session import Session
 from emmc_rig.version import __version__
 from reconstruction.adaptive.film import Film
@@ -218,11 +218,6 @@ def _refuse_without_films(method: str) -> None:
         raise AppError(f"'{method}' takes no films: choose {able}, or a single frame by --frame")
 
 
-def planned_frames(session: Session) -> int:
-    """Return how many frames of a film a session's plan has."""
-    return sum(frame.film is not None for frame in session.frames)
-
-
 @dataclass(frozen=True)
 class FilmJob:
     """What the frames of a session's film are computed from; picklable, so that workers get it.
@@ -236,13 +231,14 @@ class FilmJob:
     settings: MethodSettings
 
     def settle(
-        self, session: Session, psi_path: Path | None, on_note: Callable[[str], None]
+        self, capture: SessionCapture, psi_path: Path | None, on_note: Callable[[str], None]
     ) -> None:
         """Write what all frames have alike, unless an earlier run of the same film did.
 
         Raises AppError, CalibrationError.
         """
         path, given = self.kept / SCALE, None if psi_path is None else open_psi(psi_path).load()
+        session = capture.session
         stored = [entry.model_dump(mode="json") for entry in session.stored.values()]
         settings = self.settings.model_dump(mode="json")
         of_psi = None if given is None else given.checksum()
@@ -258,7 +254,7 @@ class FilmJob:
             on_note("starts anew: an earlier run was of other frames, settings or version")
             path.unlink()  # before all else: without it nothing is gone on from
         emptied(self.kept)
-        scale = session_scale(session)
+        scale = capture.scale(psi_path, on_note)
         psi = scale.psi if given is None else given
         if psi.frames_shape != scale.psi.frames_shape:
             raise AppError(f"{psi_path}: is not of this session's shots and frames")
@@ -307,21 +303,20 @@ def segment_task(
     latest = Latest(Film(job.settings.film), place=task.places.start - 1)
     with suppress(*DAMAGED):
         latest = Latest.opened(task.path, scale.psi)
-    for frame in film_frames(session, scale, range(latest.place + 1, task.places.stop)):
-        latest = replace(latest, place=frame.place)
-        frames = Frames(frame.readings, frame.deviation, frame.usable)
+    for at, frames in film_frames(session, scale, range(latest.place + 1, task.places.stop)):
+        latest, shot = replace(latest, place=at.place), scale.shots.index(at.shot)
         try:
-            result, latest = latest.next(scale.psi, frame.shot, frames, job.method, job.settings)
+            result, latest = latest.next(scale.psi, shot, frames, job.method, job.settings)
         except ReconstructionError as fault:
-            latest = replace(latest, failed={**latest.failed, frame.place: str(fault)})
+            latest = replace(latest, failed={**latest.failed, at.place: str(fault)})
         else:
-            _write(replace(result, verdict=result.verdict.with_reasons(reasons)), frame, task)
+            _write(replace(result, verdict=result.verdict.with_reasons(reasons)), at, task)
         latest = latest.saved(task.path, scale.psi)
         on_frame()
     return latest.failed
 
 
-def _write(result: Result, frame: FilmFrame, task: SegmentTask) -> None:
+def _write(result: Result, frame: FilmPlace, task: SegmentTask) -> None:
     """Write the result of a frame, whole and on the disk."""
     of_film = {
         "frame": frame.place,
@@ -339,7 +334,7 @@ def _write(result: Result, frame: FilmFrame, task: SegmentTask) -> None:
 
 
 def reconstruct_film_session(
-    folder: Path,
+    capture: SessionCapture,
     out: Path,
     method: str = DEFAULT_METHOD,
     psi_path: Path | None = None,
@@ -360,12 +355,11 @@ def reconstruct_film_session(
     Raises AppError, CalibrationError; StoppedError by Ctrl-C.
     """
     _refuse_without_films(method)
-    belongs = folder / SESSION_RECONSTRUCTION
-    with result_folder(out, "reconstruct", belongs_to=belongs, resumes=True) as new:
-        kept, session = kept_folder(new).absolute(), Session(folder)
+    with result_folder(out, "reconstruct", belongs_to=capture.own_place, resumes=True) as new:
+        kept, session = kept_folder(new).absolute(), capture.session
         job = FilmJob(session.folder, kept, method, settings or MethodSettings())
-        count, places = planned_frames(session), film_places(session)
-        job.settle(session, psi_path, on_note)
+        count, places = capture.planned_frames, film_places(session)
+        job.settle(capture, psi_path, on_note)
         tasks = _segments(job, places)
 
         def on_frame() -> None:
@@ -383,7 +377,7 @@ def reconstruct_film_session(
         shutil.copytree(kept / FRAMES, new / FRAMES, copy_function=_linked)
         if psi_path is None:
             _linked(kept / PSI, new / PSI)
-            metrics |= {"assumed": PSI_ASSUMED} if psi_is_assumed(session) else {}
+            metrics |= {"assumed": PSI_ASSUMED} if capture.assumed else {}
         write_metrics(new, metrics)
     return metrics
 

@@ -20,12 +20,10 @@ from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import LIGHT_FIELD, MAPS
 from emmc_rig.files.folders import (
     KEPT,
-    SESSION_RECONSTRUCTION,
-    is_session,
     kept_folder,
     result_folder,
 )
-from emmc_rig.files.psi import PSI, open_psi, psi_beside, read_frames
+from emmc_rig.files.psi import open_psi
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
@@ -37,6 +35,7 @@ from emmc_rig.model.sensing import ImagingMatrix, PsiSizes
 from emmc_rig.model.settings import validated
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
+from emmc_rig.processing.captures import Capture, opened_capture
 from emmc_rig.processing.memory import (
     BASE_BYTES,
     Ceiling,
@@ -51,7 +50,6 @@ from reconstruction.inputs import check_frames
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress
 from reconstruction.tiles import reconstruct_in_blocks
-from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
@@ -66,8 +64,8 @@ CODES, FEW_CODES = 255, 32
 """Of pictures of 8 bits; fewer different ones may be a drawing in readings."""
 RESULT_GROUP = "result.zarr"
 """Light field and maps, where they are written as Zarr."""
-Place = tuple[Path, Path]
-"""A capture's folder, and the folder to write: in a session only the one it has for this."""
+Place = tuple[Capture, Path]
+"""A capture, and the folder to write: in a session only the one it has for this."""
 
 
 def reconstruct(
@@ -236,14 +234,14 @@ def reconstruct_folder(folder: Path, out: Path, *given: Any, **named: Any) -> di
 
     given, named: the further arguments of `reconstruct_undrawn`.
     """
-    metrics, result = reconstruct_undrawn(folder, out, *given, **named)
+    metrics, result = reconstruct_undrawn(opened_capture(folder), out, *given, **named)
     if result is not None:
         result.draw(out)
     return metrics
 
 
 def reconstruct_undrawn(
-    folder: Path,
+    capture: Capture,
     out: Path,
     method: str = DEFAULT_METHOD,
     psi_path: Path | None = None,
@@ -256,8 +254,9 @@ def reconstruct_undrawn(
     as_zarr: bool = False,
     without_shots: Sequence[int] = (),
     frame: int | None = None,
+    on_note: Callable[[str], None] = lambda text: None,
 ) -> tuple[dict, Result | None]:
-    """Reconstruct a folder's frames into an existing folder `out`, all but the pictures.
+    """Reconstruct a capture's frames into an existing folder `out`, all but the pictures.
 
     Returns the metrics, and what to draw: None of a light field that is not drawn.
 
@@ -266,12 +265,13 @@ def reconstruct_undrawn(
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
     as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
-    without_shots: counted from 1, that are not used. frame: of a session's film, alone.
+    without_shots: counted from 1, that are not used. frame: of a session's film, alone. on_note:
+    told which Psi it is.
     """
     find_method(method)
     settings = settings or MethodSettings()
-    assumed = psi_path is None and is_session(folder) and _is_assumed(folder)
-    frames, psi_path = stored_frames(folder, out, psi_path, frame)
+    assumed = psi_path is None and capture.assumed
+    frames, psi_path = capture.frames(psi_path, frame, out, on_note)
     frames = _without(frames, without_shots)
     saved = open_psi(psi_path)
     in_memory = is_one_block(saved.size, settings) and not as_zarr
@@ -298,15 +298,14 @@ def reconstruct_undrawn(
                 blocks.write_shards(out / RESULT_GROUP, workers)
         further |= blocks.metrics()
         if not in_memory:
-            return _write_blocks(blocks, frames, folder, out, truth, further), None
+            return _write_blocks(blocks, frames, capture, out, truth, further), None
         arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
         for name, array in arrays.items():
             blocks.write(name, array)
         light_field = arrays.pop("light_field")
         solved = replace(blocks.result(), light_field=light_field, maps=arrays)
         result = Result(solved, blocks.verdict(), saved.load(), frames)
-    if is_session(folder):
-        result = replace(result, verdict=with_exposure(result.verdict, folder))
+    result = replace(result, verdict=result.verdict.with_reasons(capture.exposure_reasons()))
     compared_with = _compared(result.light_field, truth, result.psi)
     metrics = {**result.metrics(), **further, **compared_with}
     result.write(out, metrics)
@@ -316,18 +315,16 @@ def reconstruct_undrawn(
 def _write_blocks(
     blocks: Blocks,
     frames: Frames,
-    folder: Path,
+    capture: Capture,
     out: Path,
     truth: str | None,
     further: Mapping[str, Any],
 ) -> dict:
     """Write what does not fit into memory, unless it is a Zarr group already; return the metrics.
 
-    folder: of the frames. further: metrics besides those of the result.
+    further: metrics besides those of the result.
     """
-    psi, verdict = blocks.job.psi, blocks.verdict()
-    if is_session(folder):
-        verdict = with_exposure(verdict, folder)
+    psi, verdict = blocks.job.psi, blocks.verdict().with_reasons(capture.exposure_reasons())
     metrics = {
         **figures(blocks.result(), verdict, frames),
         "shots": psi.shots,
@@ -362,25 +359,9 @@ def _compared(light_field: Any, truth: str | None, psi: PsiSizes) -> dict[str, A
     return {"truth": truth, **compared(light_field, np.asarray(scene))}
 
 
-def with_exposure(verdict: Verdict, session: Path) -> Verdict:
-    """Return the verdict with what speaks against the exposures of a session's shots."""
-    # What sessions need, the formats of cameras among it, loads for as long as all else here.
-    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
-    from emmc_rig.session.session import Session
-
-    return verdict.with_reasons(exposure_reasons(shot_exposures(Session(session))))
-
-
-def _is_assumed(session: Path) -> bool:
-    from emmc_rig.session.measured_psi import psi_is_assumed
-    from emmc_rig.session.session import Session
-
-    return psi_is_assumed(Session(session))
-
-
 def ceiling_for(
     memory: int,
-    folders: Sequence[Path],
+    captures: Sequence[Capture],
     psi: Path | None,
     settings: MethodSettings,
     as_zarr: bool,
@@ -392,17 +373,12 @@ def ceiling_for(
     where not even one worker fits.
     """  # fmt: skip
     need = own = 0
-    for folder in folders:
-        if is_session(folder) and psi is None:
-            raise AppError(
-                f"{folder}: --memory needs Psi before the workers start; run `emmc-rig calibrate` "
-                "and give --psi"
-            )
-        saved = open_psi(psi or psi_beside(folder))
+    for capture in captures:
+        saved = open_psi(psi or capture.psi_file())
         need = max(need, task_bytes(saved, assumed_grid(saved, settings)))
         own = max(own, own_bytes(saved, settings, as_zarr, compares))
     single, double = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))
-    if len(folders) > 1 and double.total - double.own >= 2 * need:
+    if len(captures) > 1 and double.total - double.own >= 2 * need:
         return double, double.workers(need), 2
     return single, single.workers(need), 1
 
@@ -428,7 +404,7 @@ def reconstruct_captures(
     at_a_time = len(places)
     if memory is not None:
         ceiling, most, at_a_time = ceiling_for(
-            memory, [folder for folder, _ in places], given.get("psi_path"),
+            memory, [capture for capture, _ in places], given.get("psi_path"),
             given.get("settings") or MethodSettings(), given.get("as_zarr", False),
             given.get("truth") is not None,
         )  # fmt: skip
@@ -456,12 +432,13 @@ def reconstruct_captures(
 
 def _outcome(place: Place, **given: Any) -> dict | Exception:
     """Return a capture's metrics, or what it failed by; raises StoppedError by Ctrl-C."""
-    frames, out = place
-    of_session = frames / SESSION_RECONSTRUCTION if is_session(frames) else None
+    capture, out = place
     try:
-        with result_folder(out, "reconstruct", belongs_to=of_session, resumes=True) as folder:
+        with result_folder(
+            out, "reconstruct", belongs_to=capture.own_place, resumes=True
+        ) as folder:
             try:
-                metrics, result = reconstruct_undrawn(frames, folder, **given)
+                metrics, result = reconstruct_undrawn(capture, folder, **given)
             except KeyboardInterrupt as stop:
                 if not (folder.parent / KEPT).is_dir():
                     raise
@@ -470,25 +447,13 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
                     "command goes on"
                 ) from stop
         if result is not None:  # the result is on the disk, whatever happens to its pictures
-            with result_folder(out, "reconstruct", belongs_to=of_session, adds=True) as folder:
+            with result_folder(
+                out, "reconstruct", belongs_to=capture.own_place, adds=True
+            ) as folder:
                 result.draw(folder)
         return metrics
     except ERRORS as fault:
         return fault
-
-
-def session_frames(folder: Path, frame: int | None = None) -> tuple[ImagingMatrix, Frames]:
-    """Return a session's shots, and the Psi of its whiteboards that they were normalised by.
-
-    frame: of a film, by its place in time from 0: that one alone. Raises AppError or
-    CalibrationError.
-    """
-    from emmc_rig.session.readings import film_readings, session_readings
-    from emmc_rig.session.session import Session
-
-    session = Session(folder)
-    taken = session_readings(session) if frame is None else film_readings(session, frame)
-    return taken.psi, Frames(taken.readings, np.sqrt(taken.variance), taken.usable)
 
 
 def open_frames(
@@ -496,9 +461,10 @@ def open_frames(
 ) -> tuple[ImagingMatrix, Frames]:
     """Return Psi and the frames of a folder: a session, or what `simulate` or `demo` wrote.
 
-    psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, what
-    its whiteboards measure). frame: of a session's film, by its place in time from 0. Raises
-    AppError, SensingError, CalibrationError, or ArgumentError for what is no path.
+    psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, its
+    calibration, which is measured and stored there first where there is none). frame: of a
+    session's film, by its place in time from 0. Raises AppError, SensingError, CalibrationError, or
+    ArgumentError for what is no path.
     """
     takes = "the folder of a session, or one that `emmc-rig simulate` or `demo` wrote"
     folder = path_of(folder, "folder", takes)
@@ -509,21 +475,7 @@ def open_frames(
             f"{folder}: a file; open_frames takes {takes}; readings of your own are given to "
             "`reconstruct` as an array (shot, pixel_y, pixel_x)"
         )
-    if is_session(folder):
-        measured, frames = session_frames(folder, frame)
-        return measured if psi is None else open_psi(Path(psi)).load(), frames
-    return open_psi(Path(psi or psi_beside(folder))).load(), read_frames(folder)
-
-
-def stored_frames(
-    folder: Path, out: Path, psi_path: Path | None, frame: int | None = None
-) -> tuple[Frames, Path]:
-    """Return the frames of a folder, and the file of their Psi: a session's is written to `out`."""
-    if is_session(folder):
-        measured, frames = session_frames(folder, frame)
-        measured.save(out / PSI)
-        return frames, psi_path or out / PSI
-    return read_frames(folder), psi_path or psi_beside(folder)
+    return opened_capture(folder).loaded(None if psi is None else Path(psi), frame)
 
 
 def _without(frames: Frames, shots: Sequence[int]) -> Frames:

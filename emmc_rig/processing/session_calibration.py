@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +15,36 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.placement import SCALARS, labels
 from calibration.routes import Outcome
+from calibration.scale import Scale
 from calibration.sensor import SensorSheet, characterise
 from calibration.whiteboard import Calibration, NewArray, in_memory
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.psi import PSI
-from emmc_rig.files.results import command_line, metrics_text, versions, write_metrics
+from emmc_rig.files.results import METRICS, command_line, metrics_text, versions, write_metrics
+from emmc_rig.files.scales import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.model.arguments import numbers_of, path_of
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import camera_of as camera_of_psi
 from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.frames import Frames
+from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import sensor_pairs
-from emmc_rig.session.frame_means import camera_of
-from emmc_rig.session.measured_psi import session_outcome
-from emmc_rig.session.readings import taken_shots
+from emmc_rig.session.frame_means import camera_of, taken_shots
+from emmc_rig.session.measured_psi import (
+    PSI_PRODUCT,
+    is_judged,
+    measured_scale,
+    psi_inputs,
+    scale_of,
+    session_outcome,
+    stored_scale,
+)
 from emmc_rig.session.session import CALIBRATION, Session
+from emmc_rig.store.products import record_product
 from reconstruction.inputs import check_frames
 
 SENSOR = "sensor.json"
@@ -44,7 +55,7 @@ METHODS = {
     "free": ("free",),
 }
 Array = NDArray[np.floating]
-REPORT, CALIBRATION_FILE = "report.html", "calibration.h5"
+REPORT = "report.html"
 
 
 def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, Any]:
@@ -54,18 +65,32 @@ def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, 
     }
 
 
+@dataclass(frozen=True, eq=False)
+class GivenFrame:
+    """A raw frame given as an array: see `calibration.scale.RawValues`."""
+
+    mosaic: NDArray
+    black_level_dn: NDArray[np.floating]
+    white_level_dn: int
+    exposure_s: float
+    gain: float = 1.0
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class SessionCalibration:
     """Psi as whiteboards measure it, those of a session or arrays.
 
     outcome: all methods tried, and the choice among them. calibration: the one chosen, of the shots
-    that the session has. metrics: what metrics.json says.
+    that the session has. scale: what makes readings of raw frames by it. metrics: what metrics.json
+    says. inputs: what Psi follows from, for `store.products`; None of arrays.
     """
 
     outcome: Outcome
     calibration: Calibration
+    scale: Scale
     metrics: dict[str, Any]
     sensor: SensorSheet | None = None
+    inputs: dict[str, Any] | None = None
 
     @property
     def psi(self) -> ImagingMatrix:
@@ -80,20 +105,20 @@ class SessionCalibration:
     def frames(self, dn: ArrayLike, exposures_s: float | Sequence[float] = 1.0) -> Frames:
         """Return the readings of raw frames by these whiteboards, with deviations.
 
-        dn: (shot, pixel_y, pixel_x), of the shots of Psi. exposures_s: of all, or of each; in the
+        dn: (shot, pixel_y, pixel_x), of the shots of Psi. exposures_s: of all, or of each, in the
         unit of the whiteboards' exposures. Raises ReconstructionError for another shape, and
         ArgumentError for what are no numbers.
         """
         taken = numbers_of(dn, "dn", "raw values, an array (shot, pixel_y, pixel_x)")
         check_frames(self.psi.frames_shape, taken)
-        known, times_s = self.calibration, np.broadcast_to(exposures_s, len(taken))
-        lit = known.white_dn_per_s > 0
-        safe = replace(known, white_dn_per_s=np.where(lit, known.white_dn_per_s, 1))
-        white_dn = camera_of_psi(self.psi).sensor.noise.white_level_dn
-        usable = known.usable(taken, white_dn) & lit
-        variance = safe.reading_variance(taken, times_s)
-        good = lit if known.good is None else lit & known.good
-        return Frames(safe.readings(taken, times_s) * good, np.sqrt(variance), usable)
+        times_s = np.broadcast_to(np.asarray(exposures_s, np.float64), len(taken))
+        noise = camera_of_psi(self.psi).sensor.noise
+        black = np.full((1, 1), noise.black_level_dn)
+        raw = {
+            shot: GivenFrame(mosaic, black, noise.white_level_dn, float(time_s))
+            for shot, mosaic, time_s in zip(self.scale.shots, taken, times_s, strict=True)
+        }
+        return self.scale.frames(lambda shot: [raw[shot]])
 
     def save(self, out: str | Path) -> None:
         """Write psi.h5, calibration.h5, metrics.json and report.html as the folder `out`.
@@ -106,7 +131,9 @@ class SessionCalibration:
 
     def write(self, folder: Path) -> None:
         """Write the same files into an existing folder."""
-        save_outcome(folder, self.outcome, self.calibration)
+        save_outcome(folder, self.outcome, self.calibration, self.scale)
+        if self.inputs is not None:
+            record_product(folder, PSI_PRODUCT, self.inputs)
         write_calibration_report(folder / REPORT, self.outcome, self.metrics, self.sensor)
         write_metrics(folder, self.metrics)
         if self.sensor is not None:
@@ -152,6 +179,47 @@ def calibrate_into(
     return calibration
 
 
+def calibrated_scale(
+    session: Session,
+    on_note: Callable[[str], None] = lambda text: None,
+    watcher: Watcher | None = None,
+) -> Scale:
+    """Return the scale that is stored in a session; measured and stored first where there is none.
+
+    on_note: told in a sentence which calibration it is. A calibration of other frames or another
+    version is replaced by one of the same method. Raises AppError or CalibrationError.
+    """
+    known, words = stored_scale(session)
+    if known is not None:
+        on_note(f"Psi: {words}")
+        return known
+    if not is_judged(session):
+        return measured_scale(session)
+    place, method = session.folder / CALIBRATION, _method_of(session)
+    if words:
+        on_note(f"{words}: measured again, method {method}")
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(result_folder(place, "calibrate", belongs_to=place))
+        except AppError as fault:
+            on_note(f"the calibration is not stored: {fault}")
+            return measured_scale(session)
+        calibrate_into(folder, session, method, False, watcher or Silent())
+    return open_scale(place)
+
+
+def _method_of(session: Session) -> str:
+    """Return the method of the calibration in a session; auto where there is none."""
+    try:
+        metrics = parse_json(
+            (session.folder / CALIBRATION / METRICS).read_bytes(), METRICS, ValueError
+        )
+        method = metrics["route"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return "auto"
+    return method if method in METHODS else "auto"
+
+
 @one_blas_thread()
 def _calibrated(
     session: Session, method: str, sensor: bool, watcher: Watcher, empty: NewArray
@@ -181,7 +249,9 @@ def _calibrated(
         watcher.begin("sensor", None)
         white_dn = camera_of(session).sensor.noise.white_level_dn
         sheet = characterise(*sensor_pairs(session), white_dn)
-    return SessionCalibration(outcome, chosen, metrics, sheet)
+    scale = scale_of(chosen, session, shots)
+    inputs = {**psi_inputs(session), "method": method}
+    return SessionCalibration(outcome, chosen, scale, metrics, sheet, inputs)
 
 
 def calibration_metrics(
@@ -271,7 +341,7 @@ def arrays_in(folder: Path) -> Iterator[NewArray]:
         yield empty
 
 
-def save_outcome(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
+def save_outcome(folder: Path, outcome: Outcome, chosen: Calibration, scale: Scale) -> None:
     """Write psi.h5 and calibration.h5 of the calibration chosen into an existing folder.
 
     Arrays that are on disk stay where they are, and their files get the rest.
@@ -279,22 +349,17 @@ def save_outcome(folder: Path, outcome: Outcome, chosen: Calibration) -> None:
     weights, deviation = chosen.psi.weights, chosen.deviation
     if isinstance(weights, h5py.Dataset) and isinstance(deviation, h5py.Dataset):
         chosen.psi.describe(weights.file)
-        _describe(deviation.file, outcome, chosen)
+        _describe(deviation.file, outcome, scale)
         return
     chosen.psi.save(folder / PSI)
     with h5py.File(folder / CALIBRATION_FILE, "w") as file:
         file["deviation"] = chosen.deviation
-        _describe(file, outcome, chosen)
+        _describe(file, outcome, scale)
 
 
-def _describe(file: h5py.File, outcome: Outcome, chosen: Calibration) -> None:
-    """Write what turns frames into readings, and where the mask sat."""
-    file.attrs["gain_dn_per_electron"] = chosen.gain.gain_dn_per_electron
-    file.attrs["dark_variance_dn2"] = chosen.gain.dark_variance_dn2
-    file["dark_dn"] = chosen.dark_dn
-    file["white_dn_per_s"] = chosen.white_dn_per_s
-    if chosen.good is not None:
-        file["good"] = chosen.good
+def _describe(file: h5py.File, outcome: Outcome, scale: Scale) -> None:
+    """Write the scale of the readings, the crosstalk, and the placement of the mask."""
+    write_scale(file, scale)
     if outcome.crosstalk is not None:
         # What every filter sees of the colours, (filter, colour).
         file["crosstalk"] = outcome.crosstalk.seen

@@ -139,7 +139,7 @@ def sensor_pairs(session: Session) -> tuple[list[Pair], Iterator[Pair]]:
 
     def pairs(groups: Mapping[float, list[PlannedFrame]]) -> Iterator[Pair]:
         for exposure_s, frames in groups.items():
-            first, second = (frame.mosaic for frame, _ in decoded(session, frames[:2]))
+            first, second = (frame.mosaic for frame in decoded(session, frames[:2]))
             yield Pair(exposure_s, first, second)
 
     return list(pairs(darks)), pairs(flats)

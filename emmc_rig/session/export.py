@@ -99,7 +99,7 @@ def export_dng(
     runs = of_kind(session.journal.entries, RunEntry)
     imported = bool(of_kind(session.journal.entries, ImportedEntry))
     with result_folder(folder, "session export --dng") as new:
-        for planned, (frame, _) in zip(frames, decoded(session, frames), strict=True):
+        for planned, frame in zip(frames, decoded(session, frames), strict=True):
             line = session.stored[planned.id]
             run = runs[max(0, line.run - 1)] if runs else None
             named = {} if run is None else run.camera
@@ -231,7 +231,7 @@ def _write_frames(
         "data", (len(frames), *shape), np.uint16, chunks=(1, *shape), **packing
     )
     data.attrs["units"] = UNITS["data"]
-    for place, (frame, _) in enumerate(decoded(session, frames)):
+    for place, frame in enumerate(decoded(session, frames)):
         if frame.mosaic.shape != shape:
             name = frames[place].id
             raise AppError(f"{session.folder}: frame {name} has another size than the first")

@@ -18,19 +18,25 @@ from emmc_rig.session.journal import FrameEntry, ImportedEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
+KEPT_BYTES = 2**28
+"""Of means of frames that an open session keeps."""
+
 
 def camera_of(session: Session) -> Camera:
     """Return the camera as planned."""
     return validated(Camera, session.camera, str(session.folder), AppError)
 
 
-def decoded(session: Session, frames: Iterable[PlannedFrame]) -> Iterator[tuple[RawFrame, float]]:
-    """Yield frames and their exposures in seconds; raises AppError for one that is not good."""
+def taken_shots(session: Session) -> tuple[int, ...]:
+    """Return the shots of the scene that the session needs, by their place in the plan."""
+    return tuple(sorted({f.bench.shot for f in session.needed if f.kind == "shot"}))
+
+
+def decoded(session: Session, frames: Iterable[PlannedFrame]) -> Iterator[RawFrame]:
+    """Yield frames with exposure and gain as journalled; raises AppError for a damaged frame."""
     for frame in frames:
-        entry = session.stored.get(frame.id)
         data = session.read(frame.id)
-        assert entry is not None
-        yield decode_frame(data, entry), entry.exposure_s
+        yield decode_frame(data, session.stored[frame.id])
 
 
 def stage_um_of(frame: PlannedFrame) -> tuple[float, float]:
@@ -148,10 +154,19 @@ def alike_frames(session: Session, frames: list[PlannedFrame]) -> list[PlannedFr
 
 
 def mean_of(session: Session, frames: list[PlannedFrame]) -> MeanFrame:
-    """Return the mean of frames that differ in nothing; raises AppError or CalibrationError."""
+    """Return the mean of frames that differ in nothing; raises AppError or CalibrationError.
+
+    Each mean is computed once while those of a session take less than KEPT_BYTES.
+    """
     alike = alike_frames(session, frames)
     entries = [session.stored[frame.id] for frame in alike]
-    mosaics = (frame.mosaic for frame, _ in decoded(session, alike))
+    key = tuple((frame.id, entry.sha256) for frame, entry in zip(alike, entries, strict=True))
+    if key in session.means:
+        return session.means[key]
+    mosaics = (frame.mosaic for frame in decoded(session, alike))
     taken_s = float(np.mean([_taken_s(session, entry) for entry in entries]))
     first, what, lit = entries[0], alike[0].id, alike[0].kind != "dark"
-    return average(mosaics, first.exposure_s, first.white_level_dn, what, taken_s, lit)
+    mean = average(mosaics, first.exposure_s, first.white_level_dn, what, taken_s, lit)
+    if (len(session.means) + 1) * mean.mean_dn.nbytes <= KEPT_BYTES:
+        session.means[key] = mean
+    return mean

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.boards import BoardSet, channels_of
-from calibration.frames import MeanFrame, SensorGain
+from calibration.frames import MeanFrame
 from calibration.routes import Outcome, calibrate
+from calibration.scale import Scale, designed_scale
 from calibration.whiteboard import Calibration, NewArray, in_memory, measure_psi
 from emmc_rig.errors import AppError
-from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light, psi_layout
+from emmc_rig.files.psi import PSI
+from emmc_rig.files.scales import open_scale
+from emmc_rig.model.camera import Camera, build_imaging_matrix, psi_layout
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.session.board_sets import SessionBoards, board_sets, whiteboards
 from emmc_rig.session.frame_means import (
@@ -21,32 +23,24 @@ from emmc_rig.session.frame_means import (
     frame_shape,
     mean_dark,
     session_darks,
+    taken_shots,
 )
-from emmc_rig.session.session import Session
+from emmc_rig.session.planned import VALIDATION
+from emmc_rig.session.session import CALIBRATION, Session
+from emmc_rig.store.products import product_digest, read_product
 
-
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """What turns a session's frames into readings, of every planned shot, taken or not.
-
-    white_dn_per_s: (shot, y, x), what a reading of 1 gives. darks: of one exposure or
-    more. good: (y, x), pixels to use at all.
-    """
-
-    psi: ImagingMatrix
-    white_dn_per_s: NDArray[np.floating]
-    darks: tuple[MeanFrame, ...]
-    gain: SensorGain
-    good: NDArray[np.bool_]
+PSI_PRODUCT = "psi"
+SCENE_KINDS = ("shot", "metering")
+"""Kinds of frames from which no Psi follows."""
 
 
 def session_calibration(session: Session) -> Calibration:
     """Return Psi measured from the session's whiteboards; raises AppError or CalibrationError.
 
-    Whiteboards of the open aperture are fitted, and tested on those for validation; where there are
-    none, every coefficient is measured through the pinhole.
+    Of pinholes alone, without a whiteboard for validation, every coefficient is measured through
+    the pinhole, and nothing judges it.
     """
-    if any(frame.kind == "open" for frame in session.frames):
+    if is_judged(session):
         return session_outcome(session).calibration
     boards = whiteboards(session)
     return measure_psi(boards, designed_psi(session, boards.dark))
@@ -135,24 +129,77 @@ def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:
     return opened >= {(shot, view) for shot in shots for view in np.ndindex(camera.views)}
 
 
+def psi_inputs(session: Session) -> dict[str, Any]:
+    """Return what the Psi of a session's whiteboards follows from, besides the method: plain data.
+
+    All frames but those of the scene, how the bench stood for them, and the camera as planned.
+    """
+    stored = session.stored
+    return {
+        "camera": session.camera,
+        "shots": taken_shots(session),
+        "frames": [
+            {
+                **frame.as_dict(),
+                "sha256": entry.sha256,
+                "exposed_s": entry.exposure_s,
+                "black_level_dn": entry.black_level_dn,
+                "white_level_dn": entry.white_level_dn,
+                "deviation_um": entry.deviation_um,
+                "time_s": entry.host_time_s,
+            }
+            for frame in session.frames
+            if frame.kind not in SCENE_KINDS and (entry := stored.get(frame.id)) is not None
+        ],
+    }
+
+
+def stored_scale(session: Session) -> tuple[Scale | None, str]:
+    """Return the scale that a calibration stored in the session, and a sentence that names it.
+
+    None where there is none, or one of other frames, another plan or version; the sentence says
+    which, and is empty where there is none.
+    """
+    folder = session.folder / CALIBRATION
+    if not (folder / PSI).is_file():
+        return None, ""
+    product = read_product(folder, PSI_PRODUCT)
+    if product is None:
+        return None, f"{folder} was made by a version that did not note its frames"
+    method = product.inputs.get("method")
+    if product.digest != product_digest(PSI_PRODUCT, {**psi_inputs(session), "method": method}):
+        return None, f"{folder} is of other frames, another plan or version"
+    return open_scale(folder), f"{folder}, method {method}, made {product.made}"
+
+
 def session_scale(session: Session) -> Scale:
-    """Return the calibration by the session's whiteboards and darks.
+    """Return the scale that is stored in a session, else that of its whiteboards and darks.
 
     Without whiteboards it is the designed Psi and the camera's own noise model, which is coarser.
     Raises AppError or CalibrationError.
     """
-    darks, dark = session_darks(session), mean_dark(session)
-    if not psi_is_assumed(session):
-        known = session_calibration(session)
-        good = np.ones(dark.mean_dn.shape, dtype=bool) if known.good is None else known.good
-        return Scale(known.psi, known.white_dn_per_s, darks, known.gain, good)
-    camera = camera_of(session)
-    noise = camera.sensor.noise
-    psi = designed_psi(session, dark)
-    per_second = noise.gain_dn_per_electron * noise.electrons_per_s
-    white = per_second * pixel_light(camera, psi.size)
-    gain = SensorGain(noise.gain_dn_per_electron, dark.variance_dn2)
-    return Scale(psi, white, darks, gain, np.ones(dark.mean_dn.shape, dtype=bool))
+    known, _ = stored_scale(session)
+    return measured_scale(session) if known is None else known
+
+
+def measured_scale(session: Session) -> Scale:
+    """Return the scale of a session's whiteboards and darks, computed now: see `session_scale`."""
+    if psi_is_assumed(session):
+        return designed_scale(designed_psi(session, mean_dark(session)), session_darks(session))
+    return scale_of(session_calibration(session), session)
+
+
+def scale_of(calibration: Calibration, session: Session, shots: Sequence[int] = ()) -> Scale:
+    """Return the scale of a calibration and all darks of its session; shots: see `Scale`."""
+    white, good = calibration.white_dn_per_s, calibration.good
+    good = np.ones(white.shape[1:], dtype=bool) if good is None else good
+    darks = session_darks(session)
+    return Scale(calibration.psi, white, darks, calibration.gain, good, tuple(shots))
+
+
+def is_judged(session: Session) -> bool:
+    """Return whether a calibration of the session is judged by validation, as `calibrate` does."""
+    return any(frame.kind in ("open", VALIDATION) for frame in session.frames)
 
 
 def psi_is_assumed(session: Session) -> bool:

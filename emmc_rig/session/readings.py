@@ -1,4 +1,4 @@
-"""Normalised readings of a session's shots: brackets fused, one frame in memory at a time."""
+"""Frames of a session: readings of its shots, or of its film frame by frame."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.bracket import LinearFrame, fuse
-from calibration.frames import MeanFrame, SensorGain
+from calibration.scale import Scale
 from emmc_rig.errors import AppError
-from emmc_rig.model.camera import json_of_shots
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.frame_means import camera_of, decoded
+from emmc_rig.session.frame_means import decoded, taken_shots
 from emmc_rig.session.journal import FilmEntry, FrameEntry, of_kind
-from emmc_rig.session.measured_psi import Scale, session_scale
+from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
@@ -26,25 +24,6 @@ SAME_EXPOSURE = 0.01
 """By how much the exposures of a film's frames may differ: by less than cameras state them."""
 EVERY = range(sys.maxsize)
 """All places of a film."""
-
-
-@dataclass(frozen=True, eq=False)
-class SessionReadings:
-    """What was captured, normalised as Psi is, all (shot, y, x).
-
-    readings: see `Frames`. variance: of the readings; infinite where not usable.
-    """
-
-    psi: ImagingMatrix
-    readings: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    usable: NDArray[np.bool_]
-
-    @property
-    def noise_sigma(self) -> float:
-        """Root mean variance of the usable readings, which solvers take as their typical noise."""
-        usable = self.variance[self.usable]
-        return float(np.sqrt(np.mean(usable, dtype=np.float64))) if usable.size else 0.0
 
 
 def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
@@ -59,70 +38,13 @@ def shot_frames(session: Session) -> dict[int, list[PlannedFrame]]:
     return dict(sorted(shots.items()))
 
 
-def fused_shot(
-    session: Session,
-    frames: list[PlannedFrame],
-    darks: Sequence[MeanFrame],
-    gain: SensorGain,
-) -> LinearFrame:
-    """Return a shot's bracket as one linear frame, at a gain of 1."""
-    mosaics, exposures_s, white_dn = [], [], 0
-    for frame, exposure_s in decoded(session, frames):
-        mosaics.append(frame.mosaic)
-        exposures_s.append(exposure_s)
-        white_dn = frame.white_level_dn
-    amplified = {frame.gain for frame in frames}
-    if len(amplified) > 1:
-        raise AppError(f"{session.folder}: the gain differs within one shot; plan it alike")
-    factor = amplified.pop()
-    if factor == 1:
-        return fuse(mosaics, exposures_s, darks, gain, white_dn)
-    # The signal above the black grows with the gain, its shot noise per DN too.
-    amplified_gain = SensorGain(
-        gain.gain_dn_per_electron * factor, gain.dark_variance_dn2 * factor**2
-    )
-    black = np.mean(session.stored[frames[0].id].black_level_dn)
-    lifted = [
-        replace(
-            dark,
-            mean_dn=(black + factor * (dark.mean_dn - black)).astype(np.float32),
-            variance_dn2=dark.variance_dn2 * factor**2,
-            extra_variance_dn2=dark.extra_variance_dn2 * factor**2,
-        )
-        for dark in darks
-    ]
-    fused = fuse(mosaics, exposures_s, lifted, amplified_gain, white_dn)
-    return LinearFrame(fused.dn_per_s / factor, fused.variance / factor**2, fused.usable)
+def shot_readings(session: Session, scale: Scale) -> Frames:
+    """Return the readings of the shots of a scale; one bracket is in memory at a time.
 
-
-def taken_shots(session: Session) -> tuple[int, ...]:
-    """Return the shots of the scene that the session needs, by their place in the plan."""
-    return tuple(sorted({f.bench.shot for f in session.needed if f.kind == "shot"}))
-
-
-def scaled_readings(session: Session, scale: Scale, shots: Sequence[int]) -> SessionReadings:
-    """Return what some shots read, and their Psi, in the order given."""
-    whole = list(shots) == list(range(scale.psi.shots))
-    psi = (
-        scale.psi if whole else scale.psi.of_shots(shots, json_of_shots(camera_of(session), shots))
-    )
+    Raises AppError or CalibrationError.
+    """
     frames = shot_frames(session)
-    readings = np.empty(psi.frames_shape, dtype=np.float32)
-    variance = np.empty(psi.frames_shape, dtype=np.float32)
-    usable = np.empty(psi.frames_shape, dtype=bool)
-    for place, shot in enumerate(shots):
-        linear = fused_shot(session, frames[shot], scale.darks, scale.gain)
-        readings[place], variance[place], usable[place] = _normalised(linear, scale, shot)
-    return SessionReadings(psi, readings, variance, usable)
-
-
-def _normalised(linear: LinearFrame, scale: Scale, shot: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Return a shot's readings, their variance and which are usable, each (y, x)."""
-    seen = scale.white_dn_per_s[shot] > 0
-    white = np.where(seen, scale.white_dn_per_s[shot], 1.0)
-    # What a pixel that is not to be used reads says nothing, not even how much at least.
-    readings = linear.dn_per_s / white * (seen & scale.good)
-    return readings, linear.variance / white**2, linear.usable & seen & scale.good
+    return scale.frames(lambda shot: list(decoded(session, frames[shot])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,20 +65,8 @@ class FilmPlace:
 
     @property
     def shot(self) -> int:
-        """Which of Psi's shots it is."""
+        """Number of the camera's shot."""
         return self.planned.bench.shot
-
-
-@dataclass(frozen=True, eq=False)
-class FilmFrame(FilmPlace):
-    """One frame of a film, normalised as Psi is; readings, deviation, usable: (1, y, x).
-
-    deviation: of the readings, infinite where not usable.
-    """
-
-    readings: NDArray[np.float32]
-    deviation: NDArray[np.float32]
-    usable: NDArray[np.bool_]
 
 
 def film_places(session: Session) -> list[FilmPlace]:
@@ -187,33 +97,27 @@ def film_places(session: Session) -> list[FilmPlace]:
 
 
 def film_frames(
-    session: Session, scale: Scale | None = None, only: Container[int] = EVERY
-) -> Iterator[FilmFrame]:
-    """Yield the film that a session holds, frame by frame in the order of time.
+    session: Session, scale: Scale, only: Container[int] = EVERY
+) -> Iterator[tuple[FilmPlace, Frames]]:
+    """Yield the frames of a session's film in the order of time, each of one shot.
 
-    One frame is in memory at a time. scale: what `session_scale` returns, which it is by default.
-    only: places to yield (default: all). Raises AppError, before the first frame, as `film_places`;
-    later for one that shows the same as the frame before it; CalibrationError.
+    One frame is in memory at a time. scale: of all shots of the plan. only: places to yield
+    (default: all). Raises AppError, before the first frame, as `film_places`; later for a frame
+    that shows the same as the frame before it; CalibrationError.
     """
-    places = film_places(session)
-    scale = session_scale(session) if scale is None else scale
     before = np.zeros(0)
-    for at in places:
-        # One before what is wanted is read, too, to be compared with.
+    for at in film_places(session):
+        # The frame before a wanted one is decoded, too, to be compared with.
         if at.place not in only and at.place + 1 not in only:
             continue
-        linear = fused_shot(session, [at.planned], scale.darks, scale.gain)
-        if np.array_equal(linear.dn_per_s, before):
+        (raw,) = decoded(session, [at.planned])
+        if np.array_equal(raw.mosaic, before):
             raise AppError(f"{session.folder}: {at.entry.id} shows the same as the frame before it")
-        before = linear.dn_per_s
+        before = raw.mosaic
         if at.place in only:
-            readings, variance, usable = _normalised(linear, scale, at.shot)
-            yield FilmFrame(
-                **vars(at),
-                readings=readings[np.newaxis].astype(np.float32),
-                deviation=np.sqrt(variance)[np.newaxis].astype(np.float32),
-                usable=usable[np.newaxis],
-            )
+            frames = scale.of_shots([at.shot]).frames(lambda shot, raw=raw: [raw])
+            exposures = (replace(frames.exposures[0], time_s=at.time_s),)
+            yield at, replace(frames, exposures=exposures)
 
 
 def _film(session: Session) -> list[tuple[PlannedFrame, FrameEntry]]:
@@ -256,26 +160,24 @@ def _moment(entry: FrameEntry) -> tuple[int, float]:
     return entry.segment, entry.film_s
 
 
-def session_readings(session: Session) -> SessionReadings:
-    """Return what the shots read that a session needs, by the Psi of its whiteboards.
+def session_frames(
+    session: Session, scale: Scale | None = None, place: int | None = None
+) -> tuple[ImagingMatrix, Frames]:
+    """Return Psi and the readings of the shots that a session needs, or of one frame of its film.
 
-    Raises AppError, as for a film, or CalibrationError.
+    scale: of the shots of the plan (default: see `session_scale`). place: of a film's frame, by its
+    place in time from 0. Raises AppError, as `film_frames` and for a place without a frame, or
+    CalibrationError.
     """
-    if not shot_frames(session) and _film(session):
+    if place is None and not shot_frames(session) and _film(session):
         raise AppError(
             f"{session.folder}: holds a film, whose frames are no shots of one light field: "
             "choose one, such as --frame 0"
         )
-    return scaled_readings(session, session_scale(session), taken_shots(session))
-
-
-def film_readings(session: Session, place: int) -> SessionReadings:
-    """Return what one frame of a film reads, by its place in time, as of a capture of one shot.
-
-    Raises AppError, as `film_frames` and for a place without a frame, or CalibrationError.
-    """
-    scale = session_scale(session)
-    for one in film_frames(session, scale, [place]):
-        psi = scale.psi.of_shots([one.shot], json_of_shots(camera_of(session), [one.shot]))
-        return SessionReadings(psi, one.readings, np.square(one.deviation), one.usable)
+    scale = session_scale(session) if scale is None else scale
+    if place is None:
+        scale = scale.of_shots(taken_shots(session))
+        return scale.psi, shot_readings(session, scale)
+    for at, frames in film_frames(session, scale, [place]):
+        return scale.of_shots([at.shot]).psi, frames
     raise AppError(f"{session.folder}: no frame {place}; frames are counted from 0")

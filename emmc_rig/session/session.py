@@ -41,6 +41,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from calibration.frames import MeanFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import (
     FILES,
@@ -112,13 +113,17 @@ class Frozen:
 
 
 class Session:
-    """An open session. One program at a time may add to it: see `lock.held`."""
+    """An open session. One program at a time may add to it: see `lock.held`.
+
+    means: of frames, by their ids and SHA-256, so that each is decoded once: see `frame_means`.
+    """
 
     def __init__(self, folder: str | Path, disk: Disk = SYSTEM_DISK) -> None:
         """Open a folder; raises AppError with one line when it is no session, or damaged."""
         folder = path_of(folder, "session", "the folder of a session")
         self.folder = Path(os.path.abspath(folder))
         self.disk = disk
+        self.means: dict[tuple[tuple[str, str], ...], MeanFrame] = {}
         try:
             self.journal = Journal(disk, self.folder / JOURNAL)
         except (FileNotFoundError, NotADirectoryError) as fault:

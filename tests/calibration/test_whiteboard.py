@@ -6,8 +6,10 @@ import pytest
 from calibration.boards import BoardFrame, BoardSet
 from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, average, photon_transfer
+from calibration.scale import MANY, Scale
 from calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
+from emmc_rig.processing.session_calibration import GivenFrame
 
 SIZE = (12, 16)
 WHITE_DN = 65_535
@@ -112,14 +114,21 @@ def test_readings_are_what_the_design_predicts():
     camera, design = design_of()
     calibration = measure_psi(noisy_boards(camera, design, 0, 4), design)
     truth = np.full((1, *SIZE), 0.4)
-    light = pixel_light(camera, SIZE)
+    noise, light = camera.sensor.noise, pixel_light(camera, SIZE)
     rng = np.random.default_rng(3)
-    frames = np.array(
-        [camera.sensor.noise.expose_dn(truth, 0.05, light, rng) for _ in range(50)], dtype=float
-    )
-    readings = np.array([calibration.readings(frame, np.array([0.05])) for frame in frames])
+    dark = MeanFrame(calibration.dark_dn, calibration.gain.dark_variance_dn2, MANY, 0.05)
+    good = np.ones(SIZE, dtype=bool)
+    scale = Scale(calibration.psi, calibration.white_dn_per_s, (dark,), calibration.gain, good)
+    black = np.full((1, 1), noise.black_level_dn)
+
+    def frames():
+        (mosaic,) = noise.expose_dn(truth, 0.05, light, rng)
+        return scale.frames(lambda shot: [GivenFrame(mosaic, black, noise.white_level_dn, 0.05)])
+
+    taken = [frames() for _ in range(50)]
+    readings = np.array([one.readings for one in taken])
     assert readings.mean() == pytest.approx(0.4, rel=2e-3)
-    stated = calibration.reading_variance(frames[0], np.array([0.05])).mean()
+    stated = np.square(taken[0].deviation).mean()
     assert readings.var(axis=0, ddof=1).mean() == pytest.approx(stated, rel=0.1)
 
 

@@ -233,14 +233,14 @@ def test_a_session_is_reconstructed_as_it_is(captured, run, tmp_path):
 def test_the_psi_of_a_session_is_that_of_the_demo_s_road(captured):
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.model.camera import build_imaging_matrix
-    from emmc_rig.session.readings import session_readings
+    from emmc_rig.session.readings import session_frames
 
-    taken = session_readings(Session(captured / "plan-session"))
+    psi, taken = session_frames(Session(captured / "plan-session"))
     design = build_imaging_matrix(find_camera("rgbw-bayer-2shots"), (24, 32))
     # The masks sit off by 6.5 um and more, which the design does not know.
-    assert 0 < design.relative_difference(taken.psi) < 0.6
+    assert 0 < design.relative_difference(psi) < 0.6
     assert taken.usable.all()
-    assert np.isfinite(taken.variance).all()
+    assert np.isfinite(taken.deviation).all()
 
 
 def test_a_plan_for_a_camera_is_written_once(run, tmp_path):

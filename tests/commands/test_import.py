@@ -49,7 +49,7 @@ def exported(session, folder, write):
     folder.mkdir()
     frames = [f for f in session.frames if f.kind != "metering" and f.id in session.stored]
     rows = []
-    for frame, (raw, exposure_s) in zip(frames, decoded(session, frames), strict=True):
+    for frame, raw in zip(frames, decoded(session, frames), strict=True):
         bench, um = frame.bench, frame.bench.offsets_um
         kind, turned = frame.kind, {}
         if kind == "turned":
@@ -58,7 +58,7 @@ def exported(session, folder, write):
         elif kind == "check" and not bench.masks_in:
             kind = "reference-check"
         row = {"file": write(folder / frame.id, raw.mosaic), "kind": kind, **turned}
-        row |= {"exposure_s": repr(exposure_s), "lamp": bench.lamp}
+        row |= {"exposure_s": repr(raw.exposure_s), "lamp": bench.lamp}
         if frame.kind != "dark" or frame.is_dark_of_shots:
             row["shot"] = bench.shot
         for axis in ("mask_x", "mask_y") if bench.masks_in else ():
@@ -533,7 +533,7 @@ def imported(run, folder, *arguments):
 
 def mosaics(session, kind):
     frames = [frame for frame in session.frames if frame.kind == kind]
-    return np.stack([raw.mosaic for raw, _ in decoded(session, frames)])
+    return np.stack([raw.mosaic for raw in decoded(session, frames)])
 
 
 @pytest.mark.slow

@@ -6,12 +6,13 @@ import pytest
 from browsers import MARKS, complaints
 from test_live import FakeCamera, PatientCamera
 
+from calibration.scale import designed_scale
 from drivers.errors import DriverError
 from emmc_rig.acquisition.control import Control
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.live.light_field import LiveLightField, designed_scale
+from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
 from emmc_rig.live.setup_page import SetupPage

@@ -11,9 +11,11 @@ import pytest
 from test_live_alignment import frame_of
 
 import emmc_rig as emmc
+from calibration.scale import designed_scale
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
-from emmc_rig.live.light_field import LiveLightField, designed_scale, disparity_of, open_scale
+from emmc_rig.live.light_field import LiveLightField, disparity_of, live_scale
+from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import psnr_db, shifted
 from emmc_rig.model.sensing import ImagingMatrix
@@ -259,14 +261,14 @@ def test_frames_that_do_not_fit_and_dark_ones_are_refused_in_words(one_shot):
 def test_a_psi_is_opened_with_what_lies_beside_it(tmp_path, one_shot):
     _, psi, _ = one_shot
     psi.save(tmp_path / "psi.h5")
-    assert open_scale(tmp_path).psi.checksum() == psi.checksum()
-    assert open_scale(tmp_path / "psi.h5").white_dn_per_s.shape == psi.frames_shape
+    assert live_scale(tmp_path).psi.checksum() == psi.checksum()
+    assert live_scale(tmp_path / "psi.h5").white_dn_per_s.shape == psi.frames_shape
     with pytest.raises(AppError, match="no Psi"):
-        open_scale(tmp_path / "elsewhere")
+        live_scale(tmp_path / "elsewhere")
     nameless = ImagingMatrix(psi.weights, psi.colour)
     nameless.save(tmp_path / "nameless.h5")
-    with pytest.raises(AppError, match="does not know its camera"):
-        open_scale(tmp_path / "nameless.h5")
+    with pytest.raises(ModelError, match="does not know its camera"):
+        live_scale(tmp_path / "nameless.h5")
 
 
 def test_a_solver_that_fails_is_reported(one_shot):

@@ -12,6 +12,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.psi import read_frames
 from emmc_rig.model.lightfield import load_hdf5
+from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.reconstructing import (
     load_settings,
     reconstruct_captures,
@@ -52,12 +53,13 @@ def test_a_result_is_on_the_disk_before_its_pictures_are_drawn(frames, tmp_path,
 
     out = tmp_path / "out"
     monkeypatch.setattr(Result, "draw", stopped)
+    places = [(opened_capture(frames), out)]
     with pytest.raises(KeyboardInterrupt):
-        list(reconstruct_captures([(frames, out)], None, None, None, print, method="tv"))
+        list(reconstruct_captures(places, None, None, None, print, method="tv"))
     assert load_hdf5(out / "light_field.h5").shape == (5, 5, *SIZE, 3)
     assert json.loads((out / "metrics.json").read_text())["method"] == "tv"
     monkeypatch.undo()
-    ((_, metrics),) = reconstruct_captures([(frames, out)], None, None, None, print, method="tv")
+    ((_, metrics),) = reconstruct_captures(places, None, None, None, print, method="tv")
     assert not isinstance(metrics, Exception)
     assert metrics["method"] == "tv"
     assert any((out / "pictures").iterdir())

@@ -15,9 +15,12 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.model.frames import Exposure
 from emmc_rig.session.frame_file import FrameFile
+from emmc_rig.session.frame_means import taken_shots
 from emmc_rig.session.journal import FilmEntry
-from emmc_rig.session.readings import film_frames, session_readings, taken_shots
+from emmc_rig.session.measured_psi import session_scale
+from emmc_rig.session.readings import film_frames, film_places, session_frames
 from emmc_rig.session.session import Session
 
 SIZE = (24, 32)
@@ -46,25 +49,26 @@ def captured(text, camera="u3v"):
 def test_a_films_frames_read_what_shots_of_their_exposure_do_to_their_deviation():
     film = captured(STEPPED, "ptp")
     assert taken_shots(film) == (0, 1)
-    shots = session_readings(captured(STILL, "ptp"))
-    frames = list(film_frames(film))
-    assert [(one.place, one.shot, one.segment) for one in frames] == [
+    _, shots = session_frames(captured(STILL, "ptp"))
+    frames = list(film_frames(film, session_scale(film)))
+    assert [(at.place, at.shot, at.segment) for at, _ in frames] == [
         (place, place % 2, 0) for place in range(6)
     ]
-    np.testing.assert_allclose([one.time_s for one in frames], np.arange(6) / 2, atol=0.25)
-    for one in frames:
-        assert one.readings.shape == one.deviation.shape == one.usable.shape == (1, *SIZE)
-        both = one.usable[0] & shots.usable[one.shot]
+    np.testing.assert_allclose([at.time_s for at, _ in frames], np.arange(6) / 2, atol=0.25)
+    for at, taken in frames:
+        assert taken.shape == (1, *SIZE)
+        both = taken.usable[0] & shots.usable[at.shot]
         assert both.mean() > 0.9
-        spread = np.hypot(one.deviation[0], np.sqrt(shots.variance[one.shot]))[both]
-        off = (one.readings[0] - shots.readings[one.shot])[both] / spread
+        spread = np.hypot(taken.deviation[0], shots.deviation[at.shot])[both]
+        off = (taken.readings[0] - shots.readings[at.shot])[both] / spread
         assert 0.8 < np.sqrt(np.mean(off**2)) < 1.25
-        assert np.isinf(one.deviation[~one.usable]).all()
+        assert np.isinf(taken.deviation[~taken.usable]).all()
+        assert taken.exposures == (Exposure(at.shot, (at.entry.exposure_s,), 1.0, at.time_s),)
 
 
 def test_the_time_of_a_streamed_frame_is_that_of_the_cameras_stamps():
     session = captured(STREAMED)
-    frames = list(film_frames(session))
+    frames = film_places(session)
     stamps = np.array([one.entry.camera_time_s for one in frames])
     np.testing.assert_allclose([one.time_s for one in frames], stamps - stamps[0], atol=1e-9)
 
@@ -75,7 +79,7 @@ def test_a_second_segment_goes_on_in_time_at_its_place():
     for place in (4, 5):
         entry = session.stored[f"film-00000{place}"]
         session.note(entry.model_copy(update={"segment": 1, "film_s": (place - 4) / 2 + 0.0}))
-    frames = list(film_frames(session))
+    frames = film_places(session)
     np.testing.assert_allclose([one.time_s for one in frames], np.arange(6) / 2, atol=1e-6)
     assert [one.segment for one in frames] == [0, 0, 0, 0, 1, 1]
 
@@ -113,7 +117,7 @@ def test_a_film_that_cannot_be_trusted_is_refused_naming_the_frame(alter, what):
     session = captured(STREAMED)
     alter(session)
     with pytest.raises(AppError, match=what):
-        list(film_frames(session))
+        list(film_frames(session, session_scale(session)))
 
 
 def test_a_mask_that_did_not_step_is_named_with_the_axis():
@@ -121,14 +125,14 @@ def test_a_mask_that_did_not_step_is_named_with_the_axis():
     before = session.stored["film-000002"].read_um
     altered(3, read_um=before)(session)
     with pytest.raises(AppError, match="film-000003: mask_x did not step"):
-        list(film_frames(session))
+        list(film_frames(session, session_scale(session)))
 
 
 def test_a_film_is_not_taken_for_shots_of_one_light_field():
     with pytest.raises(AppError, match="holds a film"):
-        session_readings(captured(STREAMED))
+        session_frames(captured(STREAMED))
 
 
 def test_a_session_without_a_film_says_what_its_plan_needs():
     with pytest.raises(AppError, match="holds no film"):
-        list(film_frames(captured(STILL, "ptp")))
+        film_places(captured(STILL, "ptp"))

@@ -27,7 +27,7 @@ from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import NO_FIGURES, decode_frame, frame_entry, frame_file
-from emmc_rig.session.readings import session_readings
+from emmc_rig.session.readings import session_frames
 from simulators.clock import ManualClock
 from simulators.effects import Flaws
 from simulators.flaws import SensorFlaws
@@ -63,20 +63,20 @@ darks: {{repeats: 8}}
 
 def test_a_plan_without_whiteboards_is_read_by_the_design(without_boards):
     session, camera = without_boards
-    taken = session_readings(session)
+    psi, frames = session_frames(session)
     design = build_imaging_matrix(camera, SIZE)
-    np.testing.assert_array_equal(taken.psi.weights, design.weights)
+    np.testing.assert_array_equal(psi.weights, design.weights)
     light_field = fine_scene("near-planar", 1, 1, size=SIZE, views=camera.views).scene.light_field
     foretold = design.forward(light_field)
     # The masks sit elsewhere than designed; on average the light is the same.
-    assert taken.readings.mean() == pytest.approx(foretold.mean(), rel=0.05)
+    assert frames.readings.mean() == pytest.approx(foretold.mean(), rel=0.05)
 
 
 def test_readings_do_not_depend_on_the_gain_and_their_deviation_is_true(without_boards):
-    taken = session_readings(without_boards[0])
+    _, taken = session_frames(without_boards[0])
     for other in (1, 2):
-        score = (taken.readings[0] - taken.readings[other]) / np.sqrt(
-            taken.variance[0] + taken.variance[other]
+        score = (taken.readings[0] - taken.readings[other]) / np.hypot(
+            taken.deviation[0], taken.deviation[other]
         )
         assert abs(score.mean()) < 0.2
         # The dark frames are shared, so that the difference is a little surer than foretold.
@@ -101,9 +101,9 @@ darks: {{repeats: 4, of_shots: {of_shots}}}
 """
     warm = Flaws(sensor=SensorFlaws(dark_electrons_per_s=100.0))
     (session, _), (cold, _) = captured(text, warm), captured(text)
-    taken, truth = session_readings(session), session_readings(cold)
+    (_, taken), (_, truth) = session_frames(session), session_frames(cold)
     off = (taken.readings - truth.readings)[taken.usable & truth.usable]
-    deviation = np.sqrt(np.median(taken.variance))
+    deviation = np.median(taken.deviation)
     reasons = [reason.what for reason in exposure_reasons(shot_exposures(session))]
     if of_shots:
         assert abs(off.mean()) < 0.001

@@ -128,7 +128,7 @@ def test_frames_that_only_a_plug_in_could_decode_are_read_back_without_it(tmp_pa
     again = Session(session.folder)
     assert verify(again).is_complete
     assert not again.unexpected_files()[1]
-    for frame, (back, _) in zip(taken, decoded(again, again.frames), strict=True):
+    for frame, back in zip(taken, decoded(again, again.frames), strict=True):
         np.testing.assert_array_equal(back.mosaic, frame.mosaic)
         np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
         assert (back.white_level_dn, back.cfa) == (frame.white_level_dn, frame.cfa)
