@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.psi import open_psi, psi_beside, read_frames
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.verdict.rules import Reason
+
+if TYPE_CHECKING:
+    from reconstruction.verdict.rules import Reason
 
 Note = Callable[[str], None]
 

@@ -30,7 +30,6 @@ from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.pages.calibration_page import write_calibration_report
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import sensor_pairs
 from emmc_rig.session.frame_means import camera_of, taken_shots
@@ -131,6 +130,8 @@ class SessionCalibration:
 
     def write(self, folder: Path) -> None:
         """Write the same files into an existing folder."""
+        from emmc_rig.pages.calibration_page import write_calibration_report  # matplotlib: a second
+
         save_outcome(folder, self.outcome, self.calibration, self.scale)
         if self.inputs is not None:
             record_product(folder, PSI_PRODUCT, self.inputs)

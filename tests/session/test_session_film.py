@@ -17,7 +17,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.frames import Exposure
 from emmc_rig.session.frame_file import FrameFile
-from emmc_rig.session.frame_means import taken_shots
+from emmc_rig.session.frame_means import decoded, taken_shots
 from emmc_rig.session.journal import FilmEntry
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.readings import film_frames, film_places, session_frames
@@ -136,3 +136,15 @@ def test_a_film_is_not_taken_for_shots_of_one_light_field():
 def test_a_session_without_a_film_says_what_its_plan_needs():
     with pytest.raises(AppError, match="holds no film"):
         film_places(captured(STILL, "ptp"))
+
+
+def test_a_frame_of_a_film_reads_what_it_reads_alone():
+    session = captured(STREAMED)
+    scale = session_scale(session)
+    (first, *_) = film_places(session)
+    _, frames = session_frames(session, scale, 0)
+    alone = scale.of_shots([first.shot]).frames(
+        lambda shot: list(decoded(session, [first.planned]))
+    )
+    assert frames.readings.tobytes() == alone.readings.tobytes()
+    assert frames.deviation.tobytes() == alone.deviation.tobytes()
