@@ -45,7 +45,7 @@ def shown_live(scale, raw):
 
 
 def imported(folder, gain, exposure_s, black_dn, binning):
-    """A session of a shot and darks as DNGs of a sensor with these settings; and the true frames."""
+    """A session of a shot and darks, DNGs of a sensor with these settings, and true readings."""
     described = {
         "title": "mine",
         "views": [3, 3],
@@ -69,7 +69,7 @@ def imported(folder, gain, exposure_s, black_dn, binning):
     scene = emmc.scene("near-planar", size=(24 * binning, 32 * binning), views=(3, 3))
     psi = camera.psi(scene.size)
     true, rng = np.asarray(psi @ scene), np.random.default_rng(0)
-    shape, area = true.shape[1:], pixel_light(camera, scene.size)
+    shape, area = true.shape[1:], np.broadcast_to(pixel_light(camera, scene.size), true.shape)[0]
 
     def exposed(light, gain):
         electrons = rng.poisson(light * area * RATE * exposure_s)
