@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import SIZE_VARIABLE
-from emmc_rig.commands.output import give_result, shown_progress, tell
+from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.errors import AppError
 
 DEFAULT_CAMERA = "rgbw-bayer-1shot"
@@ -133,14 +133,23 @@ def _tell_findings(metrics: dict) -> None:
 
 def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) -> None:
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.processing.session_calibration import calibrate_into
+    from emmc_rig.files.results import METRICS
+    from emmc_rig.model.json_text import parse_json
+    from emmc_rig.processing.session_calibration import SENSOR, calibrate_into
+    from emmc_rig.session.measured_psi import stored_calibration
     from emmc_rig.session.session import CALIBRATION, Session
 
     captured, place = Session(path), path / CALIBRATION
-    out = out or place
-    with result_folder(out, "calibrate", belongs_to=place) as folder, shown_progress() as bars:
-        calibration = calibrate_into(folder, captured, method, sensor, bars)
-    metrics = calibration.metrics
+    product, words = stored_calibration(captured) if out is None else (None, "")
+    out, sheet = out or place, None
+    known = product is not None and product.inputs["method"] == method
+    if known and (not sensor or (place / SENSOR).is_file()):
+        say("note", f"nothing new to measure: {words}")
+        metrics = parse_json((place / METRICS).read_bytes(), str(place / METRICS), AppError)
+    else:
+        with result_folder(out, "calibrate", belongs_to=place) as folder, shown_progress() as bars:
+            calibration = calibrate_into(folder, captured, method, sensor, bars)
+        metrics, sheet = calibration.metrics, calibration.sensor
     chosen = metrics["chosen"]
     judged = metrics["held_out"][chosen]
     tell(
@@ -148,7 +157,6 @@ def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) 
         f"to {judged['relative_error']:.2%}"
     )
     _tell_findings(metrics)
-    sheet = calibration.sensor
     for name, value, deviation, unit in () if sheet is None else sheet.rows():
         spread = "" if deviation is None else f" +- {deviation:.2g}"
         tell(f"    {name}: {value:.5g}{spread} {unit}".rstrip())

@@ -27,7 +27,7 @@ from emmc_rig.session.frame_means import (
 )
 from emmc_rig.session.planned import VALIDATION
 from emmc_rig.session.session import CALIBRATION, Session
-from emmc_rig.store.products import product_digest, read_product
+from emmc_rig.store.products import Product, product_digest, read_product
 
 PSI_PRODUCT = "psi"
 SCENE_KINDS = ("shot", "metering")
@@ -154,8 +154,8 @@ def psi_inputs(session: Session) -> dict[str, Any]:
     }
 
 
-def stored_scale(session: Session) -> tuple[Scale | None, str]:
-    """Return the scale that a calibration stored in the session, and a sentence that names it.
+def stored_calibration(session: Session) -> tuple[Product | None, str]:
+    """Return what the calibration stored in a session follows from, and a sentence that names it.
 
     None where there is none, or one of other frames, another plan or version; the sentence says
     which, and is empty where there is none.
@@ -169,7 +169,13 @@ def stored_scale(session: Session) -> tuple[Scale | None, str]:
     method = product.inputs.get("method")
     if product.digest != product_digest(PSI_PRODUCT, {**psi_inputs(session), "method": method}):
         return None, f"{folder} is of other frames, another plan or version"
-    return open_scale(folder), f"{folder}, method {method}, made {product.made}"
+    return product, f"{folder}, method {method}, made {product.made}"
+
+
+def stored_scale(session: Session) -> tuple[Scale | None, str]:
+    """Return the scale of the calibration stored in a session: see `stored_calibration`."""
+    product, words = stored_calibration(session)
+    return None if product is None else open_scale(session.folder / CALIBRATION), words
 
 
 def session_scale(session: Session) -> Scale:

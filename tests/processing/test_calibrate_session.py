@@ -1,19 +1,24 @@
 """A session's whiteboards to Psi: planned by `calibrate --plan`, captured, fitted, used."""
 
 import json
+import shutil
+from collections import Counter
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import yaml
-from programs import exit_code
+from programs import exit_code, program
 from simulated_calibration import CalibrateSettings, rig_to_calibrate, true_psi
 
 from emmc_rig.acquisition.plan import load_plan
 from emmc_rig.bench.hardware import NO_FLAWS
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.files.folders import Listing
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.session import frame_means
 from emmc_rig.session.frame_means import camera_of
 from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import Session
@@ -163,3 +168,90 @@ def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, caps
     assert exit_code("calibrate", "--sensor", "--out", tmp_path / "sheet") == 2
     assert exit_code("calibrate", "--plan", "--skip", "hue", "--out", tmp_path / "x") == 1
     assert "colours" in capsys.readouterr().err
+
+
+def used_psi(folder):
+    return ImagingMatrix.load(folder / "psi.h5").checksum()
+
+
+@pytest.fixture
+def own_session(captured, tmp_path):
+    """A copy of the session, without what other tests made of it."""
+    left_out = shutil.ignore_patterns("calibration", "reconstruction")
+    return Path(shutil.copytree(captured / "session", tmp_path / "session", ignore=left_out))
+
+
+def decoded_by(monkeypatch, *words):
+    """What a command says, and how many sessions it opens and frames it decodes."""
+    counts = Counter()
+
+    def counted(name, function):
+        def call(*given, **named):
+            counts[name] += 1
+            return function(*given, **named)
+
+        return call
+
+    monkeypatch.setattr(Session, "__init__", counted("opened", Session.__init__))
+    monkeypatch.setattr(frame_means, "decode_frame", counted("decoded", frame_means.decode_frame))
+    code, out, err = program(*words)
+    assert code == 0, err
+    monkeypatch.undo()
+    return out + err, counts
+
+
+def test_reconstruct_takes_the_calibration_that_was_made_and_names_it(own_session, monkeypatch):
+    assert exit_code("calibrate", own_session, "--method", "parametric") == 0
+    said, counts = decoded_by(monkeypatch, "reconstruct", own_session, "--method", "tv")
+    assert "method parametric" in said
+    assert counts == {"opened": 1, "decoded": 1}
+    parametric = used_psi(own_session / "calibration")
+    assert used_psi(own_session / "reconstruction") == parametric
+    metrics = json.loads((own_session / "reconstruction" / "metrics.json").read_text())
+    assert metrics["psi_sha256"] == parametric
+    # Asked for again, it is there; another is made on demand.
+    said, counts = decoded_by(monkeypatch, "calibrate", own_session, "--method", "parametric")
+    assert "nothing new to measure" in said
+    assert counts == {"opened": 1}
+    assert exit_code("calibrate", own_session, "--method", "free") == 0
+    assert exit_code("reconstruct", own_session, "--method", "tv") == 0
+    assert used_psi(own_session / "reconstruction") == used_psi(own_session / "calibration")
+    assert used_psi(own_session / "calibration") != parametric
+
+
+def test_reconstruct_stores_the_calibration_that_it_measures(own_session, monkeypatch):
+    said, counts = decoded_by(monkeypatch, "reconstruct", own_session, "--method", "tv")
+    frames = len(Session(own_session).stored)
+    assert counts["opened"] == 1
+    assert counts["decoded"] <= frames
+    assert (own_session / "calibration" / "report.html").is_file()
+    first = (own_session / "reconstruction" / "light_field.h5").read_bytes()
+    said, counts = decoded_by(monkeypatch, "reconstruct", own_session, "--method", "tv")
+    assert counts == {"opened": 1, "decoded": 1}
+    assert "method auto" in said
+    assert (own_session / "reconstruction" / "light_field.h5").read_bytes() == first
+
+
+def test_a_calibration_of_other_frames_is_measured_again_by_its_method(own_session):
+    assert exit_code("calibrate", own_session, "--method", "parametric") == 0
+    product = own_session / "calibration" / "product.json"
+    stated = json.loads(product.read_text())
+    stated["psi"]["digest"] = "0" * 64
+    product.write_text(json.dumps(stated))
+    # Whatever is in the way of storing it, the reconstruction is made and says so.
+    code, out, err = program("reconstruct", own_session, "--method", "tv")
+    assert code == 0, err
+    assert "other frames" in " ".join((out + err).split())
+    assert "not stored" in " ".join((out + err).split())
+    shutil.rmtree(own_session / "calibration")
+    assert exit_code("calibrate", own_session, "--method", "parametric") == 0
+    kept = used_psi(own_session / "calibration")
+    (own_session / "calibration" / "product.json").unlink()
+    listing = own_session / "calibration" / "files.json"
+    listed = Listing.read(own_session / "calibration")
+    files = {name: sha for name, sha in listed.files.items() if name != "product.json"}
+    listing.write_text(Listing(listed.command, files).text())
+    code, out, err = program("reconstruct", own_session, "--method", "tv")
+    assert code == 0, err
+    assert "measured again, method parametric" in " ".join((out + err).split())
+    assert used_psi(own_session / "calibration") == kept
