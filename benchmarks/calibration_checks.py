@@ -57,6 +57,7 @@ from emmc_rig.files.psi import SavedPsi
 from emmc_rig.files.results import parse_size
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import psi_layout
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
@@ -262,7 +263,7 @@ class Captured:
     def psnr(self, psi: ImagingMatrix) -> float:
         """Return the PSNR of a reconstruction by total variation."""
         sigma = float(np.sqrt(self.variance[self.usable].mean()))
-        result = reconstruct_tv(psi, self.readings, sigma, TVSettings(), self.usable)
+        result = reconstruct_tv(psi, even_frames(self.readings, sigma, self.usable), TVSettings())
         return psnr_db(result.light_field, self.truth)
 
 

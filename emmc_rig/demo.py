@@ -27,6 +27,7 @@ from emmc_rig.files.exports import save_maps
 from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import (
     export_pictures,
     focus_disparities,
@@ -184,11 +185,9 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             return reconstruct_judged(
                 settings.method,
                 psi,
-                readings,
-                sigma,
+                even_frames(readings, sigma, usable),
                 dictionary,
                 settings.solver,
-                usable,
                 lambda p: watcher.step(_progress_words(p)),
             )
 

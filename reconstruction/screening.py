@@ -7,12 +7,13 @@ Dark shots, repeated shots, flicker and bad pixels are not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.bands import row_kernel
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
 from reconstruction.flat import FlatPsi, flat_psi
@@ -70,14 +71,13 @@ ones a half to a tenth are called bad (dice, without glints, as many)."""
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """frames, usable: (shot, pixel_y, pixel_x), for any method. notes: what was done, in words.
+    """Frames for any method, and what was done to them, in words (notes) and figures.
 
-    dark, double: shots left out. gains: (shot,), by which the frames were divided. bad:
+    dark, double: shots left out. gains: (shot,), by which the readings were divided. bad:
     (pixel_y, pixel_x), single pixels left out; lines: those of dead rows and columns.
     """
 
-    frames: Array
-    usable: NDArray[np.bool_]
+    frames: Frames
     notes: tuple[str, ...]
     dark: tuple[int, ...]
     double: tuple[int, ...]
@@ -86,13 +86,10 @@ class Screened:
     lines: NDArray[np.bool_]
 
 
-def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Screened:
-    """Return the frames screened.
-
-    frames, usable: (shot, pixel_y, pixel_x), finite where usable. Where nothing is found they
-    come back as they are.
-    """
+def screened(psi: ImagingMatrix, given: Frames) -> Screened:
+    """Return frames, finite where usable, after screening: as they are where nothing is found."""
     notes, flat = [], flat_psi(psi)
+    frames, usable = given.readings, given.usable
     dark = dark_shots(flat, frames, usable)
     usable = _without(usable, dark)
     double = double_shots(flat, frames, usable)
@@ -127,7 +124,8 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
         notes.append(
             f"excluded {int(bad.sum())} bad pixels ({bad.mean():.2%}), unlike their neighbours"
         )
-    return Screened(frames, usable, tuple(notes), dark, double, gains, bad, lines)
+    kept = replace(given, readings=frames, usable=usable)
+    return Screened(kept, tuple(notes), dark, double, gains, bad, lines)
 
 
 def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:

@@ -114,9 +114,8 @@ class Latest:
         """Return the result of the next frame, taken as a shot of Psi, and what follows from it."""
         one = _one_shot(psi, shot)
         solved, verdict = reconstruct_judged(
-            method, one, frames.readings, frames.noise_sigma, None, settings, frames.usable,
-            on_step, self.film,
-        )  # fmt: skip
+            method, one, frames, None, settings, on_step, self.film
+        )
         shots = (*self.shots, shot)[-len(solved.film.known.earlier) :]
         result = Result(replace(solved, film=None), verdict, one, frames)
         return result, replace(self, film=solved.film, shots=shots)

@@ -140,16 +140,8 @@ def _solved(
         dictionary = None
     elif not isinstance(dictionary, Dictionary):
         dictionary = open_dictionary(dictionary, psi.views, psi.binning)
-    solve = reconstruct_judged
-    if not is_one_block(psi.size, settings):
-        check_frames(psi.frames_shape, frames.readings)
-        solve = reconstruct_in_blocks
-    # One deviation, not of each reading: estimated from the reading itself, it is least where noise
-    # made that small.
-    solved, verdict = solve(
-        method, psi, frames.readings, frames.noise_sigma, dictionary, settings, frames.usable,
-        on_step,
-    )  # fmt: skip
+    solve = reconstruct_judged if is_one_block(psi.size, settings) else reconstruct_in_blocks
+    solved, verdict = solve(method, psi, frames, dictionary, settings, on_step)
     return Result(solved, verdict, psi, frames, None if dictionary is None else dictionary.kind)
 
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from emmc_rig.model.bands import in_views
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
@@ -42,7 +43,7 @@ from reconstruction.adaptive.joint import (
 from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Plain, Readings, checked, plain_of, unseen_by
+from reconstruction.adaptive.survey import Plain, checked, plain_of, unseen_by
 from reconstruction.adaptive.sweep import STRIDE, mean_around, swept
 from reconstruction.adaptive.times import (
     HELD_WINDOW_PX,
@@ -53,6 +54,7 @@ from reconstruction.adaptive.times import (
     rested,
 )
 from reconstruction.errors import ReconstructionError
+from reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 
@@ -166,7 +168,7 @@ class Film:
 
         psis: of each of the frames `known.earlier`, as `reconstruct` was given it, of one shot.
         """
-        fitted = (checked(psi, np.zeros(psi.frames_shape), 1.0, None).psi for psi in psis)
+        fitted = (checked(psi, even_frames(np.zeros(psi.frames_shape), 1.0)).psi for psi in psis)
         kinds = (cls, FilmSettings, Known, Rest, OtherTime, Readings, search.Volume)
         about = parse_json(str(arrays["about"]), "a stored film", ReconstructionError)
         return put_together(about, arrays, kinds, lambda: next(fitted))

@@ -34,6 +34,7 @@ from reconstruction.adaptive.evidence import (
     TexturePrior,
     patch_evidence,
 )
+from reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 COARSE_STEP_PX = 0.5
@@ -129,14 +130,16 @@ def posteriors(evidence: Array, pairs: Array, rounds: int = 3, floor: float = 1e
 
 @dataclass(frozen=True, eq=False)
 class SearchData:
-    """What is to be explained. readings: frames less those of the smooth picture, variance: theirs,
-    usable, all (shot, pixel_y, pixel_x); brightness: (pixel_y, pixel_x) of the smooth picture."""
+    """The data of a search. residual: frames less those of the smooth picture, with the variance of
+    what no model explains in their noise; brightness: of that picture, (pixel_y, pixel_x)."""
 
-    psi: ImagingMatrix
-    readings: Array
-    variance: Array
-    usable: NDArray[np.bool_]
+    residual: Readings
     brightness: Array
+
+    @property
+    def psi(self) -> ImagingMatrix:
+        """Psi of the residual."""
+        return self.residual.psi
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,9 +203,9 @@ def evidence_at(
     bright = data.brightness[corners[:, 0] + half, corners[:, 1] + half]
     return patch_evidence(
         data.psi,
-        data.readings,
-        data.variance,
-        data.usable,
+        data.residual.frames,
+        data.residual.noise,
+        data.residual.usable,
         bright,
         corners,
         patches.places(data.psi.shots),

@@ -54,7 +54,7 @@ def searched_again(survey: Survey, settings: AdaptiveSettings) -> search.Volume 
         return None
     looser = survey.bright.variance(LOOSER * settings.misfit)
     return search.fine(
-        replace(survey.data, variance=looser),
+        replace(survey.data, residual=replace(survey.data.residual, noise=looser)),
         survey.prior,
         survey.rough,
         settings.stride,

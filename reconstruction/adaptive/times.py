@@ -22,7 +22,6 @@ from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import (
     Plain,
-    Readings,
     Survey,
     plain_of,
     surveyed,
@@ -30,6 +29,7 @@ from reconstruction.adaptive.survey import (
 )
 from reconstruction.adaptive.sweep import mean_around
 from reconstruction.adaptive.visibility import carried
+from reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0

@@ -17,6 +17,7 @@ from emmc_rig.files.formats import FORMATS
 from emmc_rig.files.psi import FRAMES, PSI, open_psi, save_shards
 from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
 from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES
@@ -300,7 +301,7 @@ def test_what_a_method_calls_disparity_is_a_shift_between_times():
 def test_the_preview_of_a_camera_without_colours_is_grey():
     psi = psi_of((1, 6), BANDS, size=(32, 48))
     frames = frames_of(psi, light_of((1, 6), BANDS, (32, 48)))
-    preview = Preview(psi, 4, frames, NOISE)
+    preview = Preview(psi, 4, even_frames(frames, NOISE))
     preview.follow(frames, 5)
     light = preview.light_field
     assert light.std() > 0.01
