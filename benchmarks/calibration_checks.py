@@ -53,7 +53,7 @@ from emmc_rig.acquisition.plan import Checks, Plan, PlannedShot
 from emmc_rig.bench.hardware import Fitted
 from emmc_rig.demo import simulated_session
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.psi import SavedPsi
+from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.results import parse_size
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import psi_layout
@@ -325,7 +325,7 @@ def check_drift(size: Size, seed: int) -> Iterator[Row]:
     outcome, _ = _fitted(size, seed)
     assert outcome.mixed is not None
     known, shadow, stages = outcome.calibration, outcome.mixed.shadow, shot_stages(settings.camera)
-    colour, layout = known.psi.colour, known.psi.layout
+    colour, layout = known.psi.colour, known.psi
     for name in size.drifts:
         drift = np.array(DRIFTS[name])
         after = replace(settings, flaws=moved(settings.flaws, drift), seed=seed + 2)
@@ -369,7 +369,7 @@ def _streamed_error(path: Path, shadow: Shadow, channels: NDArray[np.uint8]) -> 
     """Return the relative error of a stored Psi over the middle rows."""
     first = channels.shape[0] // 4 * 2
     rows = slice(first, min(first + COMPARED_ROWS, channels.shape[0]))
-    found = SavedPsi(path).window(rows, slice(None)).weights[0, :, :, :, 0]
+    found = StoredPsi(path).window(rows, slice(None)).weights[0, :, :, :, 0]
     missed = total = 0.0
     for view in np.ndindex(shadow.mask.views):
         true = drawn(shadow, channels, rows, views_open(shadow.mask.views, view))

@@ -37,7 +37,7 @@ def mended(moved: Trial) -> ImagingMatrix:
     drift = find_drift(taken, mask, designed_placement(camera), stages, QUICK)
     if drift.refused or not drift.drifted:
         return psi
-    return psi_at(Shadow(mask, drift.placement), psi.layout, stages)
+    return psi_at(Shadow(mask, drift.placement), psi, stages)
 
 
 def measure(

@@ -102,11 +102,7 @@ class Preview:
         coarse = coarser(psi, factor)
         self.size = coarse.size
         self._factor, self._part = factor, factor // psi.binning
-        self._shared = ImagingMatrix(
-            np.ascontiguousarray(psi.weights.sum(axis=(1, 2), keepdims=True)),
-            psi.colour,
-            psi.binning,
-        )
+        self._shared = psi.of_one_view()
         mean = float(np.mean(readings[good]))
         picture_noise, coarse_noise = (
             max(frames.noise_sigma, share * mean) for share in (PICTURE_NOISE, COARSE_NOISE)

@@ -16,7 +16,6 @@ from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
-from reconstruction.flat import FlatPsi, flat_psi
 
 Array = NDArray[np.floating]
 DARK_SHARE = 0.02
@@ -88,11 +87,11 @@ class Screened:
 
 def screened(psi: ImagingMatrix, given: Frames) -> Screened:
     """Return frames, finite where usable, after screening: as they are where nothing is found."""
-    notes, flat = [], flat_psi(psi)
+    notes: list[str] = []
     frames, usable = given.readings, given.usable
-    dark = dark_shots(flat, frames, usable)
+    dark = dark_shots(psi, frames, usable)
     usable = _without(usable, dark)
-    double = double_shots(flat, frames, usable)
+    double = double_shots(psi, frames, usable)
     usable = _without(usable, double)
     if dark:
         notes.append(f"excluded {_shots(dark)}: dark, while the others are not")
@@ -101,12 +100,12 @@ def screened(psi: ImagingMatrix, given: Frames) -> Screened:
             f"excluded {_shots(double)}: the same as another, although in Psi the masks moved; "
             "check the stage, or calibrate again"
         )
-    gains = shot_gains(flat, frames, usable)
+    gains = shot_gains(psi, frames, usable)
     if (gains != 1).any():
         frames = (frames / gains[:, None, None]).astype(frames.dtype)
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
         notes.append(f"scaled the shots to equal brightness: they differed by {spread:.1%}")
-    rows, columns = dead_lines(flat, frames, usable)
+    rows, columns = dead_lines(psi, frames, usable)
     lines = rows[:, None] | columns
     if lines.any():
         usable = usable & ~lines
@@ -118,7 +117,7 @@ def screened(psi: ImagingMatrix, given: Frames) -> Screened:
                 if dead.any()
             )
         )
-    bad = bad_pixels(flat, frames, usable)
+    bad = bad_pixels(psi, frames, usable)
     if bad.any():
         usable = usable & ~bad
         notes.append(
@@ -128,9 +127,9 @@ def screened(psi: ImagingMatrix, given: Frames) -> Screened:
     return Screened(kept, tuple(notes), dark, double, gains, bad, lines)
 
 
-def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that no light of the scene reached, while it reached others."""
-    expected = flat.weights.sum(axis=-1).mean(axis=(1, 2)) * flat.binning**2
+    expected = psi.picture_weights.sum(axis=-1).mean(axis=(1, 2)) * psi.binning**2
     seen = np.array(
         [
             float(frame[kept].mean()) if kept.any() else np.nan
@@ -144,13 +143,13 @@ def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple
     return tuple(int(shot) for shot in np.flatnonzero(dark))
 
 
-def double_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that repeat another although Psi says that they differ.
 
     Of two such the one that fits its part of Psi worse is meant.
     """
     kept = [shot for shot in range(len(frames)) if usable[shot].any()]
-    predicted = _predicted(flat, frames, usable)
+    predicted = _predicted(psi, frames, usable)
     found: list[int] = []
     for place, shot in enumerate(kept):
         for other in kept[:place]:
@@ -166,7 +165,7 @@ def double_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tup
     return tuple(sorted(found))
 
 
-def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return the brightness of the light in every shot, all 1 where none is sure.
 
     The light of most shots counts as 1 (the median), of two their mean.
@@ -181,7 +180,7 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
     gains, error = even.copy(), np.inf
     for _ in range(GAIN_STEPS):
         even_frames = frames / gains[:, None, None]
-        predicted = _predicted(flat, even_frames, usable)[kept]
+        predicted = _predicted(psi, even_frames, usable)[kept]
         lit = (usable[kept] & (predicted > WELL_LIT * max(predicted.mean(), 1e-12))).all(axis=0)
         if lit.sum() < FEWEST_LIT:
             return even
@@ -204,7 +203,7 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
 
 
 def dead_lines(
-    flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]
+    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the rows and the columns (both one-dimensional) that are dead or stuck in all shots.
 
@@ -213,8 +212,8 @@ def dead_lines(
     that are dark are no such lines: light fields that were rectified end so, and `adaptive` tells
     these edges from the scene.
     """
-    seen, k = usable.any(axis=(1, 2)), flat.binning
-    colours = np.zeros(frames.shape) if flat.colour is None else flat.colour[:, ::k, ::k]
+    seen, k = usable.any(axis=(1, 2)), psi.binning
+    colours = np.zeros(frames.shape) if psi.colour is None else psi.colour[:, ::k, ::k]
     frames, usable, colours = frames[seen], usable[seen], colours[seen]
     rows = _dead(frames, usable, colours)
     return rows, _dead(frames.swapaxes(1, 2), usable.swapaxes(1, 2), colours.swapaxes(1, 2))
@@ -311,7 +310,7 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
                 low[y, x], high[y, x] = least[step, x], most[step, x]
 
 
-def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the pixels (pixel_y, pixel_x) that read much more or less than any neighbour suggests.
 
     What a pixel reads over what a smooth picture predicts is compared with the range of that ratio
@@ -320,7 +319,7 @@ def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArr
     the shots, as a bad pixel is bad in all. The more there are, the less it takes to be one of
     them: to leave out a good pixel costs little, to miss a bad one much.
     """
-    k = flat.binning
+    k = psi.binning
     bad = np.zeros(frames.shape[1:], dtype=bool)
     one_colour = np.zeros(bad.shape, dtype=np.uint8)
     low, high = np.empty((2, *bad.shape), dtype=np.float32)
@@ -329,13 +328,13 @@ def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArr
         kept = usable & ~bad
         if not kept.any():
             break
-        predicted = _predicted(flat, frames, kept)
+        predicted = _predicted(psi, frames, kept)
         score, count = np.zeros(bad.shape), np.zeros(bad.shape)
         for shot in np.flatnonzero(kept.any(axis=(1, 2))):
             least = max(LEAST * float(predicted[shot].mean()), 1e-12)
             guess = np.maximum(predicted[shot], least)
             ratio = np.where(usable[shot], frames[shot] / guess, 0).astype(np.float32)
-            colours = one_colour if flat.colour is None else flat.colour[shot, ::k, ::k]
+            colours = one_colour if psi.colour is None else psi.colour[shot, ::k, ::k]
             neighbour_range(ratio, colours, kept[shot], NEIGHBOURS_PX, TAIL, FEWEST, low, high)
             known = np.isfinite(low) & usable[shot]
             if not known.any():
@@ -370,9 +369,9 @@ def _bright_details(
     return (count > 1) & (factor > 0) & (as_light < AS_LIGHT * as_offset)
 
 
-def _predicted(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def _predicted(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return what a smooth picture, the same in all views, reads."""
-    return flat.forward(smooth_guess(flat, frames, usable))
+    return psi.forward_picture(smooth_guess(psi, frames, usable))
 
 
 def _square(difference: Array, where: NDArray[np.bool_]) -> float:

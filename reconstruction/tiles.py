@@ -16,19 +16,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import ceil, lcm
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames, even_frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from reconstruction.adaptive.settings import SIDES, AdaptiveSettings, Side
 from reconstruction.adaptive.survey import contrast_of
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.flat import flat_psi
 from reconstruction.inputs import check_frames
 from reconstruction.methods import BlockSettings, MethodSettings, find_method, reconstruct
 from reconstruction.methods.surfaces import sparse_patches, takes_patches
@@ -58,24 +56,6 @@ what lies further is seen by fewer readings of a block beside it, and averaged w
 
 Array = NDArray[np.floating]
 Place = tuple[slice, slice]
-
-
-class PsiSource(Protocol):
-    """An imaging matrix of which a window can be had at a time."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Rows and columns of the light field."""
-        ...
-
-    @property
-    def binning(self) -> int:
-        """k; a pixel sums k x k samples."""
-        ...
-
-    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
-        """Return the imaging matrix of some samples; the slices are multiples of k."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -288,7 +268,7 @@ def _largest_disparity(psi: ImagingMatrix, frames: Frames, settings: MethodSetti
 
 def surveyed(
     name: str,
-    psi: PsiSource,
+    psi: PsiLayout,
     frames: Frames,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
@@ -334,11 +314,10 @@ def surveyed(
         )
         reach = PATCHED_REACH if patched else TEXTURE_REACH
         halo = reach * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
-        flat = flat_psi(mosaic)
-        picture = smooth_guess(flat, read.readings, read.usable).astype(np.float32)
+        picture = smooth_guess(mosaic, read.readings, read.usable).astype(np.float32)
         noise = np.full(read.shape, read.noise_sigma**2)
         own = settings.adaptive.contrast or contrast_of(
-            flat, read.readings, picture, noise, read.usable
+            mosaic, read.readings, picture, noise, read.usable
         )
         # What a block would decide by its own size is decided for all.
         count = settings.adaptive.patches if patched else None
@@ -466,7 +445,7 @@ def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:
 
 def reconstruct_in_blocks(
     name: str,
-    psi: PsiSource,
+    psi: PsiLayout,
     frames: Frames,
     dictionary: Dictionary | None,
     settings: MethodSettings,

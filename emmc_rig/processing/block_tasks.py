@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.folders import emptied
-from emmc_rig.files.psi import SavedPsi, open_psi
+from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames, even_frames
@@ -82,9 +82,9 @@ class BlockJob:
     fingerprint: str
 
     @cached_property
-    def psi(self) -> SavedPsi:
+    def psi(self) -> StoredPsi:
         """Psi, read window by window."""
-        return open_psi(self.psi_path)
+        return StoredPsi(self.psi_path)
 
     def opened_dictionary(self) -> Dictionary | None:
         """Return the dictionary where the method needs one."""
@@ -114,7 +114,7 @@ class BlockTask:
 
 
 def fingerprint_of(
-    psi: SavedPsi, frames: Frames, method: str, dictionary: str | None, settings: MethodSettings
+    psi: StoredPsi, frames: Frames, method: str, dictionary: str | None, settings: MethodSettings
 ) -> str:
     """Return a SHA-256 of all that the light field follows from."""
     digest = hashlib.sha256()

@@ -55,7 +55,7 @@ class Known:
     def psi_after(self, placement: Placement) -> ImagingMatrix:
         """Return Psi with the mask there."""
         shadow = Shadow(self.mask, placement)
-        psi = psi_at(shadow, self.psi.layout, self.stages)
+        psi = psi_at(shadow, self.psi, self.stages)
         if self.seen is None or self.colour is None:
             return psi
         share = np.moveaxis(self.seen[self.colour], -1, 2)[:, None, None]

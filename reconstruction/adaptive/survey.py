@@ -23,7 +23,6 @@ from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.choices import choose_mu, contrast, smooth_guess
 from reconstruction.colour import unseen_colour
 from reconstruction.errors import ReconstructionError
-from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.inputs import Readings
 from reconstruction.wave import few_steps
 
@@ -95,9 +94,8 @@ def unseen_by(given: Readings) -> Array:
     """Return the variance by colours that frames do not show, (y, x)."""
     if given.psi.colour is not None:
         return np.zeros(given.psi.size)
-    flat = flat_psi(given.psi)
-    picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
-    return unseen_colour(flat, given.frames, given.usable, picture)
+    picture = np.asarray(smooth_guess(given.psi, given.frames, given.usable), dtype=np.float32)
+    return unseen_colour(given.psi, given.frames, given.usable, picture)
 
 
 def plain_of(given: Readings, scale: float, unseen: Array, steps: int) -> Plain:
@@ -122,15 +120,15 @@ def surveyed(
     disparity: of the centre view (y, x) where it is known. on_searched: called with 1 and 2 after
     the coarse and the fine search.
     """
-    k, flat = given.psi.binning, flat_psi(given.psi)
-    picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
-    unseen = unseen_colour(flat, given.frames, given.usable, picture)
-    own = settings.contrast or contrast_of(flat, given.frames, picture, given.noise, given.usable)
+    psi, k = given.psi, given.psi.binning
+    picture = np.asarray(smooth_guess(psi, given.frames, given.usable), dtype=np.float32)
+    unseen = unseen_colour(psi, given.frames, given.usable, picture)
+    own = settings.contrast or contrast_of(psi, given.frames, picture, given.noise, given.usable)
     scale = min(1.0, own / CONTRAST)
     bright = given.over(scale)
     picture = picture / np.float32(scale)
     grey = picture.mean(axis=-1)
-    residual = (bright.frames - flat.forward(picture)).astype(np.float32)
+    residual = (bright.frames - psi.forward_picture(picture)).astype(np.float32)
     data = search.SearchData(
         replace(bright, frames=residual, noise=bright.variance(settings.misfit)),
         grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3)),
@@ -139,7 +137,6 @@ def surveyed(
         TexturePrior(length, tuple(finer), freedom=settings.freedom)
         for length, *finer in (COARSE_PX, settings.lengths_px)
     )
-    psi = given.psi
     smooth = settings.slope_px, settings.jump
     rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
     on_searched(1)
@@ -153,14 +150,14 @@ def surveyed(
 
 
 def contrast_of(
-    flat: FlatPsi, frames: Array, picture: Array, noise: Array, usable: NDArray[np.bool_]
+    psi: ImagingMatrix, frames: Array, picture: Array, noise: Array, usable: NDArray[np.bool_]
 ) -> float:
     """Return the standard deviation of a scene's values, as far as frames (shot, y, x) show it.
 
     That of the smooth picture (y, x, c), and of the texture it lacks: the variance of the readings
     beyond their noise, over the squared sums of Psi's rows, as if the texture lay at disparity 0.
     """
-    missed = np.square(frames - flat.forward(picture))[usable].sum(dtype=np.float64)
+    missed = np.square(frames - psi.forward_picture(picture))[usable].sum(dtype=np.float64)
     beyond = max(float(missed - noise[usable].sum(dtype=np.float64)), 0.0)
-    rows = np.square(flat.forward(np.ones_like(picture)))[usable].sum(dtype=np.float64)
+    rows = np.square(psi.forward_picture(np.ones_like(picture)))[usable].sum(dtype=np.float64)
     return float(np.hypot(contrast(picture), np.sqrt(beyond / max(float(rows), 1e-20))))

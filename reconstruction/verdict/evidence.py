@@ -15,7 +15,6 @@ from emmc_rig.model.lightfield import centre_view, sum_of_squares
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from reconstruction.colour import unseen_colour
-from reconstruction.flat import flat_psi
 from reconstruction.result import SCALE, Reconstruction
 from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import displaced
@@ -203,7 +202,7 @@ def gathered(
 def _colour_error(
     psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], found: Relief
 ) -> float:
-    unseen = unseen_colour(flat_psi(psi), frames, usable, found.picture)
+    unseen = unseen_colour(psi, frames, usable, found.picture)
     square = np.square(found.picture.mean(axis=-1, dtype=np.float64)).mean()
     return float(np.sqrt(unseen.mean() / max(square, 1e-12)))
 

@@ -103,19 +103,13 @@ def over_baselines(
     kept = kept & usable
     if kept.sum() < FEWEST:
         return {"over_flat": None, "over_neighbours": None}
-    fitted, flat = usable & ~kept, _flat(psi)
+    fitted, flat = usable & ~kept, psi.of_one_view()
     mu = choose_mu(flat, frames[fitted], noise_sigma)
     of_flat = frames - flat.forward(few_steps(flat, frames, fitted, mu, FLAT_STEPS))
     return {
         "over_flat": _surely_over(residual[kept], of_flat[kept]),
         "over_neighbours": _surely_over(residual[kept], _off_neighbours(psi, frames, fitted)[kept]),
     }
-
-
-def _flat(psi: ImagingMatrix) -> ImagingMatrix:
-    """Return Psi of a light field of one view, which all views are."""
-    summed = psi.weights.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
-    return ImagingMatrix(summed.astype(psi.weights.dtype), psi.colour, psi.binning)
 
 
 def _off_neighbours(

@@ -169,9 +169,9 @@ def test_the_mended_psi_is_that_of_the_bench_as_it_stands():
     found = found_for(drift)
     design = build_imaging_matrix(CAMERA, SIZE)
     mask, stages = shadow_mask(CAMERA, SIZE), [(0.0, 0.0)]
-    exact = psi_at(Shadow(mask, placed()), design.layout, stages)
-    stale = psi_at(Shadow(mask, drifted(placed(), -np.array(drift))), design.layout, stages)
-    mended = psi_at(Shadow(mask, found.placement), design.layout, stages)
+    exact = psi_at(Shadow(mask, placed()), design, stages)
+    stale = psi_at(Shadow(mask, drifted(placed(), -np.array(drift))), design, stages)
+    mended = psi_at(Shadow(mask, found.placement), design, stages)
     assert mended.relative_difference(exact) < 0.1 * stale.relative_difference(exact)
 
 

@@ -10,7 +10,6 @@ from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture
-from reconstruction.flat import flat_psi
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.screening import bad_pixels, neighbour_range, screened
 
@@ -49,13 +48,13 @@ def test_the_range_of_neighbours_is_that_of_numpy():
 @pytest.mark.parametrize("binning", [1, 2])
 def test_a_picture_in_all_views_is_seen_as_psi_sees_it(random_psi, stored, binning):
     psi = random_psi(shots=2, stored=stored, binning=binning)
-    flat, rng = flat_psi(psi), np.random.default_rng(1)
+    rng = np.random.default_rng(1)
     picture = rng.random((*psi.size, 3), dtype=np.float32)
     everywhere = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
-    assert flat.forward(picture) == pytest.approx(psi.forward(everywhere), rel=1e-5)
+    assert psi.forward_picture(picture) == pytest.approx(psi.forward(everywhere), rel=1e-5)
     frames = rng.random(psi.frames_shape, dtype=np.float32)
     summed = psi.adjoint(frames).sum(axis=(0, 1))
-    assert flat.adjoint(frames) == pytest.approx(summed, rel=1e-4, abs=1e-5)
+    assert psi.adjoint_picture(frames) == pytest.approx(summed, rel=1e-4, abs=1e-5)
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "rgbw-mono"])
@@ -108,7 +107,7 @@ def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
     bad = ~reported.usable[0]
     # A dead pixel in the shade, or one that hardly glows, does no harm.
     harmful = np.abs(one.readings - one.psi.forward(one.truth)).mean(axis=0) > 0.1
-    found = bad_pixels(flat_psi(one.psi), one.readings, one.usable)
+    found = bad_pixels(one.psi, one.readings, one.usable)
     assert harmful[bad].mean() > 0.5
     assert found[bad & harmful].mean() > 0.7
     assert found[~bad].mean() < 0.05
@@ -116,7 +115,7 @@ def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
 
 def test_pixels_that_are_known_to_be_bad_do_not_spoil_their_neighbours():
     reported = made("masked-pixels", 10)
-    found = bad_pixels(flat_psi(reported.psi), reported.readings, reported.usable)
+    found = bad_pixels(reported.psi, reported.readings, reported.usable)
     assert not found[~reported.usable[0]].any()
     assert found[reported.usable[0]].mean() < 0.01
 
@@ -179,19 +178,19 @@ def test_shots_so_dim_that_most_pixels_read_nothing_tell_no_gain():
 
 def test_a_glint_behind_masks_that_differ_is_no_hot_pixel():
     one = made(None, 0.0)
-    plain = bad_pixels(flat_psi(one.psi), one.readings, one.usable)
+    plain = bad_pixels(one.psi, one.readings, one.usable)
     glint, hot = (20, 30), (30, 20)
     assert not plain[glint]
     assert not plain[hot]
     frames = one.readings.copy()
     frames[(slice(None), *glint)] *= 8
     frames[(slice(None), *hot)] += 0.5
-    found = bad_pixels(flat_psi(one.psi), frames, one.usable)
+    found = bad_pixels(one.psi, frames, one.usable)
     assert not found[glint]
     assert found[hot]
     alone = one.usable.copy()
     alone[1:] = False
-    assert bad_pixels(flat_psi(one.psi), frames, alone)[glint], "one shot cannot tell"
+    assert bad_pixels(one.psi, frames, alone)[glint], "one shot cannot tell"
 
 
 def test_dark_outermost_lines_are_an_edge_of_the_light_field_and_no_dead_lines():

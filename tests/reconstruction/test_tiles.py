@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from emmc_rig.files.psi import SavedPsi
+from emmc_rig.files.psi import StoredPsi
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
@@ -142,7 +142,7 @@ def test_a_light_field_of_one_block_is_that_of_the_method_itself(random_psi):
 def test_psi_is_read_from_its_file_window_by_window(random_psi, tmp_path):
     psi, frames, _ = scene(random_psi, binning=2)
     psi.save(tmp_path / "psi.h5")
-    saved = SavedPsi(tmp_path / "psi.h5")
+    saved = StoredPsi(tmp_path / "psi.h5")
     saved.verify()
     assert (saved.size, saved.binning) == (psi.size, 2)
     part, expected = (source.window(slice(4, 20), slice(10, 30)) for source in (saved, psi))
@@ -159,10 +159,10 @@ def test_a_damaged_psi_is_found_out_without_holding_it(random_psi, tmp_path):
     content[-100] ^= 1
     (tmp_path / "psi.h5").write_bytes(content)
     with pytest.raises(SensingError, match="damaged"):
-        SavedPsi(tmp_path / "psi.h5").verify()
+        StoredPsi(tmp_path / "psi.h5").verify()
     (tmp_path / "psi.h5").write_bytes(b"no")
     with pytest.raises(SensingError, match="cannot be read"):
-        SavedPsi(tmp_path / "psi.h5")
+        StoredPsi(tmp_path / "psi.h5")
 
 
 def test_progress_is_reported_block_by_block(random_psi):
