@@ -38,7 +38,7 @@ from simulated_calibration import (
 
 import emmc_rig as emmc
 from calibration.boards import channels_of
-from calibration.drift import Captures, DriftSettings, drifted, find_drift
+from calibration.drift import DriftSettings, drifted, find_drift
 from calibration.frames import bands
 from calibration.openings import views_open
 from calibration.parametric import psi_at, shot_stages
@@ -57,7 +57,7 @@ from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.results import parse_size
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import psi_layout
-from emmc_rig.model.frames import even_frames
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
@@ -332,8 +332,9 @@ def check_drift(size: Size, seed: int) -> Iterator[Row]:
         lost = gained = 0.0
         for spec in scenes(size.scenes):
             captured = captured_scene(spec, after, known)
-            taken = Captures(captured.readings, captured.variance, captured.usable, colour)
-            found = find_drift(taken, shadow.mask, shadow.placement, stages, size.search)
+            deviation = np.sqrt(captured.variance)
+            taken = Frames(captured.readings, deviation, captured.usable)
+            found = find_drift(taken, colour, shadow.mask, shadow.placement, stages, size.search)
             mismatched = captured.psnr(known.psi)
             oracle, blind = (
                 captured.psnr(psi_at(Shadow(shadow.mask, at), layout, stages))
