@@ -26,7 +26,7 @@ def check_frames(shape: tuple[int, int, int], frames: Array) -> None:
 
 
 def _unlike(given: tuple[int, ...], needed: tuple[int, int, int]) -> str:
-    """Return how another shape differs from the one that Psi needs, and what to do."""
+    """Return the difference between a shape and the one that Psi needs, and the remedy."""
     shots, *size = needed
     if list(given) == size:
         return "an axis of shots is missing: frames[None]"

@@ -35,7 +35,7 @@ def coarser(psi: ImagingMatrix, factor: int) -> ImagingMatrix:
     """Return Psi of light fields that are constant over blocks of factor x factor samples.
 
     factor: a multiple of the binning. What is left of the picture beyond whole blocks is cut off.
-    Its shots are those of Psi, each with the pixels of a block one after another, row by row.
+    Its shots are the shots of Psi times the pixels of a block, row by row.
     """
     k = psi.binning
     if factor % k:

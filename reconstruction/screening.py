@@ -23,9 +23,9 @@ DARK_SHARE = 0.02
 ALIKE = 0.25
 """Share of the expected squared difference of two shots below which they are called the same."""
 SHOWN = 0.1
-"""Strength at which the difference of two shots shows the one that Psi says, from which on they are
-two: masks that are blurred or elsewhere show weaker than Psi says, a shot that repeats another not
-at all."""
+"""Strength of Psi's difference between two shots in the difference of their readings, from which on
+the shots are two. Masks that are blurred or displaced show weaker than in Psi, those of a repeated
+shot not at all."""
 LEAST_FLICKER, SURE = 0.003, 4.0
 """The least flicker evened, and by how many standard errors it must exceed none."""
 GAIN_STEPS = 4
@@ -70,7 +70,7 @@ ones a half to a tenth are called bad (dice, without glints, as many)."""
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """Frames for any method, and what was done to them, in words (notes) and figures.
+    """Frames after screening. notes: each change in words.
 
     dark, double: shots left out. gains: (shot,), by which the readings were divided. bad:
     (pixel_y, pixel_x), single pixels left out; lines: those of dead rows and columns.
@@ -86,7 +86,10 @@ class Screened:
 
 
 def screened(psi: ImagingMatrix, given: Frames) -> Screened:
-    """Return frames, finite where usable, after screening: as they are where nothing is found."""
+    """Return frames after screening; frames without faults come back unchanged.
+
+    given: finite where usable.
+    """
     notes: list[str] = []
     frames, usable = given.readings, given.usable
     dark = dark_shots(psi, frames, usable)
@@ -144,9 +147,9 @@ def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
 
 
 def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
-    """Return the shots that repeat another although Psi says that they differ.
+    """Return the shots that repeat another although they differ in Psi.
 
-    Of two such the one that fits its part of Psi worse is meant.
+    Of two equal shots the one with the larger residual is returned.
     """
     kept = [shot for shot in range(len(frames)) if usable[shot].any()]
     predicted = _predicted(psi, frames, usable)
@@ -207,8 +210,8 @@ def dead_lines(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the rows and the columns (both one-dimensional) that are dead or stuck in all shots.
 
-    Their readings hardly vary, while those of the lines on either side do. A line's neighbours are
-    as dead as its pixels, so that none of these seems to differ from those around. Outermost lines
+    Their readings hardly vary, while those of the lines on either side do. Pixels of a dead line do
+    not differ from their neighbours along it, so that `bad_pixels` finds none. Outermost lines
     that are dark are no such lines: light fields that were rectified end so, and `adaptive` tells
     these edges from the scene.
     """
@@ -311,13 +314,13 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
 
 
 def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the pixels (pixel_y, pixel_x) that read much more or less than any neighbour suggests.
+    """Return the bad pixels, (pixel_y, pixel_x), whose readings are unlike those of all neighbours.
 
-    What a pixel reads over what a smooth picture predicts is compared with the range of that ratio
-    among the neighbours that see the same colour, a tenth of them left out at both ends: at an edge
-    or in a texture that range is wide. How far beyond it, in widths of the range, is averaged over
-    the shots, as a bad pixel is bad in all. The more there are, the less it takes to be one of
-    them: to leave out a good pixel costs little, to miss a bad one much.
+    The ratio of a reading to the prediction of a smooth picture is compared with the range of that
+    ratio among neighbours of the same colour, a tenth of them left out at both ends: at an edge or
+    in a texture the range is wide. Its distance from the range, in widths of the range, is averaged
+    over the shots, as a bad pixel is bad in all. The limit is lower where many pixels are bad:
+    leaving out a good pixel costs little, missing a bad one costs much.
     """
     k = psi.binning
     bad = np.zeros(frames.shape[1:], dtype=bool)

@@ -51,8 +51,8 @@ blocks."""
 SAMPLE, SAMPLES = 96, 3
 """Rows and columns of a sample window of the survey, and windows along each axis."""
 SURE_PX, COVERED = 0.25, 99.0
-"""Deviation of disparities below which they count for the halo, and percent of them that it covers:
-what lies further is seen by fewer readings of a block beside it, and averaged with that block's."""
+"""Largest deviation of the disparities that the halo is chosen by, and the percent of them that it
+covers. Fewer readings of a block show surfaces beyond; there it is averaged with its neighbour."""
 
 Array = NDArray[np.floating]
 Place = tuple[slice, slice]
@@ -60,9 +60,10 @@ Place = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class Block:
-    """outer: rows and columns reconstructed; part: those that count, with what overlaps the
-    neighbours; inner: those nearer to it than to any other; all in the light field's samples.
-    sides: of the light field, at which it lies."""
+    """A block of the grid, by rows and columns of the light field's samples.
+
+    outer: reconstructed, with the halo; part: without the halo, overlapping the neighbours; inner:
+    nearer to this block than to any other. sides: of the light field, which the block touches."""
 
     row: int
     column: int

@@ -28,12 +28,12 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What a reconstruction is given; all arrays (shot, pixel_y, pixel_x).
+    """Normalised readings with their noise; all arrays (shot, pixel_y, pixel_x).
 
-    readings: 1 is what the fully open camera reads from a white light field; of a saturated pixel
-    the least that it can be, of any other that is not usable 0. deviation: the standard deviation
-    of each reading. usable: neither saturated nor a bad pixel. exposures: of each shot, where they
-    are known. NumPy takes frames as their readings.
+    readings: 1 is the reading of the fully open camera and a white light field. Saturated pixels
+    have the reading of their white level, a lower bound; other unusable pixels have 0. deviation:
+    standard deviation of each reading. usable: pixels that are neither saturated nor bad.
+    exposures: of each shot, where they are known. NumPy takes frames as their readings.
     """
 
     readings: NDArray[np.floating]
@@ -60,7 +60,7 @@ class Frames:
     @property
     def noise_sigma(self) -> float:
         """Root mean variance of the usable readings, which solvers take as their typical noise."""
-        if not any(self.deviation.strides):  # one number for all readings
+        if self.deviation.size and not any(self.deviation.strides):  # one number for all
             return float(self.deviation.flat[0])
         of_usable = self.deviation[self.usable]
         if not of_usable.size:

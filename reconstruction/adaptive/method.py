@@ -117,9 +117,8 @@ def reconstruct_next(
 ) -> Reconstruction | Film:
     """Return the light field of the next frame of a film, from what the frames before showed.
 
-    film: after the frame before; others as those of `reconstruct_adaptive`, of one shot. Where what
-    was seen before does not foretell the frame, or misleads, it is a first one: of the film that is
-    returned.
+    frames: of one shot. film: after the frame before. Where earlier frames do not predict this one,
+    or mislead its fit, a film is returned that begins with it.
     """
     started = time.perf_counter()
     whole = checked(psi, frames)
@@ -157,8 +156,8 @@ def reconstruct_moving(
 ) -> Reconstruction:
     """Return the light field at the time of the first of several shots, of a scene that moves.
 
-    What the other shots saw is carried to that time, where it explains their readings. patches: of
-    the first shot; others as those of `reconstruct_adaptive`.
+    The light field is carried to the times of the other shots; their readings count where it
+    explains them. patches: of the first shot.
     """
     present, *others = (
         checked(psi.of_shots([n]), frames.cut(np.s_[n : n + 1,])) for n in range(psi.shots)

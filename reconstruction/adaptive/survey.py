@@ -30,10 +30,10 @@ Array = NDArray[np.floating]
 COARSE_PX = 8.0, 2.0
 """Correlation lengths of the textures of the coarse search. 2x +0.15, 0.5x -0.05 dB."""
 CONTRAST = 0.15
-"""Deviation of a scene's values below which it is reconstructed as if it had so much, since the
-settings are shares of that. Against a mean brightness of 0.25 in its place, on 96x96 crops of group
-A: buttercup and occlusions +0.1 dB. With 0.2 antinous gains 0.2 dB and they gain nothing. 2x -0.01,
-0.5x 0.00 dB."""
+"""Least deviation of a scene's values; a scene of less contrast is scaled up to it, because the
+settings are shares of the contrast. Compared with scaling to a mean brightness of 0.25, on 96x96
+crops of group A: buttercup and occlusions +0.1 dB. With 0.2 antinous gains 0.2 dB and the two gain
+nothing. 2x -0.01, 0.5x 0.00 dB."""
 
 PASSED = 0.5
 """Share of the light that masks pass for which the settings were chosen."""

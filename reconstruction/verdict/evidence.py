@@ -25,8 +25,8 @@ from reconstruction.verdict.shots import Motion, compared
 
 Array = NDArray[np.floating]
 CLIPPED = 0.5
-"""Of the largest reading of a shot, from which on one that is not usable is a saturated one: over a
-flat field the white level differs from pixel to pixel."""
+"""Share of a shot's largest reading, from which on an unusable reading counts as saturated: divided
+by a flat field the white level differs from pixel to pixel."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class FittedFrames:
 
     @property
     def clipped(self) -> NDArray[np.bool_]:
-        """Which readings were not usable and are as large as any that are: saturated ones."""
+        """Saturated readings: excluded, and as large as the usable ones."""
         most = self.shown.max(axis=(1, 2), keepdims=True)
         return (self.excluded > 0) & (self.excluded >= CLIPPED * most)
 
@@ -152,10 +152,10 @@ def gathered(
     found: Relief | None = None,
     moved: Motion | None = None,
 ) -> Evidence:
-    """Return what there is to say of a light field that was fitted without the readings kept.
+    """Return the figures of a light field that was fitted without the readings kept.
 
-    found: what the masks make of the usable readings, where it is known. moved: where shots differ
-    most in what they saw, if there are several.
+    found: relief of the usable readings, where it is known. moved: the largest difference between
+    the scenes of several shots.
     """
     frames, usable, noise_sigma = read.shown, read.frames.usable, read.frames.noise_sigma
     found = relief(psi, frames, noise_sigma, usable) if found is None else found
@@ -229,7 +229,7 @@ def _parallax(light_field: Array, view_axes: ViewAxes) -> float | None:
 
 
 def _plain(values: Iterable[float]) -> tuple[float | None, ...]:
-    """Return plain numbers; None for those that are not finite."""
+    """Return plain numbers, None in place of infinity and NaN."""
     return tuple(float(value) if np.isfinite(value) else None for value in values)
 
 

@@ -1,10 +1,10 @@
-"""A reconstruction with its verdict: some readings are kept from the fit, and asked afterwards.
+"""A reconstruction with its verdict: readings kept from the fit are predicted afterwards.
 
-A saturated reading says that there was at least so much light. The light field is fitted without
-them first; those that it falls short of join the readings, and it is fitted again (an active set,
-of one round: a second one changed 64x80 crops by 0.0 to 0.4 dB). Where one shot saw another scene
-than the others, its readings are left out, and it is fitted again, too. Where several did, the
-scene moved: what they saw is carried to the time of the first.
+A saturated reading is a lower bound of the light. The light field is first fitted without saturated
+readings. Bounds that it does not reach join the readings, and it is fitted again (an active set of
+one round: a second round changed 64x80 crops by 0.0 to 0.4 dB). Readings of a shot that shows
+another scene than the others are left out, and the light field is fitted again. Where several shots
+do, the scene moved, and all shots are carried to the time of the first.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""
 COLOURS = 3
 COARSE_STEPS, CLEARLY_MOVED = 15, 1.6
-"""Of total variation; and the ratio of `Motion` from which on what it shows is certain: at rest it
-is 0.3 to 1.3 (group A at 96x128, two to six shots), at 1 to 5 pixels between three shots 1.5 to 12.
-What moved by less the light field itself shows, a fit later."""
+"""Steps of total variation, and the ratio of `Motion` from which on motion is certain: at rest the
+ratio is 0.3 to 1.3 (group A at 96x128, two to six shots), with 1 to 5 pixels between three shots it
+is 1.5 to 12. Smaller motion is found from the light field, after the first fit."""
 
 
 @one_blas_thread()
