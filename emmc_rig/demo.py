@@ -27,7 +27,6 @@ from emmc_rig.files.exports import save_maps
 from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import (
     export_pictures,
     focus_disparities,
@@ -185,7 +184,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             return reconstruct_judged(
                 settings.method,
                 psi,
-                even_frames(readings, sigma, usable),
+                taken,
                 dictionary,
                 settings.solver,
                 lambda p: watcher.step(_progress_words(p)),
