@@ -36,9 +36,7 @@ def measure(scene: str, camera: str, size: tuple[int, int], seed: int, without: 
     disparity = matched_disparity(given.truth) if without == ORACLE else None
     settings = AdaptiveSettings.model_validate(PARTS.get(without, {}))
     started = time.process_time()
-    result = reconstruct_adaptive(
-        given.psi, given.readings, given.noise_sigma, settings, given.usable, disparity=disparity
-    )
+    result = reconstruct_adaptive(given.psi, given.frames, settings, disparity=disparity)
     return {
         "psnr_db": given.psnr_db(result.light_field),
         "cpu_s": time.process_time() - started,

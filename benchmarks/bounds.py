@@ -13,6 +13,7 @@ import lab
 import numpy as np
 from oracle import matched_disparity
 
+from emmc_rig.model.frames import even_frames
 from emmc_rig.study.trial import Capture, Trial, trial_of
 from reconstruction.adaptive.method import reconstruct_adaptive
 from reconstruction.adaptive.settings import AdaptiveSettings
@@ -40,10 +41,9 @@ def measure(scene: str, camera: str, size: tuple[int, int], seed: int, known: st
         psi, readings = _without(given, hidden)
     # Of one shot, with or without its colours: no sparse patches.
     settings = AdaptiveSettings(patches=None)
-    light_field = reconstruct_adaptive(
-        psi, readings, given.noise_sigma, settings, given.usable,
-        disparity=disparity if "disparity" in of else None,
-    ).light_field  # fmt: skip
+    frames = even_frames(readings, given.noise_sigma, given.usable)
+    known = disparity if "disparity" in of else None
+    light_field = reconstruct_adaptive(psi, frames, settings, disparity=known).light_field
     if "occlusion" in of:
         light_field = np.where(hidden[..., None], given.truth, light_field)
     return {"psnr_db": given.psnr_db(light_field), "hidden": float(hidden.mean())}

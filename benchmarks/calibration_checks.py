@@ -38,7 +38,7 @@ from simulated_calibration import (
 
 import emmc_rig as emmc
 from calibration.boards import channels_of
-from calibration.drift import Captures, DriftSettings, drifted, find_drift
+from calibration.drift import DriftSettings, drifted, find_drift
 from calibration.frames import bands
 from calibration.openings import views_open
 from calibration.parametric import psi_at, shot_stages
@@ -53,10 +53,11 @@ from emmc_rig.acquisition.plan import Checks, Plan, PlannedShot
 from emmc_rig.bench.hardware import Fitted
 from emmc_rig.demo import simulated_session
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.psi import SavedPsi
+from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.results import parse_size
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import psi_layout
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
@@ -262,7 +263,7 @@ class Captured:
     def psnr(self, psi: ImagingMatrix) -> float:
         """Return the PSNR of a reconstruction by total variation."""
         sigma = float(np.sqrt(self.variance[self.usable].mean()))
-        result = reconstruct_tv(psi, self.readings, sigma, TVSettings(), self.usable)
+        result = reconstruct_tv(psi, even_frames(self.readings, sigma, self.usable), TVSettings())
         return psnr_db(result.light_field, self.truth)
 
 
@@ -324,15 +325,16 @@ def check_drift(size: Size, seed: int) -> Iterator[Row]:
     outcome, _ = _fitted(size, seed)
     assert outcome.mixed is not None
     known, shadow, stages = outcome.calibration, outcome.mixed.shadow, shot_stages(settings.camera)
-    colour, layout = known.psi.colour, known.psi.layout
+    colour, layout = known.psi.colour, known.psi
     for name in size.drifts:
         drift = np.array(DRIFTS[name])
         after = replace(settings, flaws=moved(settings.flaws, drift), seed=seed + 2)
         lost = gained = 0.0
         for spec in scenes(size.scenes):
             captured = captured_scene(spec, after, known)
-            taken = Captures(captured.readings, captured.variance, captured.usable, colour)
-            found = find_drift(taken, shadow.mask, shadow.placement, stages, size.search)
+            deviation = np.sqrt(captured.variance)
+            taken = Frames(captured.readings, deviation, captured.usable)
+            found = find_drift(taken, colour, shadow.mask, shadow.placement, stages, size.search)
             mismatched = captured.psnr(known.psi)
             oracle, blind = (
                 captured.psnr(psi_at(Shadow(shadow.mask, at), layout, stages))
@@ -368,7 +370,7 @@ def _streamed_error(path: Path, shadow: Shadow, channels: NDArray[np.uint8]) -> 
     """Return the relative error of a stored Psi over the middle rows."""
     first = channels.shape[0] // 4 * 2
     rows = slice(first, min(first + COMPARED_ROWS, channels.shape[0]))
-    found = SavedPsi(path).window(rows, slice(None)).weights[0, :, :, :, 0]
+    found = StoredPsi(path).window(rows, slice(None)).weights[0, :, :, :, 0]
     missed = total = 0.0
     for view in np.ndindex(shadow.mask.views):
         true = drawn(shadow, channels, rows, views_open(shadow.mask.views, view))

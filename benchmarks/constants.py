@@ -99,9 +99,7 @@ def measure(
     given = trial_of(Capture(scene, camera, size, seed))
     try:
         with scaled(constant, factor) as settings:
-            result = reconstruct_adaptive(
-                given.psi, given.readings, given.noise_sigma, settings, given.usable
-            )
+            result = reconstruct_adaptive(given.psi, given.frames, settings)
     except ValidationError:
         return {"psnr_db": None}
     return {"psnr_db": given.psnr_db(result.light_field)}

@@ -47,9 +47,7 @@ def measure(camera: str, scene: str, size: tuple[int, int], seed: int) -> dict:
     truth = open_scene(scene, size, described.views, seed).light_field
     psi = printed_psi(described, (truth.shape[2], truth.shape[3]), Print())
     shots = described.expose(truth, seed, psi)
-    result = reconstruct(
-        DEFAULT_METHOD, psi, shots.readings, shots.noise_sigma, usable=shots.usable
-    )
+    result = reconstruct(DEFAULT_METHOD, psi, shots)
     return {"expected_db": theory.psnr_db, "psnr_db": psnr_db(result.light_field, truth)}
 
 

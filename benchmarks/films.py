@@ -99,13 +99,12 @@ def measure(
         shown = described.read_out(np.maximum(psi.forward(truth), 0), seed + frame)
         shot = frame % psi.shots
         part = psi.of_shots([shot], psi.camera_json)
-        given = part, shown.readings[[shot]], shown.noise_sigma
-        usable = shown.usable[[shot]]
+        given = part, shown.of_one_deviation().cut(np.s_[shot : shot + 1,])
         started = time.process_time()
-        result, _ = reconstruct_judged("adaptive", *given, usable=usable, film=film)
+        result, _ = reconstruct_judged("adaptive", *given, film=film)
         carried_s = time.process_time() - started
         film = result.film
-        alone, _ = reconstruct_judged("adaptive", *given, usable=usable)
+        alone, _ = reconstruct_judged("adaptive", *given)
         alone_s = time.process_time() - started - carried_s
         low_db, high_db = result.stated["stated_interval_db"] or (np.nan, np.nan)
         both = psnr_db(result.light_field, truth), psnr_db(alone.light_field, truth)

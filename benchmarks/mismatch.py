@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import lab
+import numpy as np
 
-from calibration.drift import Captures, DriftSettings, find_drift
+from calibration.drift import DriftSettings, find_drift
 from calibration.parametric import psi_at, shot_stages
 from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import camera_of, pixel_light
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture, Trial
@@ -33,11 +35,11 @@ def mended(moved: Trial) -> ImagingMatrix:
     variance = noise.variance(moved.readings, camera.exposures_s()[:, None, None], light)
     mask, stages = shadow_mask(camera, psi.size), shot_stages(camera)
     colour = None if psi.colour is None else psi.colour[:, :: psi.binning, :: psi.binning]
-    taken = Captures(moved.readings, variance, moved.usable, colour)
-    drift = find_drift(taken, mask, designed_placement(camera), stages, QUICK)
+    taken = Frames(moved.readings, np.sqrt(variance), moved.usable)
+    drift = find_drift(taken, colour, mask, designed_placement(camera), stages, QUICK)
     if drift.refused or not drift.drifted:
         return psi
-    return psi_at(Shadow(mask, drift.placement), psi.layout, stages)
+    return psi_at(Shadow(mask, drift.placement), psi, stages)
 
 
 def measure(

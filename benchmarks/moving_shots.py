@@ -49,8 +49,8 @@ def _captured(
 
 def _judged(psi, shown):
     """Return the reconstruction, the verdict, and the processor time of both."""
-    started, given = time.process_time(), (psi, shown.readings, shown.noise_sigma)
-    found = reconstruct_judged("adaptive", *given, usable=shown.usable)
+    started = time.process_time()
+    found = reconstruct_judged("adaptive", psi, shown)
     return *found, time.process_time() - started
 
 
@@ -61,15 +61,14 @@ def _at_rest(scene: str, camera: str, shots: int, size: tuple[int, int], seed: i
     truth = _seen(scene, size, 0.0, 0)
 
     def one(shot: int, film: Film | None = None):
-        given = rest.readings[[shot]], rest.noise_sigma, None, None, rest.usable[[shot]]
-        return reconstruct("adaptive", psi.of_shots([shot]), *given, film=film)
+        seen = rest.of_one_deviation().cut(np.s_[shot : shot + 1,])
+        return reconstruct("adaptive", psi.of_shots([shot]), seen, film=film)
 
     last = one(0, Film())
     alone = last.light_field
     for shot in range(1, shots):
         last = one(shot, last.film)
-    given = psi, rest.readings, rest.noise_sigma, None, WITHOUT_PATCHES, rest.usable
-    together = reconstruct("adaptive", *given)
+    together = reconstruct("adaptive", psi, rest, None, WITHOUT_PATCHES)
     at_rest, _, cpu_s = _judged(psi, rest)
     return {
         "rest_db": psnr_db(at_rest.light_field, truth),

@@ -41,9 +41,7 @@ def measure(
     """
     capture = Capture(scene, camera, size, seed + cut, noise=noise)
     given = trial_of(capture, scene=None if capture.is_built_in or not cut else _cut(scene, size))
-    result, verdict = reconstruct_judged(
-        method, given.psi, given.readings, given.noise_sigma, usable=given.usable
-    )
+    result, verdict = reconstruct_judged(method, given.psi, given.frames)
     if "sigma" not in result.maps:
         return {"verdict": verdict.level}
     sigma = result.maps["sigma"].astype(np.float64)[..., None]

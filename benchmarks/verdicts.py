@@ -37,10 +37,8 @@ def measure(
     point = Point(Capture(scene, camera, size, seed, zoom), fault, strength, method)
     try:
         given = point.trial()
-        result, verdict = reconstruct_judged(
-            method, given.psi, given.readings, given.noise_sigma, given.dictionary(method), None,
-            given.usable,
-        )  # fmt: skip
+        atoms = given.dictionary(method)
+        result, verdict = reconstruct_judged(method, given.psi, given.frames, atoms)
     except (NotApplicableError, ReconstructionError, ModelError) as why:
         return {"psnr_db": None, "even_db": None, "level": "", "reasons": str(why)}
     return {

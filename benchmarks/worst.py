@@ -13,6 +13,7 @@ from __future__ import annotations
 import lab
 import numpy as np
 
+from emmc_rig.model.frames import even_frames
 from emmc_rig.study.trial import Capture, trial_of
 from reconstruction.methods import installed_methods, reconstruct
 
@@ -75,7 +76,7 @@ def measure(
     def solve(readings):
         frames = readings.astype(np.float32)
         return reconstruct(
-            method, trial.psi, frames, deviation, dictionary, usable=trial.usable
+            method, trial.psi, even_frames(frames, deviation, trial.usable), dictionary
         ).light_field
 
     rng = np.random.default_rng(seed)

@@ -118,8 +118,8 @@ def other_colours(
     at = known.fit.placement
     lost = None if known.defects is None else known.defects.lost
     mask = plain if lost is None else mask_with_losses(plain, at, lost)
-    shots, v, u, y, _, x = layout.shape
-    three = replace(layout, shape=(shots, v, u, y, 3, x), colour=None)
+    shots, v, u, y, _, x = layout.weights_shape
+    three = PsiLayout((shots, v, u, y, 3, x), None, camera_json=layout.camera_json)
     through = 3 * psi_at(Shadow(mask, at), three, stages).weights
     own = np.arange(3)[:, None] == layout.colour[:, None, None, :, None, :]
     share, unsure = (

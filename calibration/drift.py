@@ -31,6 +31,7 @@ from calibration.placement import Placement
 from calibration.registration import correlated
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
@@ -155,25 +156,6 @@ class Drift:
 
 
 @dataclass(frozen=True, eq=False)
-class Captures:
-    """Shots of a scene: readings, variance and usable, (shot, pixel_y, pixel_x), normalised.
-
-    colour: likewise, the one colour that each pixel sees; None: every pixel sees all three.
-    """
-
-    readings: Array
-    variance: Array
-    usable: NDArray[np.bool_]
-    colour: NDArray[np.uint8] | None
-
-    def channels(self) -> NDArray[np.uint8]:
-        """Return the colour that each pixel sees, or ANY_COLOUR, (shot, pixel_y, pixel_x)."""
-        if self.colour is None:
-            return np.full(self.readings.shape, ANY_COLOUR, dtype=np.uint8)
-        return self.colour
-
-
-@dataclass(frozen=True, eq=False)
 class _Blocks:
     """Blocks of the captures: pixels (block, side^2, 2), and per shot what they read."""
 
@@ -189,29 +171,34 @@ class _Blocks:
 
 
 def _blocks(
-    taken: Captures, side: int, count: int, rng: np.random.Generator, half_px: float = np.inf
+    frames: Frames,
+    channels: NDArray[np.uint8],
+    side: int,
+    count: int,
+    rng: np.random.Generator,
+    half_px: float = np.inf,
 ) -> _Blocks:
     """Return blocks on a jittered grid whose pixels are all usable and not dark.
 
-    half_px: from the middle of the picture, along either axis.
+    channels: the colour that each pixel sees, or ANY_COLOUR, (shot, pixel_y, pixel_x). half_px:
+    from the middle of the picture, along either axis.
     """
     sizes = [
-        min(n, max(int(2 * half_px), 4 * side)) if half_px < n else n
-        for n in taken.readings.shape[1:]
+        min(n, max(int(2 * half_px), 4 * side)) if half_px < n else n for n in frames.shape[1:]
     ]
     rows, columns = sizes
-    above, before = ((n - m) // 4 * 2 for n, m in zip(taken.readings.shape[1:], sizes, strict=True))
+    above, before = ((n - m) // 4 * 2 for n, m in zip(frames.shape[1:], sizes, strict=True))
     across = max(int(np.sqrt(count * columns / rows)), 1)
     down = max(count // across, 1)
     found = []
-    floor = 0.05 * float(np.percentile(taken.readings[taken.usable], 90))
+    floor = 0.05 * float(np.percentile(frames.readings[frames.usable], 90))
     for i in range(down):
         for j in range(across):
             for _ in range(4):
                 top = above + int((i + rng.random()) * (rows - side) / down) // 2 * 2
                 left = before + int((j + rng.random()) * (columns - side) / across) // 2 * 2
                 place = (slice(None), slice(top, top + side), slice(left, left + side))
-                if taken.usable[place].all() and taken.readings[place].mean() > floor:
+                if frames.usable[place].all() and frames.readings[place].mean() > floor:
                     found.append((top, left))
                     break
     if len(found) < 8:
@@ -228,9 +215,9 @@ def _blocks(
 
     return _Blocks(
         pixels,
-        at(taken.channels()),
-        at(taken.readings).astype(np.float64),
-        at(taken.variance).astype(np.float64),
+        at(channels),
+        at(frames.readings).astype(np.float64),
+        np.square(at(frames.deviation), dtype=np.float64),
     )
 
 
@@ -355,19 +342,22 @@ def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> flo
 
 @one_blas_thread()
 def find_drift(
-    taken: Captures,
+    frames: Frames,
+    colour: NDArray[np.uint8] | None,
     mask: ShadowMask,
     placement: Placement,
     stages: Stages,
     settings: DriftSettings | None = None,
 ) -> Drift:
-    """Return how the mask has moved between the calibration and these captures.
+    """Return how the mask has moved between the calibration and the frames of a scene.
 
-    placement, mask: as calibrated. stages: (x, y) in um per shot. Raises CalibrationError where too
-    little of the captures can be used.
+    colour: the one that each pixel sees, (shot, pixel_y, pixel_x); None: each sees all. placement,
+    mask: as calibrated. stages: (x, y) in um per shot. Raises CalibrationError where too few of the
+    readings can be used.
     """
     settings = settings or DriftSettings()
-    shots = len(taken.readings)
+    shots = frames.shape[0]
+    channels = np.full(frames.shape, ANY_COLOUR, np.uint8) if colour is None else colour
     rng = np.random.default_rng(settings.seed)
     side = settings.block_px if shots < 3 else max(settings.block_px - 2, 4)
     disparities = np.linspace(
@@ -381,7 +371,7 @@ def find_drift(
     lean = min(step * mask.lens_um / (far_um * half_um), 1e-3)
     names, spreads = list(KINDS), list(SPREADS)
     steps = [step, step, step / half_um, step / half_um, 0.02, lean, lean]
-    if taken.colour is not None:
+    if colour is not None:
         names, spreads, steps = [*names, "crosstalk"], [*spreads, CROSSTALK_SPREAD], [*steps, 0.01]
     names += [f"brightness_{shot + 1}" for shot in range(1, shots)]
     every_step = np.array(steps + [0.005] * (shots - 1))
@@ -392,17 +382,17 @@ def find_drift(
         search.begin(blocks, start, settings.candidates)
         return _climb(search, start, settings.tolerance)
 
-    half_px, widest_px = START_PX / 2, max(taken.readings.shape[1:]) / 2
-    blocks = _blocks(taken, side, settings.coarse_blocks, rng, half_px)
-    starts = _starts(taken, mask, placement, stages, settings, len(names))
+    half_px, widest_px = START_PX / 2, max(frames.shape[1:]) / 2
+    blocks = _blocks(frames, channels, side, settings.coarse_blocks, rng, half_px)
+    starts = _starts(frames, channels[0], mask, placement, stages, settings, len(names))
     tried = [climbed(blocks, start)[0] for start in starts]
     search.begin(blocks, starts[0])
     drift = max(tried, key=search.total)
     while WIDENING * half_px < widest_px:
         half_px *= WIDENING
-        blocks = _blocks(taken, side, settings.coarse_blocks, rng, half_px)
+        blocks = _blocks(frames, channels, side, settings.coarse_blocks, rng, half_px)
         drift = climbed(blocks, drift)[0]
-    blocks = _blocks(taken, side, settings.blocks, rng)
+    blocks = _blocks(frames, channels, side, settings.blocks, rng)
     drift, steps_taken, converged = climbed(blocks, drift)
     drift, covariance = _polish(search, drift)
     recognised = _recognised(search, blocks, drift, settings, rng)
@@ -437,7 +427,8 @@ def find_drift(
 
 
 def _starts(
-    taken: Captures,
+    frames: Frames,
+    channels: NDArray[np.uint8],
     mask: ShadowMask,
     placement: Placement,
     stages: Stages,
@@ -445,7 +436,7 @@ def _starts(
     size: int,
 ) -> list[Array]:
     """Return where to begin: no drift, and the best places of the open aperture's shadow."""
-    reading, usable, channels = taken.readings[0], taken.usable[0], taken.channels()[0]
+    reading, usable = frames.readings[0], frames.usable[0]
     flat = np.zeros(reading.shape)
     for channel in np.unique(channels):
         seen = (channels == channel) & usable

@@ -76,7 +76,7 @@ def coefficient_planes(
 
     stages: per shot.
     """
-    shots, views_v, views_u, _, stored_colours, _ = layout.shape
+    shots, views_v, views_u, _, stored_colours, _ = layout.weights_shape
     samples_shadow = of_samples(shadow)
     for place in np.ndindex(shots, views_v, views_u, stored_colours):
         yield place, coefficient_plane(samples_shadow, layout, place, stages[place[0]])
@@ -98,9 +98,9 @@ def coefficient_plane(
     samples_shadow: see `of_samples`.
     """
     shot, v, u, stored = place
-    scale = layout.shape[4] * layout.binning**2
+    scale = layout.weights_shape[4] * layout.binning**2
     plane = np.empty(layout.size, dtype=np.float32)
-    chosen = views_open((layout.shape[1], layout.shape[2]), (v, u))
+    chosen = views_open((layout.weights_shape[1], layout.weights_shape[2]), (v, u))
     for band, samples, channels in _bands(layout, shot, stored):
         read = samples_shadow.readings(samples, channels, chosen, stage_um, shot)
         plane[band] = read.reshape(plane[band].shape) / scale
@@ -109,7 +109,7 @@ def coefficient_plane(
 
 def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
     """Return Psi with the mask stage at `stages`, one (x, y) in um per shot."""
-    weights = np.empty(layout.shape, dtype=np.float32)
+    weights = np.empty(layout.weights_shape, dtype=np.float32)
     for (shot, v, u, stored), plane in coefficient_planes(shadow, layout, stages):
         weights[shot, v, u, :, stored] = plane
     return layout.psi(weights)
@@ -130,8 +130,8 @@ def psi_deviation(
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0)))[:, values > 0]
     samples_shadow = of_samples(shadow)
-    deviation = np.empty(layout.shape, dtype=np.float32)
-    shots, views_v, views_u, _, stored_colours, _ = layout.shape
+    deviation = np.empty(layout.weights_shape, dtype=np.float32)
+    shots, views_v, views_u, _, stored_colours, _ = layout.weights_shape
     scale = stored_colours * layout.binning**2
     for shot, v, u, stored in np.ndindex(shots, views_v, views_u, stored_colours):
         chosen = views_open((views_v, views_u), (v, u))

@@ -78,7 +78,7 @@ from calibration.whiteboard import (
 )
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.sensing import PsiLayout
 
 LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
@@ -121,7 +121,7 @@ class Outcome:
 @one_blas_thread()
 def calibrate(
     camera: Camera,
-    design: ImagingMatrix | PsiLayout,
+    design: PsiLayout,
     routes: Sequence[str],
     held_out: BoardSet,
     few: BoardSet | None = None,
@@ -140,13 +140,12 @@ def calibrate(
     references, by the degrees that the board was turned.
     Raises CalibrationError for whatever makes the whiteboards unfit.
     """
-    layout = design.layout if isinstance(design, ImagingMatrix) else design
     advice: list[str] = []
     turned = turned or {}
     sets = [held_out, *(one for one in (few, pinholes) if one is not None), *turned.values()]
     refuse_unfit(sets)
     good = np.logical_and.reduce([sensor_blemishes(one) for one in sets])
-    channels = channels_of(layout)
+    channels = channels_of(design)
     levels = fit_levels(list(dict.fromkeys(check for one in sets for check in one.checks)))
     findings = level_findings(levels)
     if levels is not None:
@@ -156,7 +155,7 @@ def calibrate(
         pinholes = None if pinholes is None else pinholes.levelled(*how)
         turned = {turn: one.levelled(*how) for turn, one in turned.items()}
     seen_colours = crosstalk(held_out, channels, good)
-    judges = as_readings(held_out, layout, good)
+    judges = as_readings(held_out, design, good)
     if not judges:
         raise CalibrationError(
             "no validation whiteboard: capture one more with the aperture open, to judge Psi by"
@@ -169,7 +168,7 @@ def calibrate(
     if not modelled or pinholes is not None:
         boards = pinholes or held_out
         odd, shadow = _unlike_the_design(
-            camera, layout, boards, judges, good, seen_colours, not modelled
+            camera, design, boards, judges, good, seen_colours, not modelled
         )
         findings += odd
     calibrations: dict[str, Calibration] = {}
@@ -182,10 +181,10 @@ def calibrate(
         if few is None:
             raise CalibrationError("the calibration method parametric was given no whiteboards")
         on_stage("parametric fit")
-        seen = as_readings(few, layout, good)
+        seen = as_readings(few, design, good)
         for board in seen:
             refuse_without_mask(board)
-        plain = shadow_mask(camera, layout.size)
+        plain = shadow_mask(camera, design.size)
         mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
         fit = fit_placement(seen, camera, mask)
         advice += fit_advice(fit)
@@ -198,14 +197,14 @@ def calibrate(
             fit = fit_placement(seen, camera, mask, start=fit.placement)
         findings += _hands_finding(fit, seen, mask)
         parametric = with_misfit(Parametric(fit, mask), seen)
-        if {"mixed", "combined"} & set(routes) and layout.binning == 1:
+        if {"mixed", "combined"} & set(routes) and design.binning == 1:
             on_stage("defects of the mask")
             mixed = with_misfit(_mixed(seen, camera, parametric), seen)
         for name, one in (("parametric", parametric), ("mixed", mixed)):
             if one is not None:
                 one = replace(one, of_defects=_missed_at_defects(one, [*seen, *judges]))
                 on_stage(f"Psi, {name}")
-                bare[name] = _calibration(one, camera, layout, few, good)
+                bare[name] = _calibration(one, camera, design, few, good)
                 calibrations[name] = _counting_misfit(bare[name], one)
                 judged[name] = _judged(name, one, judges, seen)
                 frames[name] = few.exposures
@@ -218,7 +217,7 @@ def calibrate(
         on_stage("Psi, free")
         free = replace(measure_psi(pinholes, design, empty, on_plane), good=good)
         if (best := mixed or parametric) is not None:
-            _put_right(free, best, seen, layout)
+            _put_right(free, best, seen, design)
         calibrations["free"] = free
         still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
         if not still:
@@ -226,19 +225,19 @@ def calibrate(
                 "the calibration method free is judged by an open whiteboard with the mask where "
                 "the first shot has it: capture a validation whiteboard there"
             )
-        judged["free"] = _judged_measured("free", free, still[0], layout.binning)
+        judged["free"] = _judged_measured("free", free, still[0], design.binning)
         frames["free"] = pinholes.exposures
         if "combined" in routes and best is not None and few is not None:
             on_stage("Psi, combined")
             model = bare["mixed" if mixed is not None else "parametric"]
             both = combined(free, model, good)
             calibrations["combined"] = both
-            judged["combined"] = _judged_measured("combined", both, still[0], layout.binning)
+            judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
             frames["combined"] = few.exposures
     for name, one in calibrations.items():
         _make_less_sure(one, _unsteady(name, sets, [*judges, *seen], parametric))
         if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
-            _count_moves(one, parametric, layout, shot_stages(camera))
+            _count_moves(one, parametric, design, shot_stages(camera))
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > LARGEST_CHI2:
@@ -261,11 +260,11 @@ def calibrate(
             )
         by = mixed or parametric
         assert by is not None
-        others = other_colours(by, plain, seen_colours, layout, shot_stages(camera))
+        others = other_colours(by, plain, seen_colours, design, shot_stages(camera))
         calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
     board = None
     if turned:
-        boards = {turn: as_readings(one, layout, good)[0] for turn, one in turned.items()}
+        boards = {turn: as_readings(one, design, good)[0] for turn, one in turned.items()}
         by = mixed or parametric
         shadow = shadow if by is None else by.shadow
         board = board_over_angle(calibrations[chosen.route].psi, boards, shadow)
@@ -279,7 +278,7 @@ def calibrate(
         findings += leaning_findings(leans, bool(turned))
         for one in calibrations.values():
             less_sure(one, leans.lopsided)
-    not_known = unwatched(_missing(sets, levels, layout, bool(turned)))
+    not_known = unwatched(_missing(sets, levels, design, bool(turned)))
     if parametric is not None and all(board.views_open.all() for board in seen):
         stated = calibrations[chosen.route].stated_error
         not_known.append(views_assumed(pinhole_worth(mixed or parametric, seen, stated)))
@@ -518,7 +517,7 @@ def _put_right(
         off_x, off_y = check.moved_um
         unsure_um = check.moved_deviation_um
         lost = _cut_off(check.moved_um, board, one.mask)
-        for stored in range(layout.shape[4]):
+        for stored in range(layout.weights_shape[4]):
             place = board.shot, v, u, stored
 
             def at(x: float, y: float, place: tuple = place) -> NDArray[np.float32]:

@@ -38,7 +38,7 @@ NewArray = Callable[[str, tuple[int, ...]], Any]
 Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32]]
 
 
-def lamps_needed(design: ImagingMatrix | PsiLayout) -> tuple[str, ...]:
+def lamps_needed(design: PsiLayout) -> tuple[str, ...]:
     """Return the lamp colours to measure under: white alone where a pixel sees one colour only."""
     return LAMP_COLOURS if design.colour is None else ("white",)
 
@@ -86,7 +86,7 @@ def in_memory(name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 def measure_psi(
     boards: BoardSet,
-    design: ImagingMatrix | PsiLayout,
+    design: PsiLayout,
     empty: NewArray = in_memory,
     on_plane: Callable[[str], None] = lambda what: None,
 ) -> Calibration:
@@ -98,20 +98,19 @@ def measure_psi(
     there. on_plane: called after each. Raises CalibrationError for missing frames, frames of
     another size, and a whiteboard too dark to divide by.
     """
-    whole = isinstance(design, ImagingMatrix)
-    layout, designed = (design.layout, design.weights) if whole else (design, None)
-    gain = _gain(boards, layout)
-    weights, deviation = (empty(name, layout.shape) for name in ("weights", "deviation"))
-    for (shot, v, u, stored), values, spread in measured_planes(boards, layout, designed):
+    designed = design.weights if isinstance(design, ImagingMatrix) else None
+    gain = _gain(boards, design)
+    weights, deviation = (empty(name, design.weights_shape) for name in ("weights", "deviation"))
+    for (shot, v, u, stored), values, spread in measured_planes(boards, design, designed):
         weights[shot, v, u, :, stored] = values
         deviation[shot, v, u, :, stored] = spread
         on_plane(f"view ({v}, {u})")
-    white = np.zeros(layout.frames_shape, dtype=np.float32)
+    white = np.zeros(design.frames_shape, dtype=np.float32)
     for shot, reading in enumerate(white):
-        for reference in _references(boards, gain, layout, shot):
+        for reference in _references(boards, gain, design, shot):
             for rows in bands(reading):
                 reading[rows] += _bright(boards, gain, reference, rows)[0]
-    return Calibration(layout.psi(weights), deviation, boards.dark.mean_dn, white, gain)
+    return Calibration(design.psi(weights), deviation, boards.dark.mean_dn, white, gain)
 
 
 def measured_planes(
@@ -129,7 +128,7 @@ def measured_planes(
     views_v, views_u = layout.views
     k = layout.binning
     pinholes = {(one.shot, one.pinhole, one.lamp): one for one in boards.frames}
-    for shot in range(layout.shape[0]):
+    for shot in range(layout.weights_shape[0]):
         references = _references(boards, gain, layout, shot)
         for v, u in np.ndindex(views_v, views_u):
             for stored, lamp in enumerate(lamps):

@@ -184,11 +184,9 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             return reconstruct_judged(
                 settings.method,
                 psi,
-                readings,
-                sigma,
+                taken,
                 dictionary,
                 settings.solver,
-                usable,
                 lambda p: watcher.step(_progress_words(p)),
             )
 

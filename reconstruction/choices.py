@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.colour import coloured
 from reconstruction.differences import norm_squared
-from reconstruction.flat import FlatPsi, flat_psi
 from reconstruction.problem import PatchTerm
 
 Array = NDArray[np.floating]
@@ -71,23 +70,22 @@ def contrast(guess: Array) -> float:
     return max(float(guess.std()), 0.05 * float(np.abs(guess).max()), 1e-12)
 
 
-def smooth_guess(psi: ImagingMatrix | FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def smooth_guess(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return a blurred picture (y, x, c) that explains the frames' local means, float32.
 
     Every colour is the ratio of blurred back-projections, as if all views were equal; where no
     pixel has a filter, that is grey, and colours are those that the masks show (`colour`).
     """
-    flat = psi if isinstance(psi, FlatPsi) else flat_psi(psi)
     kept = np.where(usable, frames, 0).astype(np.float32)
-    seen = flat.forward(np.ones(flat.weights.shape[1:], dtype=np.float32)) * usable
-    deviation = BLUR_SAMPLES * flat.binning
+    seen = psi.forward_picture(np.ones((*psi.size, 3), dtype=np.float32)) * usable
+    deviation = BLUR_SAMPLES * psi.binning
     blurred = [
-        cv2.GaussianBlur(flat.adjoint(image).astype(np.float32), (0, 0), deviation)
+        cv2.GaussianBlur(psi.adjoint_picture(image).astype(np.float32), (0, 0), deviation)
         for image in (kept, seen)
     ]
     floor = 1e-3 * float(blurred[1].mean())
     picture = np.maximum(blurred[0], 0) / np.maximum(blurred[1], floor)
-    return picture if flat.colour is not None else coloured(flat, kept, usable, picture)
+    return picture if psi.colour is not None else coloured(psi, kept, usable, picture)
 
 
 def first_light_field(psi: ImagingMatrix, guess: Array, patch_term: PatchTerm | None) -> Array:

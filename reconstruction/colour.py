@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import OPPONENT
-from reconstruction.flat import FlatPsi
+from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]
 NEAREST_PX = 0.7
@@ -41,16 +41,18 @@ class Chroma:
     variance: NDArray[np.float64]
 
 
-def chroma_of(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_], picture: Array) -> Chroma:
+def chroma_of(
+    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], picture: Array
+) -> Chroma:
     """Return the chrominance that frames (shot, pixel_y, pixel_x) show.
 
     picture: a smooth one (y, x, c) that explains their local means; its colours are ignored.
     """
     grey = np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1)
-    level = flat.forward(grey)
+    level = psi.forward_picture(grey)
     good = usable & (level > DIMMEST * float(level.mean()))
     safe = np.where(good, level, 1)
-    signals = [frames, *(flat.forward(grey * np.sqrt(3) * axis) for axis in OPPONENT[1:])]
+    signals = [frames, *(psi.forward_picture(grey * np.sqrt(3) * axis) for axis in OPPONENT[1:])]
     near = np.maximum(_blurred(good.sum(axis=0), NEAREST_PX), 1e-6)
     varied = []
     for one in signals:
@@ -88,23 +90,23 @@ def _regressed(
     return change, np.asarray(covariance, dtype=np.float64)
 
 
-def coloured(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_], picture: Array) -> Array:
+def coloured(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], picture: Array) -> Array:
     """Return the smooth picture (y, x, c) with the colours that the frames show, none below 0."""
-    chroma = _of_samples(chroma_of(flat, frames, usable, picture).value, flat.binning)
+    chroma = _of_samples(chroma_of(psi, frames, usable, picture).value, psi.binning)
     grey = picture.mean(axis=-1, keepdims=True)
     return np.maximum(grey * (1 + np.sqrt(3) * chroma @ OPPONENT[1:]), 0).astype(picture.dtype)
 
 
 def unseen_colour(
-    flat: FlatPsi, frames: Array, usable: NDArray[np.bool_], picture: Array
+    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], picture: Array
 ) -> NDArray[np.float64]:
     """Return the variance of a light field's values by colours that frames do not show, (y, x).
 
     0 where pixels have filters: what their readings miss, others of the frames show.
     """
-    if flat.colour is not None:
+    if psi.colour is not None:
         return np.zeros(picture.shape[:2])
-    variance = _of_samples(chroma_of(flat, frames, usable, picture).variance, flat.binning)
+    variance = _of_samples(chroma_of(psi, frames, usable, picture).variance, psi.binning)
     return np.square(picture.mean(axis=-1, dtype=np.float64)) * variance
 
 

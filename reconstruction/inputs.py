@@ -1,10 +1,13 @@
-"""What every method is given, checked once: frames that fit Psi, finite where they are used."""
+"""Frames checked before any method: they fit Psi, and are finite where they are used."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
 
@@ -23,7 +26,7 @@ def check_frames(shape: tuple[int, int, int], frames: Array) -> None:
 
 
 def _unlike(given: tuple[int, ...], needed: tuple[int, int, int]) -> str:
-    """Return how another shape differs from the one that Psi needs, and what to do."""
+    """Return the difference between a shape and the one that Psi needs, and the remedy."""
     shots, *size = needed
     if list(given) == size:
         return "an axis of shots is missing: frames[None]"
@@ -49,59 +52,73 @@ def _unlike(given: tuple[int, ...], needed: tuple[int, int, int]) -> str:
     return "frames of another sensor or part of it: use the Psi measured with it"
 
 
-def checked_inputs(
-    psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_] | None
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the frames in Psi's type, 0 where not usable, and the mask of usable pixels.
+def checked_inputs(psi: ImagingMatrix, frames: Frames) -> Frames:
+    """Return frames whose readings are of Psi's type, and 0 where they are not usable.
 
-    frames, usable: (shot, pixel_y, pixel_x). Raises ReconstructionError for frames that do not
-    fit Psi or are not finite where usable, that are far brighter than a white scene, for a noise
-    level that is negative or not finite, and when no pixel is usable.
+    Raises ReconstructionError for frames that do not fit Psi or are not finite where usable, that
+    are far brighter than a white scene, for deviations of usable readings that are negative or not
+    finite, and when no pixel is usable.
     """
-    if not 0 <= noise_sigma < np.inf:
-        raise ReconstructionError(
-            f"a noise level of {noise_sigma:g}: it must be finite, at least 0"
-        )
-    check_frames(psi.frames_shape, frames)
-    if usable is None:
-        usable = np.ones(psi.frames_shape, dtype=bool)
-    if usable.shape != psi.frames_shape:
-        raise ReconstructionError(f"the mask of usable pixels has shape {usable.shape}")
-    if not usable.any():
+    check_frames(psi.frames_shape, frames.readings)
+    usable, used = frames.usable, frames.readings[frames.usable]
+    if not used.size:
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
-    if not np.isfinite(frames[usable]).all():
+    deviation = frames.deviation[usable]
+    wrong = deviation[~(np.isfinite(deviation) & (deviation >= 0))]
+    if wrong.size:
+        raise ReconstructionError(
+            f"a noise level of {wrong[0]:g}: it must be finite, at least 0, or its reading excluded"
+        )
+    if not np.isfinite(used).all():
         raise ReconstructionError("the frames hold values that are not finite: exclude them")
-    typical, white = float(np.mean(frames[usable], dtype=np.float64)), psi.light_efficiency()
-    if typical > WHITER * white + noise_sigma:
+    typical, white = float(np.mean(used, dtype=np.float64)), psi.light_efficiency()
+    if typical > WHITER * white + frames.noise_sigma:
         raise ReconstructionError(
             f"readings of {typical:.3g} on average, where Psi makes {white:.3g} of a white scene: "
             "normalise the frames so that a white board without masks reads 1"
         )
-    return np.where(usable, frames, 0).astype(psi.weights.dtype), usable
+    readings = np.where(usable, frames.readings, 0).astype(psi.weights.dtype)
+    return replace(frames, readings=readings)
 
 
-def checked_noise(
-    psi: ImagingMatrix, noise_sigma: float | Array, usable: NDArray[np.bool_] | None
-) -> tuple[float, Array]:
-    """Return the typical standard deviation of the readings, and the variance of each, float32.
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Psi with its readings as a solver scales them.
 
-    noise_sigma: one for all, or (shot, pixel_y, pixel_x); the typical one is the root mean square
-    of those usable. Readings that are not usable get it too. Raises ReconstructionError for a shape
-    that does not fit Psi, and for deviations in use that are negative or not finite.
+    frames, usable: (shot, pixel_y, pixel_x), checked. typical: standard deviation of the readings,
+    root mean square. noise: variance of each reading, float32, the mean where it is not usable.
     """
-    if np.ndim(noise_sigma) == 0:
-        typical = float(noise_sigma)
-        return typical, np.full(psi.frames_shape, typical**2, dtype=np.float32)
-    each = np.asarray(noise_sigma)
-    if each.shape != psi.frames_shape:
-        raise ReconstructionError(
-            f"noise levels of shape {each.shape} given, Psi needs {psi.frames_shape} "
-            "(shot, row, column), or one for all"
-        )
-    used = np.ones(psi.frames_shape, dtype=bool) if usable is None else usable
-    if not (np.isfinite(each[used]) & (each[used] >= 0)).all():
-        raise ReconstructionError(
-            "the noise levels hold values that are negative or not finite: exclude these readings"
-        )
-    mean = float(np.mean(np.square(each[used], dtype=np.float64))) if used.any() else 0.0
-    return float(np.sqrt(mean)), np.where(used, np.square(each), mean).astype(np.float32)
+
+    psi: ImagingMatrix
+    frames: Array
+    typical: float
+    noise: Array
+    usable: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, psi: ImagingMatrix, frames: Frames) -> Readings:
+        """Return the readings of frames; raises ReconstructionError as `checked_inputs` does."""
+        frames = checked_inputs(psi, frames)
+        typical = frames.noise_sigma
+        noise = np.where(frames.usable, np.square(frames.deviation), typical**2)
+        return cls(psi, frames.readings, typical, noise.astype(np.float32), frames.usable)
+
+    def over(self, scale: float, of_psi: bool = False) -> Readings:
+        """Return the same with readings divided by a scale: of a scene, or of Psi, so much dimmer.
+
+        Psi, frames and noise so many times larger are the same problem.
+        """
+        if scale == 1:
+            return self
+        part = self.frames.dtype.type(scale)
+        psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
+        noise = (self.noise / scale**2).astype(np.float32)
+        return Readings(psi, self.frames / part, self.typical / scale, noise, self.usable)
+
+    def variance(self, misfit: float) -> Array:
+        """Return the variance of the readings, with that of what no model explains."""
+        return self.noise + np.float32(misfit**2)
+
+    def precision(self, held: NDArray[np.bool_], misfit: float) -> Array:
+        """Return the inverse variance of the readings fitted, 0 of the others."""
+        return np.where(self.usable & ~held, 1 / self.variance(misfit), 0).astype(np.float32)

@@ -8,38 +8,32 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.film import Film
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import checked_noise
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.sparse import PatchEstimates
 
 if TYPE_CHECKING:
     from reconstruction.methods import MethodSettings
 
-Array = NDArray[np.floating]
-
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What a method reconstructs from.
+    """The inputs of a method.
 
-    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
-    one or of each. usable: pixels to fit (default all). dictionary: for methods that need one.
-    estimates: what `estimate_patches` found from the same inputs, to go on from. film: that frames
-    are the next one of, see `reconstruction.adaptive.film`. moving: whether the scene moved between
-    the shots; then the light field is that at the time of the first one.
+    frames: screened; NumPy takes them as their readings. dictionary: for methods that need one.
+    estimates: of `estimate_patches` from the same inputs, to go on from. film: that frames are the
+    next one of, see `reconstruction.adaptive.film`. moving: whether the scene moved between the
+    shots; then the light field is that at the time of the first one.
     """
 
     psi: ImagingMatrix
-    frames: Array
-    noise_sigma: float | Array
-    usable: NDArray[np.bool_] | None
+    frames: Frames
     dictionary: Dictionary | None
     on_step: Callable[[Progress], None] | None
     estimates: PatchEstimates | None = None
@@ -48,17 +42,7 @@ class Given:
 
     def of_first_shot(self) -> Given:
         """Return the same of the first shot alone."""
-        sigma = np.broadcast_to(np.asarray(self.noise_sigma), self.psi.frames_shape)
-        usable = None if self.usable is None else self.usable[:1]
-        return replace(
-            self, psi=self.psi.of_shots([0]), frames=self.frames[:1], noise_sigma=sigma[:1],
-            usable=usable,
-        )  # fmt: skip
-
-    @property
-    def typical_noise(self) -> float:
-        """The root mean square of the readings' deviations, for methods that take one."""
-        return checked_noise(self.psi, self.noise_sigma, self.usable)[0]
+        return replace(self, psi=self.psi.of_shots([0]), frames=self.frames.cut(np.s_[:1,]))
 
     def needed_dictionary(self, method: str) -> Dictionary:
         """Return the dictionary; raises ReconstructionError when there is none."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import njit
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
 
@@ -81,12 +82,11 @@ class PatchSensing:
 
 def sense_patches(
     psi: ImagingMatrix,
-    frames: NDArray[np.floating],
-    usable: NDArray[np.bool_],
+    frames: Frames,
     corners: NDArray[np.int64],
     shape: tuple[int, int],
 ) -> PatchSensing:
-    """Cut Psi and the frames (shot, pixel_y, pixel_x) into the patches with these corners."""
+    """Cut Psi and the frames into the patches with these corners."""
     k = psi.binning
     shots, views_v, views_u, _, stored, _ = psi.weights.shape
     samples = shape[0] * shape[1]
@@ -99,12 +99,12 @@ def sense_patches(
     for i, (y, x) in enumerate(corners):
         rows, columns = slice(y, y + shape[0]), slice(x, x + shape[1])
         seen = slice(y // k, (y + shape[0]) // k), slice(x // k, (x + shape[1]) // k)
-        kept = usable[:, seen[0], seen[1]]
+        kept = frames.usable[:, seen[0], seen[1]]
         cut = psi.weights[:, :, :, rows, :, columns].transpose(0, 1, 2, 4, 3, 5)
         if not kept.all():
             cut = cut * kept.repeat(k, axis=1).repeat(k, axis=2)[:, None, None, None]
         weights[i, :, :, :samples] = cut.reshape(shots, parts, samples)
-        data[i, : shots * pixels] = np.where(kept, frames[:, seen[0], seen[1]], 0).ravel()
+        data[i, : shots * pixels] = np.where(kept, frames.readings[:, seen[0], seen[1]], 0).ravel()
         measured[i] = kept.sum()
     return PatchSensing(weights, data, measured)
 

@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.inputs import checked_inputs
@@ -34,7 +35,7 @@ def coarser(psi: ImagingMatrix, factor: int) -> ImagingMatrix:
     """Return Psi of light fields that are constant over blocks of factor x factor samples.
 
     factor: a multiple of the binning. What is left of the picture beyond whole blocks is cut off.
-    Its shots are those of Psi, each with the pixels of a block one after another, row by row.
+    Its shots are the shots of Psi times the pixels of a block, row by row.
     """
     k = psi.binning
     if factor % k:
@@ -63,12 +64,10 @@ def _grouped(frames: NDArray, part: int, high: int, wide: int) -> NDArray:
 class _Following:
     """Total variation of frame after frame by one Psi: `planar` is (v, u, y, colour, x)."""
 
-    def __init__(
-        self, psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_]
-    ) -> None:
-        settings = TVSettings()
-        self._data, self._usable = checked_inputs(psi, frames, noise_sigma, usable)
-        mu = choose_mu(psi, self._data[usable], noise_sigma)
+    def __init__(self, psi: ImagingMatrix, frames: Frames) -> None:
+        settings, usable = TVSettings(), frames.usable
+        self._data, self._usable = checked_inputs(psi, frames).readings, usable
+        mu = choose_mu(psi, self._data[usable], frames.noise_sigma)
         guess = smooth_guess(psi, self._data, usable)
         gamma = choose_primal_step(contrast(guess), mu, settings.chroma_weight)
         dtype = psi.weights.dtype.type
@@ -93,36 +92,25 @@ class _Following:
 class Preview:
     """A coarse light field that follows frames.
 
-    psi: of the frames. factor: of samples along each axis that become one. usable: (shot, pixel_y,
-    pixel_x), pixels of Psi to use at all. noise_sigma: of the readings. The settings follow from
-    the first frames: a scene of another brightness wants another Preview.
+    psi: of the frames. factor: of samples along each axis that become one. The settings follow from
+    the first frames, and so do the pixels used: a scene of another brightness wants another
+    Preview.
     """
 
-    def __init__(
-        self,
-        psi: ImagingMatrix,
-        factor: int,
-        frames: Array,
-        noise_sigma: float,
-        usable: NDArray[np.bool_] | None = None,
-    ) -> None:
-        good = np.ones(psi.frames_shape, bool) if usable is None else usable
+    def __init__(self, psi: ImagingMatrix, factor: int, frames: Frames) -> None:
+        readings, good = frames.readings, frames.usable
         coarse = coarser(psi, factor)
         self.size = coarse.size
         self._factor, self._part = factor, factor // psi.binning
-        self._shared = ImagingMatrix(
-            np.ascontiguousarray(psi.weights.sum(axis=(1, 2), keepdims=True)),
-            psi.colour,
-            psi.binning,
+        self._shared = psi.of_one_view()
+        mean = float(np.mean(readings[good]))
+        picture_noise, coarse_noise = (
+            max(frames.noise_sigma, share * mean) for share in (PICTURE_NOISE, COARSE_NOISE)
         )
-        mean = float(np.mean(frames[good]))
-        self._picture = _Following(
-            self._shared, frames, max(noise_sigma, PICTURE_NOISE * mean), good
-        )
+        self._picture = _Following(self._shared, even_frames(readings, picture_noise, good))
         self._seen_by = coarse
-        self._coarse = _Following(
-            coarse, self._cut(frames), max(noise_sigma, COARSE_NOISE * mean), self._cut(good)
-        )
+        cut = even_frames(self._cut(readings), coarse_noise, self._cut(good))
+        self._coarse = _Following(coarse, cut)
 
     def _cut(self, frames: NDArray) -> NDArray:
         return _grouped(frames, self._part, *self.size)

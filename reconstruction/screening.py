@@ -7,15 +7,15 @@ Dark shots, repeated shots, flicker and bad pixels are not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.bands import row_kernel
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
-from reconstruction.flat import FlatPsi, flat_psi
 
 Array = NDArray[np.floating]
 DARK_SHARE = 0.02
@@ -23,9 +23,9 @@ DARK_SHARE = 0.02
 ALIKE = 0.25
 """Share of the expected squared difference of two shots below which they are called the same."""
 SHOWN = 0.1
-"""Strength at which the difference of two shots shows the one that Psi says, from which on they are
-two: masks that are blurred or elsewhere show weaker than Psi says, a shot that repeats another not
-at all."""
+"""Strength of Psi's difference between two shots in the difference of their readings, from which on
+the shots are two. Masks that are blurred or displaced show weaker than in Psi, those of a repeated
+shot not at all."""
 LEAST_FLICKER, SURE = 0.003, 4.0
 """The least flicker evened, and by how many standard errors it must exceed none."""
 GAIN_STEPS = 4
@@ -70,14 +70,13 @@ ones a half to a tenth are called bad (dice, without glints, as many)."""
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """frames, usable: (shot, pixel_y, pixel_x), for any method. notes: what was done, in words.
+    """Frames after screening. notes: each change in words.
 
-    dark, double: shots left out. gains: (shot,), by which the frames were divided. bad:
+    dark, double: shots left out. gains: (shot,), by which the readings were divided. bad:
     (pixel_y, pixel_x), single pixels left out; lines: those of dead rows and columns.
     """
 
-    frames: Array
-    usable: NDArray[np.bool_]
+    frames: Frames
     notes: tuple[str, ...]
     dark: tuple[int, ...]
     double: tuple[int, ...]
@@ -86,16 +85,16 @@ class Screened:
     lines: NDArray[np.bool_]
 
 
-def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Screened:
-    """Return the frames screened.
+def screened(psi: ImagingMatrix, given: Frames) -> Screened:
+    """Return frames after screening; frames without faults come back unchanged.
 
-    frames, usable: (shot, pixel_y, pixel_x), finite where usable. Where nothing is found they
-    come back as they are.
+    given: finite where usable.
     """
-    notes, flat = [], flat_psi(psi)
-    dark = dark_shots(flat, frames, usable)
+    notes: list[str] = []
+    frames, usable = given.readings, given.usable
+    dark = dark_shots(psi, frames, usable)
     usable = _without(usable, dark)
-    double = double_shots(flat, frames, usable)
+    double = double_shots(psi, frames, usable)
     usable = _without(usable, double)
     if dark:
         notes.append(f"excluded {_shots(dark)}: dark, while the others are not")
@@ -104,12 +103,12 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
             f"excluded {_shots(double)}: the same as another, although in Psi the masks moved; "
             "check the stage, or calibrate again"
         )
-    gains = shot_gains(flat, frames, usable)
+    gains = shot_gains(psi, frames, usable)
     if (gains != 1).any():
         frames = (frames / gains[:, None, None]).astype(frames.dtype)
         spread = float(np.ptp(gains[usable.any(axis=(1, 2))]))
         notes.append(f"scaled the shots to equal brightness: they differed by {spread:.1%}")
-    rows, columns = dead_lines(flat, frames, usable)
+    rows, columns = dead_lines(psi, frames, usable)
     lines = rows[:, None] | columns
     if lines.any():
         usable = usable & ~lines
@@ -121,18 +120,19 @@ def screened(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Sc
                 if dead.any()
             )
         )
-    bad = bad_pixels(flat, frames, usable)
+    bad = bad_pixels(psi, frames, usable)
     if bad.any():
         usable = usable & ~bad
         notes.append(
             f"excluded {int(bad.sum())} bad pixels ({bad.mean():.2%}), unlike their neighbours"
         )
-    return Screened(frames, usable, tuple(notes), dark, double, gains, bad, lines)
+    kept = replace(given, readings=frames, usable=usable)
+    return Screened(kept, tuple(notes), dark, double, gains, bad, lines)
 
 
-def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that no light of the scene reached, while it reached others."""
-    expected = flat.weights.sum(axis=-1).mean(axis=(1, 2)) * flat.binning**2
+    expected = psi.picture_weights.sum(axis=-1).mean(axis=(1, 2)) * psi.binning**2
     seen = np.array(
         [
             float(frame[kept].mean()) if kept.any() else np.nan
@@ -146,13 +146,13 @@ def dark_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple
     return tuple(int(shot) for shot in np.flatnonzero(dark))
 
 
-def double_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
-    """Return the shots that repeat another although Psi says that they differ.
+def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+    """Return the shots that repeat another although they differ in Psi.
 
-    Of two such the one that fits its part of Psi worse is meant.
+    Of two equal shots the one with the larger residual is returned.
     """
     kept = [shot for shot in range(len(frames)) if usable[shot].any()]
-    predicted = _predicted(flat, frames, usable)
+    predicted = _predicted(psi, frames, usable)
     found: list[int] = []
     for place, shot in enumerate(kept):
         for other in kept[:place]:
@@ -168,7 +168,7 @@ def double_shots(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> tup
     return tuple(sorted(found))
 
 
-def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return the brightness of the light in every shot, all 1 where none is sure.
 
     The light of most shots counts as 1 (the median), of two their mean.
@@ -183,7 +183,7 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
     gains, error = even.copy(), np.inf
     for _ in range(GAIN_STEPS):
         even_frames = frames / gains[:, None, None]
-        predicted = _predicted(flat, even_frames, usable)[kept]
+        predicted = _predicted(psi, even_frames, usable)[kept]
         lit = (usable[kept] & (predicted > WELL_LIT * max(predicted.mean(), 1e-12))).all(axis=0)
         if lit.sum() < FEWEST_LIT:
             return even
@@ -206,17 +206,17 @@ def shot_gains(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array
 
 
 def dead_lines(
-    flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]
+    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the rows and the columns (both one-dimensional) that are dead or stuck in all shots.
 
-    Their readings hardly vary, while those of the lines on either side do. A line's neighbours are
-    as dead as its pixels, so that none of these seems to differ from those around. Outermost lines
+    Their readings hardly vary, while those of the lines on either side do. Pixels of a dead line do
+    not differ from their neighbours along it, so that `bad_pixels` finds none. Outermost lines
     that are dark are no such lines: light fields that were rectified end so, and `adaptive` tells
     these edges from the scene.
     """
-    seen, k = usable.any(axis=(1, 2)), flat.binning
-    colours = np.zeros(frames.shape) if flat.colour is None else flat.colour[:, ::k, ::k]
+    seen, k = usable.any(axis=(1, 2)), psi.binning
+    colours = np.zeros(frames.shape) if psi.colour is None else psi.colour[:, ::k, ::k]
     frames, usable, colours = frames[seen], usable[seen], colours[seen]
     rows = _dead(frames, usable, colours)
     return rows, _dead(frames.swapaxes(1, 2), usable.swapaxes(1, 2), colours.swapaxes(1, 2))
@@ -313,16 +313,16 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
                 low[y, x], high[y, x] = least[step, x], most[step, x]
 
 
-def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the pixels (pixel_y, pixel_x) that read much more or less than any neighbour suggests.
+def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the bad pixels, (pixel_y, pixel_x), whose readings are unlike those of all neighbours.
 
-    What a pixel reads over what a smooth picture predicts is compared with the range of that ratio
-    among the neighbours that see the same colour, a tenth of them left out at both ends: at an edge
-    or in a texture that range is wide. How far beyond it, in widths of the range, is averaged over
-    the shots, as a bad pixel is bad in all. The more there are, the less it takes to be one of
-    them: to leave out a good pixel costs little, to miss a bad one much.
+    The ratio of a reading to the prediction of a smooth picture is compared with the range of that
+    ratio among neighbours of the same colour, a tenth of them left out at both ends: at an edge or
+    in a texture the range is wide. Its distance from the range, in widths of the range, is averaged
+    over the shots, as a bad pixel is bad in all. The limit is lower where many pixels are bad:
+    leaving out a good pixel costs little, missing a bad one costs much.
     """
-    k = flat.binning
+    k = psi.binning
     bad = np.zeros(frames.shape[1:], dtype=bool)
     one_colour = np.zeros(bad.shape, dtype=np.uint8)
     low, high = np.empty((2, *bad.shape), dtype=np.float32)
@@ -331,13 +331,13 @@ def bad_pixels(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> NDArr
         kept = usable & ~bad
         if not kept.any():
             break
-        predicted = _predicted(flat, frames, kept)
+        predicted = _predicted(psi, frames, kept)
         score, count = np.zeros(bad.shape), np.zeros(bad.shape)
         for shot in np.flatnonzero(kept.any(axis=(1, 2))):
             least = max(LEAST * float(predicted[shot].mean()), 1e-12)
             guess = np.maximum(predicted[shot], least)
             ratio = np.where(usable[shot], frames[shot] / guess, 0).astype(np.float32)
-            colours = one_colour if flat.colour is None else flat.colour[shot, ::k, ::k]
+            colours = one_colour if psi.colour is None else psi.colour[shot, ::k, ::k]
             neighbour_range(ratio, colours, kept[shot], NEIGHBOURS_PX, TAIL, FEWEST, low, high)
             known = np.isfinite(low) & usable[shot]
             if not known.any():
@@ -372,9 +372,9 @@ def _bright_details(
     return (count > 1) & (factor > 0) & (as_light < AS_LIGHT * as_offset)
 
 
-def _predicted(flat: FlatPsi, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def _predicted(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return what a smooth picture, the same in all views, reads."""
-    return flat.forward(smooth_guess(flat, frames, usable))
+    return psi.forward_picture(smooth_guess(psi, frames, usable))
 
 
 def _square(difference: Array, where: NDArray[np.bool_]) -> float:

@@ -24,6 +24,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction import bpdn
@@ -142,16 +143,14 @@ class _Coder:
     def __init__(
         self,
         psi: ImagingMatrix,
-        frames: Array,
-        usable: NDArray[np.bool_],
-        noise_sigma: float,
+        frames: Frames,
         dictionary: Dictionary,
         settings: SparseSettings,
     ) -> None:
         rows, columns = dictionary.patch_shape[2:4]
         dictionary.check_views(psi.light_field_shape[:2])
-        self.psi, self.frames, self.usable = psi, frames, usable
-        self.noise_sigma, self.settings = noise_sigma, settings
+        self.psi, self.frames, self.settings = psi, frames, settings
+        self.noise_sigma = frames.noise_sigma
         self.atoms = favoured(dictionary.atoms, settings.flat_favour)
         self.matrix = self.atoms.reshape(dictionary.size, -1)
         self.grid = regular_grid(psi.size, (rows, columns), settings.stride, psi.binning)
@@ -170,7 +169,7 @@ class _Coder:
                 firsts = sorted({keys.index(key) for key in keys})
                 distinct = [selected_atoms(atoms, colours[first]) for first in firsts]
                 which = [firsts.index(keys.index(key)) for key in keys]
-            classes = _classes(self.psi, self.usable, self.grid, indices)
+            classes = _classes(self.psi, self.frames.usable, self.grid, indices)
             self.classes += len(classes)
             length = self.psi.shots * self.pixels
             at_once = max(1, int(BATCH_BYTES // (4 * len(atoms) * (length + 8))))
@@ -179,7 +178,7 @@ class _Coder:
                 members = classes[start : start + at_once]
                 flat = np.concatenate(members)
                 sensing = sense_patches(
-                    self.psi, self.frames, self.usable, self.grid.corners[flat], self.grid.shape
+                    self.psi, self.frames, self.grid.corners[flat], self.grid.shape
                 )
                 yield distinct, which, _Work(members, sensing)
 
@@ -215,15 +214,13 @@ class _Coder:
 
 def estimate_patches(
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
+    frames: Frames,
     dictionary: Dictionary,
     settings: SparseSettings,
-    usable: NDArray[np.bool_],
     on_step: Callable[[Progress], None] | None = None,
 ) -> PatchEstimates:
-    """Return the patches' estimates, put together; see `reconstruct_sparse`."""
-    coder = _Coder(psi, frames, usable, noise_sigma, dictionary, settings)
+    """Return the estimates of all patches from checked frames; see `reconstruct_sparse`."""
+    coder = _Coder(psi, frames, dictionary, settings)
     total = np.zeros(psi.light_field_shape, dtype=np.float32)
     weight = np.zeros(psi.size, dtype=np.float32)
     used = np.zeros(len(coder.grid), dtype=np.int64)
@@ -268,28 +265,24 @@ def _in_order(pool: ThreadPoolExecutor, call: Callable, items: Iterator, ahead: 
 
 def reconstruct_sparse(
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
+    frames: Frames,
     dictionary: Dictionary,
     settings: SparseSettings | None = None,
-    usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     found: PatchEstimates | None = None,
 ) -> Reconstruction:
     """Return the light field whose patches are sparse in the dictionary.
 
-    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
-    deviation, which sets the penalty when the settings do not. usable: pixels to fit (default
-    all); saturated and dead ones are left out exactly, and where a whole patch is unusable it
-    says nothing. found: the estimates of the same inputs, where they are known already. Raises
-    ReconstructionError for inputs that do not fit each other, and a light field smaller than a
-    patch.
+    The typical deviation of the frames sets the penalty when the settings do not; saturated and
+    dead pixels are left out exactly, and where a whole patch is unusable it says nothing. found:
+    the estimates of the same inputs, where they are known already. Raises ReconstructionError for
+    inputs that do not fit each other, and a light field smaller than a patch.
     """
     settings = settings or SparseSettings()
     started = time.perf_counter()
-    frames, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    frames = checked_inputs(psi, frames)
     if found is None:
-        found = estimate_patches(psi, frames, noise_sigma, dictionary, settings, usable, on_step)
+        found = estimate_patches(psi, frames, dictionary, settings, on_step)
     uncovered = int((found.weight == 0).sum())
     if found.empty == len(found.atoms):
         raise ReconstructionError("no patch holds a usable pixel: nothing can be reconstructed")
@@ -312,7 +305,7 @@ def reconstruct_sparse(
         objective=(),
         seconds=time.perf_counter() - started,
         parameters={
-            "noise_sigma": noise_sigma,
+            "noise_sigma": frames.noise_sigma,
             "patches": len(found.atoms),
             "classes": found.classes,
             "atoms_per_patch": float(found.atoms.mean()),

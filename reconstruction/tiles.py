@@ -16,18 +16,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import ceil, lcm
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.frames import Frames, even_frames
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from reconstruction.adaptive.settings import SIDES, AdaptiveSettings, Side
 from reconstruction.adaptive.survey import contrast_of
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.flat import flat_psi
+from reconstruction.inputs import check_frames
 from reconstruction.methods import BlockSettings, MethodSettings, find_method, reconstruct
 from reconstruction.methods.surfaces import sparse_patches, takes_patches
 from reconstruction.methods.variational import patched_weights
@@ -51,36 +51,19 @@ blocks."""
 SAMPLE, SAMPLES = 96, 3
 """Rows and columns of a sample window of the survey, and windows along each axis."""
 SURE_PX, COVERED = 0.25, 99.0
-"""Deviation of disparities below which they count for the halo, and percent of them that it covers:
-what lies further is seen by fewer readings of a block beside it, and averaged with that block's."""
+"""Largest deviation of the disparities that the halo is chosen by, and the percent of them that it
+covers. Fewer readings of a block show surfaces beyond; there it is averaged with its neighbour."""
 
 Array = NDArray[np.floating]
 Place = tuple[slice, slice]
 
 
-class PsiSource(Protocol):
-    """An imaging matrix of which a window can be had at a time."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Rows and columns of the light field."""
-        ...
-
-    @property
-    def binning(self) -> int:
-        """k; a pixel sums k x k samples."""
-        ...
-
-    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
-        """Return the imaging matrix of some samples; the slices are multiples of k."""
-        ...
-
-
 @dataclass(frozen=True)
 class Block:
-    """outer: rows and columns reconstructed; part: those that count, with what overlaps the
-    neighbours; inner: those nearer to it than to any other; all in the light field's samples.
-    sides: of the light field, at which it lies."""
+    """A block of the grid, by rows and columns of the light field's samples.
+
+    outer: reconstructed, with the halo; part: without the halo, overlapping the neighbours; inner:
+    nearer to this block than to any other. sides: of the light field, which the block touches."""
 
     row: int
     column: int
@@ -248,12 +231,14 @@ class CaptureSurvey:
         """Return what settles nothing: a single block is the whole."""
         return cls(settings, 0, (), (1.0,) * shots, (), 0.0)
 
-    def applied(self, frames: Array, usable: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-        """Return frames (shot, y, x) of even brightness, and usable without shots left out."""
-        kept = usable.copy()
-        kept[list(self.left_out)] = False
-        gains = np.asarray(self.gains, dtype=frames.dtype)
-        return (frames if (gains == 1).all() else frames / gains[:, None, None]), kept
+    def applied(self, frames: Frames) -> Frames:
+        """Return frames of even brightness, without the shots left out."""
+        readings, usable = frames.readings, frames.usable.copy()
+        usable[list(self.left_out)] = False
+        gains = np.asarray(self.gains, dtype=readings.dtype)
+        if (gains != 1).any():
+            readings = readings / gains[:, None, None]
+        return replace(frames, readings=readings, usable=usable)
 
 
 def samples(size: tuple[int, int], multiple: int) -> list[Place]:
@@ -275,32 +260,21 @@ def multiple_of(binning: int, dictionary: Dictionary | None, settings: MethodSet
     return lcm(2 * binning, settings.sparse.stride if dictionary is not None else 1)
 
 
-def _largest_disparity(
-    psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_],
-    settings: MethodSettings,
-) -> float:
+def _largest_disparity(psi: ImagingMatrix, frames: Frames, settings: MethodSettings) -> float:
     """Return the largest disparity, in size, that `adaptive-fast` is sure of in a window."""
-    maps = reconstruct("adaptive-fast", psi, frames, noise_sigma, None, settings, usable).maps
+    maps = reconstruct("adaptive-fast", psi, frames, None, settings).maps
     sure = maps["disparity"][maps["disparity_sigma"] < SURE_PX]
     return float(np.percentile(np.abs(sure), COVERED)) if sure.size else 0.0
 
 
 def surveyed(
     name: str,
-    psi: PsiSource,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_],
+    psi: PsiLayout,
+    frames: Frames,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
 ) -> CaptureSurvey:
-    """Return what is settled from sample windows of a capture, read one at a time.
-
-    frames, usable: (shot, pixel_y, pixel_x).
-    """
+    """Return what is settled from sample windows of a capture, read one at a time."""
     settings, method, k = settings or MethodSettings(), find_method(name), psi.binning
     places = samples(psi.size, multiple_of(k, dictionary, settings))
     windows = [psi.window(*place) for place in places]
@@ -312,17 +286,17 @@ def surveyed(
         else np.concatenate([one.colour for one in windows if one.colour is not None], axis=2),
     )
     seen = [pixels_of(place, k) for place in places]
-    use = np.concatenate([usable[one] for one in seen], axis=2)
-    read = np.concatenate([frames[one] for one in seen], axis=2).astype(np.float32)
-    read = np.where(use, read, 0)
-    left_out, gains, words = (), (1.0,) * len(frames), ()
+    use = np.concatenate([frames.usable[place] for place in seen], axis=2)
+    readings = np.concatenate([frames.readings[place] for place in seen], axis=2).astype(np.float32)
+    read = even_frames(np.where(use, readings, 0), frames.noise_sigma, use)
+    left_out, gains, words = (), (1.0,) * psi.shots, ()
     if settings.screening and use.any():
-        found = screened(mosaic, read, use)
+        found = screened(mosaic, read)
         left_out = tuple(sorted((*found.dark, *found.double)))
         gains = tuple(float(gain) for gain in found.gains)
         # Bad pixels and lines are left to the blocks.
         words = found.notes[: len(found.notes) - bool(found.bad.any()) - bool(found.lines.any())]
-        read, use = found.frames, found.usable
+        read = found.frames
     halo, largest = REACH, 0.0
     patched = name == "adaptive" and takes_patches(mosaic, settings.adaptive)
     if method.settings is AdaptiveSettings:
@@ -333,18 +307,19 @@ def surveyed(
         ]
         largest = max(
             (
-                _largest_disparity(window, read[part], noise_sigma, use[part], settings)
+                _largest_disparity(window, read.cut(part), settings)
                 for window, part in parts
-                if use[part].any()
+                if read.usable[part].any()
             ),
             default=0.0,
         )
         reach = PATCHED_REACH if patched else TEXTURE_REACH
         halo = reach * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
-        flat = flat_psi(mosaic)
-        picture = smooth_guess(flat, read, use).astype(np.float32)
-        noise = np.full(read.shape, noise_sigma**2)
-        own = settings.adaptive.contrast or contrast_of(flat, read, picture, noise, use)
+        picture = smooth_guess(mosaic, read.readings, read.usable).astype(np.float32)
+        noise = np.full(read.shape, read.noise_sigma**2)
+        own = settings.adaptive.contrast or contrast_of(
+            mosaic, read.readings, picture, noise, read.usable
+        )
         # What a block would decide by its own size is decided for all.
         count = settings.adaptive.patches if patched else None
         adaptive = settings.adaptive.model_copy(update={"contrast": own, "patches": count})
@@ -354,15 +329,13 @@ def surveyed(
     sparse = settings.sparse if name == "tv-dict" else None
     if patched:
         sparse = sparse_patches(settings.sparse, k)
-    settled = _settled(mosaic, read, noise_sigma, use, settings, sparse)
+    settled = _settled(mosaic, read, settings, sparse)
     return CaptureSurvey(settled, halo, left_out, gains, words, largest)
 
 
 def _settled(
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_],
+    frames: Frames,
     settings: MethodSettings,
     sparse: SparseSettings | None,
 ) -> MethodSettings:
@@ -370,13 +343,13 @@ def _settled(
 
     sparse: settings of the patches, of methods that draw total variation towards some.
     """
-    readings, tv = frames[usable], settings.tv
+    readings, noise_sigma, tv = frames.readings[frames.usable], frames.noise_sigma, settings.tv
     if not readings.size:
         return settings
     if sparse is not None:
         tv = patched_weights(tv, sparse, psi, readings, noise_sigma)
     mu = tv.mu or choose_mu(psi, readings, noise_sigma, tv.order)
-    guess = smooth_guess(psi, frames, usable)
+    guess = smooth_guess(psi, frames.readings, frames.usable)
     step = tv.primal_step or choose_primal_step(contrast(guess), mu, tv.chroma_weight, tv.order)
     tv = tv.model_copy(
         update={"mu": mu, "primal_step": step, "rtol": 1e-12, "max_steps": min(STEPS, tv.max_steps)}
@@ -399,28 +372,24 @@ class SolvedBlock:
 def solve_block(
     name: str,
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_],
+    frames: Frames,
     block: Block,
     settings: MethodSettings,
     dictionary: Dictionary | None = None,
 ) -> SolvedBlock:
-    """Return a block's part. psi, frames, usable: of its outer place, after the survey's steps.
+    """Return a block's part. psi, frames: of its outer place, after the survey's steps.
 
     settings: as the survey settled them. A block without usable pixels is black.
     """
-    if not usable.any():
+    if not frames.usable.any():
         views = psi.light_field_shape[:2]
         dark = np.zeros((*views, *(part.stop - part.start for part in block.part), 3), np.float32)
         result = Reconstruction(name, dark, Status.INCOMPLETE, "", 0, (), 0.0, {})
         return SolvedBlock({"light_field": dark}, result.without_light_field(), None)
     edges = tuple(side for side in settings.adaptive.edges if side in block.sides)
     adaptive = settings.adaptive.model_copy(update={"edges": edges})
-    result, verdict = reconstruct_judged(
-        name, psi, frames, noise_sigma, dictionary,
-        settings.model_copy(update={"adaptive": adaptive}), usable,
-    )  # fmt: skip
+    own = settings.model_copy(update={"adaptive": adaptive})
+    result, verdict = reconstruct_judged(name, psi, frames, dictionary, own)
     place = within(block.part, block.outer)
     arrays = {"light_field": result.light_field[:, :, *place]}
     for key, values in result.maps.items():
@@ -477,32 +446,30 @@ def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:
 
 def reconstruct_in_blocks(
     name: str,
-    psi: PsiSource,
-    frames: Array,
-    noise_sigma: float,
+    psi: PsiLayout,
+    frames: Frames,
     dictionary: Dictionary | None,
     settings: MethodSettings,
-    usable: NDArray[np.bool_],
     on_step: Callable[[Progress], None] | None = None,
 ) -> tuple[Reconstruction, Verdict]:
     """Return a light field and the verdict on it, block by block in this process.
 
-    frames, usable: (shot, pixel_y, pixel_x). Raises ReconstructionError as `reconstruct`.
+    Raises ReconstructionError as `reconstruct` does.
     """
     started = time.perf_counter()
-    if not usable.any():
+    check_frames(psi.frames_shape, frames.readings)
+    if not frames.usable.any():
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
-    survey = surveyed(name, psi, frames, noise_sigma, usable, dictionary, settings)
+    survey = surveyed(name, psi, frames, dictionary, settings)
     multiple = multiple_of(psi.binning, dictionary, settings)
     grid = Grid(psi.size, multiple, survey.halo, settings.blocks)
     parts, results, verdicts = {}, [], []
-    frames, usable = survey.applied(frames, usable)
+    frames = survey.applied(frames.of_one_deviation())
     for done, block in enumerate(grid, 1):
         seen = pixels_of(block.outer, psi.binning)
         solved = solve_block(
-            name, psi.window(*block.outer), frames[seen], noise_sigma, usable[seen], block,
-            survey.settings, dictionary,
-        )  # fmt: skip
+            name, psi.window(*block.outer), frames.cut(seen), block, survey.settings, dictionary
+        )
         parts[block.name] = solved.arrays
         results.append(solved.result)
         if solved.verdict is not None:

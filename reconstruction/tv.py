@@ -31,6 +31,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from emmc_rig.model.settings import Settings
 from reconstruction import kernels
@@ -87,26 +88,23 @@ def row_bands(pixel_rows: int, bands: int) -> NDArray[np.int64]:
 
 def reconstruct_tv(
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
+    frames: Frames,
     settings: TVSettings | None = None,
-    usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     patch_term: PatchTerm | None = None,
 ) -> Reconstruction:
     """Return the light field of least total variation that explains the frames.
 
-    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their typical standard
-    deviation, which sets mu when the settings do not. usable: pixels to fit (default all);
-    saturated and dead ones are left out exactly. patch_term: estimates to stay near, rho times
-    their weight, and to begin with. Raises ReconstructionError for frames that do not fit Psi or
-    are not finite, and for a noise level that is negative or not finite.
+    Their typical deviation sets mu when the settings do not; saturated and dead pixels are left out
+    exactly. patch_term: estimates to stay near, rho times their weight, and to begin with. Raises
+    ReconstructionError for frames that do not fit Psi, see `checked_inputs`.
     """
     settings = settings or TVSettings()
     started = time.perf_counter()
     if settings.rho == 0:
         patch_term = None
-    data, usable = checked_inputs(psi, frames, noise_sigma, usable)
+    frames = checked_inputs(psi, frames)
+    data, usable, noise_sigma = frames.readings, frames.usable, frames.noise_sigma
     dtype = psi.weights.dtype.type
     mu = settings.mu or choose_mu(psi, data[usable], noise_sigma, settings.order)
     guess = smooth_guess(psi, data, usable)

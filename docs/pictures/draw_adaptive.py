@@ -72,7 +72,7 @@ def figures(size: tuple[int, int] = SIZE) -> dict[str, Figure]:
     psi, truth = camera.psi(scene.size), np.asarray(scene)
     frames = camera.expose(scene, seed=0, psi=psi)
     settings = AdaptiveSettings()
-    given = checked(psi, frames.readings, frames.noise_sigma, frames.usable)
+    given = checked(psi, frames.of_one_deviation())
     survey = surveyed(given, settings, None, lambda step: None)
     fits = fitted_models(survey, settings, lambda step: None)
     disparity_sigma = np.sqrt(variance_per_pixel(survey.volume, psi.size, psi.binning))

@@ -162,8 +162,4 @@ def light_field_so_far(
     Raises AppError, CalibrationError or ReconstructionError.
     """
     scale = scale.of_shots(shots)
-    frames = shot_readings(session, scale)
-    return reconstruct(
-        METHOD, scale.psi, frames.readings, frames.noise_sigma, usable=frames.usable,
-        on_step=on_step,
-    )  # fmt: skip
+    return reconstruct(METHOD, scale.psi, shot_readings(session, scale), on_step=on_step)

@@ -106,7 +106,7 @@ def _export_psi(source: Path, form: str, out: Path | None) -> None:
     """Write the Psi of a file or folder, and its frames if it has any, as a sparse matrix."""
     import emmc_rig as emmc
     from emmc_rig.files.folders import is_session, result_folder
-    from emmc_rig.files.psi import FRAMES, FRAMES_GROUP, PSI_GROUP, open_psi, psi_beside
+    from emmc_rig.files.psi import FRAMES, FRAMES_GROUP, PSI_GROUP, StoredPsi, psi_beside
     from emmc_rig.files.psi_exports import PSI_FORMATS
     from emmc_rig.files.results import shown_bytes, write_metrics
 
@@ -122,7 +122,7 @@ def _export_psi(source: Path, form: str, out: Path | None) -> None:
             psi, frames = emmc.open_frames(source)
         else:
             inside = source.is_dir() and source.name != PSI_GROUP
-            psi = open_psi(psi_beside(source) if inside else source).load()
+            psi = StoredPsi(psi_beside(source) if inside else source).load()
         bars.begin("write")
         PSI_FORMATS[form](folder, psi, frames)
         written = sum(path.stat().st_size for path in folder.iterdir())

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.commands.output import say
 from emmc_rig.model.compiling import is_kept
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction import kernels
 from reconstruction.result import Progress
@@ -130,7 +131,7 @@ def _search(psi: ImagingMatrix, frames: NDArray[np.floating]) -> None:
             raise FitError
 
     with suppress(FitError):
-        reconstruct_adaptive(psi, frames, NOISE, on_step=stop)
+        reconstruct_adaptive(psi, even_frames(frames, NOISE), on_step=stop)
 
 
 def _fit(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from emmc_rig.files.folders import refuse_missing
 from emmc_rig.files.shards import (
     CHUNK,
     SHARD,
-    StoredGroup,
     created_group,
     missing_value,
     stored_shards,
@@ -24,7 +23,7 @@ from emmc_rig.files.shards import (
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
-from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiSizes, checksum_of
+from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiLayout, checksum_of
 from emmc_rig.model.view_axes import ATTRIBUTE, axes_from, stored_as
 
 PSI_GROUP = "psi.zarr"
@@ -35,88 +34,63 @@ FRAMES_AGAIN = "make the frames again"
 WRITTEN_BY = "name one that `emmc-rig demo`, `simulate` or `capture` wrote"
 
 
-class SavedPsi(PsiSizes):
-    """The imaging matrix in a file, read window by window.
+class StoredPsi(PsiLayout):
+    """Psi in a file or a Zarr group, of which a window is read at a time.
 
-    The file's checksum is not verified, which would need all of it: `verify` does. Raises
-    SensingError when the file is no imaging matrix.
+    In a group a shard holds all views of SHARD x SHARD samples. The colour map is read with a
+    window. The checksum is not verified, which would need all of it: `verify` does. Raises
+    SensingError when there is no imaging matrix.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._sharded = path, path.is_dir()
         with self._opened() as stored:
-            weights = stored.dataset("weights")
-            self.shape = weights.shape
-            self.binning = int(np.asarray(stored.attributes["binning"]))
+            shape = stored.dataset("weights").shape
+            binning = int(np.asarray(stored.attributes["binning"]))
+            axes = axes_from(stored.attributes.get(ATTRIBUTE), path, SensingError)
+            super().__init__(shape, None, binning, str(stored.attributes["camera"]), axes)
             self.checksum = str(stored.attributes["sha256"])
-            self.view_axes = axes_from(stored.attributes.get(ATTRIBUTE), path, SensingError)
-            if len(self.shape) != 6 or self.binning < 1:
+            if len(shape) != 6 or binning < 1:
                 raise SensingError(f"{path}: damaged (no shape of an imaging matrix); {AGAIN}")
-
-    @property
-    def weights_shape(self) -> tuple[int, ...]:
-        """Shape of the weights."""
-        return self.shape
 
     def verify(self) -> None:
         """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
         with self._opened() as stored:
-            camera, weights = str(stored.attributes["camera"]), stored.dataset("weights")
+            weights = stored.dataset("weights")
             planes = (self._whole(weights[place]) for place in np.ndindex(self.weights_shape[:3]))
             colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
             colour = self._whole(colour)
-            checksum = checksum_of(self.binning, camera, planes, colour, self.view_axes)
+            checksum = checksum_of(self.binning, self.camera_json, planes, colour, self.view_axes)
         if checksum != self.checksum:
             raise SensingError(f"{self._path}: damaged (its checksum differs); {AGAIN}")
 
     def load(self) -> ImagingMatrix:
         """Return all of it, verified."""
-        return ImagingMatrix.load(self._path)
+        if not self._sharded:
+            return ImagingMatrix.load(self._path)
+        self.verify()
+        return self.window(*(slice(0, length) for length in self.size))
 
     def window(self, rows: slice, columns: slice) -> ImagingMatrix:
         """Return the imaging matrix of some samples; the slices are multiples of k."""
         with self._opened() as stored:
-            weights = stored.dataset("weights")[:, :, :, rows, :, columns]
+            weights = self._whole(stored.dataset("weights")[:, :, :, rows, :, columns])
             colour = None
             if "colour" in stored:
                 colour = self._whole(stored.dataset("colour")[:, rows, columns])
-            camera = str(stored.attributes["camera"])
-            weights = self._whole(weights)
-            return ImagingMatrix(weights, colour, self.binning, camera, self.view_axes)
+        return ImagingMatrix(weights, colour, self.binning, self.camera_json, self.view_axes)
 
     def _whole(self, values: NDArray) -> NDArray:
-        """Return values that were read, after a check that none is missing."""
-        return values
+        """Return values that were read, after a check that no shard of them is missing."""
+        return whole(values, self._path, SensingError, AGAIN) if self._sharded else values
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        with self._file() as stored:
+        opened = stored_shards if self._sharded else stored_arrays
+        with opened(self._path, SensingError, AGAIN) as stored:
             if stored.attributes.get("format") != FORMAT or "weights" not in stored:
                 raise SensingError(f"{self._path}: not an imaging matrix of this program")
             yield stored
-
-    def _file(self) -> AbstractContextManager[Any]:
-        return stored_arrays(self._path, SensingError, AGAIN)
-
-
-class ShardedPsi(SavedPsi):
-    """The imaging matrix in a Zarr group; a shard holds all views of SHARD x SHARD samples."""
-
-    def load(self) -> ImagingMatrix:
-        """Return all of it, verified."""
-        self.verify()
-        return self.window(*(slice(0, length) for length in self.size))
-
-    def _whole(self, values: NDArray) -> NDArray:
-        return whole(values, self._path, SensingError, AGAIN)
-
-    def _file(self) -> AbstractContextManager[StoredGroup]:
-        return stored_shards(self._path, SensingError, AGAIN)
-
-
-def open_psi(path: Path) -> SavedPsi:
-    """Return a saved imaging matrix, not read; raises SensingError when there is none."""
-    return ShardedPsi(path) if path.is_dir() else SavedPsi(path)
 
 
 def psi_beside(folder: Path) -> Path:

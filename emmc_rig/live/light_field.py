@@ -34,7 +34,7 @@ from emmc_rig.files.scales import open_scale
 from emmc_rig.live.alignment import is_dark
 from emmc_rig.live.server import Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
-from emmc_rig.model.frames import Frames
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.pages.display import PART_PIXELS
@@ -238,7 +238,7 @@ class LiveLightField:
             self._shots, self._level = len(shots), level
             step = FACTOR // np.gcd(FACTOR, psi.binning) * psi.binning
             noise = self._noise(scale, readings)
-            self.preview = Preview(psi, int(step), readings, noise, seen)
+            self.preview = Preview(psi, int(step), even_frames(readings, noise, seen))
         self.preview.follow(readings, STEPS)
         coarse = self.preview.light_field
         block = max(1, self.psi.size[1] // coarse.shape[3])
@@ -337,18 +337,9 @@ class _Refinement:
         self._given_up.set()
 
     def _run(self) -> None:
-        frames = self.frames
         try:
             self.result = self._solve(
-                self._method,
-                self.psi,
-                frames.readings,
-                frames.noise_sigma,
-                None,
-                None,
-                frames.usable,
-                self._on_step,
-                self._film,
+                self._method, self.psi, self.frames, None, None, self._on_step, self._film
             )
         except _ChangedError:
             return

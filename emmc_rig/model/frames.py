@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +28,12 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What a reconstruction is given; all arrays (shot, pixel_y, pixel_x).
+    """Normalised readings with their noise; all arrays (shot, pixel_y, pixel_x).
 
-    readings: 1 is what the fully open camera reads from a white light field; of a saturated pixel
-    the least that it can be, of any other that is not usable 0. deviation: the standard deviation
-    of each reading. usable: neither saturated nor a bad pixel. exposures: of each shot, where they
-    are known. NumPy takes frames as their readings.
+    readings: 1 is the reading of the fully open camera and a white light field. Saturated pixels
+    have the reading of their white level, a lower bound; other unusable pixels have 0. deviation:
+    standard deviation of each reading. usable: pixels that are neither saturated nor bad.
+    exposures: of each shot, where they are known. NumPy takes frames as their readings.
     """
 
     readings: NDArray[np.floating]
@@ -59,10 +60,25 @@ class Frames:
     @property
     def noise_sigma(self) -> float:
         """Root mean variance of the usable readings, which solvers take as their typical noise."""
+        if self.deviation.size and not any(self.deviation.strides):  # one number for all
+            return float(self.deviation.flat[0])
         of_usable = self.deviation[self.usable]
         if not of_usable.size:
             return 0.0
         return float(np.sqrt(np.mean(np.square(of_usable, dtype=np.float64))))
+
+    def of_one_deviation(self) -> Frames:
+        """Return the same readings, whose deviation is `noise_sigma` throughout."""
+        return replace(self, deviation=np.broadcast_to(self.noise_sigma, self.shape))
+
+    def cut(self, part: tuple[slice, ...]) -> Frames:
+        """Return some shots, rows and columns."""
+        arrays = (array[part] for array in (self.readings, self.deviation, self.usable))
+        return Frames(*arrays, exposures=self.exposures[part[0]])
+
+    def mean(self, *given: Any, **named: Any) -> Any:
+        """Return NumPy's mean of the readings."""
+        return self.readings.mean(*given, **named)
 
     def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self.readings, dtype=dtype, copy=copy)
@@ -81,3 +97,14 @@ class SimulatedFrames(Frames):
 
     frames_dn: NDArray[np.uint16]
     noise_free: NDArray[np.floating]
+
+
+def even_frames(
+    readings: NDArray[np.floating], noise_sigma: float, usable: NDArray[np.bool_] | None = None
+) -> Frames:
+    """Return frames of readings (shot, pixel_y, pixel_x) that all have one standard deviation.
+
+    usable: as `Frames.usable`; by default all are.
+    """
+    everywhere = np.ones(readings.shape, dtype=bool) if usable is None else usable
+    return Frames(readings, np.broadcast_to(float(noise_sigma), readings.shape), everywhere)

@@ -69,15 +69,36 @@ def rows_of_colours(light_field: Array) -> Array:
     return np.moveaxis(light_field, -1, -2)
 
 
-class PsiSizes:
-    """What follows from the shape of Psi's weights, (shot, v, u, y, stored colour, x), and k."""
+class PsiLayout:
+    """Sizes, colours and camera of a Psi: all that Psi in memory and in files have in common.
 
-    binning: int
+    Alone it stands for a Psi without coefficients, of sensors whose Psi does not fit into memory.
+    weights_shape: (shot, v, u, y, stored colour, x). Others: see `ImagingMatrix`.
+    """
+
+    def __init__(
+        self,
+        weights_shape: tuple[int, ...],
+        colour: NDArray[np.uint8] | None,
+        binning: int = 1,
+        camera_json: str = "",
+        view_axes: ViewAxes = ANGLES,
+    ) -> None:
+        self._weights_shape, self.colour, self.binning = weights_shape, colour, binning
+        self.camera_json, self.view_axes = camera_json, view_axes
 
     @property
     def weights_shape(self) -> tuple[int, ...]:
         """Shape of the weights."""
-        raise NotImplementedError
+        return self._weights_shape
+
+    def psi(self, weights: Array) -> ImagingMatrix:
+        """Return the Psi that this is the layout of."""
+        return ImagingMatrix(weights, self.colour, self.binning, self.camera_json, self.view_axes)
+
+    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
+        """Return Psi of some rows and columns of samples, whole pixels."""
+        raise SensingError("this Psi has no coefficients")
 
     @property
     def shots(self) -> int:
@@ -101,32 +122,8 @@ class PsiSizes:
 
 
 @dataclass(frozen=True, eq=False)
-class PsiLayout(PsiSizes):
-    """What a Psi is for, without its coefficients: for sensors whose Psi does not fit into memory.
-
-    shape, colour, binning, camera_json, view_axes: as those of `ImagingMatrix`, and its weights'.
-    """
-
-    shape: tuple[int, ...]
-    colour: NDArray[np.uint8] | None
-    binning: int = 1
-    camera_json: str = ""
-    view_axes: ViewAxes = ANGLES
-
-    @property
-    def weights_shape(self) -> tuple[int, ...]:
-        """Shape of the weights."""
-        return self.shape
-
-    def psi(self, weights: Array) -> ImagingMatrix:
-        """Return the Psi that this is the layout of."""
-        facts = self.colour, self.binning, self.camera_json, self.view_axes
-        return ImagingMatrix(weights, *facts)
-
-
-@dataclass(frozen=True, eq=False)
-class ImagingMatrix(PsiSizes):
-    """Psi.
+class ImagingMatrix(PsiLayout):
+    """Psi in memory, an operator.
 
     weights: (shot, v, u, y, stored colour, x), float32 or float64. One stored colour where every
         pixel sees one colour only, else three. Of a Psi larger than memory an HDF5 dataset: then
@@ -186,12 +183,6 @@ class ImagingMatrix(PsiSizes):
             cfa = parse_json(self.camera_json, "the camera of Psi", SensingError)["sensor"]["cfa"]
             return cfa if isinstance(cfa, str) else "custom colour filters"
         return "one colour a pixel" if self.colour is not None else "three colours a pixel"
-
-    @property
-    def layout(self) -> PsiLayout:
-        """What this Psi is for, without its coefficients."""
-        facts = self.colour, self.binning, self.camera_json, self.view_axes
-        return PsiLayout(self.weights_shape, *facts)
 
     @property
     def weights_shape(self) -> tuple[int, ...]:
@@ -309,6 +300,32 @@ class ImagingMatrix(PsiSizes):
                 "use a ridge above 0"
             )
         return inverse
+
+    def of_one_view(self) -> ImagingMatrix:
+        """Return Psi of light fields of one view, which stands for all."""
+        summed = self.weights.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
+        return ImagingMatrix(summed.astype(self.weights.dtype), self.colour, self.binning)
+
+    @cached_property
+    def picture_weights(self) -> Array:
+        """Coefficients of a picture that all views are, (shot, y, x, c): sums over the views."""
+        summed = np.moveaxis(self.of_one_view().weights[:, 0, 0], 2, 3)
+        if self.colour is None:
+            return np.ascontiguousarray(summed)
+        weights = np.zeros((*summed.shape[:3], 3), dtype=summed.dtype)
+        np.put_along_axis(weights, self.colour[..., None].astype(np.intp), summed, axis=-1)
+        return weights
+
+    def forward_picture(self, picture: Array) -> Array:
+        """Return the frames (shot, pixel_y, pixel_x) of a picture (y, x, c) that all views are."""
+        seen = np.einsum("syxc,yxc->syx", self.picture_weights, picture)
+        (shots, rows, columns), k = self.frames_shape, self.binning
+        return seen.reshape(shots, rows, k, columns, k).sum(axis=(2, 4))
+
+    def adjoint_picture(self, frames: Array) -> Array:
+        """Return the sum over the views of Psi^T frames, a picture (y, x, c)."""
+        samples = frames.repeat(self.binning, axis=1).repeat(self.binning, axis=2)
+        return np.einsum("syxc,syx->yxc", self.picture_weights, samples)
 
     def row_norms(self) -> NDArray[np.float64]:
         """Return the Euclidean norm of every row of Psi: (shot, pixel_y, pixel_x)."""
@@ -536,7 +553,7 @@ class ImagingMatrix(PsiSizes):
 
 @dataclass(frozen=True, eq=False)
 class TransposedPsi:
-    """Psi^T: `psi.T @ frames` is a light field (v, u, y, x, c)."""
+    """A view of Psi as Psi^T: `psi.T @ frames` is a light field (v, u, y, x, c)."""
 
     T: ImagingMatrix
 

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.folders import emptied
-from emmc_rig.files.psi import SavedPsi, open_psi
+from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
-from emmc_rig.model.frames import Frames
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
@@ -82,9 +82,9 @@ class BlockJob:
     fingerprint: str
 
     @cached_property
-    def psi(self) -> SavedPsi:
+    def psi(self) -> StoredPsi:
         """Psi, read window by window."""
-        return open_psi(self.psi_path)
+        return StoredPsi(self.psi_path)
 
     def opened_dictionary(self) -> Dictionary | None:
         """Return the dictionary where the method needs one."""
@@ -92,11 +92,11 @@ class BlockJob:
             return None
         return open_dictionary(self.dictionary, self.psi.views, self.psi.binning)
 
-    def frames(self, pixels: Any) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-        """Return readings and usable at some pixels."""
+    def frames(self, pixels: Any) -> Frames:
+        """Return the frames at some pixels."""
         with stored_arrays(self.kept / FRAMES, AppError, REMEDY) as stored:
             usable = stored.dataset("usable")[pixels].astype(bool)
-            return stored.dataset("readings")[pixels], usable
+            return even_frames(stored.dataset("readings")[pixels], self.noise_sigma, usable)
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class BlockTask:
 
 
 def fingerprint_of(
-    psi: SavedPsi, frames: Frames, method: str, dictionary: str | None, settings: MethodSettings
+    psi: StoredPsi, frames: Frames, method: str, dictionary: str | None, settings: MethodSettings
 ) -> str:
     """Return a SHA-256 of all that the light field follows from."""
     digest = hashlib.sha256()
@@ -155,11 +155,8 @@ def _read(path: Path, fingerprint: str) -> dict[str, Any] | None:
 
 def survey_task(job: BlockJob) -> CaptureSurvey:
     """Settle in a worker what holds for the whole capture."""
-    readings, usable = job.frames(EVERYWHERE)
-    return surveyed(
-        job.method, job.psi, readings, job.noise_sigma, usable, job.opened_dictionary(),
-        job.settings,
-    )  # fmt: skip
+    frames, dictionary = job.frames(EVERYWHERE), job.opened_dictionary()
+    return surveyed(job.method, job.psi, frames, dictionary, job.settings)
 
 
 def block_task(task: BlockTask) -> None:
@@ -203,10 +200,10 @@ def _variance(block: Block, arrays: Mapping[str, NDArray]) -> float | None:
 
 def _solved(task: BlockTask) -> SolvedBlock:
     job, block = task.job, task.block
-    readings, usable = task.survey.applied(*job.frames(pixels_of(block.outer, job.psi.binning)))
+    frames = task.survey.applied(job.frames(pixels_of(block.outer, job.psi.binning)))
     return solve_block(
-        job.method, job.psi.window(*block.outer), readings, job.noise_sigma, usable, block,
-        task.survey.settings, job.opened_dictionary(),
+        job.method, job.psi.window(*block.outer), frames, block, task.survey.settings,
+        job.opened_dictionary(),
     )  # fmt: skip
 
 

@@ -46,6 +46,5 @@ def timed(psi: ImagingMatrix, frames: Frames) -> float:
         places.append(slice(start, start + side))
     part = psi.window(*places)
     pixels = (slice(None), *(slice(at.start // k, at.stop // k) for at in places))
-    seen = Frames(frames.readings[pixels], frames.deviation[pixels], frames.usable[pixels])
-    solved = reconstruct(TIMED, part, seen.readings, seen.noise_sigma, usable=seen.usable)
+    solved = reconstruct(TIMED, part, frames.cut(pixels))
     return solved.seconds * float(np.prod(psi.size)) / float(np.prod(part.size))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from emmc_rig.files.folders import is_session
-from emmc_rig.files.psi import open_psi, psi_beside, read_frames
+from emmc_rig.files.psi import StoredPsi, psi_beside, read_frames
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 
@@ -85,7 +85,7 @@ class FolderCapture:
 
     def loaded(self, psi: Path | None, place: int | None) -> tuple[ImagingMatrix, Frames]:
         """Return Psi and readings."""
-        return open_psi(psi or self.psi_file()).load(), read_frames(self.folder)
+        return StoredPsi(psi or self.psi_file()).load(), read_frames(self.folder)
 
     def exposure_reasons(self) -> Sequence[Reason]:
         """Return nothing: a folder does not state its exposures."""

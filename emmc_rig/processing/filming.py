@@ -39,7 +39,7 @@ from emmc_rig.files.folders import (
     placed,
     result_folder,
 )
-from emmc_rig.files.psi import PSI, open_psi
+from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.results import METRICS, PSI_ASSUMED, write_metrics
 from emmc_rig.model.arguments import refusal, required
 from emmc_rig.model.camera import camera_of, json_of_shots
@@ -114,9 +114,8 @@ class Latest:
         """Return the result of the next frame, taken as a shot of Psi, and what follows from it."""
         one = _one_shot(psi, shot)
         solved, verdict = reconstruct_judged(
-            method, one, frames.readings, frames.noise_sigma, None, settings, frames.usable,
-            on_step, self.film,
-        )  # fmt: skip
+            method, one, frames, None, settings, on_step, self.film
+        )
         shots = (*self.shots, shot)[-len(solved.film.known.earlier) :]
         result = Result(replace(solved, film=None), verdict, one, frames)
         return result, replace(self, film=solved.film, shots=shots)
@@ -237,7 +236,7 @@ class FilmJob:
 
         Raises AppError, CalibrationError.
         """
-        path, given = self.kept / SCALE, None if psi_path is None else open_psi(psi_path).load()
+        path, given = self.kept / SCALE, None if psi_path is None else StoredPsi(psi_path).load()
         session = capture.session
         stored = [entry.model_dump(mode="json") for entry in session.stored.values()]
         settings = self.settings.model_dump(mode="json")
@@ -246,7 +245,7 @@ class FilmJob:
         fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
         with suppress(*DAMAGED):
             if _open(path)[0]["fingerprint"] == fingerprint:
-                open_psi(self.kept / PSI).verify()
+                StoredPsi(self.kept / PSI).verify()
                 done = len(list((self.kept / FRAMES).iterdir()))
                 on_note(f"goes on with an earlier run; frames done: {done}")
                 return
@@ -271,7 +270,7 @@ class FilmJob:
 
     def scale(self) -> Scale:
         """Return what turns frames into readings, with the Psi that all are reconstructed by."""
-        psi = open_psi(self.kept / PSI).load()
+        psi = StoredPsi(self.kept / PSI).load()
         about, arrays = _open(self.kept / SCALE)
         return put_together(about["scale"], arrays, (Scale, MeanFrame, SensorGain), lambda: psi)
 
@@ -414,7 +413,7 @@ def _computed(
     shared = cluster is not None or (workers is not None and len(tasks) > 1)
     count, ceiling = workers or 1, None
     if memory is not None:
-        saved, settings = open_psi(job.kept / PSI), job.settings
+        saved, settings = StoredPsi(job.kept / PSI), job.settings
         own = own_bytes(saved, settings, False, False)
         ceiling = Ceiling(memory, BASE_BYTES + own if shared else own)
         count = min(count, ceiling.workers(task_bytes(saved, assumed_grid(saved, settings))))
@@ -489,7 +488,7 @@ def _metrics(
         },
         "seconds": took_s,
         "verdict": worst["verdict"],
-        "psi_sha256": open_psi(job.kept / PSI).checksum,
+        "psi_sha256": StoredPsi(job.kept / PSI).checksum,
         "peak_gib": max(one["peak_gib"] for one in done),
         "program_peak_gib": peak_memory_mib() / 2**10,
     }

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from emmc_rig.errors import AppError, WrongUsageError
-from emmc_rig.files.psi import SavedPsi
+from emmc_rig.files.psi import StoredPsi
 from reconstruction.methods import MethodSettings
 from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
 
@@ -69,28 +69,28 @@ def parse_memory(text: str) -> int:
     return int(float(match[1]) * UNITS[match[2]])
 
 
-def task_bytes(psi: SavedPsi, grid: Grid) -> int:
+def task_bytes(psi: StoredPsi, grid: Grid) -> int:
     """Return what a worker needs for the largest block of a grid, and for the survey."""
     samples = max(_samples(block.outer) for block in grid)
     if len(grid) > 1:
         samples = max(samples, min((SAMPLE * SAMPLES) ** 2, int(np.prod(psi.size))))
-    shots, v, u, _, stored, _ = psi.shape
+    shots, v, u, _, stored, _ = psi.weights_shape
     return int(BASE_BYTES + samples * v * u * (RAY_BYTES + WEIGHT_BYTES * shots * stored))
 
 
-def assumed_grid(psi: SavedPsi, settings: MethodSettings) -> Grid:
+def assumed_grid(psi: StoredPsi, settings: MethodSettings) -> Grid:
     """Return the grid of blocks with the halo of usual disparities."""
     views = max(psi.views)
     halo = int(TEXTURE_REACH * psi.binning + PARALLAX_PX * (views // 2))
     return Grid(psi.size, 2 * psi.binning, halo, settings.blocks)
 
 
-def own_bytes(psi: SavedPsi, settings: MethodSettings, as_zarr: bool, compares: bool) -> int:
+def own_bytes(psi: StoredPsi, settings: MethodSettings, as_zarr: bool, compares: bool) -> int:
     """Return what the program holds of a capture beside its workers."""
     grid, views = assumed_grid(psi, settings), int(np.prod(psi.views))
     light_field = int(np.prod(psi.size)) * views * 12
     if len(grid) == 1 and not as_zarr:
-        written = WHOLE * light_field + 4 * int(np.prod(psi.shape))
+        written = WHOLE * light_field + 4 * int(np.prod(psi.weights_shape))
     else:
         written = 2 * views * 12 * max(_samples(block.part) for block in grid)
     compared = COMPARED * light_field if compares else 0

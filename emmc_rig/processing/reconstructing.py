@@ -23,7 +23,7 @@ from emmc_rig.files.folders import (
     kept_folder,
     result_folder,
 )
-from emmc_rig.files.psi import open_psi
+from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
@@ -31,7 +31,7 @@ from emmc_rig.model.arguments import NAMES, numbers_of, path_of, refusal, requir
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml
-from emmc_rig.model.sensing import ImagingMatrix, PsiSizes
+from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import validated
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
@@ -140,16 +140,8 @@ def _solved(
         dictionary = None
     elif not isinstance(dictionary, Dictionary):
         dictionary = open_dictionary(dictionary, psi.views, psi.binning)
-    solve = reconstruct_judged
-    if not is_one_block(psi.size, settings):
-        check_frames(psi.frames_shape, frames.readings)
-        solve = reconstruct_in_blocks
-    # One deviation, not of each reading: estimated from the reading itself, it is least where noise
-    # made that small.
-    solved, verdict = solve(
-        method, psi, frames.readings, frames.noise_sigma, dictionary, settings, frames.usable,
-        on_step,
-    )  # fmt: skip
+    solve = reconstruct_judged if is_one_block(psi.size, settings) else reconstruct_in_blocks
+    solved, verdict = solve(method, psi, frames, dictionary, settings, on_step)
     return Result(solved, verdict, psi, frames, None if dictionary is None else dictionary.kind)
 
 
@@ -273,7 +265,7 @@ def reconstruct_undrawn(
     assumed = psi_path is None and capture.assumed
     frames, psi_path = capture.frames(psi_path, frame, out, on_note)
     frames = _without(frames, without_shots)
-    saved = open_psi(psi_path)
+    saved = StoredPsi(psi_path)
     in_memory = is_one_block(saved.size, settings) and not as_zarr
     further: dict[str, Any] = {"chosen": chosen}
     if assumed:
@@ -351,7 +343,7 @@ def _write_blocks(
     return metrics
 
 
-def _compared(light_field: Any, truth: str | None, psi: PsiSizes) -> dict[str, Any]:
+def _compared(light_field: Any, truth: str | None, psi: PsiLayout) -> dict[str, Any]:
     """Return how near a light field, an array or dataset, is to the scene captured, if known."""
     if truth is None:
         return {}
@@ -374,7 +366,7 @@ def ceiling_for(
     """  # fmt: skip
     need = own = 0
     for capture in captures:
-        saved = open_psi(psi or capture.psi_file())
+        saved = StoredPsi(psi or capture.psi_file())
         need = max(need, task_bytes(saved, assumed_grid(saved, settings)))
         own = max(own, own_bytes(saved, settings, as_zarr, compares))
     single, double = (Ceiling(memory, BASE_BYTES + captures * own) for captures in (1, 2))

@@ -9,7 +9,7 @@ from pathlib import Path
 from calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import SESSION_RECONSTRUCTION
-from emmc_rig.files.psi import PSI, open_psi
+from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.scales import CALIBRATION_FILE, open_scale
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -69,7 +69,7 @@ class SessionCapture:
     def loaded(self, psi: Path | None, place: int | None) -> tuple[ImagingMatrix, Frames]:
         """Return Psi and readings."""
         own, frames = session_frames(self.session, self.scale(psi), place)
-        return own if psi is None else open_psi(psi).load(), frames
+        return own if psi is None else StoredPsi(psi).load(), frames
 
     def exposure_reasons(self) -> Sequence[Reason]:
         """Return what speaks against the exposures of its shots."""

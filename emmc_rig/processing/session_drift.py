@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calibration.boards import Board
 from calibration.colours import mixing
 from calibration.defects import mask_with_losses
-from calibration.drift import Captures, Drift, DriftSettings, find_drift
+from calibration.drift import Drift, DriftSettings, find_drift
 from calibration.fit import fit_placement
 from calibration.parametric import SAMPLED, Stages, psi_at, shot_stages
 from calibration.placement import SCALARS, Placement, with_aperture_mean_one
@@ -55,7 +55,7 @@ class Known:
     def psi_after(self, placement: Placement) -> ImagingMatrix:
         """Return Psi with the mask there."""
         shadow = Shadow(self.mask, placement)
-        psi = psi_at(shadow, self.psi.layout, self.stages)
+        psi = psi_at(shadow, self.psi, self.stages)
         if self.seen is None or self.colour is None:
             return psi
         share = np.moveaxis(self.seen[self.colour], -1, 2)[:, None, None]
@@ -180,9 +180,10 @@ def run_drift(
             f"{capture.readings.shape[1]} x {capture.readings.shape[2]} pixels; this calibration "
             "is for {} of {} x {}".format(*known.psi.frames_shape)
         )
-    variance = np.full(capture.readings.shape, capture.noise_sigma**2)
-    taken = Captures(capture.readings, variance, capture.usable, known.colour)
-    drift = find_drift(taken, known.seen_mask, known.placement, known.stages, settings)
+    taken = capture.of_one_deviation()
+    drift = find_drift(
+        taken, known.colour, known.seen_mask, known.placement, known.stages, settings
+    )
     if drift.refused:
         raise AppError(f"{frames_folder}: {drift.words}")
     mended = known.psi_after(drift.placement) if drift.drifted else known.psi

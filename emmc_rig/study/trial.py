@@ -21,6 +21,7 @@ from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.scenes import Scene, zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.points import NotApplicableError
@@ -190,9 +191,12 @@ class Trial:
     ) -> Reconstruction:
         """Return a method's reconstruction; raises what it does."""
         atoms = self.dictionary(method, dictionary)
-        return reconstruct(
-            method, self.psi, self.readings, self.noise_sigma, atoms, settings, self.usable
-        )
+        return reconstruct(method, self.psi, self.frames, atoms, settings)
+
+    @property
+    def frames(self) -> Frames:
+        """The readings with their deviation, and which are usable."""
+        return even_frames(self.readings, self.noise_sigma, self.usable)
 
     def psnr_db(self, light_field: Array) -> float:
         """Return the PSNR of a light field against the truth."""

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive.settings import SIDES, Side
-from reconstruction.flat import flat_psi
 
 Array = NDArray[np.floating]
 WIDEST = 5
@@ -103,7 +102,7 @@ def _lines(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], side: S
     rows, columns = pixels
     part = psi.window(*(slice(one.start * k, one.stop * k) for one in pixels))
     used = usable[:, rows, columns]
-    seen = flat_psi(part).weights.reshape(*used.shape[:2], k, used.shape[2], k, -1).sum(axis=(2, 4))
+    seen = part.picture_weights.reshape(*used.shape[:2], k, used.shape[2], k, -1).sum(axis=(2, 4))
     kept = np.where(used, frames[:, rows, columns], 0)
     seen = np.where(used[..., None], seen, 0)
     if axis:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from emmc_rig.model.bands import in_views
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
@@ -42,7 +43,7 @@ from reconstruction.adaptive.joint import (
 from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Plain, Readings, checked, plain_of, unseen_by
+from reconstruction.adaptive.survey import Plain, checked, plain_of, unseen_by
 from reconstruction.adaptive.sweep import STRIDE, mean_around, swept
 from reconstruction.adaptive.times import (
     HELD_WINDOW_PX,
@@ -53,6 +54,7 @@ from reconstruction.adaptive.times import (
     rested,
 )
 from reconstruction.errors import ReconstructionError
+from reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 
@@ -86,26 +88,26 @@ class FilmSettings(Settings):
 KEPT = 0.8
 """Part of the belief in a disparity that the next frame keeps; the rest is spread over all."""
 NEW_SHARE = 0.4
-"""Share of the picture that is foretold worse than by total variation, from which on a frame is a
-first one."""
+"""Share of the picture that the carried scene predicts worse than total variation does, from which
+on a frame begins anew."""
 STILL = 1.05
-"""Where what is carried without motion misses readings by no more than so many times what it misses
-with, nothing flows."""
+"""Ratio of the squared residual of the scene carried without flow to that of the scene carried with
+it, up to which nothing flows."""
 UNCHANGED = 1.4, 2.5
-"""Times the mean square that noise changes readings by, up to which the scene rests: where it flows
-and where it does not. Alone by noise they are 0.5 to 1.4, and up to 2 where one deviation is given
-for bright and dark readings; where a pan moves texture by 1.5 pixels, 13 and more."""
+"""Mean square change of the readings over that by noise, up to which a place rests: with flow, and
+without. Noise alone makes it 0.5 to 1.4, and up to 2 where bright and dark readings have one
+deviation; a pan that moves texture by 1.5 pixels makes it 13 and more."""
 CAMERA_RESTS = 0.75
-"""Share of the picture that must rest for the scene to: 0.98 to 1 do at rest, up to 0.6 while
-smooth scenes pan."""
+"""Share of resting pixels from which on the scene rests: 0.98 to 1 at rest, up to 0.6 while smooth
+scenes pan."""
 RESTING_PX = 0.25
 """Flow up to which the light field of the frame before stands for that of the present one."""
 LONGEST = 8
 """Frames at rest over which light fields are averaged, about."""
 WORSE, MOVING_SHARE = 1.2, 0.02
-"""Times the residual of first frames, over noise, from which on one that follows is a first one: by
-it films of group A that pan lose 0.01 dB, and `panning-desk` 4.9 dB less (96x128,
-`benchmarks/films.py`). And the share of the picture that moves without which it is not asked."""
+"""Residual of a following frame over that of first frames, from which on the film begins anew: with
+this limit films of group A that pan lose 0.01 dB, and `panning-desk` loses 4.9 dB less (96x128,
+`benchmarks/films.py`). And the least share of moving pixels for which the residual is compared."""
 UNDERSTATED = 2.6
 """Of two fits of a capture the spread shows what closeness to the readings changes; a frame that
 follows has one. Films of group A (96x128, `benchmarks/films.py`) stated 3.2 to 5.4 dB more than
@@ -162,11 +164,11 @@ class Film:
 
     @classmethod
     def restored(cls, arrays: Mapping[str, NDArray], psis: Sequence[ImagingMatrix]) -> Film:
-        """Return the film that `arrays` was called of.
+        """Return the film whose `arrays` these are.
 
-        psis: of each of the frames `known.earlier`, as `reconstruct` was given it, of one shot.
+        psis: the Psi of one shot for each frame of `known.earlier`, as given to `reconstruct`.
         """
-        fitted = (checked(psi, np.zeros(psi.frames_shape), 1.0, None).psi for psi in psis)
+        fitted = (checked(psi, even_frames(np.zeros(psi.frames_shape), 1.0)).psi for psi in psis)
         kinds = (cls, FilmSettings, Known, Rest, OtherTime, Readings, search.Volume)
         about = parse_json(str(arrays["about"]), "a stored film", ReconstructionError)
         return put_together(about, arrays, kinds, lambda: next(fitted))
@@ -274,7 +276,7 @@ def followed(
     settings: AdaptiveSettings,
     on_step: Callable[[int], None],
 ) -> Followed | None:
-    """Return the models of a frame that follows; None where it is a first one."""
+    """Return the models of a frame that follows; None where the film begins anew with it."""
     before, own, psi = film.known, film.settings, given.psi
     assert before is not None
     margin = before.margin

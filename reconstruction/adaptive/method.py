@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
 from reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
@@ -38,7 +39,6 @@ from reconstruction.adaptive.second import searched_again
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import (
     Plain,
-    Readings,
     checked,
     checked_disparity,
     plain_of,
@@ -46,6 +46,7 @@ from reconstruction.adaptive.survey import (
 )
 from reconstruction.adaptive.times import moved, of_present, surveyed_together
 from reconstruction.adaptive.uncertainty import within_db
+from reconstruction.inputs import Readings
 from reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
@@ -60,10 +61,8 @@ MISFIT_WINDOW_PX = 8.0
 
 def reconstruct_adaptive(
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float | Array,
+    frames: Frames,
     settings: AdaptiveSettings | None = None,
-    usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     disparity: Array | None = None,
     patches: Patches | None = None,
@@ -71,11 +70,9 @@ def reconstruct_adaptive(
 ) -> Reconstruction:
     """Return the light field of the surfaces and textures that the frames speak for.
 
-    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
-    one or of each. usable: pixels to fit (default all). disparity: of the centre view (y, x), where
-    it is known, in place of the one searched. patches: see `Patches`; they are asked for from
-    `settings.patches` shots on, or where surfaces fail (`second`). film: that this is a frame of,
-    see `reconstruction.result.Reconstruction.film`.
+    disparity: of the centre view (y, x), where it is known, in place of the one searched. patches:
+    see `Patches`; they are asked for from `settings.patches` shots on, or where surfaces fail
+    (`second`). film: that this is a frame of, see `reconstruction.result.Reconstruction.film`.
     Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
@@ -90,7 +87,7 @@ def reconstruct_adaptive(
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
-    whole = checked(psi, frames, noise_sigma, usable)
+    whole = checked(psi, frames)
     known = None if disparity is None else checked_disparity(disparity, psi)
     given, edges = _without_edges(whole, settings)
     survey = surveyed(given, settings, known, report)
@@ -113,21 +110,18 @@ def reconstruct_adaptive(
 
 def reconstruct_next(
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float | Array,
+    frames: Frames,
     film: Film,
     settings: AdaptiveSettings,
-    usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
 ) -> Reconstruction | Film:
     """Return the light field of the next frame of a film, from what the frames before showed.
 
-    film: after the frame before; others as those of `reconstruct_adaptive`, of one shot. Where what
-    was seen before does not foretell the frame, or misleads, it is a first one: of the film that is
-    returned.
+    frames: of one shot. film: after the frame before. Where earlier frames do not predict this one,
+    or mislead its fit, a film is returned that begins with it.
     """
     started = time.perf_counter()
-    whole = checked(psi, frames, noise_sigma, usable)
+    whole = checked(psi, frames)
     if shown := film.shown(whole.psi):
         return _among(whole, shown, settings, on_step, film)
     given, edges = _without_edges(whole, settings)
@@ -155,22 +149,18 @@ def reconstruct_next(
 
 def reconstruct_moving(
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float | Array,
+    frames: Frames,
     settings: AdaptiveSettings,
-    usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     patches: Patches | None = None,
 ) -> Reconstruction:
     """Return the light field at the time of the first of several shots, of a scene that moves.
 
-    What the other shots saw is carried to that time, where it explains their readings. patches: of
-    the first shot; others as those of `reconstruct_adaptive`.
+    The light field is carried to the times of the other shots; their readings count where it
+    explains them. patches: of the first shot.
     """
-    sigma = np.broadcast_to(np.asarray(noise_sigma), psi.frames_shape)
-    every = np.ones(psi.frames_shape, bool) if usable is None else usable
     present, *others = (
-        checked(psi.of_shots([n]), frames[[n]], sigma[[n]], every[[n]]) for n in range(psi.shots)
+        checked(psi.of_shots([n]), frames.cut(np.s_[n : n + 1,])) for n in range(psi.shots)
     )
     nothing, steps = np.zeros(psi.size), settings.start_steps
     shown = [(one, plain_of(one, 1.0, nothing, steps).picture) for one in others]

@@ -1,4 +1,4 @@
-"""Search the disparities of a capture, from coarse to fine: where, and which, they may be.
+"""Search the disparities of a capture, from coarse to fine, patch by patch.
 
 The likelihood of disparities is evaluated for wide patches of every third pixel, half a pixel apart
 where they are small and one beyond; the range grows while its ends are wanted. Each tile of the
@@ -34,6 +34,7 @@ from reconstruction.adaptive.evidence import (
     TexturePrior,
     patch_evidence,
 )
+from reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 COARSE_STEP_PX = 0.5
@@ -129,14 +130,16 @@ def posteriors(evidence: Array, pairs: Array, rounds: int = 3, floor: float = 1e
 
 @dataclass(frozen=True, eq=False)
 class SearchData:
-    """What is to be explained. readings: frames less those of the smooth picture, variance: theirs,
-    usable, all (shot, pixel_y, pixel_x); brightness: (pixel_y, pixel_x) of the smooth picture."""
+    """The data of a search. residual: frames less those of the smooth picture, with the variance of
+    what no model explains in their noise; brightness: of that picture, (pixel_y, pixel_x)."""
 
-    psi: ImagingMatrix
-    readings: Array
-    variance: Array
-    usable: NDArray[np.bool_]
+    residual: Readings
     brightness: Array
+
+    @property
+    def psi(self) -> ImagingMatrix:
+        """Psi of the residual."""
+        return self.residual.psi
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +164,7 @@ class Volume:
 
     @property
     def grids(self) -> tuple[Volume, ...]:
-        """Return this and the one between, if there is one: beliefs are their mean."""
+        """This volume and, where there is a second grid, `between`: beliefs are their mean."""
         return (self,) if self.between is None else (self, self.between)
 
 
@@ -200,9 +203,9 @@ def evidence_at(
     bright = data.brightness[corners[:, 0] + half, corners[:, 1] + half]
     return patch_evidence(
         data.psi,
-        data.readings,
-        data.variance,
-        data.usable,
+        data.residual.frames,
+        data.residual.noise,
+        data.residual.usable,
         bright,
         corners,
         patches.places(data.psi.shots),
@@ -273,7 +276,9 @@ def _possible(
     grid: tuple[NDArray[np.int64], NDArray[np.int64]],
     labels: Array,
 ) -> NDArray[np.bool_]:
-    """Return which `labels` are near what may be at or around each patch, (row, column, label).
+    """Return which `labels` are near a likely disparity at or around each patch.
+
+    Shape (row, column, label).
 
     grid: rows and columns of the patches' corners.
     """
@@ -361,15 +366,17 @@ def _shared(possible: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _asked(possible: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
-    """Return which of each `every`-th label to evaluate, that of those possible (..., label) all
-    have one to both sides."""
+    """Return which of each `every`-th label to evaluate, (..., label).
+
+    Every possible label then has an evaluated label on both sides.
+    """
     padded = np.pad(possible, ((0, 0), (0, 0), (every - 1, every - 1)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * every - 1, axis=2)
     return np.logical_or.reduce(windows[:, :, ::every], axis=-1)
 
 
 def _spanned(asked: NDArray[np.bool_], every: int) -> NDArray[np.bool_]:
-    """Return which labels lie at or between those of each `every`-th that are asked for."""
+    """Return which labels lie at or between the `every`-th labels that are evaluated."""
     known = np.where(asked, np.float32(0), np.float32(-np.inf))
     return np.isfinite(_between(known[None], every)[0])
 
@@ -423,14 +430,16 @@ def _between(evidence: NDArray[np.float32], every: int) -> NDArray[np.float32]:
 
 
 def _near_best(evidence: NDArray[np.float32], every: int) -> NDArray[np.bool_]:
-    """Return which labels lie between evidence (patch, label) at each `every`-th of them, and next
-    to one that is nearly the best: (patch, label)."""
+    """Return which labels lie beside a nearly best label of a patch, (patch, label).
+
+    evidence: (patch, label), of each `every`-th label; the labels returned lie between these.
+    """
     known = np.isfinite(evidence)
     good = evidence > evidence.max(axis=1, keepdims=True) - CONTENDING
     between = known[:, 1:] & known[:, :-1] & (good[:, 1:] | good[:, :-1])
     out = np.zeros((len(evidence), every * (evidence.shape[1] - 1) + 1), dtype=bool)
-    for one in range(1, every):
-        out[:, one::every] = between
+    for offset in range(1, every):
+        out[:, offset::every] = between
     return out
 
 

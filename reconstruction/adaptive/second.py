@@ -34,9 +34,9 @@ WIDE_SHARE = 0.1
 """Of the patches with wide disparities, from which the second search is worth its time."""
 BESIDE, MISSED = 0.15, 0.35
 """Sparse patches are worth their time where the rays of one pixel spread over BESIDE of the
-picture's shorter side, and surfaces miss held-out readings by MISSED of what total variation misses
-them by. One shot of dice, 64x80: by 0.4 to 0.5 of it, patches gain 0.8 dB with one camera;
-by 0.25 to 0.3, they gain nothing with another."""
+picture's shorter side, and the residual of surfaces at held-out readings is MISSED of that of total
+variation. One shot of dice, 64x80: at a share of 0.4 to 0.5 patches gain 0.8 dB with one camera; at
+0.25 to 0.3 they gain nothing with another camera."""
 
 Array = NDArray[np.floating]
 
@@ -54,7 +54,7 @@ def searched_again(survey: Survey, settings: AdaptiveSettings) -> search.Volume 
         return None
     looser = survey.bright.variance(LOOSER * settings.misfit)
     return search.fine(
-        replace(survey.data, variance=looser),
+        replace(survey.data, residual=replace(survey.data.residual, noise=looser)),
         survey.prior,
         survey.rough,
         settings.stride,

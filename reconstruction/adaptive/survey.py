@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
@@ -22,69 +23,29 @@ from reconstruction.adaptive.uncertainty import held_out
 from reconstruction.choices import choose_mu, contrast, smooth_guess
 from reconstruction.colour import unseen_colour
 from reconstruction.errors import ReconstructionError
-from reconstruction.flat import FlatPsi, flat_psi
-from reconstruction.inputs import checked_inputs, checked_noise
+from reconstruction.inputs import Readings
 from reconstruction.wave import few_steps
 
 Array = NDArray[np.floating]
 COARSE_PX = 8.0, 2.0
 """Correlation lengths of the textures of the coarse search. 2x +0.15, 0.5x -0.05 dB."""
 CONTRAST = 0.15
-"""Deviation of a scene's values below which it is reconstructed as if it had so much, since the
-settings are shares of that. Against a mean brightness of 0.25 in its place, on 96x96 crops of group
-A: buttercup and occlusions +0.1 dB. With 0.2 antinous gains 0.2 dB and they gain nothing. 2x -0.01,
-0.5x 0.00 dB."""
+"""Least deviation of a scene's values; a scene of less contrast is scaled up to it, because the
+settings are shares of the contrast. Compared with scaling to a mean brightness of 0.25, on 96x96
+crops of group A: buttercup and occlusions +0.1 dB. With 0.2 antinous gains 0.2 dB and the two gain
+nothing. 2x -0.01, 0.5x 0.00 dB."""
 
 PASSED = 0.5
 """Share of the light that masks pass for which the settings were chosen."""
 
 
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """Psi, the frames, their typical deviation, the variance `noise` of each reading, and which are
-    usable, all but Psi (shot, pixel_y, pixel_x)."""
+def checked(psi: ImagingMatrix, frames: Frames) -> Readings:
+    """Return the readings of frames, scaled as if the masks passed half the light.
 
-    psi: ImagingMatrix
-    frames: Array
-    typical: float
-    noise: Array
-    usable: NDArray[np.bool_]
-
-    def over(self, scale: float, of_psi: bool = False) -> Readings:
-        """Return the same with readings divided by a scale: of a scene, or of Psi, so much dimmer.
-
-        Psi, frames and noise so many times larger are the same problem.
-        """
-        if scale == 1:
-            return self
-        part = self.frames.dtype.type(scale)
-        psi = replace(self.psi, weights=self.psi.weights / part) if of_psi else self.psi
-        noise = (self.noise / scale**2).astype(np.float32)
-        return Readings(psi, self.frames / part, self.typical / scale, noise, self.usable)
-
-    def variance(self, misfit: float) -> Array:
-        """Return the variance of the readings, with that of what no model explains."""
-        return self.noise + np.float32(misfit**2)
-
-    def precision(self, held: NDArray[np.bool_], misfit: float) -> Array:
-        """Return the inverse variance of the readings fitted, 0 of the others."""
-        return np.where(self.usable & ~held, 1 / self.variance(misfit), 0).astype(np.float32)
-
-
-def checked(
-    psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float | Array,
-    usable: NDArray[np.bool_] | None,
-) -> Readings:
-    """Return the inputs of a method, as if the masks passed half the light.
-
-    Raises ReconstructionError for inputs that do not fit each other.
+    Raises ReconstructionError for frames that do not fit Psi.
     """
-    typical, noise = checked_noise(psi, noise_sigma, usable)
-    frames, usable = checked_inputs(psi, frames, typical, usable)
     passed = max(psi.light_efficiency(), 1e-12)
-    return Readings(psi, frames, typical, noise, usable).over(passed / PASSED, of_psi=True)
+    return Readings.of(psi, frames).over(passed / PASSED, of_psi=True)
 
 
 def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
@@ -133,9 +94,8 @@ def unseen_by(given: Readings) -> Array:
     """Return the variance by colours that frames do not show, (y, x)."""
     if given.psi.colour is not None:
         return np.zeros(given.psi.size)
-    flat = flat_psi(given.psi)
-    picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
-    return unseen_colour(flat, given.frames, given.usable, picture)
+    picture = np.asarray(smooth_guess(given.psi, given.frames, given.usable), dtype=np.float32)
+    return unseen_colour(given.psi, given.frames, given.usable, picture)
 
 
 def plain_of(given: Readings, scale: float, unseen: Array, steps: int) -> Plain:
@@ -160,26 +120,23 @@ def surveyed(
     disparity: of the centre view (y, x) where it is known. on_searched: called with 1 and 2 after
     the coarse and the fine search.
     """
-    k, flat = given.psi.binning, flat_psi(given.psi)
-    picture = np.asarray(smooth_guess(flat, given.frames, given.usable), dtype=np.float32)
-    unseen = unseen_colour(flat, given.frames, given.usable, picture)
-    own = settings.contrast or contrast_of(flat, given.frames, picture, given.noise, given.usable)
+    psi, k = given.psi, given.psi.binning
+    picture = np.asarray(smooth_guess(psi, given.frames, given.usable), dtype=np.float32)
+    unseen = unseen_colour(psi, given.frames, given.usable, picture)
+    own = settings.contrast or contrast_of(psi, given.frames, picture, given.noise, given.usable)
     scale = min(1.0, own / CONTRAST)
     bright = given.over(scale)
     picture = picture / np.float32(scale)
     grey = picture.mean(axis=-1)
+    residual = (bright.frames - psi.forward_picture(picture)).astype(np.float32)
     data = search.SearchData(
-        given.psi,
-        (bright.frames - flat.forward(picture)).astype(np.float32),
-        bright.variance(settings.misfit),
-        given.usable,
+        replace(bright, frames=residual, noise=bright.variance(settings.misfit)),
         grey.reshape(grey.shape[0] // k, k, grey.shape[1] // k, k).mean(axis=(1, 3)),
     )
     coarse, fine = (
         TexturePrior(length, tuple(finer), freedom=settings.freedom)
         for length, *finer in (COARSE_PX, settings.lengths_px)
     )
-    psi = given.psi
     smooth = settings.slope_px, settings.jump
     rough = search.coarse(data, coarse, settings.furthest_px, *smooth)
     on_searched(1)
@@ -193,14 +150,14 @@ def surveyed(
 
 
 def contrast_of(
-    flat: FlatPsi, frames: Array, picture: Array, noise: Array, usable: NDArray[np.bool_]
+    psi: ImagingMatrix, frames: Array, picture: Array, noise: Array, usable: NDArray[np.bool_]
 ) -> float:
     """Return the standard deviation of a scene's values, as far as frames (shot, y, x) show it.
 
     That of the smooth picture (y, x, c), and of the texture it lacks: the variance of the readings
     beyond their noise, over the squared sums of Psi's rows, as if the texture lay at disparity 0.
     """
-    missed = np.square(frames - flat.forward(picture))[usable].sum(dtype=np.float64)
+    missed = np.square(frames - psi.forward_picture(picture))[usable].sum(dtype=np.float64)
     beyond = max(float(missed - noise[usable].sum(dtype=np.float64)), 0.0)
-    rows = np.square(flat.forward(np.ones_like(picture)))[usable].sum(dtype=np.float64)
+    rows = np.square(psi.forward_picture(np.ones_like(picture)))[usable].sum(dtype=np.float64)
     return float(np.hypot(contrast(picture), np.sqrt(beyond / max(float(rows), 1e-20))))

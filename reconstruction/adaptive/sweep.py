@@ -34,7 +34,7 @@ from reconstruction.adaptive.search import (
     places,
     posteriors,
 )
-from reconstruction.adaptive.survey import Readings
+from reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 FREEDOM = 3.0

@@ -22,7 +22,6 @@ from reconstruction.adaptive.refine import Seen
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import (
     Plain,
-    Readings,
     Survey,
     plain_of,
     surveyed,
@@ -30,20 +29,20 @@ from reconstruction.adaptive.survey import (
 )
 from reconstruction.adaptive.sweep import mean_around
 from reconstruction.adaptive.visibility import carried
+from reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0
-"""Deviation of the windows in which squared residuals of what is foretold are averaged; and of the
-few readings that are kept from every fit."""
+"""Deviations of the windows that squared residuals are averaged in: of all readings, and of the few
+that are held out."""
 ANOTHER = 4.0
-"""Times the mean square that total variation misses held-out readings by, from which on what it
-foretells of another time's is of another scene."""
+"""Squared residual of total variation at another time over that at held-out readings, from which on
+the other frame shows another scene."""
 LEAST_SEEN = 0.3
-"""Share of another time's readings that must be of this scene, without which none counts."""
+"""Share of another frame's readings that must show this scene; below it none of them counts."""
 REST, REST_PX = 1.12, 2.0
-"""Where what total variation foretells without motion misses readings by no more than so many times
-what it misses with, the scene rests: by 0.95 to 1.12 at rest, by 1.2 to 2 of motions of 0.3 px.
-And the deviation by which such places are blurred."""
+"""Squared residual of total variation without motion over that with it, up to which a place rests:
+0.95 to 1.12 at rest, 1.2 to 2 with motion of 0.3 px. And the blur of the places."""
 RESTING, ALL_MOVES = np.float32(0.1), np.float32(1)
 """Share of what is missed by which readings are doubted: where the scene rests, and elsewhere."""
 
@@ -114,15 +113,15 @@ def padded(flow: Array, margin: int) -> Array:
     return np.pad(flow, ((margin, margin), (margin, margin), (0, 0)), mode="edge")
 
 
-def aligned(one: OtherTime, binning: int) -> Readings:
+def aligned(other: OtherTime, binning: int) -> Readings:
     """Return a frame of another time moved by whole pixels, as of the present scene."""
-    k, theirs = binning, one.readings
-    moves = np.rint(one.back[k // 2 :: k, k // 2 :: k] / k).astype(np.intp)
+    k, theirs = binning, other.readings
+    moves = np.rint(other.back[k // 2 :: k, k // 2 :: k] / k).astype(np.intp)
     at = np.indices(moves.shape[:2]) + np.moveaxis(moves, -1, 0)
     last = np.array(moves.shape[:2])[:, None, None] - 1
     inside, (y, x) = ((at >= 0) & (at <= last)).all(axis=0), np.clip(at, 0, last)
     rows, columns = (
-        k * of_samples(along, one.back) + within
+        k * of_samples(along, other.back) + within
         for along, within in zip((y, x), np.indices(theirs.psi.size) % k, strict=True)
     )
     weights = np.moveaxis(theirs.psi.weights, 4, 3)[..., rows, columns]
@@ -132,14 +131,14 @@ def aligned(one: OtherTime, binning: int) -> Readings:
         weights=np.ascontiguousarray(np.moveaxis(weights, 3, 4)),
         colour=None if colour is None else colour[:, rows, columns],
     )
-    usable = one.used[:, y, x] & inside
+    usable = other.used[:, y, x] & inside
     return Readings(psi, theirs.frames[:, y, x], theirs.typical, theirs.noise[:, y, x], usable)
 
 
 def together(given: Readings, others: Sequence[Readings]) -> Readings:
     """Return frames of one scene as shots of one capture."""
     every = given, *others
-    psis = [one.psi for one in every]
+    psis = [readings.psi for readings in every]
     colours = [psi.colour for psi in psis if psi.colour is not None]
     psi = replace(
         given.psi,
@@ -148,7 +147,7 @@ def together(given: Readings, others: Sequence[Readings]) -> Readings:
         camera_json="",
     )
     frames, noise, usable = (
-        np.concatenate([getattr(one, name) for one in every])
+        np.concatenate([getattr(readings, name) for readings in every])
         for name in ("frames", "noise", "usable")
     )
     return Readings(psi, frames, given.typical, noise, usable)
@@ -169,13 +168,13 @@ def others_of(plain: Plain, shown: Sequence[tuple[Readings, Array]]) -> list[Oth
         there, back = flow_between(picture, plain.picture)
         at = at_places(psi.size)
         views = light_field.reshape(-1, *light_field.shape[2:])
-        then = np.stack([sampled(one, at + there) for one in views]).reshape(light_field.shape)
+        then = np.stack([sampled(view, at + there) for view in views]).reshape(light_field.shape)
         weight = readings.usable.astype(np.float32)
         moves, still = (
             mean_around(
-                np.square(readings.frames - readings.psi.forward(one)), weight, WINDOW_PX
+                np.square(readings.frames - readings.psi.forward(predicted)), weight, WINDOW_PX
             ).sum(axis=0)
-            for one in (then, light_field)
+            for predicted in (then, light_field)
         )
         rests = (still <= REST * moves).astype(np.float32)
         there, back = rested(there, back, rests)
@@ -210,9 +209,9 @@ def surveyed_together(
     shown: see `others_of`. The frames returned are over the scene's scale.
     """
     others = others_of(plain_of(given, 1.0, unseen_by(given), settings.start_steps), shown)
-    whole = together(given, [aligned(one, given.psi.binning) for one in others])
+    whole = together(given, [aligned(other, given.psi.binning) for other in others])
     survey = surveyed(whole, settings, None, on_searched)
-    return survey, [replace(one, readings=one.readings.over(survey.scale)) for one in others]
+    return survey, [replace(other, readings=other.readings.over(survey.scale)) for other in others]
 
 
 def of_present(survey: Survey, given: Readings) -> Survey:
@@ -236,9 +235,10 @@ def of_samples(pixels: NDArray, of: Array) -> NDArray:
 def moved(others: Sequence[OtherTime]) -> dict[str, float]:
     """Return by how much the scene moved to the furthest time, pixels, and what share is seen."""
     steps = (
-        np.linalg.norm(one.there[of_samples(one.used[0], one.there)], axis=-1) for one in others
+        np.linalg.norm(other.there[of_samples(other.used[0], other.there)], axis=-1)
+        for other in others
     )
     return {
         "moved_px": max((float(np.median(by)) for by in steps if by.size), default=0.0),
-        "seen_share": float(np.mean([one.used.mean() for one in others])),
+        "seen_share": float(np.mean([other.used.mean() for other in others])),
     }

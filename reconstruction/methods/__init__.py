@@ -14,26 +14,24 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, create_model
 
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.errors import nearest_of
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from reconstruction.adaptive.film import Film, FilmSettings
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import checked_inputs, checked_noise
+from reconstruction.inputs import checked_inputs
 from reconstruction.method import Given, Method
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
 from reconstruction.sparse import PatchEstimates, SparseSettings
 from reconstruction.tv import TVSettings
 
-Array = NDArray[np.floating]
 Part = TypeVar("Part", bound=Settings)
 DEFAULT_METHOD = "adaptive"
 ENTRY_POINTS = "emmc_rig.methods"
@@ -109,11 +107,9 @@ def find_method(name: str) -> Method:
 def reconstruct(
     name: str,
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float | Array,
+    frames: Frames,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
-    usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     estimates: PatchEstimates | None = None,
     film: Film | None = None,
@@ -121,9 +117,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Return the light field that the method called `name` estimates.
 
-    frames: (shot, pixel_y, pixel_x) normalised readings. noise_sigma: their standard deviation,
-    one or of each (known: estimated from a reading it would favour those that noise made small);
-    methods that take one take the root mean square. usable: pixels to fit (default all).
+    All readings count by one deviation, `frames.noise_sigma`: that of a single reading follows from
+    the reading itself, and is least where noise made that small.
     estimates: what `estimate_patches` found from the same inputs, for `dict-...` and `tv-dict` to
     go on from. film: that the frames, of one shot, are the next one of: `Film()` before the first,
     then `film` of the result before. moving: see `Given`. Raises ReconstructionError for a method
@@ -135,13 +130,13 @@ def reconstruct(
         able = ", ".join(film_methods())
         raise ReconstructionError(f"'{name}' takes no films: --method one of {able}")
     settings = settings or MethodSettings()
-    given = Given(psi, frames, noise_sigma, usable, dictionary, on_step, estimates, film, moving)
+    frames = frames.of_one_deviation()
+    given = Given(psi, frames, dictionary, on_step, estimates, film, moving)
     if not settings.screening:
         return method.solve(given, settings)
     started = time.perf_counter()
-    frames, usable = checked_inputs(psi, frames, checked_noise(psi, noise_sigma, usable)[0], usable)
-    seen = screened(psi, frames, usable)
+    seen = screened(psi, checked_inputs(psi, frames))
     took = time.perf_counter() - started
-    given = dataclasses.replace(given, frames=seen.frames, usable=seen.usable)
+    given = dataclasses.replace(given, frames=seen.frames)
     result = method.solve(given, settings)
     return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.notes)

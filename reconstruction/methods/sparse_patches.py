@@ -19,10 +19,8 @@ def _solve(solver: bpdn.Method, given: Given, settings: MethodSettings) -> Recon
     return reconstruct_sparse(
         given.psi,
         given.frames,
-        given.typical_noise,
         given.needed_dictionary(f"dict-{solver}"),
         settings.sparse.model_copy(update={"solver": chosen}),
-        given.usable,
         given.on_step,
         given.estimates,
     )

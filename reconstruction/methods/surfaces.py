@@ -68,7 +68,8 @@ def _solve(
 
     def patches(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
         atoms = _dictionary(psi.light_field_shape[:2], psi.binning)
-        fitted = dataclasses.replace(present, usable=usable, dictionary=atoms, on_step=None)
+        frames = dataclasses.replace(present.frames, usable=usable)
+        fitted = dataclasses.replace(present, frames=frames, dictionary=atoms, on_step=None)
         sparse = sparse_patches(settings.sparse, psi.binning)
         unseen = settings.tv.model_copy(update={"objective_every": settings.tv.max_steps + 1})
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
@@ -76,18 +77,13 @@ def _solve(
 
     result, taken = given.film, patches if may_take_patches(present.psi, adaptive) else None
     if given.moving:
-        result = reconstruct_moving(
-            psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step, taken
-        )
+        result = reconstruct_moving(psi, given.frames, adaptive, given.on_step, taken)
     elif result is not None and result.known is not None:
-        result = reconstruct_next(
-            psi, given.frames, given.noise_sigma, result, adaptive, given.usable, given.on_step
-        )
+        result = reconstruct_next(psi, given.frames, result, adaptive, given.on_step)
     if not isinstance(result, Reconstruction):
         result = reconstruct_adaptive(
-            psi, given.frames, given.noise_sigma, adaptive, given.usable, given.on_step,
-            patches=taken, film=result,
-        )  # fmt: skip
+            psi, given.frames, adaptive, given.on_step, patches=taken, film=result
+        )
     return dataclasses.replace(result, method=name)
 
 

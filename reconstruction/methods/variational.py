@@ -45,23 +45,22 @@ def patched_weights(
 
 
 def _solve_tv(given: Given, settings: MethodSettings) -> Reconstruction:
-    return reconstruct_tv(
-        given.psi, given.frames, given.typical_noise, settings.tv, given.usable, given.on_step
-    )
+    return reconstruct_tv(given.psi, given.frames, settings.tv, given.on_step)
 
 
 def solve_tv_dict(given: Given, settings: MethodSettings) -> Reconstruction:
     """Return the light field of `tv-dict`; `adaptive` averages with it."""
     started = time.perf_counter()
-    psi, noise, dictionary = given.psi, given.typical_noise, given.needed_dictionary("tv-dict")
-    frames, usable = checked_inputs(psi, given.frames, noise, given.usable)
+    psi, dictionary = given.psi, given.needed_dictionary("tv-dict")
+    frames = checked_inputs(psi, given.frames)
     found = given.estimates or estimate_patches(
-        psi, frames, noise, dictionary, settings.sparse, usable, given.on_step
+        psi, frames, dictionary, settings.sparse, given.on_step
     )
     first_s = time.perf_counter() - started
     term = PatchTerm(found.light_field, found.weight)
-    tv = patched_weights(settings.tv, settings.sparse, psi, frames[usable], noise)
-    result = reconstruct_tv(psi, frames, noise, tv, usable, given.on_step, term)
+    readings = frames.readings[frames.usable]
+    tv = patched_weights(settings.tv, settings.sparse, psi, readings, frames.noise_sigma)
+    result = reconstruct_tv(psi, frames, tv, given.on_step, term)
     return dataclasses.replace(
         result,
         method="tv-dict",

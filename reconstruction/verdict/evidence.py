@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import centre_view, sum_of_squares
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from reconstruction.colour import unseen_colour
-from reconstruction.flat import flat_psi
 from reconstruction.result import SCALE, Reconstruction
 from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import displaced
@@ -25,8 +25,8 @@ from reconstruction.verdict.shots import Motion, compared
 
 Array = NDArray[np.floating]
 CLIPPED = 0.5
-"""Of the largest reading of a shot, from which on one that is not usable is a saturated one: over a
-flat field the white level differs from pixel to pixel."""
+"""Share of a shot's largest reading, from which on an unusable reading counts as saturated: divided
+by a flat field the white level differs from pixel to pixel."""
 
 
 @dataclass(frozen=True)
@@ -107,18 +107,17 @@ REPORTED_PARAMETERS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Read:
-    """frames, usable: (shot, pixel_y, pixel_x), as screened. kept: those kept from the fit.
+class FittedFrames:
+    """Screened frames, of which some readings are kept from the fit.
 
-    excluded: what the pixels read that were not usable to begin with, 0 elsewhere. left_out: shots
-    that screening left out, for being dark or for repeating others. bad: share of the pixels that
-    it left out, for differing from their neighbours. short: share of the readings that are
-    saturated and that a light field fitted without them falls short of. gains: by which screening
-    divided the shots.
+    kept, excluded: (shot, pixel_y, pixel_x); which are kept, and the readings of pixels that were
+    not usable before screening, 0 elsewhere. left_out: shots that screening left out, for being
+    dark or for repeating others. bad: share of the pixels that it left out, for differing from
+    their neighbours. short: share of the readings that are saturated and that a light field fitted
+    without them falls short of. gains: by which screening divided the shots.
     """
 
-    frames: Array
-    usable: NDArray[np.bool_]
+    frames: Frames
     kept: NDArray[np.bool_]
     excluded: Array
     left_out: tuple[int, ...] = ()
@@ -126,35 +125,39 @@ class Read:
     short: float = 0.0
     gains: tuple[float, ...] = ()
 
-    def of_first_shot(self) -> Read:
+    def of_first_shot(self) -> FittedFrames:
         """Return the same of the first shot alone."""
-        arrays = {
-            name: getattr(self, name)[:1] for name in ("frames", "usable", "kept", "excluded")
-        }
         left_out = tuple(shot for shot in self.left_out if shot == 0)
-        return replace(self, **arrays, left_out=left_out, gains=self.gains[:1])
+        return replace(
+            self, frames=self.frames.cut(np.s_[:1,]), kept=self.kept[:1],
+            excluded=self.excluded[:1], left_out=left_out, gains=self.gains[:1],
+        )  # fmt: skip
+
+    @property
+    def shown(self) -> Array:
+        """The readings (shot, pixel_y, pixel_x), 0 where they are not usable."""
+        return np.where(self.frames.usable, self.frames.readings, 0)
 
     @property
     def clipped(self) -> NDArray[np.bool_]:
-        """Which readings were not usable and are as large as any that are: saturated ones."""
-        most = np.where(self.usable, self.frames, 0).max(axis=(1, 2), keepdims=True)
+        """Saturated readings: excluded, and as large as the usable ones."""
+        most = self.shown.max(axis=(1, 2), keepdims=True)
         return (self.excluded > 0) & (self.excluded >= CLIPPED * most)
 
 
 def gathered(
     psi: ImagingMatrix,
-    read: Read,
-    noise_sigma: float,
+    read: FittedFrames,
     result: Reconstruction,
     found: Relief | None = None,
     moved: Motion | None = None,
 ) -> Evidence:
-    """Return what there is to say of a light field that was fitted without the readings kept.
+    """Return the figures of a light field that was fitted without the readings kept.
 
-    found: what the masks make of the usable readings, where it is known. moved: where shots differ
-    most in what they saw, if there are several.
+    found: relief of the usable readings, where it is known. moved: the largest difference between
+    the scenes of several shots.
     """
-    frames, usable = np.where(read.usable, read.frames, 0), read.usable
+    frames, usable, noise_sigma = read.shown, read.frames.usable, read.frames.noise_sigma
     found = relief(psi, frames, noise_sigma, usable) if found is None else found
     masks = shadow(found)
     residual = frames - psi.forward(result.light_field)
@@ -199,7 +202,7 @@ def gathered(
 def _colour_error(
     psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], found: Relief
 ) -> float:
-    unseen = unseen_colour(flat_psi(psi), frames, usable, found.picture)
+    unseen = unseen_colour(psi, frames, usable, found.picture)
     square = np.square(found.picture.mean(axis=-1, dtype=np.float64)).mean()
     return float(np.sqrt(unseen.mean() / max(square, 1e-12)))
 
@@ -226,7 +229,7 @@ def _parallax(light_field: Array, view_axes: ViewAxes) -> float | None:
 
 
 def _plain(values: Iterable[float]) -> tuple[float | None, ...]:
-    """Return plain numbers; None for those that are not finite."""
+    """Return plain numbers, None in place of infinity and NaN."""
     return tuple(float(value) if np.isfinite(value) else None for value in values)
 
 

@@ -20,7 +20,7 @@ SHARE = 0.003
 """Of the usable readings that are kept from every fit; more of few, so that WANTED are."""
 WANTED, MOST_SHARE = 150, 0.04
 SEED = 1
-"""Other than that of the readings which `adaptive` keeps for its standard deviation."""
+"""Another seed than that of `adaptive`, which keeps readings for its standard deviation."""
 
 FLAT_STEPS = 60
 """Of total variation for one picture that all views are: `tv` ends after about 50 for buttercup and
@@ -48,8 +48,8 @@ def compare_held_out(
         return {"kept": 0, "explained": None, "noise_share": None}
     smooth = found.level * (1 + found.masks)
     square, before = (
-        float(np.mean(np.square(one[kept], dtype=np.float64)))
-        for one in (residual, frames - smooth)
+        float(np.mean(np.square(missed[kept], dtype=np.float64)))
+        for missed in (residual, frames - smooth)
     )
     noise = noise_sigma**2
     removed = 1 - (square - noise) / max(before - noise, 1e-30) if before > 2 * noise else 0.0
@@ -103,19 +103,13 @@ def over_baselines(
     kept = kept & usable
     if kept.sum() < FEWEST:
         return {"over_flat": None, "over_neighbours": None}
-    fitted, flat = usable & ~kept, _flat(psi)
+    fitted, flat = usable & ~kept, psi.of_one_view()
     mu = choose_mu(flat, frames[fitted], noise_sigma)
     of_flat = frames - flat.forward(few_steps(flat, frames, fitted, mu, FLAT_STEPS))
     return {
         "over_flat": _surely_over(residual[kept], of_flat[kept]),
         "over_neighbours": _surely_over(residual[kept], _off_neighbours(psi, frames, fitted)[kept]),
     }
-
-
-def _flat(psi: ImagingMatrix) -> ImagingMatrix:
-    """Return Psi of a light field of one view, which all views are."""
-    summed = psi.weights.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
-    return ImagingMatrix(summed.astype(psi.weights.dtype), psi.colour, psi.binning)
 
 
 def _off_neighbours(
@@ -133,7 +127,7 @@ def _off_neighbours(
 
 def _surely_over(mine: Array, theirs: Array) -> float:
     """Return the ratio of root mean squares, three deviations of their difference lower."""
-    mine2, theirs2 = (np.square(one, dtype=np.float64) for one in (mine, theirs))
+    mine2, theirs2 = (np.square(missed, dtype=np.float64) for missed in (mine, theirs))
     deviation = float(np.std(mine2 - theirs2)) / np.sqrt(len(mine2))
     least = max(float(mine2.mean()) - 3 * deviation, 0.0)
     return float(np.sqrt(least / max(float(theirs2.mean()), 1e-30)))

@@ -1,10 +1,10 @@
-"""A reconstruction with its verdict: some readings are kept from the fit, and asked afterwards.
+"""A reconstruction with its verdict: readings kept from the fit are predicted afterwards.
 
-A saturated reading says that there was at least so much light. The light field is fitted without
-them first; those that it falls short of join the readings, and it is fitted again (an active set,
-of one round: a second one changed 64x80 crops by 0.0 to 0.4 dB). Where one shot saw another scene
-than the others, its readings are left out, and it is fitted again, too. Where several did, the
-scene moved: what they saw is carried to the time of the first.
+A saturated reading is a lower bound of the light. The light field is first fitted without saturated
+readings. Bounds that it does not reach join the readings, and it is fitted again (an active set of
+one round: a second round changed 64x80 crops by 0.0 to 0.4 dB). Readings of a shot that shows
+another scene than the others are left out, and the light field is fitted again. Where several shots
+do, the scene moved, and all shots are carried to the time of the first.
 """
 
 from __future__ import annotations
@@ -16,84 +16,80 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import shows_parallax
 from reconstruction.adaptive.film import Film
 from reconstruction.choices import choose_mu
 from reconstruction.dictionary import Dictionary
-from reconstruction.inputs import checked_inputs, checked_noise
+from reconstruction.inputs import checked_inputs
 from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
-from reconstruction.verdict.evidence import Read, gathered
+from reconstruction.verdict.evidence import FittedFrames, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import MOTION, Verdict, verdict_from
 from reconstruction.verdict.shadow import relief
 from reconstruction.verdict.shots import Motion, motion
 from reconstruction.wave import few_steps
 
-Array = NDArray[np.floating]
 FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""
 COLOURS = 3
 COARSE_STEPS, CLEARLY_MOVED = 15, 1.6
-"""Of total variation; and the ratio of `Motion` from which on what it shows is certain: at rest it
-is 0.3 to 1.3 (group A at 96x128, two to six shots), at 1 to 5 pixels between three shots 1.5 to 12.
-What moved by less the light field itself shows, a fit later."""
+"""Steps of total variation, and the ratio of `Motion` from which on motion is certain: at rest the
+ratio is 0.3 to 1.3 (group A at 96x128, two to six shots), with 1 to 5 pixels between three shots it
+is 1.5 to 12. Smaller motion is found from the light field, after the first fit."""
 
 
 @one_blas_thread()
 def reconstruct_judged(
     name: str,
     psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float | Array,
+    frames: Frames,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
-    usable: NDArray[np.bool_] | None = None,
     on_step: Callable[[Progress], None] | None = None,
     film: Film | None = None,
 ) -> tuple[Reconstruction, Verdict]:
-    """Return what `reconstruct` finds, given the same, and whether to trust it.
+    """Return the result of `reconstruct`, given the same, and whether to trust it.
 
-    frames: what a pixel reads that is not usable is the least that it can be, see `Read.clipped`; 0
-    says nothing. The light field is that of all readings but the few kept, which costs it next to
-    nothing. Where every pixel sees the same colour, its three colours are alike. film: see
-    `reconstruct`.
+    frames: the reading of a pixel that is not usable is the least that it can be, see
+    `FittedFrames.clipped`; 0 says nothing. The light field is that of all readings but the few
+    kept, which costs it next to nothing. Where every pixel sees the same colour, its three colours
+    are alike. film: see `reconstruct`.
     """
     settings = settings or MethodSettings()
-    typical, _ = checked_noise(psi, noise_sigma, usable)
-    read, notes = _as_fitted(psi, frames, typical, usable, settings.screening)
+    read, notes = _as_fitted(psi, frames.of_one_deviation(), settings.screening)
+    typical = read.frames.noise_sigma
     unscreened = settings.model_copy(update={"screening": False})
 
-    def solved(
-        readings: Array, fitted: NDArray[np.bool_], before: float = 0.0, moving: bool = False
-    ) -> Reconstruction:
+    def solved(frames: Frames, before: float = 0.0, moving: bool = False) -> Reconstruction:
         result = reconstruct(
-            name, psi, readings, noise_sigma, dictionary, unscreened, fitted, on_step, film=film,
-            moving=moving,
-        )  # fmt: skip
+            name, psi, frames, dictionary, unscreened, on_step, film=film, moving=moving
+        )
         return dataclasses.replace(result, seconds=result.seconds + before)
 
-    readings, fitted = read.frames, read.usable & ~read.kept
-    shown = np.where(read.usable, read.frames, 0)
-    seen = relief(psi, shown, typical, read.usable)
+    fitted = dataclasses.replace(read.frames, usable=read.frames.usable & ~read.kept)
+    shown = read.shown
+    seen = relief(psi, shown, typical, read.frames.usable)
 
-    def differing(light_field: Array) -> Motion | None:
+    def differing(light_field: NDArray[np.floating]) -> Motion | None:
         return motion(seen, shown - psi.forward(light_field), typical)
 
-    can_carry, moving = _can_carry(name, psi, fitted), False
+    can_carry, moving = _can_carry(name, psi, fitted.usable), False
     if can_carry:
-        mu = choose_mu(psi, readings[fitted], typical)
-        coarse = few_steps(psi, readings, fitted, mu, COARSE_STEPS)
+        mu = choose_mu(psi, fitted.readings[fitted.usable], typical)
+        coarse = few_steps(psi, fitted.readings, fitted.usable, mu, COARSE_STEPS)
         moving = _moved(differing(coarse), CLEARLY_MOVED)
-    result = solved(readings, fitted, moving=moving)
+    result = solved(fitted, moving=moving)
     short = _short(psi, read, result)
     if short is not None:
         took = result.seconds
         del result
-        readings, fitted = np.where(short, read.excluded, readings), fitted | short
-        result = solved(readings, fitted, took, moving)
+        bounded = np.where(short, read.excluded, fitted.readings)
+        fitted = dataclasses.replace(fitted, readings=bounded, usable=fitted.usable | short)
+        result = solved(fitted, took, moving)
         read = dataclasses.replace(read, short=float(short.mean()))
         notes = (
             *notes,
@@ -105,7 +101,7 @@ def reconstruct_judged(
         if can_carry and _moved(found, MOTION.doubt):
             took, moving = result.seconds, True
             del result
-            result = solved(readings, fitted, took, moving)
+            result = solved(fitted, took, moving)
     if moving:
         moved_px, share = (result.parameters[key] for key in ("moved_px", "seen_share"))
         notes = (
@@ -114,11 +110,12 @@ def reconstruct_judged(
             f"that of shot 1, to whose time {share:.0%} of the other shots are carried",
         )
         psi, read, shown, found = psi.of_shots([0]), read.of_first_shot(), shown[:1], None
-        seen = relief(psi, shown, typical, read.usable)
+        seen = relief(psi, shown, typical, read.frames.usable)
     elif found is not None and found.moved.any():
         took = result.seconds
         del result
-        result = solved(readings, fitted & ~found.moved, took)
+        at_rest = dataclasses.replace(fitted, usable=fitted.usable & ~found.moved)
+        result = solved(at_rest, took)
         read = dataclasses.replace(read, kept=read.kept & ~found.moved)
         notes = (
             *notes,
@@ -126,7 +123,7 @@ def reconstruct_judged(
             "than the others",
         )
     result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
-    verdict = verdict_from(gathered(psi, read, typical, result, seen, found))
+    verdict = verdict_from(gathered(psi, read, result, seen, found))
     psi.even_unseen_colours(result.light_field)
     return result, verdict
 
@@ -149,7 +146,9 @@ def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDA
     return {name.replace("disparity", "shift"): values for name, values in maps.items()}
 
 
-def _short(psi: ImagingMatrix, read: Read, result: Reconstruction) -> NDArray[np.bool_] | None:
+def _short(
+    psi: ImagingMatrix, read: FittedFrames, result: Reconstruction
+) -> NDArray[np.bool_] | None:
     """Return which saturated readings a light field falls short of; None where hardly any."""
     clipped = read.clipped
     if clipped.mean() <= FEWEST_SHORT:
@@ -159,20 +158,15 @@ def _short(psi: ImagingMatrix, read: Read, result: Reconstruction) -> NDArray[np
 
 
 def _as_fitted(
-    psi: ImagingMatrix,
-    frames: Array,
-    noise_sigma: float,
-    usable: NDArray[np.bool_] | None,
-    screening: bool,
-) -> tuple[Read, tuple[str, ...]]:
+    psi: ImagingMatrix, frames: Frames, screening: bool
+) -> tuple[FittedFrames, tuple[str, ...]]:
     """Return the frames as a method gets them, and what was done to them before, in words."""
-    fitted, usable = checked_inputs(psi, frames, noise_sigma, usable)
-    excluded = np.where(usable, 0, frames)
+    checked, excluded = checked_inputs(psi, frames), np.where(frames.usable, 0, frames.readings)
     if not screening:
-        return Read(fitted, usable, kept_readings(usable), excluded), ()
-    seen = screened(psi, fitted, usable)
+        return FittedFrames(checked, kept_readings(checked.usable), excluded), ()
+    seen = screened(psi, checked)
     left_out = tuple(sorted((*seen.dark, *seen.double)))
-    kept, bad = kept_readings(seen.usable), float(seen.bad.mean())
+    kept, bad = kept_readings(seen.frames.usable), float(seen.bad.mean())
     excluded = (excluded / seen.gains[:, None, None]).astype(excluded.dtype)
     gains = tuple(seen.gains.tolist())
-    return Read(seen.frames, seen.usable, kept, excluded, left_out, bad, gains=gains), seen.notes
+    return FittedFrames(seen.frames, kept, excluded, left_out, bad, gains=gains), seen.notes

@@ -33,7 +33,7 @@ def measured(
     if pinholes is None:
         pinholes = ALL_VIEWS if routes == EVERY else SOME_VIEWS
     sets = Photographer(bench).sets(pinholes=pinholes, turns=turns)
-    found = calibrate(camera, camera.psi(size).layout, routes, **sets)
+    found = calibrate(camera, camera.psi(size), routes, **sets)
     return found, {
         route: agreement(bench, one.psi.weights, one.deviation, found.good)
         for route, one in found.calibrations.items()

@@ -10,7 +10,6 @@ from whiteboard_bench import BenchTruth, WhiteboardBench
 
 from calibration.drift import (
     KINDS,
-    Captures,
     DriftSettings,
     displacement_px,
     drifted,
@@ -34,6 +33,7 @@ from calibration.placement import designed_placement
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
+from emmc_rig.model.frames import Frames
 from simulators.bench import MountingErrors
 from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, SensorFlaws
 
@@ -68,20 +68,21 @@ def captured(shots=1, seed=0, scene="deep-occlusions", sensor=PERFECT_SENSOR, ki
     usable = ~noise.saturated(frames)
     layout, k = psi_layout(camera, size), camera.sensor.binning
     colour = None if layout.colour is None else layout.colour[:, ::k, ::k]
-    return Captures(readings, noise.variance(readings, times, light), usable, colour), camera
+    deviation = np.sqrt(noise.variance(readings, times, light))
+    return Frames(readings, deviation, usable), colour, camera
 
 
 @cache
 def found_for(before, shots=1, settings=QUICK, gains=(), size=SIZE, **more):
     """Return the drift found when the calibration had the mask `before` where it now stands."""
-    taken, camera = captured(shots, size=size, **more)
+    taken, colour, camera = captured(shots, size=size, **more)
     readings = taken.readings.copy()
     for shot, gain in enumerate(gains):
         readings[shot] *= gain
     stages = [shot.offset_um.get("code", (0.0, 0.0)) for shot in camera.shots]
     mask = shadow_mask(camera, size)
     placement = drifted(placed(), -np.array(before))
-    return find_drift(replace(taken, readings=readings), mask, placement, stages, settings)
+    return find_drift(replace(taken, readings=readings), colour, mask, placement, stages, settings)
 
 
 def left_px(found, drift, size=SIZE):
@@ -169,9 +170,9 @@ def test_the_mended_psi_is_that_of_the_bench_as_it_stands():
     found = found_for(drift)
     design = build_imaging_matrix(CAMERA, SIZE)
     mask, stages = shadow_mask(CAMERA, SIZE), [(0.0, 0.0)]
-    exact = psi_at(Shadow(mask, placed()), design.layout, stages)
-    stale = psi_at(Shadow(mask, drifted(placed(), -np.array(drift))), design.layout, stages)
-    mended = psi_at(Shadow(mask, found.placement), design.layout, stages)
+    exact = psi_at(Shadow(mask, placed()), design, stages)
+    stale = psi_at(Shadow(mask, drifted(placed(), -np.array(drift))), design, stages)
+    mended = psi_at(Shadow(mask, found.placement), design, stages)
     assert mended.relative_difference(exact) < 0.1 * stale.relative_difference(exact)
 
 
@@ -255,9 +256,9 @@ def test_a_displacement_is_counted_in_pixels_of_the_shadow():
 
 
 def test_captures_without_light_or_usable_pixels_are_refused():
-    taken, camera = captured()
+    taken, colour, camera = captured()
     usable = taken.usable.copy()
     usable[:, ::3, ::3] = False
     mask, stages = shadow_mask(camera, SIZE), [(0.0, 0.0)]
     with pytest.raises(CalibrationError, match="blocks of 6 x 6 pixels are lit"):
-        find_drift(replace(taken, usable=usable), mask, placed(), stages, QUICK)
+        find_drift(replace(taken, usable=usable), colour, mask, placed(), stages, QUICK)

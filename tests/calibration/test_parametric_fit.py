@@ -90,9 +90,7 @@ def test_bad_pixels_are_found_and_left_out(bench, outcome):
 
 
 def test_one_frame_verifies_a_stage_position_that_was_never_calibrated(outcome, bench, design):
-    boards = as_readings(
-        bench.capture([Setting(stage_um=(133.0, -71.0))]), design.layout, outcome.good
-    )
+    boards = as_readings(bench.capture([Setting(stage_um=(133.0, -71.0))]), design, outcome.good)
     judged = judge("mixed", boards[0], predicted_by_shadow(outcome.mixed.shadow, boards[0]))
     assert judged.relative_error < 0.01
 
@@ -220,7 +218,7 @@ def test_a_mask_that_is_not_the_design_is_refused_with_the_correlation(design, b
             }
         }
     )
-    boards = as_readings(few, design.layout)
+    boards = as_readings(few, design)
     with pytest.raises(CalibrationError, match=r"not the mask of the design.*correlation is 0\.\d"):
         fit_placement(boards, other, shadow_mask(other, SIZE))
 
@@ -300,7 +298,7 @@ def test_deviations_of_psi_do_not_depend_on_the_bands_they_are_computed_in(desig
     found = []
     for pixels in (2**16, 130):
         monkeypatch.setattr("calibration.parametric.BAND_PIXELS", pixels)
-        found.append(psi_deviation(shadow, design.layout, shot_stages(CAMERA), covariance))
+        found.append(psi_deviation(shadow, design, shot_stages(CAMERA), covariance))
     assert found[0].min() > 0
     np.testing.assert_array_equal(*found)
 
@@ -346,11 +344,11 @@ def test_no_defects_are_found_on_a_clean_mask(design):
 def test_the_expected_error_of_psi_is_the_error_of_psi(design):
     mask = shadow_mask(CAMERA, SIZE)
     truth = replace(designed_placement(CAMERA), blur_um=3.0)
-    exact = psi_at(Shadow(mask, truth), design.layout, shot_stages(CAMERA))
+    exact = psi_at(Shadow(mask, truth), design, shot_stages(CAMERA))
     squares, expected = [], []
     for seed in range(4):
         fit = fit_placement(synthetic(design, truth, 0.03, seed), CAMERA, mask, start=truth)
-        psi = psi_at(Shadow(mask, fit.placement), design.layout, shot_stages(CAMERA))
+        psi = psi_at(Shadow(mask, fit.placement), design, shot_stages(CAMERA))
         squares.append(psi.relative_difference(exact) ** 2)
         matrix, power = psi_information(Shadow(mask, fit.placement))
         expected.append(np.trace(matrix @ fit.covariance) / power)
@@ -363,17 +361,17 @@ def test_frames_of_another_camera_are_refused(few, design):
         for one in few.frames
     ]
     with pytest.raises(CalibrationError, match="42 x 60 pixels, the camera has 44 x 60"):
-        as_readings(few.with_frames(cut), design.layout)
+        as_readings(few.with_frames(cut), design)
 
 
 def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
     dark = few.dark_at(few.frames[0].frame.exposure_s)
     off = BoardFrame.held(replace(few.frames[0].frame, mean_dn=dark.mean_dn), (0.0, 0.0))
     with pytest.raises(CalibrationError, match="is the lamp on, and the aperture open"):
-        as_readings(few.with_frames([off]), design.layout)
+        as_readings(few.with_frames([off]), design)
     red = BoardFrame.held(few.frames[0].frame, (0.0, 0.0), lamp="amber")
     with pytest.raises(CalibrationError, match="no reference whiteboard under that lamp"):
-        as_readings(few.with_frames([red]), design.layout)
+        as_readings(few.with_frames([red]), design)
     with pytest.raises(CalibrationError, match="no dark frame"):
         BoardSet((), few.references, few.frames)
     with pytest.raises(CalibrationError, match="no whiteboard with the mask in"):

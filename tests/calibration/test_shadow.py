@@ -53,7 +53,7 @@ def test_a_mask_that_sits_as_designed_casts_the_shadow_of_the_camera_model(cfa, 
     camera = camera_of(cfa, binning)
     design = build_imaging_matrix(camera, SIZE)
     shadow = Shadow(shadow_mask(camera, SIZE), sharp(camera))
-    found = psi_at(shadow, design.layout, shot_stages(camera))
+    found = psi_at(shadow, design, shot_stages(camera))
     # The shadow's edges are LEAST_BLUR_UM soft, and its tables are linear between their places.
     assert found.relative_difference(design) < 5e-4
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.frames import even_frames
 from emmc_rig.study.trial import Capture
 from reconstruction.method import Given
 
@@ -27,8 +28,8 @@ def test_the_method_reconstructs_with_its_own_settings():
     names = example("A method")
     (method,) = names["METHODS"]
     psi = build_imaging_matrix(find_camera("rgbw-mono"), (8, 8))
-    frames = np.full(psi.frames_shape, 0.2, dtype=np.float32)
-    given = Given(psi, frames, 0.01, None, None, None, None)
+    frames = even_frames(np.full(psi.frames_shape, 0.2, dtype=np.float32), 0.01)
+    given = Given(psi, frames, None, None)
 
     class Settings:
         def of(self, kind):

@@ -26,7 +26,7 @@ from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.child import read_in_child
-from emmc_rig.files.psi import SavedPsi, ShardedPsi, save_shards
+from emmc_rig.files.psi import StoredPsi, save_shards
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.sensing import ImagingMatrix
@@ -447,7 +447,7 @@ def test_a_psi_whose_camera_is_no_text_any_more_is_damaged(tmp_path):
     path = tmp_path / "psi.h5"
     psi.save(path)
     flipped_camera(path)
-    for read in (lambda: ImagingMatrix.load(path), SavedPsi(path).verify, SavedPsi(path).load):
+    for read in (lambda: ImagingMatrix.load(path), StoredPsi(path).verify, StoredPsi(path).load):
         with pytest.raises(SensingError, match=r"psi\.h5: damaged \(its checksum differs\)"):
             read()
 
@@ -459,7 +459,7 @@ def test_a_psi_in_shards_whose_camera_is_no_text_any_more_is_damaged(tmp_path):
     about = tmp_path / "psi.zarr/zarr.json"
     about.write_text(about.read_text().replace('\\"title', "\\ud800title", 1))
     with pytest.raises(SensingError, match=r"damaged \(its checksum differs\)"):
-        ShardedPsi(tmp_path / "psi.zarr").verify()
+        StoredPsi(tmp_path / "psi.zarr").verify()
 
 
 @pytest.mark.parametrize("change", [{"binning": 0}, {"weights": (2, 3)}])
@@ -472,7 +472,7 @@ def test_a_psi_of_another_shape_is_refused_when_it_is_opened(tmp_path, change):
         else:
             del file["weights"]
             file["weights"] = np.zeros(change["weights"])
-    for read in (ImagingMatrix.load, SavedPsi):
+    for read in (ImagingMatrix.load, StoredPsi):
         with pytest.raises(SensingError) as fault:
             read(path)
         assert "\n" not in str(fault.value)

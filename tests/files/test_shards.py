@@ -16,7 +16,7 @@ from emmc_rig.files import psi as psis
 from emmc_rig.files import shards
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.folders import result_folder
-from emmc_rig.files.psi import SavedPsi, read_frames
+from emmc_rig.files.psi import StoredPsi, read_frames
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.processing.reconstructing import open_frames, reconstruct_folder
 from reconstruction.methods import BlockSettings, MethodSettings
@@ -89,11 +89,11 @@ def test_a_missing_part_of_psi_is_one_line_and_others_are_read(frames, name, mon
     pytest.importorskip("zarr", reason="needs the extra `zarr`")
     monkeypatch.setattr(psis, "SHARD", 32)
     monkeypatch.setattr(psis, "CHUNK", 16)
-    psi = SavedPsi(frames / "psi.h5").load()
+    psi = StoredPsi(frames / "psi.h5").load()
     psis.save_shards(psi, frames / "psi.zarr")
     parts = sorted(part for part in (frames / "psi.zarr" / name / "c").rglob("*") if part.is_file())
     parts[-1].unlink()
-    saved = psis.open_psi(frames / "psi.zarr")
+    saved = psis.StoredPsi(frames / "psi.zarr")
     here = slice(0, 30), slice(0, 60)
     np.testing.assert_array_equal(saved.window(*here).weights, psi.window(*here).weights)
     code, _, err = program("reconstruct", frames, "--method", "tv", "--out", frames / "out")

@@ -16,7 +16,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.live.light_field import LiveLightField, disparity_of, live_scale
 from emmc_rig.model.errors import ModelError
-from emmc_rig.model.frames import Frames
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db, shifted
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.errors import ReconstructionError
@@ -82,7 +82,7 @@ def test_a_few_steps_give_views_nearer_than_the_copied_centre_view(name):
     scene = open_scene(name, size=(96, 128), views=camera.views).light_field
     psi = camera.psi((96, 128))
     frames = camera.expose(scene, 0, psi)
-    preview = Preview(psi, 4, frames.readings, frames.noise_sigma)
+    preview = Preview(psi, 4, even_frames(frames.readings, frames.noise_sigma))
     for _ in range(3):
         preview.follow(frames.readings, 3)
     true = small_views(scene, 4)
@@ -97,11 +97,11 @@ def test_frames_of_a_changed_scene_take_the_preview_along():
         open_scene("deep-occlusions", size=SIZE, views=camera.views, seed=seed).light_field
         for seed in (0, 1)
     )
-    preview = Preview(psi, 4, psi @ first, 0.002)
+    preview = Preview(psi, 4, even_frames(psi @ first, 0.002))
     preview.follow(psi @ first, 20)
     before = psnr_db(preview.light_field, small_views(second, 4))
     preview.follow(psi @ second, 20)
-    afresh = Preview(psi, 4, psi @ second, 0.002)
+    afresh = Preview(psi, 4, even_frames(psi @ second, 0.002))
     afresh.follow(psi @ second, 20)
     after = psnr_db(preview.light_field, small_views(second, 4))
     assert after > before + 3
@@ -211,7 +211,7 @@ def test_noise_is_no_change_and_a_changed_scene_ends_the_reconstruction(one_shot
     other = open_scene("deep-occlusions", size=SIZE, views=camera.views).light_field
     clock, given_up = Seconds(), []
 
-    def endless(method, psi, readings, noise, dictionary, settings, usable, on_step, film):
+    def endless(method, psi, frames, dictionary, settings, on_step, film):
         try:
             for step in range(10**6):
                 on_step(Progress(step, None, None))
@@ -297,9 +297,9 @@ class Solver:
         self.asked, self.before, self.left = [], [], 0
         self._ends = threading.Semaphore(0)
 
-    def __call__(self, method, psi, readings, noise, dictionary, settings, usable, on_step, film):
+    def __call__(self, method, psi, frames, dictionary, settings, on_step, film):
         self.before.append(film.known)
-        self.asked.append(readings)
+        self.asked.append(frames.readings)
         try:
             while not self._ends.acquire(timeout=0.005):
                 on_step(Progress(1, None, None))
@@ -486,10 +486,7 @@ def test_a_live_film_is_what_reconstruct_film_gives_of_its_frames_a_cut_included
         live.update(frame)
         until(lambda frame=frame: live.update(frame) and live._run is None)
         shown.append(live.refined())
-    film = (
-        Frames(readings, np.full(readings.shape, noise), usable)
-        for _, _, readings, noise, _, _, usable, *_ in given
-    )
+    film = (frames for _, _, frames, *_ in given)
     expected = list(emmc.reconstruct_film(psi, film, "adaptive-fast"))
     for (found, verdict), result in zip(shown, expected, strict=True):
         np.testing.assert_allclose(found.light_field, result.light_field, atol=1e-4)

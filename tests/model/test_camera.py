@@ -351,7 +351,7 @@ def test_a_mask_whose_shadow_diffraction_blurs_is_warned_about():
 def test_the_layout_of_psi_is_that_of_the_psi_built(cfa, binning):
     camera = Camera.model_validate({"title": "x", "sensor": {"cfa": cfa, "binning": binning}})
     layout, built = psi_layout(camera, (24, 36)), build_imaging_matrix(camera, (24, 36))
-    assert layout.shape == built.weights.shape
+    assert layout.weights_shape == built.weights.shape
     assert layout.frames_shape == built.frames_shape
     assert (layout.colour is None) == (built.colour is None)
     if built.colour is not None:

@@ -10,6 +10,7 @@ from scipy.stats import multivariate_t
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import OPPONENT, centre_view, psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.trial import Capture, trial_of
@@ -37,7 +38,7 @@ from reconstruction.adaptive.search import (
     variance_per_pixel,
 )
 from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Readings, checked, surveyed
+from reconstruction.adaptive.survey import checked, surveyed
 from reconstruction.adaptive.sweep import plane_frames, swept
 from reconstruction.adaptive.uncertainty import (
     FEATURES,
@@ -48,7 +49,7 @@ from reconstruction.adaptive.uncertainty import (
 )
 from reconstruction.adaptive.visibility import carried
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings, reconstruct
+from reconstruction.inputs import Readings
 from reconstruction.tv import reconstruct_tv
 
 
@@ -288,7 +289,7 @@ def planted(bayer):
     sigma = 0.004
     noise = np.random.default_rng(5).normal(0, sigma, bayer.frames_shape)
     frames = (bayer.forward(truth.astype(np.float32)) + noise).astype(np.float32)
-    return truth, frames, sigma, reconstruct_adaptive(bayer, frames, sigma)
+    return truth, frames, sigma, reconstruct_adaptive(bayer, even_frames(frames, sigma))
 
 
 def test_a_planted_plane_is_recovered_with_its_disparity(bayer, planted):
@@ -297,7 +298,7 @@ def test_a_planted_plane_is_recovered_with_its_disparity(bayer, planted):
     inner = found.maps["disparity"][6:-6, 26:-6]
     assert np.median(inner) == pytest.approx(0.7, abs=0.08)
     assert np.mean(np.abs(inner - 0.7) < 0.2) > 0.9
-    rival = reconstruct_tv(bayer, frames, sigma).light_field
+    rival = reconstruct_tv(bayer, even_frames(frames, sigma)).light_field
     assert psnr_db(found.light_field, truth) > psnr_db(rival, truth) + 3
 
 
@@ -365,7 +366,7 @@ def test_a_mask_that_treats_all_views_alike_decides_nothing():
     weights[:, 1, 1] = 1 / 3
     pinhole = ImagingMatrix(weights, psi.colour)
     truth, _ = plane_scene(pinhole, 0.0, seed=1)
-    found = reconstruct_adaptive(pinhole, pinhole.forward(truth), 0.003, quick())
+    found = reconstruct_adaptive(pinhole, even_frames(pinhole.forward(truth), 0.003), quick())
     assert found.parameters["decided"] < 0.25
 
 
@@ -493,8 +494,8 @@ def test_where_surfaces_fail_total_variation_is_returned(camera):
     # Views with nothing in common: no disparity explains them.
     views = rng.random((*psi.light_field_shape[:2], 6, 7, 3)).repeat(8, axis=2).repeat(8, axis=3)
     frames = psi.forward(views.astype(np.float32))
-    found = reconstruct_adaptive(psi, frames, 0.003, quick())
-    plain = reconstruct_tv(psi, frames, 0.003).light_field
+    found = reconstruct_adaptive(psi, even_frames(frames, 0.003), quick())
+    plain = reconstruct_tv(psi, even_frames(frames, 0.003)).light_field
     assert np.median(np.abs(found.light_field - plain).mean(axis=(0, 1, 4))) < 0.05
     error = float(np.square(found.light_field - views).mean())
     assert 0.15 * error < np.square(found.maps["sigma"]).mean() < 2.5 * error
@@ -504,8 +505,8 @@ def test_surfaces_stay_where_nothing_speaks_against_them():
     psi = build_imaging_matrix(find_camera("rgbw-bayer-2shots"), (48, 56))
     truth = plane_scene(psi, 0.7)[0].astype(np.float32)
     frames = psi.forward(truth)
-    found = reconstruct_adaptive(psi, frames, 0.003, quick())
-    plain = reconstruct_tv(psi, frames, 0.003).light_field
+    found = reconstruct_adaptive(psi, even_frames(frames, 0.003), quick())
+    plain = reconstruct_tv(psi, even_frames(frames, 0.003)).light_field
     assert psnr_db(found.light_field, truth) > psnr_db(plain, truth) + 3
 
 
@@ -538,7 +539,7 @@ def test_a_scene_of_little_contrast_is_fitted_as_if_it_had_more(bayer, planted):
     _, frames, sigma, _ = planted
     scales = []
     for share in (0.1, 0.2, 3.0):
-        given = checked(bayer, (share * frames).astype(np.float32), share * sigma, None)
+        given = checked(bayer, even_frames((share * frames).astype(np.float32), share * sigma))
         scales.append(surveyed(given, quick(), None, lambda _: None).scale)
     assert scales[0] < 0.5
     assert scales[1] == pytest.approx(2 * scales[0], rel=1e-3)
@@ -551,40 +552,35 @@ def test_every_reading_counts_by_its_own_noise(bayer):
     deviation = np.full(bayer.frames_shape, 0.003)
     deviation[:, ::3, ::2] = 0.1
     frames = bayer.forward(truth.astype(np.float32)) + rng.normal(0, deviation)
-    frames = frames.astype(np.float32)
-    typical = float(np.sqrt(np.mean(np.square(deviation))))
-    settings = MethodSettings(adaptive=quick())
+    each = Frames(frames.astype(np.float32), deviation, np.ones(frames.shape, bool))
     errors = [
-        float(np.square(found.light_field - truth).mean())
-        for noise in (deviation, typical)
-        for found in [reconstruct("adaptive", bayer, frames, noise, settings=settings)]
+        float(np.square(reconstruct_adaptive(bayer, given, quick()).light_field - truth).mean())
+        for given in (each, each.of_one_deviation())
     ]
     assert errors[0] < 0.5 * errors[1]
-    each, one = (
-        reconstruct("tv", bayer, frames, noise).light_field for noise in (deviation, typical)
+    by_each, by_one = (
+        reconstruct_tv(bayer, given).light_field for given in (each, each.of_one_deviation())
     )
-    np.testing.assert_allclose(each, one, atol=1e-5)
+    np.testing.assert_allclose(by_each, by_one, atol=1e-5)
 
 
-def test_noise_levels_that_do_not_fit_are_refused_in_one_line(bayer):
-    frames = np.zeros(bayer.frames_shape, np.float32)
-    with pytest.raises(ReconstructionError, match="noise levels of shape"):
-        reconstruct_adaptive(bayer, frames, np.ones((1, 4, 4)))
+def test_a_noise_level_that_is_none_is_refused_in_one_line(bayer):
+    frames = even_frames(np.zeros(bayer.frames_shape, np.float32), 0.01)
     wrong = np.full(bayer.frames_shape, 0.01)
     wrong[0, 0, 0] = np.nan
-    with pytest.raises(ReconstructionError, match="negative or not finite"):
-        reconstruct_adaptive(bayer, frames, wrong)
+    with pytest.raises(ReconstructionError, match="a noise level of nan"):
+        reconstruct_adaptive(bayer, replace(frames, deviation=wrong))
 
 
 def test_bad_inputs_are_refused_in_one_line(bayer):
     with pytest.raises(ReconstructionError, match="frames of shape"):
-        reconstruct_adaptive(bayer, np.zeros((1, 4, 4), np.float32), 0.01)
+        reconstruct_adaptive(bayer, even_frames(np.zeros((1, 4, 4), np.float32), 0.01))
     dark, small = np.zeros(bayer.frames_shape, np.float32), np.zeros((4, 4), np.float32)
     with pytest.raises(ReconstructionError, match="a disparity of shape"):
-        reconstruct_adaptive(bayer, dark, 0.01, disparity=small)
+        reconstruct_adaptive(bayer, even_frames(dark, 0.01), disparity=small)
     tiny = bayer.window(slice(0, 4), slice(0, 4))
     with pytest.raises(ReconstructionError, match="do not fit a sensor"):
-        reconstruct_adaptive(tiny, np.zeros((1, 4, 4), np.float32), 0.01)
+        reconstruct_adaptive(tiny, even_frames(np.zeros((1, 4, 4), np.float32), 0.01))
 
 
 def test_a_pixel_is_kept_from_the_fit_with_all_its_shots_or_not_at_all():

@@ -9,7 +9,6 @@ from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.study.trial import Capture, trial_of
 from reconstruction.choices import smooth_guess
 from reconstruction.colour import chroma_of, coloured, unseen_colour
-from reconstruction.flat import flat_psi
 
 SIZE = (48, 64)
 
@@ -44,11 +43,11 @@ def test_pixels_that_are_not_usable_do_not_count(one_shot):
 
 def test_grey_masks_show_no_colour_and_all_of_it_is_left_to_chance():
     psi = build_imaging_matrix(find_camera("coded-aperture-random"), SIZE)
-    flat, usable = flat_psi(psi), everywhere(psi)
+    usable = everywhere(psi)
     frames = even(psi, (0.6, 0.3, 0.2))
     picture = smooth_guess(psi, frames, usable)
     assert np.ptp(picture, axis=-1).max() < 1e-3
-    unseen = unseen_colour(flat, frames, usable, picture) / np.square(picture.mean(axis=-1))
+    unseen = unseen_colour(psi, frames, usable, picture) / np.square(picture.mean(axis=-1))
     # What is presumed: two chrominances of deviation 0.1, and two finer ones of 0.07.
     np.testing.assert_allclose(unseen, 2 * (0.1**2 + 0.07**2), rtol=0.01)
 
@@ -56,16 +55,15 @@ def test_grey_masks_show_no_colour_and_all_of_it_is_left_to_chance():
 def test_colour_filters_leave_no_colour_unseen():
     psi = build_imaging_matrix(find_camera("scenario-ii-cfa"), SIZE)
     frames, usable = even(psi, (0.6, 0.3, 0.2)), everywhere(psi)
-    assert not unseen_colour(flat_psi(psi), frames, usable, np.full((*SIZE, 3), 0.4)).any()
+    assert not unseen_colour(psi, frames, usable, np.full((*SIZE, 3), 0.4)).any()
 
 
 def test_more_shots_leave_less_colour_unseen():
     def unseen(shots):
         camera = find_camera("scenario-iii-mono").with_shots(shots)
         given = trial_of(Capture("deep-occlusions", camera, SIZE, zoom=3))
-        flat = flat_psi(given.psi)
-        picture = smooth_guess(flat, given.readings, given.usable)
-        return unseen_colour(flat, given.readings, given.usable, picture).mean()
+        picture = smooth_guess(given.psi, given.readings, given.usable)
+        return unseen_colour(given.psi, given.readings, given.usable, picture).mean()
 
     assert unseen(3) < 0.5 * unseen(1)
 
@@ -73,19 +71,21 @@ def test_more_shots_leave_less_colour_unseen():
 @pytest.mark.parametrize("scene", ["deep-occlusions", "near-planar"])
 def test_the_deviation_of_colours_is_that_of_their_error(scene):
     given = trial_of(Capture(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
-    flat, truth = flat_psi(given.psi), given.truth @ OPPONENT[1:].T
-    picture = smooth_guess(flat, given.readings, given.usable)
+    truth = given.truth @ OPPONENT[1:].T
+    picture = smooth_guess(given.psi, given.readings, given.usable)
     error = np.square(picture @ OPPONENT[1:].T - truth).sum(axis=-1).mean() / 3
-    stated = unseen_colour(flat, given.readings, given.usable, picture).mean()
+    stated = unseen_colour(given.psi, given.readings, given.usable, picture).mean()
     assert 0.4 < stated / error < 2.5
 
 
 def test_coloured_light_fields_are_seen_better_than_grey_ones():
     given = trial_of(Capture("deep-occlusions", find_camera("scenario-iii-mono"), SIZE, zoom=3))
-    flat, usable = flat_psi(given.psi), given.usable
-    picture = smooth_guess(flat, given.readings, usable)
+    usable = given.usable
+    picture = smooth_guess(given.psi, given.readings, usable)
     grey = np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1)
-    np.testing.assert_allclose(coloured(flat, given.readings, usable, grey), picture, atol=0.01)
+    np.testing.assert_allclose(
+        coloured(given.psi, given.readings, usable, grey), picture, atol=0.01
+    )
     truth = given.truth.mean(axis=(0, 1))
     assert np.square(picture - truth).mean() < 0.8 * np.square(grey - truth).mean()
 
@@ -94,8 +94,6 @@ def test_binned_pixels_tell_colours_too():
     camera = find_camera("scenario-iii-mono")
     sensor = camera.sensor.model_copy(update={"binning": 2})
     psi = build_imaging_matrix(camera.model_copy(update={"sensor": sensor}), SIZE)
-    found = chroma_of(
-        flat_psi(psi), even(psi, (0.6, 0.3, 0.2)), everywhere(psi), np.full((*SIZE, 3), 0.3667)
-    )
+    found = chroma_of(psi, even(psi, (0.6, 0.3, 0.2)), everywhere(psi), np.full((*SIZE, 3), 0.3667))
     expected = (OPPONENT[1:] @ (0.6, 0.3, 0.2)) / (OPPONENT[0] @ (0.6, 0.3, 0.2))
     np.testing.assert_allclose(found.value.mean(axis=(0, 1)), expected, atol=0.02)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from planes import plane_scene
 
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive import method
 from reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
@@ -101,10 +102,10 @@ def test_edges_do_not_spoil_what_is_beside_them(camera_psi, monkeypatch):
     dark = darkened(light_field)
     frames = noisy(camera_psi, dark)
     settings = AdaptiveSettings(texture=TextureSettings(steps=6), patches=None)
-    aware = reconstruct_adaptive(camera_psi, frames, SIGMA, settings)
+    aware = reconstruct_adaptive(camera_psi, even_frames(frames, SIGMA), settings)
     assert aware.parameters["dark_edge_px"] == 2
     monkeypatch.setattr(method, "dark_edges", lambda *_: None)
-    unaware = reconstruct_adaptive(camera_psi, frames, SIGMA, settings)
+    unaware = reconstruct_adaptive(camera_psi, even_frames(frames, SIGMA), settings)
     assert "dark_edge_px" not in unaware.parameters
     assert psnr_db(aware.light_field, dark) > psnr_db(unaware.light_field, dark) + 2
     beside = np.s_[:, :, :-4, 4:12]

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive.film import Film
 from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
 from reconstruction.adaptive.joint import surfaces_of
-from reconstruction.adaptive.survey import Readings
 from reconstruction.adaptive.times import OtherTime
 from reconstruction.errors import ReconstructionError
+from reconstruction.inputs import Readings
 from reconstruction.methods import reconstruct
 from simulators.scenes import render
 
@@ -44,7 +45,7 @@ def followed(psi):
     for frame in range(4):
         truth = _sliding(frame)
         shown = _readings(psi, truth, frame)
-        given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+        given = "adaptive", psi, shown
         result = reconstruct(*given, film=film)
         film = result.film
         out.append((truth, result, reconstruct(*given)))
@@ -100,7 +101,7 @@ def test_a_film_goes_on_where_disparities_shrank_as_they_were_fitted(psi, monkey
         return after(film, plain, replace(scene, centre=0 * scene.centre), *more)
 
     monkeypatch.setattr(Film, "after", shrunk)
-    given = psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    given = psi, shown
     known = reconstruct("adaptive-fast", *given, film=Film()).film.known
     assert known.texture.shape[1:] == known.centre.shape
     assert known.centre.shape == tuple(length + 2 * known.margin for length in SIZE)
@@ -120,7 +121,7 @@ def _last_psnr_db(psi, followed, of_earlier):
     film = followed[-2][1].film
     known = replace(film.known, earlier=tuple(of_earlier(one) for one in film.known.earlier))
     shown = _readings(psi, followed[-1][0], len(followed) - 1)
-    given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    given = "adaptive", psi, shown
     result = reconstruct(*given, film=replace(film, known=known))
     return psnr_db(result.light_field, followed[-1][0])
 
@@ -163,7 +164,7 @@ def test_the_psnr_mostly_lies_in_the_interval_stated(followed):
 
 def test_after_a_cut_a_frame_is_a_first_one(psi, followed):
     shown = _readings(psi, _sliding(0, scene="near-planar"), 9)
-    given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    given = "adaptive", psi, shown
     result = reconstruct(*given, film=followed[-1][1].film)
     assert "new_share" not in result.parameters
     assert np.array_equal(result.light_field, reconstruct(*given).light_field)
@@ -174,7 +175,7 @@ def test_a_frame_that_earlier_ones_mislead_is_a_first_one(psi, followed):
     film = followed[-2][1].film
     easier = replace(film, known=replace(film.known, missed=0.5 * film.known.missed))
     shown = _readings(psi, truth, len(followed) - 1)
-    given = "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    given = "adaptive", psi, shown
     found = reconstruct(*given, film=easier)
     assert "new_share" in result.parameters
     assert "new_share" not in found.parameters
@@ -186,8 +187,7 @@ def test_what_rests_has_no_flow(psi):
     film = Film()
     for seed in (1, 2):
         shown = _readings(psi, _sliding(0), seed)
-        given = "adaptive-fast", psi, shown.readings, shown.noise_sigma
-        result = reconstruct(*given, usable=shown.usable, film=film)
+        result = reconstruct("adaptive-fast", psi, shown, film=film)
         film = result.film
     assert result.parameters["flow_px"] < 0.1
     assert result.parameters["still_share"] > 0.95
@@ -199,8 +199,7 @@ def test_nothing_drifts_where_the_scene_rests(psi):
     moved[:, :, 36:42, 50:56] = 1 - truth[:, :, 36:42, 50:56]
     for frame, seen in enumerate((truth, truth, truth, moved)):
         shown = _readings(psi, seen, frame)
-        given = "adaptive-fast", psi, shown.readings, shown.noise_sigma
-        film = reconstruct(*given, usable=shown.usable, film=film).film
+        film = reconstruct("adaptive-fast", psi, shown, film=film).film
         found.append(film.known)
     first, second, third, last = found
     still = np.s_[:, :, :20, :24]
@@ -224,8 +223,7 @@ def test_of_a_camera_that_moves_slowly_frames_follow_from_the_same_one(psi):
     for seed, px in enumerate((0, 0.15, 0.6)):
         moved = px * _sliding(1, (0, 1)) + (1 - px) * _sliding(0)
         shown = _readings(psi, moved, seed)
-        given = "adaptive-fast", psi, shown.readings, shown.noise_sigma
-        result = reconstruct(*given, usable=shown.usable, film=film)
+        result = reconstruct("adaptive-fast", psi, shown, film=film)
         film = result.film
         known.append(film.known)
     assert known[1] is known[0]
@@ -238,7 +236,7 @@ def test_a_film_of_another_size_is_refused(psi, followed):
     small = build_imaging_matrix(CAMERA, (40, 48))
     frames = np.full(small.frames_shape, 0.2, np.float32)
     with pytest.raises(ReconstructionError, match="48x64 samples, this Psi is of 40x48"):
-        reconstruct("adaptive", small, frames, 0.01, film=followed[0][1].film)
+        reconstruct("adaptive", small, even_frames(frames, 0.01), film=followed[0][1].film)
 
 
 def test_a_method_that_takes_no_films_says_which_do(psi):
@@ -246,4 +244,4 @@ def test_a_method_that_takes_no_films_says_which_do(psi):
     with pytest.raises(
         ReconstructionError, match="'tv' takes no films: --method one of adaptive, adaptive-fast"
     ):
-        reconstruct("tv", psi, frames, 0.01, film=Film())
+        reconstruct("tv", psi, even_frames(frames, 0.01), film=Film())

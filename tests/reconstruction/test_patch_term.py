@@ -5,6 +5,7 @@ import pytest
 from scipy import sparse
 from variation import from_patches
 
+from emmc_rig.model.frames import even_frames
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 SHAPE = (2, 3, 7, 9, 3)
@@ -89,10 +90,10 @@ def test_a_large_rho_gives_the_patches_and_none_ignores_them(coded_psi):
     truth = 0.2 + 0.5 * np.random.default_rng(0).random(psi.light_field_shape)
     frames = psi.forward(truth)
     term = from_patches([(0, 0)], [truth], None, truth.shape)
-    near = reconstruct_tv(psi, frames, 0.01, TVSettings(rho=1e4), patch_term=term)
+    near = reconstruct_tv(psi, even_frames(frames, 0.01), TVSettings(rho=1e4), patch_term=term)
     np.testing.assert_allclose(near.light_field, truth, atol=1e-3)
-    ignored = reconstruct_tv(psi, frames, 0.01, TVSettings(rho=0), patch_term=term)
-    alone = reconstruct_tv(psi, frames, 0.01)
+    ignored = reconstruct_tv(psi, even_frames(frames, 0.01), TVSettings(rho=0), patch_term=term)
+    alone = reconstruct_tv(psi, even_frames(frames, 0.01))
     np.testing.assert_array_equal(ignored.light_field, alone.light_field)
     assert (near.method, ignored.method) == ("tv-patch", "tv")
 
@@ -104,6 +105,6 @@ def test_a_light_field_that_explains_everything_stays(coded_psi):
         grey = np.full(psi.light_field_shape, 0.4, np.float32)
         term = from_patches([(0, 0)], [grey], None, grey.shape)
         settings = TVSettings(order=order, mu=1e-3, max_steps=20)
-        found = reconstruct_tv(psi, psi.forward(grey), 0.01, settings, patch_term=term)
+        found = reconstruct_tv(psi, even_frames(psi.forward(grey), 0.01), settings, patch_term=term)
         np.testing.assert_allclose(found.light_field, 0.4, atol=1e-5)
         assert found.method == ("tv-patch", "dv2-patch", "dv3-patch")[order - 1]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture
-from reconstruction.flat import flat_psi
 from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.screening import bad_pixels, neighbour_range, screened
 
@@ -22,7 +22,7 @@ def made(name, strength, camera=CAMERA, scene="near-planar"):
 
 
 def screen(one):
-    return screened(one.psi, one.readings, one.usable)
+    return screened(one.psi, one.frames)
 
 
 def test_the_range_of_neighbours_is_that_of_numpy():
@@ -48,20 +48,20 @@ def test_the_range_of_neighbours_is_that_of_numpy():
 @pytest.mark.parametrize("binning", [1, 2])
 def test_a_picture_in_all_views_is_seen_as_psi_sees_it(random_psi, stored, binning):
     psi = random_psi(shots=2, stored=stored, binning=binning)
-    flat, rng = flat_psi(psi), np.random.default_rng(1)
+    rng = np.random.default_rng(1)
     picture = rng.random((*psi.size, 3), dtype=np.float32)
     everywhere = np.ascontiguousarray(np.broadcast_to(picture, psi.light_field_shape))
-    assert flat.forward(picture) == pytest.approx(psi.forward(everywhere), rel=1e-5)
+    assert psi.forward_picture(picture) == pytest.approx(psi.forward(everywhere), rel=1e-5)
     frames = rng.random(psi.frames_shape, dtype=np.float32)
     summed = psi.adjoint(frames).sum(axis=(0, 1))
-    assert flat.adjoint(frames) == pytest.approx(summed, rel=1e-4, abs=1e-5)
+    assert psi.adjoint_picture(frames) == pytest.approx(summed, rel=1e-4, abs=1e-5)
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "rgbw-mono"])
 def test_good_frames_pass_as_they_are(camera):
     one = made("bad-pixels", 0, find_camera(camera))
     seen = screen(one)
-    assert seen.frames is one.readings
+    assert seen.frames.readings is one.readings
     assert not seen.dark
     assert not seen.double
     assert (seen.gains == 1).all()
@@ -74,8 +74,8 @@ def test_dark_and_double_shots_are_left_out(count):
     for name, kind in (("missing-shot", "dark"), ("repeated-shot", "double")):
         seen = screen(made(name, count))
         assert getattr(seen, kind) == last
-        assert not seen.usable[list(last)].any()
-        assert seen.usable[0].mean() > 0.99
+        assert not seen.frames.usable[list(last)].any()
+        assert seen.frames.usable[0].mean() > 0.99
         assert seen.notes[0].startswith("excluded shot")
 
 
@@ -96,7 +96,7 @@ def test_flicker_is_measured_and_evened(percent):
     seen = screen(one)
     real = one.readings.mean(axis=(1, 2)) / made("flicker", 0).readings.mean(axis=(1, 2))
     assert seen.gains == pytest.approx(real / np.median(real), rel=0.01)
-    assert seen.frames == pytest.approx(one.readings / seen.gains[:, None, None], rel=1e-5)
+    assert seen.frames.readings == pytest.approx(one.readings / seen.gains[:, None, None], rel=1e-5)
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "scenario-ii-cfa"])
@@ -107,7 +107,7 @@ def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
     bad = ~reported.usable[0]
     # A dead pixel in the shade, or one that hardly glows, does no harm.
     harmful = np.abs(one.readings - one.psi.forward(one.truth)).mean(axis=0) > 0.1
-    found = bad_pixels(flat_psi(one.psi), one.readings, one.usable)
+    found = bad_pixels(one.psi, one.readings, one.usable)
     assert harmful[bad].mean() > 0.5
     assert found[bad & harmful].mean() > 0.7
     assert found[~bad].mean() < 0.05
@@ -115,7 +115,7 @@ def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
 
 def test_pixels_that_are_known_to_be_bad_do_not_spoil_their_neighbours():
     reported = made("masked-pixels", 10)
-    found = bad_pixels(flat_psi(reported.psi), reported.readings, reported.usable)
+    found = bad_pixels(reported.psi, reported.readings, reported.usable)
     assert not found[~reported.usable[0]].any()
     assert found[reported.usable[0]].mean() < 0.01
 
@@ -134,7 +134,9 @@ def test_screening_mends_what_would_break_a_method(name, strength, least_db):
     reported, levels = [], []
     for screening in (True, False):
         settings = MethodSettings(screening=screening)
-        result = reconstruct("tv", one.psi, one.readings, one.noise_sigma, None, settings)
+        result = reconstruct(
+            "tv", one.psi, even_frames(one.readings, one.noise_sigma), None, settings
+        )
         levels.append(psnr_db(result.light_field, one.truth))
         reported.append(result.screening)
     assert levels[0] > levels[1] + least_db
@@ -149,7 +151,11 @@ def test_screening_costs_good_frames_next_to_nothing(method):
     levels = [
         psnr_db(
             reconstruct(
-                method, one.psi, one.readings, one.noise_sigma, None, MethodSettings(screening=on)
+                method,
+                one.psi,
+                even_frames(one.readings, one.noise_sigma),
+                None,
+                MethodSettings(screening=on),
             ).light_field,
             one.truth,
         )
@@ -166,36 +172,38 @@ def test_nothing_is_found_where_nothing_is_to_be_seen():
 
 def test_shots_so_dim_that_most_pixels_read_nothing_tell_no_gain():
     seen = screen(made("exposure", 5, scene="deep-occlusions"))
-    assert np.isfinite(seen.frames).all()
+    assert np.isfinite(seen.frames.readings).all()
     assert (seen.gains == 1).all()
 
 
 def test_a_glint_behind_masks_that_differ_is_no_hot_pixel():
     one = made(None, 0.0)
-    plain = bad_pixels(flat_psi(one.psi), one.readings, one.usable)
+    plain = bad_pixels(one.psi, one.readings, one.usable)
     glint, hot = (20, 30), (30, 20)
     assert not plain[glint]
     assert not plain[hot]
     frames = one.readings.copy()
     frames[(slice(None), *glint)] *= 8
     frames[(slice(None), *hot)] += 0.5
-    found = bad_pixels(flat_psi(one.psi), frames, one.usable)
+    found = bad_pixels(one.psi, frames, one.usable)
     assert not found[glint]
     assert found[hot]
     alone = one.usable.copy()
     alone[1:] = False
-    assert bad_pixels(flat_psi(one.psi), frames, alone)[glint], "one shot cannot tell"
+    assert bad_pixels(one.psi, frames, alone)[glint], "one shot cannot tell"
 
 
 def test_dark_outermost_lines_are_an_edge_of_the_light_field_and_no_dead_lines():
     one = made("bad-pixels", 0, find_camera("rgbw-bayer-1shot"))
     frames = one.readings.copy()
     frames[:, -1] = frames[:, :, :2] = 0.01 * frames.mean()
-    assert not screened(one.psi, frames, one.usable).lines.any()
+    assert not screened(one.psi, even_frames(frames, 0.0, one.usable)).lines.any()
     frames[:, :, -1] = 2 * frames.mean()
     stuck = np.zeros(SIZE, bool)
     stuck[:, -1] = True
-    np.testing.assert_array_equal(screened(one.psi, frames, one.usable).lines, stuck)
+    np.testing.assert_array_equal(
+        screened(one.psi, even_frames(frames, 0.0, one.usable)).lines, stuck
+    )
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-mono", "conventional"])
@@ -207,11 +215,11 @@ def test_dead_lines_are_left_out_though_their_neighbours_are_dead_as_well(camera
     frames, dead = one.readings.copy(), np.zeros(SIZE, bool)
     dead[:, 20:22] = dead[31] = True
     frames[:, dead] = stuck + response * frames[:, dead]
-    found = screened(one.psi, frames, one.usable)
+    found = screened(one.psi, even_frames(frames, 0.0, one.usable))
     np.testing.assert_array_equal(found.lines, dead)
-    assert not found.usable[:, dead].any()
+    assert not found.frames.usable[:, dead].any()
     assert any("rows 31 and columns 20, 21" in note for note in found.notes)
     # Said to be unusable they are not looked for, nor are the lines beside them blamed.
-    listed = screened(one.psi, frames, one.usable & ~dead)
+    listed = screened(one.psi, even_frames(frames, 0.0, one.usable & ~dead))
     assert not listed.lines.any()
-    np.testing.assert_array_equal(listed.usable, found.usable)
+    np.testing.assert_array_equal(listed.frames.usable, found.frames.usable)

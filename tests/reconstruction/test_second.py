@@ -9,6 +9,7 @@ import pytest
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.frames import even_frames
 from emmc_rig.study.trial import Capture, trial_of
 from reconstruction.adaptive import fits, method, second
 from reconstruction.adaptive.method import reconstruct_adaptive
@@ -25,7 +26,7 @@ def survey():
     """What is decided of frames without texture; its beliefs are set by the tests."""
     psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), SIZE)
     frames = psi.forward(np.full(psi.light_field_shape, 0.5, np.float32))
-    return surveyed(checked(psi, frames, 0.003, None), fast(AdaptiveSettings()), None, print)
+    return surveyed(checked(psi, even_frames(frames, 0.003)), fast(AdaptiveSettings()), None, print)
 
 
 def believing(survey, disparity, share=1.0):
@@ -96,7 +97,7 @@ def test_a_second_search_gains_where_disparities_are_wide(monkeypatch):
     trial = trial_of(Capture(dice, "scenario-ii-cfa", (64, 80), 0, 1, 3, noise=0.0005))
 
     def psnr_db():
-        found = reconstruct_adaptive(trial.psi, trial.readings, trial.noise_sigma)
+        found = reconstruct_adaptive(trial.psi, even_frames(trial.readings, trial.noise_sigma))
         return trial.psnr_db(found.light_field)
 
     again = psnr_db()
@@ -109,7 +110,9 @@ def test_a_known_disparity_is_not_searched_again(monkeypatch, known):
     trial, asked = wide_trial(1), []
     monkeypatch.setattr(method, "searched_again", lambda *_: asked.append(1))
     disparity = np.full(trial.psi.size, 3.0, np.float32) if known else None
-    reconstruct_adaptive(trial.psi, trial.readings, trial.noise_sigma, QUICK, disparity=disparity)
+    reconstruct_adaptive(
+        trial.psi, even_frames(trial.readings, trial.noise_sigma), QUICK, disparity=disparity
+    )
     assert bool(asked) != known
 
 
@@ -124,8 +127,7 @@ def test_one_shot_asks_for_patches_where_surfaces_fail(monkeypatch, fail):
     monkeypatch.setattr(fits, "surfaces_fail", lambda *_: fail)
     reconstruct_adaptive(
         trial.psi,
-        trial.readings,
-        trial.noise_sigma,
+        even_frames(trial.readings, trial.noise_sigma),
         fast(AdaptiveSettings()).model_copy(update={"patches": 2}),
         patches=patches,
     )

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.bpdn import BPDNSettings
@@ -58,7 +59,9 @@ def settings(method: Any = "lars", **more: Any):
 def test_patches_of_few_atoms_come_back(random_psi, scene, method, shots, stored):
     dictionary, truth = scene
     psi = random_psi(shots, VIEWS, truth.shape[2:4], stored)
-    result = reconstruct_sparse(psi, psi.forward(truth), 0.0, dictionary, settings(method))
+    result = reconstruct_sparse(
+        psi, even_frames(psi.forward(truth), 0.0), dictionary, settings(method)
+    )
     assert psnr_db(result.light_field, truth) > 40
     assert result.status == "converged"
     assert result.parameters["patches"] == 20
@@ -74,7 +77,9 @@ def test_favoured_flat_atoms_keep_the_colour_of_an_even_scene(random_psi):
         chosen = SparseSettings(
             stride=6, flat_favour=favour, solver=BPDNSettings(method="lars", smallest_penalty=0.05)
         )
-        found = reconstruct_sparse(psi, psi.forward(truth), 0.0, dictionary, chosen).light_field
+        found = reconstruct_sparse(
+            psi, even_frames(psi.forward(truth), 0.0), dictionary, chosen
+        ).light_field
         losses.append(np.abs(found.mean(axis=(0, 1, 2, 3)) - [0.8, 0.5, 0.2]).max())
     assert losses[1] < 0.3 * losses[0]
 
@@ -82,7 +87,7 @@ def test_favoured_flat_atoms_keep_the_colour_of_an_even_scene(random_psi):
 def test_pixels_that_sum_samples_are_resolved(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(4, VIEWS, truth.shape[2:4], stored=1, binning=2)
-    result = reconstruct_sparse(psi, psi.forward(truth), 0.0, dictionary, settings())
+    result = reconstruct_sparse(psi, even_frames(psi.forward(truth), 0.0), dictionary, settings())
     assert psnr_db(result.light_field, truth) > 40
 
 
@@ -91,9 +96,9 @@ def test_saturated_pixels_are_left_out_whatever_they_read(random_psi, scene):
     psi = random_psi(2, VIEWS, truth.shape[2:4])
     frames = psi.forward(truth)
     usable = np.random.default_rng(0).uniform(size=frames.shape) > 0.15
-    clean = reconstruct_sparse(psi, frames, 0.0, dictionary, settings(), usable)
+    clean = reconstruct_sparse(psi, even_frames(frames, 0.0, usable), dictionary, settings())
     broken = np.where(usable, frames, np.nan)
-    again = reconstruct_sparse(psi, broken, 0.0, dictionary, settings(), usable)
+    again = reconstruct_sparse(psi, even_frames(broken, 0.0, usable), dictionary, settings())
     np.testing.assert_array_equal(clean.light_field, again.light_field)
     assert psnr_db(clean.light_field, truth) > 35
 
@@ -103,7 +108,9 @@ def test_a_patch_without_usable_pixels_says_nothing(random_psi, scene):
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     usable = np.ones(psi.frames_shape, dtype=bool)
     usable[:, 6:12, 6:12] = False
-    result = reconstruct_sparse(psi, psi.forward(truth), 0.0, dictionary, settings(), usable)
+    result = reconstruct_sparse(
+        psi, even_frames(psi.forward(truth), 0.0, usable), dictionary, settings()
+    )
     assert result.status == "incomplete"
     assert "1 patches hold no usable pixel, 36 samples" in result.advice
     assert not result.light_field[:, :, 6:12, 6:12].any()
@@ -120,11 +127,11 @@ def test_patches_of_equal_sensing_share_one_dictionary(random_psi, scene):
     colour = np.tile(rng.integers(0, 3, (1, 6, 6), dtype=np.uint8), (1, 4, 5))
     psi = ImagingMatrix(weights, colour)
     frames = psi.forward(truth)
-    shared = reconstruct_sparse(psi, frames, 0.0, dictionary, settings("omp"))
+    shared = reconstruct_sparse(psi, even_frames(frames, 0.0), dictionary, settings("omp"))
     assert shared.parameters["classes"] == 1
     nudged = weights * (1 + 1e-6 * rng.uniform(size=weights.shape)).astype(np.float32)
     apart = reconstruct_sparse(
-        ImagingMatrix(nudged, colour), frames, 0.0, dictionary, settings("omp")
+        ImagingMatrix(nudged, colour), even_frames(frames, 0.0), dictionary, settings("omp")
     )
     assert apart.parameters["classes"] == 20
     np.testing.assert_allclose(shared.light_field, apart.light_field, atol=1e-3)
@@ -135,7 +142,8 @@ def test_the_same_frames_give_the_same_bits(random_psi, scene):
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     frames = psi.forward(truth)
     first, second = (
-        reconstruct_sparse(psi, frames, 0.01, dictionary, SparseSettings(stride=2)) for _ in "ab"
+        reconstruct_sparse(psi, even_frames(frames, 0.01), dictionary, SparseSettings(stride=2))
+        for _ in "ab"
     )
     np.testing.assert_array_equal(first.light_field, second.light_field)
 
@@ -145,7 +153,10 @@ def test_a_step_limit_is_reported_with_advice(random_psi, scene):
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     solver = BPDNSettings(method="ista", max_steps=1)
     result = reconstruct_sparse(
-        psi, psi.forward(truth), 0.0, dictionary, SparseSettings(stride=6, solver=solver)
+        psi,
+        even_frames(psi.forward(truth), 0.0),
+        dictionary,
+        SparseSettings(stride=6, solver=solver),
     )
     assert result.status == "incomplete"
     assert "raise max_steps" in result.advice
@@ -156,7 +167,7 @@ def test_progress_counts_the_patches(random_psi, scene):
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     reported = []
     reconstruct_sparse(
-        psi, psi.forward(truth), 0.0, dictionary, settings(), on_step=reported.append
+        psi, even_frames(psi.forward(truth), 0.0), dictionary, settings(), on_step=reported.append
     )
     assert reported[-1].step == reported[-1].total == 20
     assert [p.step for p in reported] == sorted(p.step for p in reported)
@@ -167,12 +178,12 @@ def test_what_does_not_fit_is_refused(random_psi, scene):
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     frames = psi.forward(truth)
     with pytest.raises(ReconstructionError, match="frames of shape"):
-        reconstruct_sparse(psi, frames[:, 1:], 0.0, dictionary)
+        reconstruct_sparse(psi, even_frames(frames[:, 1:], 0.0), dictionary)
     with pytest.raises(DictionaryError, match="2x2 views"):
-        reconstruct_sparse(psi, frames, 0.0, random_atoms(views=(2, 2)))
+        reconstruct_sparse(psi, even_frames(frames, 0.0), random_atoms(views=(2, 2)))
     small = random_psi(1, VIEWS, (5, 30))
     with pytest.raises(ReconstructionError, match="do not fit"):
-        reconstruct_sparse(small, np.zeros(small.frames_shape), 0.0, dictionary)
+        reconstruct_sparse(small, even_frames(np.zeros(small.frames_shape), 0.0), dictionary)
 
 
 @pytest.mark.slow
@@ -181,7 +192,7 @@ def test_every_method_runs_by_its_name_and_says_so(random_psi, scene, name):
     dictionary, truth = scene
     psi = random_psi(2, VIEWS, truth.shape[2:4])
     chosen = MethodSettings(sparse=SparseSettings(stride=6))
-    result = reconstruct(name, psi, psi.forward(truth), 0.001, dictionary, chosen)
+    result = reconstruct(name, psi, even_frames(psi.forward(truth), 0.001), dictionary, chosen)
     assert result.method == name
     assert psnr_db(result.light_field, truth) > 15
     method = find_method(name)
@@ -194,4 +205,4 @@ def test_every_method_runs_by_its_name_and_says_so(random_psi, scene, name):
 def test_a_missing_dictionary_says_how_to_make_one(random_psi):
     psi = random_psi()
     with pytest.raises(ReconstructionError, match="--dictionary lambertian"):
-        reconstruct("dict-omp", psi, np.zeros(psi.frames_shape), 0.0)
+        reconstruct("dict-omp", psi, even_frames(np.zeros(psi.frames_shape), 0.0))

@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from emmc_rig.files.psi import SavedPsi
+from emmc_rig.files.psi import StoredPsi
 from emmc_rig.model.errors import SensingError
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive.settings import SIDES, AdaptiveSettings
 from reconstruction.dictionary import dct_dictionary
@@ -88,7 +89,9 @@ def settings_of(method, **more):
 def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step=None):
     settings = settings_of(method, blocks=blocks)
     usable = np.ones(frames.shape, dtype=bool) if usable is None else usable
-    return reconstruct_in_blocks(method, psi, frames, 0.01, dictionary, settings, usable, on_step)
+    return reconstruct_in_blocks(
+        method, psi, even_frames(frames, 0.01, usable), dictionary, settings, on_step
+    )
 
 
 @pytest.mark.slow
@@ -109,7 +112,7 @@ def test_every_method_works_in_blocks_and_loses_little(random_psi, method, binni
     dictionary = dct_dictionary(VIEWS, (4, 4)) if "dict" in method else None
     # One shot takes no sparse patches in blocks: whether surfaces fail is not known beforehand.
     without = settings_of(method, adaptive=AdaptiveSettings(patches=None))
-    whole = reconstruct(method, psi, frames, 0.01, dictionary, without)
+    whole = reconstruct(method, psi, even_frames(frames, 0.01), dictionary, without)
     result, verdict = in_blocks(method, psi, frames, SMALL, dictionary=dictionary)
     assert result.light_field.shape == psi.light_field_shape
     assert psnr_db(result.light_field, truth) > psnr_db(whole.light_field, truth) - 0.5
@@ -139,7 +142,7 @@ def test_a_light_field_of_one_block_is_that_of_the_method_itself(random_psi):
 def test_psi_is_read_from_its_file_window_by_window(random_psi, tmp_path):
     psi, frames, _ = scene(random_psi, binning=2)
     psi.save(tmp_path / "psi.h5")
-    saved = SavedPsi(tmp_path / "psi.h5")
+    saved = StoredPsi(tmp_path / "psi.h5")
     saved.verify()
     assert (saved.size, saved.binning) == (psi.size, 2)
     part, expected = (source.window(slice(4, 20), slice(10, 30)) for source in (saved, psi))
@@ -156,10 +159,10 @@ def test_a_damaged_psi_is_found_out_without_holding_it(random_psi, tmp_path):
     content[-100] ^= 1
     (tmp_path / "psi.h5").write_bytes(content)
     with pytest.raises(SensingError, match="damaged"):
-        SavedPsi(tmp_path / "psi.h5").verify()
+        StoredPsi(tmp_path / "psi.h5").verify()
     (tmp_path / "psi.h5").write_bytes(b"no")
     with pytest.raises(SensingError, match="cannot be read"):
-        SavedPsi(tmp_path / "psi.h5")
+        StoredPsi(tmp_path / "psi.h5")
 
 
 def test_progress_is_reported_block_by_block(random_psi):
@@ -190,7 +193,7 @@ def test_shots_that_do_not_fit_are_left_out_and_evened_for_all_blocks_alike(rand
     frames[1] = 0.0
     frames[2] *= 1.2
     usable = np.ones(frames.shape, dtype=bool)
-    survey = surveyed("tv", psi, frames, 0.01, usable)
+    survey = surveyed("tv", psi, even_frames(frames, 0.01, usable))
     assert survey.left_out == (1,)
     assert survey.gains[2] / survey.gains[0] == pytest.approx(1.2, rel=0.05)
     readings, kept = survey.applied(frames, usable)
@@ -204,21 +207,21 @@ def test_shots_that_do_not_fit_are_left_out_and_evened_for_all_blocks_alike(rand
 def test_the_halo_follows_from_the_largest_disparity(random_psi):
     psi, frames, _ = scene(random_psi)
     usable = np.ones(frames.shape, dtype=bool)
-    near = surveyed("adaptive-fast", psi, frames, 0.01, usable)
+    near = surveyed("adaptive-fast", psi, even_frames(frames, 0.01, usable))
     assert near.halo == 16 + int(np.ceil(near.largest_px))
-    assert surveyed("tv", psi, frames, 0.01, usable).halo == 48
+    assert surveyed("tv", psi, even_frames(frames, 0.01, usable)).halo == 48
     psi, frames, _ = scene(random_psi, binning=2)
     usable = np.ones(frames.shape, dtype=bool)
-    binned = surveyed("adaptive-fast", psi, frames, 0.01, usable)
+    binned = surveyed("adaptive-fast", psi, even_frames(frames, 0.01, usable))
     assert binned.halo == 32 + int(np.ceil(binned.largest_px))
 
 
 @pytest.fixture(scope="module")
 def blocks(random_psi):
     psi, frames, _ = scene(random_psi)
-    _, verdict = reconstruct_judged("tv", psi, frames, 0.01)
+    _, verdict = reconstruct_judged("tv", psi, even_frames(frames, 0.01))
     wrong, _, _ = scene(random_psi, shots=2)
-    _, bad = reconstruct_judged("tv", wrong, frames[:, ::-1, ::-1].copy(), 0.01)
+    _, bad = reconstruct_judged("tv", wrong, even_frames(frames[:, ::-1, ::-1].copy(), 0.01))
     assert (verdict.level, bad.level) == ("trust", "do not use")
     return verdict, bad
 

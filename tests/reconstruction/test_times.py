@@ -6,9 +6,9 @@ import pytest
 from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive.film import Film
-from reconstruction.adaptive.survey import Readings
 from reconstruction.adaptive.times import OtherTime, aligned, rested
 from reconstruction.errors import ReconstructionError
+from reconstruction.inputs import Readings
 from reconstruction.methods import reconstruct
 from reconstruction.verdict import run
 from reconstruction.verdict.run import reconstruct_judged
@@ -44,12 +44,12 @@ def slid(psi):
 
 
 def _given(psi, shown):
-    return "adaptive", psi, shown.readings, shown.noise_sigma, None, None, shown.usable
+    return "adaptive", psi, shown
 
 
 def _first_alone(psi, shown):
-    one = psi.of_shots([0]), shown.readings[:1], shown.noise_sigma, None, None, shown.usable[:1]
-    return reconstruct("adaptive", *one)
+    first = shown.of_one_deviation().cut(np.s_[:1,])
+    return reconstruct("adaptive", psi.of_shots([0]), first)
 
 
 @pytest.mark.parametrize("binning", [1, 2])
@@ -150,10 +150,8 @@ def test_at_rest_shots_are_one_capture_as_ever(psi, fits):
 def test_a_film_at_rest_before_a_mask_that_steps_gains_by_each_frame(psi):
     shown, film, found_db = _captured(psi, [_window(0)] * psi.shots), Film(), []
     for shot in range(psi.shots):
-        result = reconstruct(
-            "adaptive", psi.of_shots([shot]), shown.readings[[shot]], shown.noise_sigma,
-            usable=shown.usable[[shot]], film=film,
-        )  # fmt: skip
+        seen = shown.of_one_deviation().cut(np.s_[shot : shot + 1,])
+        result = reconstruct("adaptive", psi.of_shots([shot]), seen, film=film)
         film = result.film
         found_db.append(psnr_db(result.light_field, _window(0)))
     assert found_db[2] > found_db[0] + LEAST_GAIN_DB

@@ -5,6 +5,8 @@ import pytest
 from variation import adjoint, gradient, variation
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.errors import SensingError
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from reconstruction.choices import choose_mu
 from reconstruction.errors import ReconstructionError
@@ -111,7 +113,7 @@ def test_the_minimiser_agrees_with_another_algorithm(cfa, binning, shots, chroma
     settings = TVSettings(
         mu=mu, chroma_weight=chroma_weight, primal_step=5, rtol=1e-7, max_steps=3000
     )
-    result = reconstruct_tv(psi, frames, 0.0, settings)
+    result = reconstruct_tv(psi, even_frames(frames, 0.0), settings)
     assert 0 < result.light_field.min() < result.light_field.max() < 1
     least = objective(dense, frames, peer, metric, mu)
     found = objective(dense, frames, result.light_field.astype(np.float64), metric, mu)
@@ -142,7 +144,7 @@ def test_the_value_of_an_excluded_pixel_has_no_influence(problem):
     results = []
     for value in (0.0, 77.0, -1e6, np.nan, np.inf):
         damaged = np.where(usable, frames, np.float32(value))
-        results.append(reconstruct_tv(psi, damaged, 0.004, usable=usable))
+        results.append(reconstruct_tv(psi, even_frames(damaged, 0.004, usable)))
     for result in results[1:]:
         np.testing.assert_array_equal(result.light_field, results[0].light_field)
         assert result.parameters == results[0].parameters
@@ -153,9 +155,9 @@ def test_excluding_saturated_pixels_is_better_than_believing_them(problem):
     usable = np.random.default_rng(7).random(frames.shape) < 0.9
     damaged = np.where(usable, frames, np.float32(1))
     truth = smooth_scene(psi)
-    excluded = reconstruct_tv(psi, damaged, 0.004, usable=usable)
-    believed = reconstruct_tv(psi, damaged, 0.004)
-    whole = reconstruct_tv(psi, frames, 0.004)
+    excluded = reconstruct_tv(psi, even_frames(damaged, 0.004, usable))
+    believed = reconstruct_tv(psi, even_frames(damaged, 0.004))
+    whole = reconstruct_tv(psi, even_frames(frames, 0.004))
     excluded_db, believed_db, whole_db = (
         psnr_db(result.light_field, truth) for result in (excluded, believed, whole)
     )
@@ -168,11 +170,11 @@ def test_frames_that_do_not_fit_are_refused(problem):
     with pytest.raises(
         ReconstructionError, match=r"frames of shape \(1, 16, 20\) given, Psi needs"
     ):
-        reconstruct_tv(psi, frames[:1], 0.01)
-    with pytest.raises(ReconstructionError, match="mask of usable pixels has shape"):
-        reconstruct_tv(psi, frames, 0.01, usable=np.ones((16, 20), dtype=bool))
+        reconstruct_tv(psi, even_frames(frames[:1], 0.01))
+    with pytest.raises(SensingError, match=r"need one shape .* usable \(16, 20\)"):
+        even_frames(frames, 0.01, np.ones((16, 20), dtype=bool))
     with pytest.raises(ReconstructionError, match="no usable pixel"):
-        reconstruct_tv(psi, frames, 0.01, usable=np.zeros(frames.shape, dtype=bool))
+        reconstruct_tv(psi, even_frames(frames, 0.01, np.zeros(frames.shape, dtype=bool)))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -181,20 +183,20 @@ def test_frames_that_are_not_finite_are_refused(problem, value):
     damaged = frames.copy()
     damaged[1, 3, 4] = value
     with pytest.raises(ReconstructionError, match="not finite: exclude them"):
-        reconstruct_tv(psi, damaged, 0.01)
+        reconstruct_tv(psi, even_frames(damaged, 0.01))
 
 
 @pytest.mark.parametrize("sigma", [-0.01, np.nan, np.inf])
 def test_a_noise_level_that_is_none_is_refused(problem, sigma):
     psi, frames = problem
     with pytest.raises(ReconstructionError, match="noise"):
-        reconstruct_tv(psi, frames, sigma)
+        reconstruct_tv(psi, even_frames(frames, sigma))
 
 
 def test_frames_without_light_give_a_black_light_field():
     psi = imaging_matrix()
     for sigma in (0.0, 0.01):
-        result = reconstruct_tv(psi, np.zeros(psi.frames_shape, np.float32), sigma)
+        result = reconstruct_tv(psi, even_frames(np.zeros(psi.frames_shape, np.float32), sigma))
         assert not result.light_field.any()
         assert result.status == "converged"
 
@@ -202,17 +204,17 @@ def test_frames_without_light_give_a_black_light_field():
 def test_a_constant_light_field_comes_back():
     psi = imaging_matrix("mono", shots=3)
     white = np.full(psi.light_field_shape, 0.5, np.float32)
-    result = reconstruct_tv(psi, psi.forward(white), 0.0)
+    result = reconstruct_tv(psi, even_frames(psi.forward(white), 0.0))
     np.testing.assert_allclose(result.light_field, 0.5, atol=2e-3)
 
 
 def test_running_out_of_steps_is_a_status_with_advice(problem):
     psi, frames = problem
-    result = reconstruct_tv(psi, frames, 0.004, TVSettings(max_steps=3, rtol=1e-9))
+    result = reconstruct_tv(psi, even_frames(frames, 0.004), TVSettings(max_steps=3, rtol=1e-9))
     assert (result.status, result.steps) == ("step limit reached", 3)
     assert result.advice == "raise max_steps or loosen rtol"
     assert result.objective == ()
-    converged = reconstruct_tv(psi, frames, 0.004)
+    converged = reconstruct_tv(psi, even_frames(frames, 0.004))
     assert (converged.status, converged.advice) == ("converged", "")
     assert converged.steps < 200
 
@@ -221,7 +223,7 @@ def test_every_step_is_observed_and_the_objective_is_reported_when_asked(problem
     psi, frames = problem
     seen = []
     settings = TVSettings(max_steps=25, rtol=1e-9, objective_every=5)
-    result = reconstruct_tv(psi, frames, 0.004, settings, on_step=seen.append)
+    result = reconstruct_tv(psi, even_frames(frames, 0.004), settings, on_step=seen.append)
     assert [progress.step for progress in seen] == list(range(1, 26))
     evaluated = [(p.step, p.objective) for p in seen if p.objective is not None]
     assert evaluated == list(result.objective)
@@ -231,16 +233,16 @@ def test_every_step_is_observed_and_the_objective_is_reported_when_asked(problem
 
 def test_the_same_frames_give_the_same_light_field(problem):
     psi, frames = problem
-    first, second = (reconstruct_tv(psi, frames, 0.004).light_field for _ in range(2))
+    first, second = (reconstruct_tv(psi, even_frames(frames, 0.004)).light_field for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
 @pytest.mark.parametrize(("scale", "tolerance"), [(0.5, 0.0), (0.3, 1e-5), (0.013, 1e-5)])
 def test_scaled_frames_and_noise_give_the_scaled_light_field(problem, scale, tolerance):
     psi, frames = problem
-    whole = reconstruct_tv(psi, frames, 0.004)
+    whole = reconstruct_tv(psi, even_frames(frames, 0.004))
     assert 0 < whole.light_field.min() < whole.light_field.max() < 1
-    scaled = reconstruct_tv(psi, frames * np.float32(scale), 0.004 * scale)
+    scaled = reconstruct_tv(psi, even_frames(frames * np.float32(scale), 0.004 * scale))
     assert scaled.parameters["mu"] == pytest.approx(scale * whole.parameters["mu"])
     assert scaled.steps == whole.steps
     np.testing.assert_allclose(
@@ -265,10 +267,12 @@ def test_the_chosen_mu_is_near_the_best(scene, cfa, shots, noise):
     sigma = noise * float(truth.mean())
     clean = psi.forward(truth)
     frames = clean + np.random.default_rng(8).normal(0, sigma, clean.shape).astype(np.float32)
-    chosen = reconstruct_tv(psi, frames, sigma)
+    chosen = reconstruct_tv(psi, even_frames(frames, sigma))
     reached_db = psnr_db(chosen.light_field, truth)
     grid_db = [
-        psnr_db(reconstruct_tv(psi, frames, sigma, TVSettings(mu=mu)).light_field, truth)
+        psnr_db(
+            reconstruct_tv(psi, even_frames(frames, sigma), TVSettings(mu=mu)).light_field, truth
+        )
         for mu in chosen.parameters["mu"] * 2.0 ** np.array([-4, -3, -2, -1, 1, 2, 3])
     ]
     assert reached_db > max(grid_db) - 0.7

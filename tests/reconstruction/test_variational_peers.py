@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from variation import from_patches, gradient
 
+from emmc_rig.model.frames import even_frames
 from reconstruction.tv import TVSettings, reconstruct_tv
 
 
@@ -55,5 +56,5 @@ def test_the_objective_is_that_of_a_conic_solver(coded_psi, order, mu, primal_st
         rtol=1e-10,
         max_steps=6000,
     )
-    found = reconstruct_tv(psi, frames, 0.0, settings, usable, patch_term=term)
+    found = reconstruct_tv(psi, even_frames(frames, 0.0, usable), settings, patch_term=term)
     assert found.objective[-1][1] == pytest.approx(least, rel=1e-6)

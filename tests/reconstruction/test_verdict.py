@@ -16,7 +16,7 @@ from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.model.frames import Frames
+from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.study.stability.faults import Point
@@ -29,7 +29,7 @@ from reconstruction.tv import TVSettings, reconstruct_tv
 from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.compression import blockiness, quantised
 from reconstruction.verdict.displaced import _regressed, _tiled, displaced
-from reconstruction.verdict.evidence import Evidence, Read, gathered
+from reconstruction.verdict.evidence import Evidence, FittedFrames, gathered
 from reconstruction.verdict.kept import (
     compare_held_out,
     kept_readings,
@@ -331,9 +331,7 @@ def judged_trial(
 ):
     given = Point(Capture(scene, camera, SIZE, seed, 3), fault, strength).trial()
     settings = QUICK.model_copy(update={"screening": screening})
-    _, verdict = reconstruct_judged(
-        "tv", given.psi, given.readings, given.noise_sigma, None, settings, given.usable
-    )
+    _, verdict = reconstruct_judged("tv", given.psi, given.frames, None, settings)
     return verdict
 
 
@@ -377,7 +375,7 @@ def test_a_shot_under_another_light_takes_the_level_of_the_others_and_is_named(t
     frames[1] *= share
     rng = np.random.default_rng(0)
     frames += 0.003 * rng.standard_normal(frames.shape, np.float32)
-    result, verdict = reconstruct_judged("tv", three, frames, 0.003, settings=QUICK)
+    result, verdict = reconstruct_judged("tv", three, even_frames(frames, 0.003), settings=QUICK)
     assert verdict.level == "doubt"
     assert f"shot 2 is {1 - share:.0%}"[:-1] in verdict.words
     assert "was scaled to them" in verdict.words
@@ -433,9 +431,10 @@ def clean_evidence(three):
     even = np.full(three.light_field_shape, 0.5, np.float32)
     empty = Reconstruction("tv", even, Status.CONVERGED, "", 1, (), 0.0, {})
     usable = everywhere(three)
-    read = Read(grey(three), usable, kept_readings(usable), np.zeros(three.frames_shape))
+    frames = even_frames(grey(three), 1e-3, usable)
+    read = FittedFrames(frames, kept_readings(usable), np.zeros(three.frames_shape))
     # Of a scene with depth, but for that.
-    return dataclasses.replace(gathered(three, read, 1e-3, empty), parallax=0.05)
+    return dataclasses.replace(gathered(three, read, empty), parallax=0.05)
 
 
 def test_evidence_survives_json(three):
@@ -479,10 +478,11 @@ def test_a_coded_aperture_leaves_nothing_in_one_frame_that_would_show_a_wrong_ps
     psi = build_imaging_matrix(find_camera("coded-aperture-random"), SIZE)
     frames = grey(psi)
     usable = everywhere(psi)
-    read = Read(frames, usable, kept_readings(usable), np.zeros(psi.frames_shape))
+    seen = even_frames(frames, 1e-3, usable)
+    read = FittedFrames(seen, kept_readings(usable), np.zeros(psi.frames_shape))
     light_field = np.full(psi.light_field_shape, 0.5, np.float32)
     result = Reconstruction("tv", light_field, Status.CONVERGED, "", 1, (), 0.0, {})
-    verdict = verdict_from(gathered(psi, read, 1e-3, result))
+    verdict = verdict_from(gathered(psi, read, result))
     assert verdict.level == "cannot tell"
     assert "cannot show whether Psi is right" in verdict.words
 
@@ -586,7 +586,7 @@ def test_faults_of_the_readings_are_the_first_reason(one_shot, fault, size, word
     psi, frames = one_shot
     spoiled = spoilt(frames, fault, size).astype(np.float32)
     for readings, level in ((frames, "trust"), (spoiled, "doubt")):
-        _, verdict = reconstruct_judged("adaptive-fast", psi, readings, 0.003)
+        _, verdict = reconstruct_judged("adaptive-fast", psi, even_frames(readings, 0.003))
         assert verdict.level == level, verdict.words
     assert words in verdict.reasons[0].what
 
@@ -618,7 +618,7 @@ def test_saturated_readings_say_at_least_how_bright_it_was(glare, method):
     psi, truth, readings, usable = glare
 
     def judged(frames):
-        return reconstruct_judged(method, psi, frames, 1e-3, settings=QUICK, usable=usable)
+        return reconstruct_judged(method, psi, even_frames(frames, 1e-3, usable), settings=QUICK)
 
     def missed(result):
         bright = np.s_[:, :, 20:28, 26:38]
@@ -659,7 +659,7 @@ def motion_in(psi, frames, sigma=1e-4, usable=None, light_field=None):
     """Return the motion that is found with a light field, by default one fitted to all shots."""
     usable = everywhere(psi) if usable is None else usable
     if light_field is None:
-        light_field = reconstruct_tv(psi, frames, sigma, usable=usable).light_field
+        light_field = reconstruct_tv(psi, even_frames(frames, sigma, usable)).light_field
     residual = frames - psi.forward(light_field)
     found = motion(relief(psi, frames, sigma, usable), residual, sigma)
     assert found is not None
@@ -671,8 +671,8 @@ def test_bad_pixels_behind_dark_cells_do_not_pass_for_motion():
     camera = find_camera("rgbw-bayer-3shots")
     for fault, strength, moves in (("bad-pixels", 3, False), ("camera-motion", 1, True)):
         given = Point(Capture("deep-occlusions", camera, (64, 80), 0, 3), fault, strength).trial()
-        seen = screened(given.psi, given.readings, given.usable)
-        found = motion_in(given.psi, seen.frames, given.noise_sigma, seen.usable)
+        seen = screened(given.psi, given.frames).frames
+        found = motion_in(given.psi, seen.readings, given.noise_sigma, seen.usable)
         assert (found.ratio > 1) == moves
 
 
@@ -739,7 +739,7 @@ def with_moved_object(psi, shot, by_px=6):
 
 def test_a_shot_is_left_out_where_something_moved_in_it_and_the_place_is_doubted(three):
     frames, truth = with_moved_object(three, 1)
-    result, verdict = reconstruct_judged("tv", three, frames, 0.003, settings=QUICK)
+    result, verdict = reconstruct_judged("tv", three, even_frames(frames, 0.003), settings=QUICK)
     assert verdict.level == "doubt"
     assert "shot 2 saw another scene than the others in " in verdict.words
     assert "excluded there" in verdict.words
@@ -747,9 +747,9 @@ def test_a_shot_is_left_out_where_something_moved_in_it_and_the_place_is_doubted
     assert verdict.evidence.moved_at is not None
     _, row, column = verdict.evidence.moved_at
     np.testing.assert_allclose((row, column), (22, 35), atol=5)
-    blind = reconstruct_tv(three, frames, 0.003, QUICK.tv)
+    blind = reconstruct_tv(three, even_frames(frames, 0.003), QUICK.tv)
     still, _ = with_moved_object(three, 1, 0)
-    best = reconstruct_tv(three, still, 0.003, QUICK.tv)
+    best = reconstruct_tv(three, even_frames(still, 0.003), QUICK.tv)
     after, before, without = (psnr_db(one.light_field, truth) for one in (result, blind, best))
     assert after > before + 2
     assert after > without - 2
@@ -776,7 +776,7 @@ def test_the_place_of_a_block_where_something_moved_is_that_of_the_whole(three):
 def test_of_two_shots_either_may_have_seen_what_moved():
     psi = build_imaging_matrix(find_camera("rgbw-bayer-2shots"), SIZE)
     frames, _ = with_moved_object(psi, 1)
-    result, verdict = reconstruct_judged("tv", psi, frames, 0.003, settings=QUICK)
+    result, verdict = reconstruct_judged("tv", psi, even_frames(frames, 0.003), settings=QUICK)
     assert verdict.level in ("doubt", "do not use")
     assert "shots saw different scenes in " in verdict.words
     assert "without-shots" not in verdict.words
@@ -858,9 +858,7 @@ def test_the_command_leaves_out_shots_and_says_which_there_are(folders, tmp_path
 @pytest.mark.parametrize("scene", ["deep-occlusions", "wide-disparity"])
 def test_colours_that_one_grey_shot_hardly_shows_are_uncertain(scene):
     given = trial_of(Capture(scene, find_camera("scenario-iii-mono"), SIZE, zoom=3))
-    result, verdict = reconstruct_judged(
-        "adaptive-fast", given.psi, given.readings, given.noise_sigma, usable=given.usable
-    )
+    result, verdict = reconstruct_judged("adaptive-fast", given.psi, given.frames)
     assert verdict.level == "cannot tell"
     assert "colour filter" in verdict.words
     stated_db = result.stated["stated_db"]

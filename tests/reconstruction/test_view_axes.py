@@ -14,9 +14,10 @@ from programs import program
 import emmc_rig as emmc
 from emmc_rig.files.exports import MAPS, open_export
 from emmc_rig.files.formats import FORMATS
-from emmc_rig.files.psi import FRAMES, PSI, open_psi, save_shards
+from emmc_rig.files.psi import FRAMES, PSI, StoredPsi, save_shards
 from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
 from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES
@@ -101,7 +102,7 @@ def test_the_names_of_the_view_axes_are_kept_by_files_and_parts_of_psi(tmp_path,
     pytest.importorskip("zarr")
     save_shards(psi, tmp_path / "psi.zarr")
     for path in (tmp_path / "psi.h5", tmp_path / "psi.zarr"):
-        saved = open_psi(path)
+        saved = StoredPsi(path)
         assert saved.load().view_axes == saved.view_axes == axes
         assert saved.window(slice(0, 8), slice(0, 8)).view_axes == axes
         assert saved.checksum == psi.checksum()
@@ -128,7 +129,7 @@ def test_other_names_of_view_axes_are_refused_in_one_line(tmp_path):
     psi_of((1, 3), BANDS).save(path)
     with h5py.File(path, "r+") as file:
         file.attrs["view_axes"] = "angle,colour"
-    for opened in (ImagingMatrix.load, open_psi):
+    for opened in (ImagingMatrix.load, StoredPsi):
         with pytest.raises(SensingError, match=r"psi\.h5: view_axes 'angle,colour': two of angle"):
             opened(path)
     with h5py.File(path, "r+") as file:
@@ -146,8 +147,8 @@ def test_a_cassi_described_by_a_file_has_the_matrix_of_its_shifted_masks(tmp_pat
     expected = emmc.Psi.from_weights(np.stack(shifted)[None, None] / count, view_axes=BANDS)
     np.testing.assert_allclose(psi.weights, expected.weights, atol=1e-7)
     np.testing.assert_array_equal(psi.colour, expected.colour)
-    assert psi.view_axes == psi_layout(camera, SIZE).view_axes == psi.layout.view_axes == BANDS
-    assert psi.layout.psi(psi.weights).checksum() == psi.checksum()
+    assert psi.view_axes == psi_layout(camera, SIZE).view_axes == psi.view_axes == BANDS
+    assert psi.psi(psi.weights).checksum() == psi.checksum()
     assert camera_of(psi) == camera
     assert "1x24 bands" in repr(camera)
     assert emmc.camera(camera.model_dump()) == camera
@@ -300,7 +301,7 @@ def test_what_a_method_calls_disparity_is_a_shift_between_times():
 def test_the_preview_of_a_camera_without_colours_is_grey():
     psi = psi_of((1, 6), BANDS, size=(32, 48))
     frames = frames_of(psi, light_of((1, 6), BANDS, (32, 48)))
-    preview = Preview(psi, 4, frames, NOISE)
+    preview = Preview(psi, 4, even_frames(frames, NOISE))
     preview.follow(frames, 5)
     light = preview.light_field
     assert light.std() > 0.01

@@ -48,9 +48,9 @@ def quick(**more):
 def few_steps(monkeypatch):
     """Total variation of a few steps: the same path, sooner done."""
 
-    def solved(name, psi, readings, sigma, dictionary, settings, usable):
+    def solved(name, psi, frames, dictionary, settings):
         chosen = MethodSettings.model_validate({"tv": {"max_steps": 3}})
-        return reconstruct(name, psi, readings, sigma, dictionary, chosen, usable)
+        return reconstruct(name, psi, frames, dictionary, chosen)
 
     monkeypatch.setattr(trial, "reconstruct", solved)
 
@@ -235,10 +235,10 @@ def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path)
 
 
 def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
-    def failing(name, psi, readings, *others):
-        if readings[2].mean() < 0.01:
+    def failing(name, psi, frames, *others):
+        if frames.readings[2].mean() < 0.01:
             raise ReconstructionError("no light in shot 3")
-        return reconstruct(name, psi, readings, *others)
+        return reconstruct(name, psi, frames, *others)
 
     monkeypatch.setattr(trial, "reconstruct", failing)
     outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Silent())

@@ -265,10 +265,7 @@ def test_sharing_the_coded_patches_changes_no_result(scenes, tmp_path):
     for method in ("dict-admm", "tv-dict"):
         cell = Cell("dragons", Setup("ii", 1, noisy=True), method)
         made, dictionary = study.trial(cell), study.dictionary(1)
-        alone = reconstruct(
-            method, made.psi, made.readings, made.noise_sigma, dictionary, QUICK.methods,
-            made.usable,
-        )  # fmt: skip
+        alone = reconstruct(method, made.psi, made.frames, dictionary, QUICK.methods)
         kept = results[cell]
         assert kept["psnr_db"] == pytest.approx(psnr_db(alone.light_field, made.truth), abs=1e-3)
         assert kept["status"] == alone.status

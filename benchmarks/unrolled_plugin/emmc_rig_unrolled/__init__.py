@@ -12,7 +12,7 @@ from pydantic import Field
 from emmc_rig.model.settings import Settings
 from emmc_rig_unrolled.weights import NetworkWeights
 from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import checked_inputs, checked_noise
+from reconstruction.inputs import Readings
 from reconstruction.method import Given, Method, cost_words
 from reconstruction.result import Reconstruction, Status
 
@@ -36,8 +36,7 @@ def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
     from emmc_rig_unrolled.network import estimated
 
     started, psi = time.perf_counter(), given.psi
-    typical, variance = checked_noise(psi, given.noise_sigma, given.usable)
-    frames, usable = checked_inputs(psi, given.frames, typical, given.usable)
+    known = Readings.of(psi, given.frames)
     path = settings.of(UnrolledSettings).weights or SHIPPED
     weights = NetworkWeights.load(path)
     trained, views = weights.architecture.views, psi.light_field_shape[:2]
@@ -46,7 +45,7 @@ def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
             f"{path.name}: a network for {trained[0]}x{trained[1]} views, Psi has "
             f"{views[0]}x{views[1]}: train one with `benchmarks/train_network.py`"
         )
-    light_field = estimated(weights, psi, frames, variance, usable)
+    light_field = estimated(weights, psi, known.frames, known.noise, known.usable)
     return Reconstruction(
         method="unrolled",
         light_field=np.clip(light_field, 0, 1),
@@ -55,7 +54,7 @@ def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
         steps=weights.architecture.stages,
         objective=(),
         seconds=time.perf_counter() - started,
-        parameters={"noise_sigma": typical},
+        parameters={"noise_sigma": known.typical},
     )
 
 

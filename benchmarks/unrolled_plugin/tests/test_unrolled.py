@@ -8,6 +8,7 @@ import pytest
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
@@ -73,7 +74,7 @@ def test_every_stage_ends_with_a_light_field_that_explains_the_frames(untrained)
     psi = random_psi(1, (3, 3), (9, 11))
     truth = np.random.default_rng(1).random(psi.light_field_shape, dtype=np.float32)
     frames = psi.forward(truth)
-    result = reconstruct("unrolled", psi, frames, 1e-4, settings=using(untrained))
+    result = reconstruct("unrolled", psi, even_frames(frames, 1e-4), settings=using(untrained))
     miss = np.abs(psi.forward(result.light_field) - frames)
     assert np.median(miss) < 0.01 * frames.mean()  # but for values cut to [0, 1]
     assert result.steps == SMALL.stages
@@ -83,7 +84,12 @@ def test_a_dimmer_scene_gives_the_same_but_dimmer(untrained):
     psi = random_psi(1, (3, 3), (8, 8))
     truth = 0.5 * np.random.default_rng(1).random(psi.light_field_shape, dtype=np.float32)
     bright, dim = (
-        reconstruct("unrolled", psi, psi.forward(truth) * c, 1e-3 * c, settings=using(untrained))
+        reconstruct(
+            "unrolled",
+            psi,
+            even_frames(psi.forward(truth) * c, 1e-3 * c),
+            settings=using(untrained),
+        )
         for c in (1.0, 1 / 16)
     )
     np.testing.assert_allclose(16 * dim.light_field, bright.light_field, atol=1e-4)
@@ -97,7 +103,9 @@ def test_readings_that_are_not_usable_do_not_matter(untrained):
     wrong = frames.copy()
     wrong[0, 3, 4] = 7
     one, other = (
-        reconstruct("unrolled", psi, y, 1e-3, settings=using(untrained), usable=usable).light_field
+        reconstruct(
+            "unrolled", psi, even_frames(y, 1e-3, usable), settings=using(untrained)
+        ).light_field
         for y in (frames, wrong)
     )
     np.testing.assert_array_equal(one, other)
@@ -107,7 +115,7 @@ def test_a_network_for_other_views_is_refused(untrained):
     psi = random_psi(1, (5, 5), (8, 8))
     frames = psi.forward(np.full(psi.light_field_shape, 0.4, np.float32))
     with pytest.raises(ReconstructionError, match="a network for 3x3 views, Psi has 5x5"):
-        reconstruct("unrolled", psi, frames, 1e-3, settings=using(untrained))
+        reconstruct("unrolled", psi, even_frames(frames, 1e-3), settings=using(untrained))
 
 
 def made(path):
@@ -237,7 +245,7 @@ def test_the_shipped_network_sees_more_than_a_smooth_picture():
     camera = find_camera("scenario-ii-cfa")
     psi = camera.psi((64, 80))
     shots = camera.expose(truth, 0, psi)
-    found = reconstruct("unrolled", psi, shots.readings, shots.noise_sigma, usable=shots.usable)
+    found = reconstruct("unrolled", psi, shots)
     smooth = np.broadcast_to(smooth_guess(psi, shots.readings, shots.usable), truth.shape)
     assert psnr_db(found.light_field, truth) > psnr_db(smooth, truth) + 2
     assert SHIPPED.stat().st_size < 2 << 20

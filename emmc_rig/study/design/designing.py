@@ -106,9 +106,7 @@ class Simulations(Study[tuple[str, str]]):
             truth = Capture(scene, camera, self.size, self.seed).scene_seen().light_field
             psi = printed_psi(camera, (truth.shape[2], truth.shape[3]), AS_DESIGNED)
             shots = camera.expose(truth, self.seed, psi)
-            result = reconstruct(
-                DEFAULT_METHOD, psi, shots.readings, shots.noise_sigma, usable=shots.usable
-            )
+            result = reconstruct(DEFAULT_METHOD, psi, shots)
             yield {"psnr_db": psnr_db(result.light_field, truth)}
 
     def label(self, point: tuple[str, str]) -> str:

@@ -32,7 +32,7 @@ def misplaced_psi(capture: Capture, placement: Placement) -> ImagingMatrix:
         raise NotApplicableError(
             "needs a camera with one mask between lens and sensor, in every shot"
         ) from fault
-    return psi_at(Shadow(mask, placement), design.layout, shot_stages(camera))
+    return psi_at(Shadow(mask, placement), design, shot_stages(camera))
 
 
 def _roomy(camera: Camera, size: tuple[int, int], placement: Placement) -> Camera:

@@ -243,8 +243,8 @@ class TablesStudy(Study[Cell]):
                     patches = _coded(made, dictionary, settings.sparse)
                     coding_s = time.perf_counter() - started
             result = solvers.reconstruct(
-                cell.method, made.psi, made.readings, made.noise_sigma, dictionary, settings,
-                made.usable, estimates=patches if dictionary else None,
+                cell.method, made.psi, made.frames, dictionary, settings,
+                estimates=patches if dictionary else None,
             )  # fmt: skip
             yield {
                 **asdict(scored(result.light_field, made.truth)),
@@ -260,6 +260,4 @@ class TablesStudy(Study[Cell]):
 
 def _coded(made: Trial, dictionary: Dictionary, settings: SparseSettings) -> PatchEstimates:
     """Return the patches of Dict-ADMM, from which TV-Dict goes on."""
-    sigma = made.noise_sigma
-    frames, usable = checked_inputs(made.psi, made.readings, sigma, made.usable)
-    return estimate_patches(made.psi, frames, sigma, dictionary, settings, usable)
+    return estimate_patches(made.psi, checked_inputs(made.psi, made.frames), dictionary, settings)
