@@ -227,12 +227,11 @@ class GrblStage(HostStage):
         number = first + self._index(axis)
         if number not in self._controller.settings:
             version = self._build.get("VER", "").rstrip(":") or "unknown"
-            known = version.startswith("1.1")
+            advice = "install Grbl 1.1 or grblHAL, which state scale, speed and travel of axes"
+            if version.startswith("1.1"):
+                advice = f"it has no axis {self._letters[axis]}, choose another letter"
             raise FirmwareError(
-                f"firmware of version {version} does not state ${number}, of {axis}",
-                f"it has no axis {self._letters[axis]}, choose another letter"
-                if known
-                else "install Grbl 1.1 or grblHAL, which state scale, speed and travel of each axis",
+                f"firmware of version {version} does not state ${number}, of {axis}", advice
             )
         value = self._controller.setting(number)
         if not value > 0:

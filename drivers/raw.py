@@ -30,7 +30,7 @@ TIFF_MAGICS = {
 }
 """First bytes of files that are laid out as TIFF, with TIFF's own: Olympus and Panasonic differ."""
 PANASONIC = b"IIU\x00"
-EXPOSURE_TIME_TAG = 33434
+EXPOSURE_TIME_TAG, ISO_TAG = 33434, 34855
 EXIF_TAG = 34665
 IMAGE_DESCRIPTION_TAG = 270
 CFA_TILE_PREFIX = "cfa_tile="
@@ -46,7 +46,7 @@ RAW_SUFFIXES = frozenset(
 """What makers call the RAW files that LibRaw knows."""
 
 TEXT_TAGS = {"maker": (271, "Make"), "model": (272, "Model"), "serial": (42033, "BodySerialNumber")}
-NUMBER_TAGS = {"iso": (34855, "ISOSpeedRatings"), "aperture": (33437, "FNumber")}
+NUMBER_TAGS = {"iso": (ISO_TAG, "ISOSpeedRatings"), "aperture": (33437, "FNumber")}
 TIME_TAGS = (
     ((36867, "DateTimeOriginal"), (37521, "SubsecTimeOriginal"), (36881, "OffsetTimeOriginal")),
     ((306, "DateTime"), (37520, "SubsecTime"), (36880, "OffsetTime")),
@@ -399,10 +399,12 @@ def _number(tags: Any, exif: Mapping[str, Any], code: int, name: str) -> float |
     """
     for value in (tags.valueof(code), exif.get(name)):
         numbers = value if isinstance(value, tuple) else (value,)
-        if not all(isinstance(one, int | float) for one in numbers) or not numbers:
+        if code == ISO_TAG:  # some write several, the first that of the picture
+            numbers = numbers[:1]
+        if len(numbers) not in (1, 2) or not all(isinstance(one, int | float) for one in numbers):
             continue
         number = float(numbers[0])
-        if len(numbers) == 2 and name != "ISOSpeedRatings":
+        if len(numbers) == 2:
             number = number / numbers[1] if numbers[1] else math.nan
         if math.isfinite(number) and number > 0:
             return number

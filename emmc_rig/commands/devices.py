@@ -268,10 +268,12 @@ def jog(
             try:
                 at_um = move({axis: distance_um})[axis]
             except NotHomedError as fault:
+                # After homing, a distance may lead out of the travel; a place within never does.
+                place_um = distance_um if to else sum(opened.limits_um(axis)) / 2
                 where = f"--rig {rig}" if stage is None else f"--stage {stage}"
                 raise AppError(
-                    f"{fault.what}: home it in the same command: `emmc-rig devices jog {axis} "
-                    f"{distance_um:g} {'--to ' * to}--home {where}`"
+                    f"{fault.what}: home it in the same command, as `emmc-rig devices jog {axis} "
+                    f"{place_um:g} --to --home {where}`"
                 ) from fault
         tell(f"{axis} at {at_um:.3f} um")
         give_result(axis=axis, at_um=at_um)
