@@ -17,13 +17,12 @@ DELETED = 10
 """Frames that may be missing at either end of the counter."""
 CLOCK_CHANGE = timedelta(hours=1)
 LONGEST_PAUSE = timedelta(minutes=10)
-"""Between two files of one sequence, where its other pauses are shorter than a third of it."""
+"""Between two files of a sequence, at a change of the clock, or three times its other pauses."""
 
 
 @dataclass(frozen=True)
 class CaptureOrder:
-    """places: of the files, the first captured first. notes: what a person should know, a line
-    each."""
+    """The places of the files, the first captured first; notes: where names and times differ."""
 
     places: tuple[int, ...]
     notes: tuple[str, ...] = ()

@@ -20,7 +20,7 @@ ANY_EXPOSURE_S: Limits = (1e-6, 3600.0)
 
 @dataclass(frozen=True)
 class Recorded:
-    """A RAW file: its name, and exposure and time of capture, None where it does not state them."""
+    """Name, exposure and time of capture of a RAW file; None: not stated."""
 
     name: str
     exposure_s: float | None
@@ -130,9 +130,9 @@ class FolderCamera:
         )
 
     def files(self) -> tuple[Recorded, ...]:
-        """Return all files with what they state, as `snap` returns them one after another.
+        """Return name, exposure and time of all files, in the order in which `snap` returns them.
 
-        Of a damaged file only the name is known.
+        A damaged file has its name alone.
         """
         return self._files
 

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, timezone
-from itertools import product
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -206,7 +205,7 @@ class _DngLevels:
 
 
 def _period(values: Array) -> int:
-    """Return after how many places values repeat; all of them where they do not soon."""
+    """Return the number of places after which values repeat; their count where none is short."""
     for period in range(1, min(LONGEST_PERIOD, values.size - 1) + 1):
         if np.array_equal(values[period:], values[:-period]):
             return period
@@ -215,7 +214,7 @@ def _period(values: Array) -> int:
 
 @dataclass(frozen=True)
 class _TiffTags:
-    """What the file says besides its pixels; levels: None where it is no DNG that states them."""
+    """Tags of the file; levels: black levels of a DNG, None where no DNG states them."""
 
     exposure_s: float | None = None
     tile: str | None = None
@@ -421,21 +420,21 @@ def _dng_levels(pages: Sequence[Any]) -> _DngLevels | None:
     if page is None or page.samplesperpixel != 1:
         return None
     codes = BLACK_TAG, BLACK_REPEAT_TAG, BLACK_ROWS_TAG, BLACK_COLUMNS_TAG, ACTIVE_AREA_TAG
-    level, repeat, rows, columns, area = (_numbers(page.tags.get(code)) for code in codes)
-    if level is None and rows is None and columns is None:
+    stated = [_numbers(page.tags.get(code)) for code in codes]
+    level, repeat, rows, columns, area = stated
+    odd = any(one is None and code in page.tags for code, one in zip(codes, stated, strict=True))
+    if odd or (level is None and rows is None and columns is None):
         return None
+    none = np.zeros(1)
+    tile, rows, columns = (none if one is None else one for one in (level, rows, columns))
+    size = (1, 1) if repeat is None else tuple(repeat.astype(int).tolist())
     top, left, bottom, right = (0, 0, page.imagelength, page.imagewidth)
     if area is not None and area.size == 4:
         top, left, bottom, right = area.astype(int).tolist()
-    size = (1, 1) if repeat is None or repeat.size != 2 else tuple(repeat.astype(int).tolist())
-    tile = np.zeros(1) if level is None else level
-    none = np.zeros(1)
-    rows, columns = (none if one is None else one for one in (rows, columns))
-    if tile.size != math.prod(size) or (rows.size, columns.size) not in product(
-        (1, bottom - top), (1, right - left)
-    ):
+    counts = rows.size in (1, bottom - top) and columns.size in (1, right - left)
+    if not counts or len(size) not in (1, 2) or tile.size != math.prod(size):
         return None
-    return _DngLevels(tile.reshape(size), rows, columns, (top, left))
+    return _DngLevels(tile.reshape(size[0], -1), rows, columns, (top, left))
 
 
 def _numbers(tag: Any) -> Array | None:
