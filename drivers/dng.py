@@ -9,13 +9,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import tifffile
 
 from drivers.camera import CameraIdentity
 from drivers.errors import RawFrameError
-from drivers.raw import CFA_TILE_PREFIX, RawFrame, hashed
+from drivers.raw import (
+    BLACK_COLUMNS_TAG,
+    BLACK_REPEAT_TAG,
+    BLACK_ROWS_TAG,
+    BLACK_TAG,
+    CFA_TILE_PREFIX,
+    RawFrame,
+    hashed,
+)
 
 Array = np.ndarray
 
@@ -32,6 +41,8 @@ PRIVATE_DATA_TAG, PRIVATE_DATA_OWNER = 50740, b"emmc-rig: camera's bytes\0"
 MONO = "mono"
 STAND_IN_PHASE = "rggb"
 """Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""
+LARGEST_TILE = 4096
+"""Of black levels: LibRaw takes no larger ones."""
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 PHOTOMETRIC_TAG, PHOTOMETRIC_CFA, PHOTOMETRIC_LINEAR_RAW = 262, 32803, 34892
 D65 = 21
@@ -73,12 +84,12 @@ def encode_dng(
     """Return a DNG with the uint16 `(y, x)` mosaic in it, uncompressed.
 
     `cfa` is a Bayer phase, "mono", or the name of any other tile: that one is marked rggb for
-    LibRaw's sake and carries its name beside it. `black_level_dn` is a whole number, or `(2, 2)`
-    of them in mosaic order; a monochrome DNG has but one. `exposure_s`: None where it is not known.
+    LibRaw's sake and carries its name beside it. `black_level_dn` is a number, or a tile of them as
+    in `RawFrame`. `exposure_s`: None where it is not known.
     `private`: other bytes to be kept in it, which `private_data` returns. `facts`: go into its EXIF
     directory, with exposure and the camera's serial number. Raises `ValueError`.
     """
-    black = np.broadcast_to(np.asarray(black_level_dn), (2, 2))
+    black = np.atleast_2d(np.asarray(black_level_dn, np.float64))
     _check(mosaic, cfa, black, exposure_s)
     tags = [
         (271, ASCII, 0, identity.maker, True),
@@ -103,17 +114,14 @@ def encode_dng(
     if private is not None:
         kept = PRIVATE_DATA_OWNER + private
         tags.append((PRIVATE_DATA_TAG, UNDEFINED, len(kept), kept, True))
-    if cfa == MONO:
-        tags.append((50714, LONG, 1, int(black[0, 0]), True))
-    else:
+    tags += _level_tags(black, cfa)
+    if cfa != MONO:
         pattern = BAYER_PATTERNS.get(cfa, BAYER_PATTERNS[STAND_IN_PHASE])
         tags += [
             (33421, SHORT, 2, (2, 2), True),
             (33422, BYTE, 4, pattern, True),
             (50710, BYTE, 3, (0, 1, 2), True),
             (50711, SHORT, 1, 1, True),
-            (50713, SHORT, 2, (2, 2), True),
-            (50714, LONG, 4, tuple(int(level) for level in black.flat), True),
             (50721, SRATIONAL, 9, IDENTITY_MATRIX, True),
             (50728, RATIONAL, 3, (1, 1) * 3, True),
             (50778, SHORT, 1, D65, True),
@@ -141,6 +149,39 @@ def encode_dng(
         exif = _exif(facts, identity.serial, exposure_s)
         _append_exif(file, exif)
     return file.getvalue()
+
+
+def _level_tags(black: Array, cfa: str) -> list[tuple[int, int, int, Any, bool]]:
+    """Return the tags of black levels: a tile, to which rows and columns add where it is large.
+
+    Raises `ValueError` for levels that are neither.
+    """
+    tile, added = black, []
+    if black.size == 1 and cfa != MONO:
+        tile = np.tile(black, (2, 2))
+    if black.size > LARGEST_TILE:
+        tile = black[:2, :2]
+        rows, columns = (np.arange(length) % 2 for length in black.shape)
+        of_rows, of_columns = black[:, 0] - tile[rows, 0], black[0] - tile[0, columns]
+        if not np.allclose(black, tile[np.ix_(rows, columns)] + of_rows[:, None] + of_columns):
+            raise ValueError("its black levels are neither a small tile nor by row and column")
+        for tag, values in ((BLACK_ROWS_TAG, of_rows), (BLACK_COLUMNS_TAG, of_columns)):
+            if values.any():
+                added.append((tag, SRATIONAL, values.size, _rationals(values), True))
+    if cfa == MONO and np.ptp(tile) == 0:
+        tile = tile[:1, :1]
+    whole = np.array_equal(tile, np.round(tile))
+    values = tuple(map(int, tile.flat)) if whole else _rationals(tile)
+    kind = LONG if whole else RATIONAL
+    tags = [(BLACK_TAG, kind, tile.size, values if tile.size > 1 or not whole else values[0], True)]
+    if tile.size > 1:
+        tags.insert(0, (BLACK_REPEAT_TAG, SHORT, 2, tile.shape, True))
+    return tags + added
+
+
+def _rationals(values: Array) -> tuple[int, ...]:
+    fractions = (Fraction(value).limit_denominator(10_000) for value in values.flat)
+    return tuple(n for value in fractions for n in (value.numerator, value.denominator))
 
 
 def _exif(facts: Facts, serial: str, exposure_s: float | None) -> dict[int, tuple[int, bytes]]:
@@ -239,9 +280,7 @@ def _check(mosaic: Array, cfa: str, black: Array, exposure_s: float | None) -> N
         )
     if not cfa.isascii() or not cfa:
         raise ValueError(f"the tile name {cfa!r} is not plain text")
-    if np.any(black != np.round(black)) or np.any(black < 0):
-        raise ValueError(f"black levels {black.tolist()} are not whole numbers of DN")
-    if cfa == MONO and np.any(black != black[0, 0]):
-        raise ValueError(f"a monochrome DNG has one black level, not {black.tolist()}")
+    if not np.all(black >= 0):
+        raise ValueError(f"a black level of {black.min():g} DN is below 0")
     if exposure_s is not None and not exposure_s > 0:
         raise ValueError(f"an exposure of {exposure_s:g} s is not positive")

@@ -108,14 +108,28 @@ class TransportTimeoutError(DriverError):
 
 
 class GarbledReplyError(DriverError):
-    """Bytes arrived that are not a valid message, or contradict each other."""
+    """Bytes arrived that are not a valid message, or contradict each other.
 
-    def __init__(self, raw: bytes, reason: str) -> None:
-        super().__init__(
-            f"garbled reply {_shown(raw)} ({reason})", "check the cable and the baud rate"
-        )
+    on_the_line: whether the bytes show that they were changed on the line, as a wrong checksum
+    does; None: no text has them.
+    """
+
+    def __init__(self, raw: bytes, reason: str, on_the_line: bool | None = None) -> None:
+        if on_the_line is None:
+            on_the_line = not (
+                raw.isascii() and all(byte >= 32 or byte in b"\r\n\t" for byte in raw)
+            )
+        advice = "check the cable and the baud rate"
+        if not on_the_line:
+            advice = "is it the device that was named, with firmware that is supported?"
+        what = f"garbled reply {_shown(raw)}" if raw else "no valid reply"
+        super().__init__(f"{what} ({reason})", advice)
         self.raw = raw
         self.reason = reason
+
+
+class FirmwareError(DriverError):
+    """The controller runs firmware that is not supported, or does not say what must be known."""
 
 
 class CommandRefusedError(DriverError):
@@ -255,7 +269,7 @@ class PositionMismatchError(DriverError):
         super().__init__(
             f"{axis} was sent to {commanded_um:.3f} um but reads {read_um:.3f} um "
             f"(tolerance {tolerance_um:g} um)",
-            "check the cable, then move again, or home the axis: `emmc-rig devices home`",
+            "see that nothing blocks it, then home the axis: `emmc-rig devices home`",
             axis=axis,
         )
         self.commanded_um = commanded_um
@@ -265,8 +279,8 @@ class PositionMismatchError(DriverError):
 class RawFrameError(DriverError):
     """Camera bytes that are not the RAW frame they should be."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"unusable RAW frame, {reason}: capture it again")
+    def __init__(self, reason: str, advice: str = "capture it again") -> None:
+        super().__init__(f"unusable RAW frame, {reason}: {advice}")
         self.reason = reason
 
 
@@ -333,7 +347,7 @@ class UsbTimeoutError(DriverError):
     def __init__(self, device: str, timeout_s: float, done: int = 0) -> None:
         got = f"stopped after {done} bytes" if done else "was silent"
         super().__init__(
-            f"{device} {got} for {timeout_s:g} s: check its cable and that it is awake"
+            f"{device} {got} for {timeout_s:g} s: see that it is switched on and awake"
         )
         self.done = done
 
@@ -361,7 +375,7 @@ class CameraFormatError(DriverError):
         shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
         super().__init__(
             f"the camera's answer is garbled, {reason} ({shown or 'nothing'}): "
-            "check the cable, then open the camera again"
+            "open the camera again"
         )
         self.reason = reason
 
@@ -410,8 +424,8 @@ class DownloadError(DriverError):
 
     def __init__(self, name: str, got: int, size: int, reason: str) -> None:
         super().__init__(
-            f"{name} came only in part, {got} of {size} bytes ({reason}): check the cable; "
-            "the picture is still on the card"
+            f"{name} came only in part, {got} of {size} bytes ({reason}): "
+            "the picture is still on the card, fetch it again"
         )
         self.reason = reason
 

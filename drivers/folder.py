@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import re
+import logging
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 from drivers.camera import EXPOSURE_AGREEMENT, CameraIdentity, Limits, check_frame
+from drivers.capture_order import capture_order
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import CameraSettingError, FolderCameraError, RawFrameError
 from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw, exposure_and_time
+
+_log = logging.getLogger(__name__)
 
 ANY_EXPOSURE_S: Limits = (1e-6, 3600.0)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A RAW file: its name, and what it states; captured: as EXIF writes times, "" where not."""
+    """Name, exposure and time of capture of a RAW file; None: not stated."""
 
     name: str
     exposure_s: float | None
-    captured: str
+    captured: datetime | None
 
 
 def open_camera(address: str, clock: Clock, backend: object = None) -> FolderCamera:
@@ -29,7 +33,7 @@ def open_camera(address: str, clock: Clock, backend: object = None) -> FolderCam
 
 
 class FolderCamera:
-    """The RAW files of a folder, in the order of their names (2 comes before 10).
+    """The RAW files of a folder, in the order in which they were captured.
 
     All must have the first one's shape and colours. The exposure of a recording cannot be chosen:
     asking for the one that the next frame has is accepted, so that a sequence can be run again; of
@@ -46,18 +50,20 @@ class FolderCamera:
         self._asked_s: float | None = None
         self._chosen = False
         try:
-            self._left = sorted(
-                (
-                    path
-                    for path in self.folder.iterdir()
-                    if path.suffix.lower() in RAW_SUFFIXES and path.is_file()
-                ),
-                key=lambda path: _natural(path.name),
-                reverse=True,
-            )
+            paths = [
+                path
+                for path in self.folder.iterdir()
+                if path.suffix.lower() in RAW_SUFFIXES and path.is_file()
+            ]
         except OSError as fault:
             raise FolderCameraError(str(folder), f"it cannot be read ({fault.strerror})") from fault
-        self._paths, self._count = tuple(self._left), len(self._left)
+        found = [_recorded(path) for path in paths]
+        order = capture_order([file.name for file in found], [file.captured for file in found])
+        for note in order.notes:
+            _log.warning("%s: %s", folder, note)
+        self._files = tuple(found[place] for place in order.places)
+        self._left = [paths[place] for place in reversed(order.places)]
+        self._count = len(paths)
         first = self._read()
         self._next: RawFrame | None = first
         self.shape: tuple[int, int] = first.mosaic.shape
@@ -124,14 +130,11 @@ class FolderCamera:
         )
 
     def files(self) -> tuple[Recorded, ...]:
-        """Return all files with what they state, by the time of capture, else by their names.
+        """Return name, exposure and time of all files, in the order in which `snap` returns them.
 
-        Raises `FolderCameraError`; of a damaged file only the name is known.
+        A damaged file has its name alone.
         """
-        found = [self._recorded(path) for path in reversed(self._paths)]
-        if all(one.captured for one in found):
-            found.sort(key=lambda one: one.captured)
-        return tuple(found)
+        return self._files
 
     def choose(self, name: str) -> None:
         """Choose the file that the next frame is read from."""
@@ -146,14 +149,6 @@ class FolderCamera:
         if self._next is None:
             self._next = check_frame(self._read(self.shape), self.cfa)
         return self._next
-
-    def _recorded(self, path: Path) -> Recorded:
-        try:
-            return Recorded(path.name, *exposure_and_time(path.read_bytes()))
-        except RawFrameError:
-            return Recorded(path.name, None, "")
-        except OSError as fault:
-            raise FolderCameraError(str(path), f"it cannot be read ({fault.strerror})") from fault
 
     def _read(self, shape: tuple[int, int] | None = None) -> RawFrame:
         if not self._left:
@@ -172,7 +167,11 @@ class FolderCamera:
             raise RawFrameError(f"{path.name}: {fault.reason}") from fault
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key by which the numbers in names sort as numbers."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)]
+def _recorded(path: Path) -> Recorded:
+    try:
+        with path.open("rb") as file:
+            return Recorded(path.name, *exposure_and_time(file))
+    except RawFrameError:
+        return Recorded(path.name, None, None)
+    except OSError as fault:
+        raise FolderCameraError(str(path), f"it cannot be read ({fault.strerror})") from fault

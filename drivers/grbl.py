@@ -9,6 +9,7 @@ from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import (
     AxisFaultError,
     CommandRefusedError,
+    FirmwareError,
     GarbledReplyError,
     LimitSwitchError,
     LostPositionError,
@@ -43,6 +44,8 @@ FACTORY_STEPS_PER_MM = 250.0
 SCALES_AGREE = 1e-3
 """Relative; Grbl shows three decimals of steps per millimetre."""
 ALL_AXES = "every axis"
+SINGLE_AXIS_HOMING = "H"
+"""Among the options of `$I`; a compile-time option, off by default (Grbl's config.h)."""
 REFUSAL_ADVICE = {
     5: "switch homing on ($22=1) and wire its limit switches",
     8: "it is busy, wait until it stands",
@@ -66,8 +69,9 @@ class GrblStage(HostStage):
     """Axes of one controller, `axes` mapping names to letters; positions are machine positions.
 
     The travel lies below zero, as Grbl has it, and ends short of the homing switches. Grbl does
-    not report whether it was homed, so every axis must be homed after connecting. Homing some of
-    the axes needs firmware that homes them one by one (option H of `$I`). The scale is the
+    not report whether it was homed, and is idle as well after `$X`, so every axis must be homed
+    after connecting. Firmware without option H in `$I`, as it is shipped, homes all axes together:
+    homing one of them homes all. The scale is the
     controller's `$100` and following; `steps_per_mm`, by name of an axis, states what they must
     be, without which the firmware's default counts as never set. Construction waits up to
     BOOT_S for the controller to start; it moves nothing. Raises `ScaleError`, or
@@ -134,14 +138,15 @@ class GrblStage(HostStage):
         moving = status.state not in ("Idle", "Alarm")
         return Reading(position_mm[index] * 1e3, status.state != "Alarm", moving)
 
+    def _homed_together(self, axes: tuple[str, ...]) -> tuple[str, ...]:
+        if SINGLE_AXIS_HOMING in self._options or set(axes) == set(self._axes):
+            return axes
+        _log.warning("this Grbl homes all axes together: %s", ", ".join(self._axes))
+        return self._axes
+
     def _start_home(self, axes: tuple[str, ...]) -> None:
-        lines = ["$H"]
-        if set(axes) != set(self._axes):
-            if "H" not in self._options:
-                raise CommandRefusedError(
-                    "$H", "no option H", ", ".join(axes), "this firmware homes all axes together"
-                )
-            lines = [f"$H{self._letters[axis]}" for axis in axes]
+        some = set(axes) != set(self._axes)
+        lines = [f"$H{self._letters[axis]}" for axis in axes] if some else ["$H"]
         self._controller.leave_alarm()
         self._controller.start_homing(lines)
 
@@ -177,9 +182,9 @@ class GrblStage(HostStage):
     def _travel_um(self, axis: str) -> tuple[float, float]:
         """Return the travel, short of the switch by as much as homing pulled off."""
         travel_um = self._positive(codec.TRAVEL, axis) * 1e3
-        settings = self._controller.settings
-        pull_off_um = settings.get(codec.HOMING_PULL_OFF, 0.0) * 1e3
-        homes_downwards = int(settings.get(codec.HOMING_DIRECTIONS, 0)) >> self._index(axis) & 1
+        pull_off_um = self._controller.setting(codec.HOMING_PULL_OFF) * 1e3
+        directions = int(self._controller.setting(codec.HOMING_DIRECTIONS))
+        homes_downwards = directions >> self._index(axis) & 1
         if not homes_downwards:
             return -travel_um, -pull_off_um
         if "Z" in self._options:
@@ -193,7 +198,7 @@ class GrblStage(HostStage):
         return self._positive(codec.MAX_RATE, axis) / 60 * 1e3
 
     def _homing_speed_um_s(self, axis: str) -> float:
-        seek_um_s = self._controller.settings.get(codec.HOMING_SEEK, 0.0) / 60 * 1e3
+        seek_um_s = self._controller.setting(codec.HOMING_SEEK) / 60 * 1e3
         top_um_s = self._top_speed_um_s(axis)
         return min(seek_um_s, top_um_s) if seek_um_s > 0 else top_um_s
 
@@ -220,7 +225,15 @@ class GrblStage(HostStage):
 
     def _positive(self, first: int, axis: str) -> float:
         number = first + self._index(axis)
-        value = self._controller.settings.get(number, 0.0)
+        if number not in self._controller.settings:
+            version = self._build.get("VER", "").rstrip(":") or "unknown"
+            advice = "install Grbl 1.1 or grblHAL, which state scale, speed and travel of axes"
+            if version.startswith("1.1"):
+                advice = f"it has no axis {self._letters[axis]}, choose another letter"
+            raise FirmwareError(
+                f"firmware of version {version} does not state ${number}, of {axis}", advice
+            )
+        value = self._controller.setting(number)
         if not value > 0:
             raise _no_such_axis(axis, "$$", f"${number}={value:g}")
         return value
@@ -236,7 +249,7 @@ class _Controller:
     """
 
     def __init__(self, transport: Transport, clock: Clock, on_lost: Callable[[str], None]) -> None:
-        self.settings: dict[int, float] = {}
+        self.settings: dict[int, codec.Setting] = {}
         self._transport = transport
         self._clock = clock
         self._on_lost = on_lost
@@ -250,6 +263,11 @@ class _Controller:
     def homes(self) -> bool:
         """Whether homing was started and has not ended."""
         return bool(self._homing_lines)
+
+    def setting(self, number: int) -> float:
+        """Return a setting, 0 where it is not stated; raises `GarbledReplyError`."""
+        stated = self.settings.get(number)
+        return 0.0 if stated is None else stated.value
 
     def send(self, command: bytes) -> None:
         """Send a real-time command, which has no answer."""
@@ -280,7 +298,7 @@ class _Controller:
 
     def machine_position_mm(self) -> tuple[codec.Status, tuple[float, ...]]:
         """Return a report and MPos, from WPos and the work offset where a report has only these."""
-        unit = codec.MM_PER_INCH if self.settings.get(codec.REPORT_INCHES) else 1.0
+        unit = codec.MM_PER_INCH if self.setting(codec.REPORT_INCHES) else 1.0
         for _ in range(REPORTS_UNTIL_OFFSET):
             status = self.status()
             if status.offset is not None:
@@ -471,7 +489,7 @@ class _Controller:
             self._restarted = True
             self._on_lost("the controller restarted")
         elif isinstance(message, codec.Setting):
-            self.settings[message.number] = message.value
+            self.settings[message.number] = message
         elif message is not None and not isinstance(message, codec.Ok | codec.Status):
             _log.debug("%r", message)
         return message

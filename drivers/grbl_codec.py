@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.errors import GarbledReplyError
+from drivers.errors import FirmwareError, GarbledReplyError
 
 TERMINATOR = b"\n"
 LINE_LENGTH = 80
@@ -60,10 +60,11 @@ ALARMS = {
     9: "homing did not find the limit switch",
 }
 
-_STATUS = re.compile(r"<([A-Z][a-z]+)(?::(\d))?((?:\|[A-Za-z]+:[^|<>]*)+)>")
+_STATUS = re.compile(r"<([A-Z][a-z]+)(?::(\d+))?((?:\|[A-Za-z]+:[^|<>]*)+)>")
 _NUMBER = re.compile(r"-?\d{1,9}(\.\d{1,6})?")
 _BANNER = re.compile(r"(?:Grbl|GrblHAL) (\d+\.\d+\S*) \[.*\]")
-_SETTING = re.compile(r"\$(\d{1,3})=(\S+)")
+_SETTING = re.compile(r"\$(\d{1,4})=(.*)")
+_OLD_STATUS = re.compile(r"<[A-Z][a-z]+,[MW]Pos:.*>")
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,18 @@ class Banner:
 
 @dataclass(frozen=True)
 class Setting:
-    """One line of the answer to `$$`."""
+    """One line of the answer to `$$`; text: a number in most, grblHAL has names and addresses."""
 
     number: int
-    value: float
+    text: str
+
+    @property
+    def value(self) -> float:
+        """The number, without the remark that some firmware writes behind it.
+
+        Raises `GarbledReplyError`.
+        """
+        return _number(f"${self.number}={self.text}".encode(), self.text.partition(" (")[0])
 
 
 @dataclass(frozen=True)
@@ -158,7 +167,7 @@ def decode_line(line: bytes) -> Message | None:
     """Return the message in one line, its line end included.
 
     None for an empty line, and for one that Grbl ran by itself when it started. Raises
-    `GarbledReplyError`.
+    `GarbledReplyError`, and `FirmwareError` for a report of Grbl 0.9 or older.
     """
     if not line.endswith(b"\n") or b"\n" in line[:-1]:
         raise GarbledReplyError(line, "not one line")
@@ -180,7 +189,7 @@ def decode_line(line: bytes) -> Message | None:
     if match := _BANNER.fullmatch(text):
         return Banner(match[1])
     if match := _SETTING.fullmatch(text):
-        return Setting(int(match[1]), _number(line, match[2]))
+        return Setting(int(match[1]), match[2].strip())
     if match := re.fullmatch(r"\[([A-Za-z0-9]+):(.*)\]", text):
         return Feedback(match[1], match[2])
     if text.startswith((">", "$N")):
@@ -189,6 +198,10 @@ def decode_line(line: bytes) -> Message | None:
 
 
 def _decode_status(line: bytes, text: str) -> Status:
+    if _OLD_STATUS.fullmatch(text):
+        raise FirmwareError(
+            f"a Grbl older than 1.1 answers ({text})", "install Grbl 1.1 or grblHAL on it"
+        )
     match = _STATUS.fullmatch(text)
     if match is None or match[1] not in STATES:
         raise GarbledReplyError(line, "not a status report")
@@ -203,8 +216,8 @@ def _decode_status(line: bytes, text: str) -> Status:
         _position(line, values[name]) if name in values else None
         for name in ("MPos", "WPos", "WCO")
     )
-    if (machine is None) == (work is None):
-        raise GarbledReplyError(line, "neither or both of MPos and WPos")
+    if machine is None and work is None:
+        raise GarbledReplyError(line, "neither MPos nor WPos")
     if offset is not None and len(offset) != len(machine or work or ()):
         raise GarbledReplyError(line, "offset and position of different length")
     return Status(

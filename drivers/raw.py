@@ -3,11 +3,13 @@
 import hashlib
 import io
 import math
+import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta, timezone
+from typing import Any, BinaryIO
 
 import numpy as np
 import rawpy
@@ -27,7 +29,7 @@ TIFF_MAGICS = {
 }
 """First bytes of files that are laid out as TIFF, with TIFF's own: Olympus and Panasonic differ."""
 PANASONIC = b"IIU\x00"
-EXPOSURE_TIME_TAG = 33434
+EXPOSURE_TIME_TAG, ISO_TAG = 33434, 34855
 EXIF_TAG = 34665
 IMAGE_DESCRIPTION_TAG = 270
 CFA_TILE_PREFIX = "cfa_tile="
@@ -42,14 +44,20 @@ RAW_SUFFIXES = frozenset(
 )
 """What makers call the RAW files that LibRaw knows."""
 
-TAG_CODES = {"maker": 271, "model": 272, "captured": 306, "serial": 42033}
-EXIF_NAMES = {
-    "iso": "ISOSpeedRatings",
-    "aperture": "FNumber",
-    "captured": "DateTimeOriginal",
-    "serial": "BodySerialNumber",
-}
-"""What a frame's metadata take from the file, where it has it."""
+TEXT_TAGS = {"maker": (271, "Make"), "model": (272, "Model"), "serial": (42033, "BodySerialNumber")}
+NUMBER_TAGS = {"iso": (ISO_TAG, "ISOSpeedRatings"), "aperture": (33437, "FNumber")}
+TIME_TAGS = (
+    ((36867, "DateTimeOriginal"), (37521, "SubsecTimeOriginal"), (36881, "OffsetTimeOriginal")),
+    ((306, "DateTime"), (37520, "SubsecTime"), (36880, "OffsetTime")),
+)
+"""Code and tifffile's name of what a frame's metadata take from the file, where it has it."""
+EXIF_TIME = "%Y:%m:%d %H:%M:%S"
+
+DNG_VERSION_TAG, ACTIVE_AREA_TAG = 50706, 50829
+BLACK_REPEAT_TAG, BLACK_TAG, BLACK_COLUMNS_TAG, BLACK_ROWS_TAG = 50713, 50714, 50715, 50716
+"""DNG 1.4: BlackLevelRepeatDim, BlackLevel, BlackLevelDeltaH (by column), BlackLevelDeltaV."""
+LONGEST_PERIOD = 64
+"""Of rows or columns whose black levels repeat; others are kept for every row or column."""
 
 HASH_BESIDE_BYTES = 1 << 20
 """From here on a file is hashed in a thread of its own, while LibRaw decodes it."""
@@ -83,7 +91,8 @@ class RawFrame:
     """One frame as the sensor gave it.
 
     `mosaic`: uint16 `(y, x)` in DN, read-only, black level still in it.
-    `black_level_dn`: float64 `(2, 2)`, of the pixels `mosaic[i::2, j::2]`.
+    `black_level_dn`: float64 tile `(h, w)` that repeats over the mosaic: `(2, 2)`, the levels of
+    the pixels `mosaic[i::2, j::2]`, unless the file's levels have another period, or none.
     `cfa`: "rggb", "grbg", "gbrg", "bggr", "mono", or the name of a tile that is not Bayer.
     `exposure_s`: None where neither the file nor the camera says.
     `original`: the camera's own bytes, `sha256` their digest in hexadecimal.
@@ -105,6 +114,28 @@ class RawFrame:
     host_time_s: float | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
 
+    def black_by_place(self) -> Array:
+        """Return the black level of every pixel, `(y, x)` in DN, read-only."""
+        levels = self.black_level_dn
+        if np.ptp(levels) == 0:
+            return np.broadcast_to(levels[0, 0], self.mosaic.shape)
+        (rows, columns), (height, width) = self.mosaic.shape, levels.shape
+        return np.tile(levels, (-(-rows // height), -(-columns // width)))[:rows, :columns]
+
+    def with_one_black(self) -> "RawFrame":
+        """Return the frame as it would be with one black level, the mean in whole DN.
+
+        Pixels at the white level, and at 0, stay there: for figures and pictures.
+        """
+        if np.ptp(self.black_level_dn) == 0:
+            return self
+        mean = np.rint(self.black_level_dn.mean())
+        shift = np.rint(mean - self.black_by_place()).astype(np.int32)
+        moved = np.clip(self.mosaic + shift, 1, max(self.white_level_dn - 1, 1))
+        kept = (self.mosaic == 0) | (self.mosaic >= self.white_level_dn)
+        mosaic = np.where(kept, self.mosaic, moved).astype(np.uint16)
+        return replace(self, mosaic=mosaic, black_level_dn=np.full((2, 2), mean))
+
 
 def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
     """Return the frame in the bytes of a RAW file: DNG, or any other that LibRaw knows.
@@ -117,14 +148,20 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
     """
     if not data:
         raise RawFrameError("it is empty")
-    tags = _read_tiff(data) if data[:4] in TIFF_MAGICS else _TiffTags()
+    magic = data[:4]
+    tags = _read_tiff(_as_tiff(data), magic) if magic in TIFF_MAGICS else _TiffTags()
     with hashed(data) as digest:
-        mosaic, black_level_dn, white_level_dn, cfa = _decoded(data)
+        mosaic, black_level_dn, white_level_dn, cfa, margins = _decoded(data)
+    if tags.levels is not None:
+        black_level_dn = tags.levels.tile_at(margins, mosaic.shape)
     if mosaic.dtype != np.uint16:
-        raise RawFrameError("it holds floating-point pixels, not one mosaic of 16 bits")
+        raise RawFrameError(
+            "it holds floating-point pixels, not one mosaic of 16 bits", "use the camera's own file"
+        )
     if expected_shape is not None and mosaic.shape != tuple(expected_shape):
         raise RawFrameError(
-            f"it has {_size(mosaic.shape)} pixels (y x) instead of {_size(expected_shape)}"
+            f"it has {_size(mosaic.shape)} pixels (y x) instead of {_size(expected_shape)}",
+            "use one size for all frames",
         )
     mosaic.flags.writeable = False
     black_level_dn.flags.writeable = False
@@ -140,26 +177,89 @@ def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> Ra
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _DngLevels:
+    """Black levels as a DNG states them.
+
+    tile: (h, w), repeated from `origin`, the first row and column of the active area. rows,
+    columns: what is added to each row and column of the active area, (1,) where nothing is.
+    """
+
+    tile: Array
+    rows: Array
+    columns: Array
+    origin: tuple[int, int]
+
+    def tile_at(self, margins: tuple[int, int], shape: tuple[int, int]) -> Array:
+        """Return the levels, as `RawFrame` has them, of a mosaic cut out at these margins."""
+        places, added = [], []
+        deltas = self.rows, self.columns
+        for axis, delta in enumerate(deltas):
+            start, period = margins[axis] - self.origin[axis], self.tile.shape[axis]
+            own = np.arange(shape[axis]) + start
+            values = delta[np.clip(own, 0, delta.size - 1)]
+            count = min(shape[axis], max(2, math.lcm(period, _period(values))))
+            places.append(own[:count] % period)
+            added.append(values[:count])
+        return self.tile[np.ix_(*places)] + added[0][:, None] + added[1]
+
+
+def _period(values: Array) -> int:
+    """Return the number of places after which values repeat; their count where none is short."""
+    for period in range(1, min(LONGEST_PERIOD, values.size - 1) + 1):
+        if np.array_equal(values[period:], values[:-period]):
+            return period
+    return values.size
+
+
 @dataclass(frozen=True)
 class _TiffTags:
-    """What the file says besides its pixels."""
+    """Tags of the file; levels: black levels of a DNG, None where no DNG states them."""
 
     exposure_s: float | None = None
     tile: str | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
+    levels: _DngLevels | None = None
 
 
-def exposure_and_time(data: bytes) -> tuple[float | None, str]:
-    """Return exposure in s and time of capture as a RAW file states them, None and "" where not.
+def exposure_and_time(file: BinaryIO) -> tuple[float | None, datetime | None]:
+    """Return exposure in s and time of capture as a RAW file states them, None where it does not.
 
     The picture is not decoded; only files laid out as TIFF are read. Raises `RawFrameError`.
     """
-    tags = _read_tiff(data) if data[:4] in TIFF_MAGICS else _TiffTags()
-    return tags.exposure_s, tags.metadata.get("captured", "")
+    magic = file.read(4)
+    file.seek(0)
+    if magic not in TIFF_MAGICS:
+        return None, None
+    tags = _read_tiff(file if TIFF_MAGICS[magic] == magic else _as_tiff(file.read()), magic)
+    return tags.exposure_s, captured_at(tags.metadata)
 
 
-def _decoded(data: bytes) -> tuple[Array, Array, int, str]:
-    """Return mosaic, black levels `(2, 2)`, white level and phase; raises `RawFrameError`."""
+def captured_at(metadata: Mapping[str, str]) -> datetime | None:
+    """Return when a frame was captured by its camera's clock, with a time zone if that is stated.
+
+    metadata: a frame's; `captured` as EXIF writes times, `captured_fraction` the digits of a
+    second, `captured_offset` +HH:MM. None where no time is stated.
+    """
+    try:
+        at = datetime.strptime(metadata.get("captured", ""), EXIF_TIME)
+    except ValueError:
+        return None
+    digits = metadata.get("captured_fraction", "")
+    if digits.isdecimal():
+        at += timedelta(seconds=int(digits) / 10 ** len(digits))
+    match = re.fullmatch(r"([+-])(\d\d):([0-5]\d)", metadata.get("captured_offset", ""))
+    if match and int(match[2]) < 24:
+        offset = timedelta(hours=int(match[2]), minutes=int(match[3]))
+        at = at.replace(tzinfo=timezone(-offset if match[1] == "-" else offset))
+    return at
+
+
+def _decoded(data: bytes) -> tuple[Array, Array, int, str, tuple[int, int]]:
+    """Return mosaic, black levels, white level, phase, and rows and columns cut off before it.
+
+    Raises `RawFrameError`.
+    """
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
             # Opened, not unpacked: LibRaw takes memory for what the file claims.
@@ -170,14 +270,17 @@ def _decoded(data: bytes) -> tuple[Array, Array, int, str]:
                 )
             mosaic = raw.raw_image_visible.copy()
             if mosaic.ndim != 2:
-                raise RawFrameError("it holds colour pixels, not one mosaic")
+                raise RawFrameError(
+                    "it holds colour pixels, not one mosaic", "use the camera's own file"
+                )
             black_level_dn, cfa = _read_levels_and_phase(raw)
             white_level_dn = int(raw.white_level)
+            margins = raw.sizes.top_margin, raw.sizes.left_margin
     except RawFrameError:
         raise
     except Exception as error:  # rawpy raises bare RuntimeErrors too, and what NumPy does
         raise RawFrameError(f"LibRaw cannot decode it ({_text(error)})") from error
-    return mosaic, black_level_dn, white_level_dn, cfa
+    return mosaic, black_level_dn, white_level_dn, cfa, margins
 
 
 @contextmanager
@@ -197,7 +300,7 @@ def hashed(data: bytes) -> Iterator[Any]:
 
 
 def _read_levels_and_phase(raw: rawpy.RawPy) -> tuple[Array, str]:
-    """Return the black levels `(2, 2)` in mosaic order, and the CFA phase.
+    """Return the black levels in mosaic order, and the CFA phase.
 
     LibRaw lists black levels by colour, the second green last; the colour of a pixel leads back
     to its place.
@@ -205,54 +308,144 @@ def _read_levels_and_phase(raw: rawpy.RawPy) -> tuple[Array, str]:
     by_colour = np.asarray(raw.black_level_per_channel, dtype=np.float64)
     if raw.num_colors == 1:
         return np.full((2, 2), by_colour[0]), "mono"
-    sizes = raw.sizes
-    colours = [
-        [raw.raw_color(sizes.top_margin + row, sizes.left_margin + column) for column in (0, 1)]
-        for row in (0, 1)
-    ]
-    if raw.raw_pattern is not None and raw.raw_pattern.shape == (6, 6):
-        return by_colour[np.array(colours)], "xtrans"
+    is_xtrans = raw.raw_pattern is not None and raw.raw_pattern.shape == (6, 6)
+    sizes, side = raw.sizes, range(6 if is_xtrans else 2)
+    colours = np.array(
+        [
+            [raw.raw_color(sizes.top_margin + row, sizes.left_margin + column) for column in side]
+            for row in side
+        ]
+    )
+    levels = by_colour[colours]
+    if is_xtrans:
+        return (levels if np.ptp(levels) else levels[:2, :2]), "xtrans"
     letters = raw.color_desc.decode("ascii").lower()
-    return by_colour[np.array(colours)], "".join(letters[c] for pair in colours for c in pair)
+    return levels, "".join(letters[colour] for colour in colours.flat)
 
 
-def _read_tiff(data: bytes) -> _TiffTags:
-    """Return what the tags say, having checked that every strip lies inside the file."""
+def _as_tiff(data: bytes) -> BinaryIO:
+    """Return the bytes of a file laid out as TIFF with TIFF's own beginning."""
+    return io.BytesIO(TIFF_MAGICS[data[:4]] + data[4:])
+
+
+def _read_tiff(file: BinaryIO, magic: bytes) -> _TiffTags:
+    """Return what the tags say, having checked that every strip lies inside the file.
+
+    A tag with a value that it cannot have states nothing. Raises `RawFrameError`.
+    """
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
     try:
-        magic = data[:4]
-        stream = io.BytesIO(TIFF_MAGICS[magic] + data[4:])
-        with tifffile.TiffFile(stream) as tiff:
+        with tifffile.TiffFile(file) as tiff:
             pages = list(tiff.pages)
             for page in pages:
                 pages.extend(page.pages or ())
             if magic == PANASONIC:
-                missing = _rw2_bytes_missing(tiff.pages.first.tags, len(data))
+                missing = _rw2_bytes_missing(tiff.pages.first.tags, size)
             else:
-                missing = max(_bytes_missing(page, len(data)) for page in pages)
+                missing = max(_bytes_missing(page, size) for page in pages)
             tags = tiff.pages.first.tags
             exif = tags.valueof(EXIF_TAG)
             exif = exif if isinstance(exif, dict) else {}
-            exposure_s = _exposure_s(tags, exif)
-            description = str(tags.valueof(IMAGE_DESCRIPTION_TAG, ""))
-            metadata = {name: tags.valueof(tag) for name, tag in TAG_CODES.items()}
-            metadata |= {name: exif.get(key) for name, key in EXIF_NAMES.items() if key in exif}
+            levels = _dng_levels(pages) if DNG_VERSION_TAG in tags else None
+            found = _TiffTags(
+                _number(tags, exif, EXPOSURE_TIME_TAG, "ExposureTime"),
+                _tile_name(tags.valueof(IMAGE_DESCRIPTION_TAG)),
+                _metadata(tags, exif),
+                levels,
+            )
     except Exception as error:  # tifffile raises whatever it runs into in damaged tags
         raise RawFrameError(f"its table of contents is damaged ({_text(error)})") from error
     if missing > 0:
         raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")
-    tile = description.removeprefix(CFA_TILE_PREFIX)
-    return _TiffTags(
-        exposure_s,
-        tile if tile != description else None,
-        {name: _shown(value) for name, value in metadata.items() if value is not None},
-    )
+    return found
 
 
-def _shown(value: object) -> str:
-    """Return a tag's value as text: a fraction as a number."""
-    if isinstance(value, tuple) and len(value) == 2 and value[1]:
-        return f"{value[0] / value[1]:g}"
-    return str(value).strip()
+def _tile_name(description: object) -> str | None:
+    if isinstance(description, str) and description.startswith(CFA_TILE_PREFIX):
+        return description.removeprefix(CFA_TILE_PREFIX)
+    return None
+
+
+def _metadata(tags: Any, exif: Mapping[str, Any]) -> dict[str, str]:
+    """Return the texts, numbers and time of capture that the tags state."""
+    found = {name: _text_of(tags, exif, *at) for name, at in TEXT_TAGS.items()}
+    for name, at in NUMBER_TAGS.items():
+        number = _number(tags, exif, *at)
+        found[name] = "" if number is None else f"{number:g}"
+    for time, fraction, offset in TIME_TAGS:
+        digits = re.findall(r"\d+", _text_of(tags, exif, *time))
+        found["captured"] = "{}:{}:{} {}:{}:{}".format(*digits) if len(digits) == 6 else ""
+        if captured_at(found) is not None:
+            found["captured_fraction"] = _text_of(tags, exif, *fraction)
+            found["captured_offset"] = _text_of(tags, exif, *offset)
+            break
+        found["captured"] = ""
+    return {name: text for name, text in found.items() if text}
+
+
+def _text_of(tags: Any, exif: Mapping[str, Any], code: int, name: str) -> str:
+    """Return a text from the EXIF directory, else from the first; "" where neither states it."""
+    values = exif.get(name), tags.valueof(code)
+    texts = (value.strip() for value in values if isinstance(value, str))
+    return next(filter(None, texts), "")
+
+
+def _number(tags: Any, exif: Mapping[str, Any], code: int, name: str) -> float | None:
+    """Return a positive number from the first directory, else from EXIF; None where not stated.
+
+    A rational with a zero in it is how EXIF says that a value is not known.
+    """
+    for value in (tags.valueof(code), exif.get(name)):
+        numbers = value if isinstance(value, tuple) else (value,)
+        if code == ISO_TAG:  # some write several, the first that of the picture
+            numbers = numbers[:1]
+        if len(numbers) not in (1, 2) or not all(isinstance(one, int | float) for one in numbers):
+            continue
+        number = float(numbers[0])
+        if len(numbers) == 2:
+            number = number / numbers[1] if numbers[1] else math.nan
+        if math.isfinite(number) and number > 0:
+            return number
+    return None
+
+
+def _dng_levels(pages: Sequence[Any]) -> _DngLevels | None:
+    """Return the black levels that the largest mosaic states; None where it states none.
+
+    Source: DNG 1.4, BlackLevel and what follows; the active area is where its tile begins.
+    """
+    mosaics = [page for page in pages if page.photometric in MOSAIC_PHOTOMETRICS]
+    page = max(mosaics, key=lambda page: page.imagewidth * page.imagelength, default=None)
+    if page is None or page.samplesperpixel != 1:
+        return None
+    codes = BLACK_TAG, BLACK_REPEAT_TAG, BLACK_ROWS_TAG, BLACK_COLUMNS_TAG, ACTIVE_AREA_TAG
+    stated = [_numbers(page.tags.get(code)) for code in codes]
+    level, repeat, rows, columns, area = stated
+    odd = any(one is None and code in page.tags for code, one in zip(codes, stated, strict=True))
+    if odd or (level is None and rows is None and columns is None):
+        return None
+    none = np.zeros(1)
+    tile, rows, columns = (none if one is None else one for one in (level, rows, columns))
+    size = (1, 1) if repeat is None else tuple(repeat.astype(int).tolist())
+    top, left, bottom, right = (0, 0, page.imagelength, page.imagewidth)
+    if area is not None and area.size == 4:
+        top, left, bottom, right = area.astype(int).tolist()
+    counts = rows.size in (1, bottom - top) and columns.size in (1, right - left)
+    if not counts or len(size) not in (1, 2) or tile.size != math.prod(size):
+        return None
+    return _DngLevels(tile.reshape(size[0], -1), rows, columns, (top, left))
+
+
+def _numbers(tag: Any) -> Array | None:
+    """Return the numbers in a tag, float64; None without a tag, or where they are not finite."""
+    if tag is None or isinstance(tag.value, str | bytes):
+        return None
+    found = np.atleast_1d(np.asarray(tag.value, np.float64))
+    if tag.dtype in (tifffile.DATATYPE.RATIONAL, tifffile.DATATYPE.SRATIONAL):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = found[0::2] / found[1::2]
+    return found if np.isfinite(found).all() else None
 
 
 def _bytes_missing(page: Any, file_size: int) -> int:
@@ -285,17 +478,6 @@ def _rw2_bytes_missing(tags: Any, file_size: int) -> int:
     per_block = RW2_PIXELS_PER_BLOCK.get((tags.valueof(0x2D), tags.valueof(0x0A)))
     needed = height * (width // per_block) * 16 if per_block else height * width // 8
     return offset + needed - file_size
-
-
-def _exposure_s(tags: Any, exif: Mapping[str, Any]) -> float | None:
-    """Return the exposure time from the first directory or from its EXIF directory."""
-    rational = tags.valueof(EXPOSURE_TIME_TAG)
-    if rational is None:
-        rational = exif.get("ExposureTime")
-    if rational is None:
-        return None
-    numerator, denominator = rational
-    return numerator / denominator
 
 
 def _size(shape: tuple[int, ...]) -> str:

@@ -268,6 +268,10 @@ class HostStage(ABC):
         """Return the speed at which the axis looks for its reference."""
         return self._home_speeds_um_s.get(axis) or self.speed_um_s(axis)
 
+    def _homed_together(self, axes: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the axes that are homed when these are to be."""
+        return axes
+
     def _readings_are_checked(self, axis: str) -> bool:
         """Return whether a checksum protects what `_read` reads."""
         return False
@@ -368,9 +372,10 @@ class HostStage(ABC):
     def home(self, axes: Iterable[str] | None = None) -> None:
         """Find the reference of the given axes (all by default), and wait until they stand.
 
+        Firmware that cannot home a single axis homes all; the log says so before they move.
         Raises `NotHomedError` when an axis still has no reference, and what a move raises.
         """
-        chosen = self._choose(axes)
+        chosen = self._homed_together(self._choose(axes))
         with self._stopped_on_error(chosen):
             self._mark_unknown(chosen, "its homing did not finish")
             self._start_home(chosen)

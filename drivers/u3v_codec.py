@@ -68,7 +68,7 @@ STATUS = {
     0x8006: ("access denied", "stop the acquisition and close other programs that use the camera"),
     0x8007: ("busy", "wait, then try again"),
     0x800B: ("message timeout", "try again"),
-    0x800E: ("invalid header", "check the cable"),
+    0x800E: ("invalid header", "open the camera again"),
     0x800F: ("wrong configuration", "open the camera again"),
     0x8FFF: ("error", "switch the camera off and on"),
     0xA001: ("resend not supported", "capture again"),

@@ -102,7 +102,7 @@ def decode_message(line: bytes, checksum_required: bool = False) -> Reply | None
     if checksum is None and checksum_required:
         raise GarbledReplyError(line, "the checksum is missing")
     if checksum is not None and int(checksum, 16) != lrc(body):
-        raise GarbledReplyError(line, "the checksum is wrong")
+        raise GarbledReplyError(line, "the checksum is wrong", on_the_line=True)
     if not body.isascii():
         raise GarbledReplyError(line, "not plain text")
     if kind != b"@":

@@ -24,6 +24,8 @@ from simulators.motion import AxisSpec, End, Motor
 LETTERS = "XYZABC"
 SMALL_AXIS = AxisSpec(microstep_um=0.3125, max_speed_um_s=8_000.0, backlash_um=3.0)
 BENCH_AXES = {"X": SMALL_AXIS, "Y": SMALL_AXIS, "Z": SMALL_AXIS}
+AS_SHIPPED, WITH_SINGLE_AXIS_HOMING = "V", "VH"
+"""Options in `$I`: those that Grbl's config.h has, and one that must be compiled in."""
 VERSION = "1.1h"
 BUILD = "20190825"
 PLANNER_BLOCKS = 15
@@ -83,6 +85,7 @@ class _Modes:
 class GrblController(SimulatedController):
     """One controller, its axes by letter; machine position 0 is at the upper end of the travel.
 
+    options: `AS_SHIPPED` or other letters of `$I`.
     Faults as `SimulatedController`'s, and `door`: the safety door opens at the next line.
     `lost_bytes` counts what came while the receive buffer was full.
     """
@@ -91,7 +94,7 @@ class GrblController(SimulatedController):
         self,
         clock: Clock,
         axes: Mapping[str, AxisSpec] = BENCH_AXES,
-        options: str = "VH",
+        options: str = AS_SHIPPED,
         settings: Mapping[int, float] | None = None,
     ) -> None:
         super().__init__(clock, ("door",))

@@ -232,6 +232,7 @@ class HandPlaces:
         mask, shot = self._mask, planned.bench.shot
         cut_y, cut_x = self._cut
         rows, columns = frame.mosaic.shape
+        frame = frame.with_one_black()
         black = float(frame.black_level_dn.mean())
         seen = frame.mosaic[cut_y : rows - cut_y, cut_x : columns - cut_x].ravel() - black
         usable = (seen < (frame.white_level_dn - black)) & (seen > 0)

@@ -42,6 +42,7 @@ class SaturatedError(FrameRefusedError):
 
 def figures(frame: RawFrame) -> Figures:
     """Return a frame's figures, from `thinned` pixels."""
+    frame = frame.with_one_black()
     black = float(frame.black_level_dn.mean())
     few = thinned(frame.mosaic)
     counts = np.bincount(few.ravel())

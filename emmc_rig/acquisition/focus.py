@@ -66,6 +66,7 @@ def sharpness(now: RawFrame, before: RawFrame) -> Sharpness | None:
 
 def _plane(frame: RawFrame) -> NDArray[np.float32]:
     """Return the middle of the frame's pixels of one colour, above black."""
+    frame = frame.with_one_black()
     planes = colour_planes(frame)
     plane = planes.get("green", planes.get("grey", []))[0]
     cuts = []

@@ -24,7 +24,7 @@ from drivers.cameras import CAMERA_HELP, CAMERAS
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.combined import CombinedStage
 from drivers.dng import SMALLEST_SIDE_PX
-from drivers.errors import DriverError, TransportTimeoutError
+from drivers.errors import DriverError, FirmwareError, TransportTimeoutError
 from drivers.grbl import GrblStage
 from drivers.grbl import identify as identify_grbl
 from drivers.ports import find_port, guess_of, list_serial_ports
@@ -461,6 +461,8 @@ def probe_port(port: str) -> str:
                     answer = ask(transport)
                     if answer:
                         return f"{protocol}: {answer}"
+                except FirmwareError as error:
+                    return f"{protocol}: {error}"
                 except DriverError as error:
                     _log.debug("%s is no %s: %s", port, protocol, error)
     return ""

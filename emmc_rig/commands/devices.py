@@ -247,12 +247,16 @@ def jog(
     to: Annotated[
         bool, typer.Option("--to", help="move to this position instead of by this distance")
     ] = False,
-    home_first: Annotated[bool, typer.Option("--home", help="home the axis first")] = False,
+    home_first: Annotated[
+        bool, typer.Option("--home", help="home it first, and all axes where one alone cannot be")
+    ] = False,
     speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
     stage: StageOption = None,
     rig: RigOption = None,
 ) -> None:
-    """Move an axis by a distance (`-- -5`: back), or to a position."""
+    """Move an axis by a distance (-5: back), or to a position."""
+    from drivers.errors import NotHomedError
+
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
             opened.set_speed_um_s(axis, speed_um_s)
@@ -261,7 +265,16 @@ def jog(
                 opened.home([axis])
                 progress.begin("move")
             move = opened.move_to_um if to else opened.move_by_um
-            at_um = move({axis: distance_um})[axis]
+            try:
+                at_um = move({axis: distance_um})[axis]
+            except NotHomedError as fault:
+                # After homing, a distance may lead out of the travel; a place within never does.
+                place_um = distance_um if to else sum(opened.limits_um(axis)) / 2
+                where = f"--rig {rig}" if stage is None else f"--stage {stage}"
+                raise AppError(
+                    f"{fault.what}: home it in the same command, as `emmc-rig devices jog {axis} "
+                    f"{place_um:g} --to --home {where}`"
+                ) from fault
         tell(f"{axis} at {at_um:.3f} um")
         give_result(axis=axis, at_um=at_um)
 

@@ -5,6 +5,7 @@ An option that would be ignored is refused: wrong usage, in one line.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
@@ -35,6 +36,9 @@ NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
 """By command, an option and the one, or those, without which it does nothing."""
 RENAMED = {"calibrate": {"--route": "--method", "--leave-out": "--skip"}}
 """By command, options of earlier versions that scripts use, and what they are called now."""
+NUMBERS = {"jog"}
+"""Commands with numbers for arguments: -5 is a number there, not an option."""
+_NEGATIVE = re.compile(r"-\.?\d")
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")
 
 
@@ -47,7 +51,10 @@ class ModalCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line; options of earlier versions are taken under their new names."""
         renamed = RENAMED.get(self.name or "", {})
-        return super().parse_args(ctx, [_under_new_name(one, renamed) for one in args])
+        words = [_under_new_name(one, renamed) for one in args]
+        if self.name in NUMBERS:  # a number with a space before it looks like no option
+            words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
+        return super().parse_args(ctx, words)
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; raises BadParameter."""

@@ -52,8 +52,7 @@ def _raw_light(content: bytes, path: Path) -> NDArray[np.float32]:
         raise AppError(f"{path}: {fault}") from fault
     if frame.cfa not in ("mono", *DEMOSAICING):
         raise AppError(f"{path}: a sensor with the colour tile {frame.cfa}; develop it as a TIFF")
-    black = np.tile(frame.black_level_dn, [-(-side // 2) for side in frame.mosaic.shape])
-    black = black[: frame.mosaic.shape[0], : frame.mosaic.shape[1]]
+    black = frame.black_by_place()
     light = np.clip((frame.mosaic - black) / (frame.white_level_dn - black), 0, 1)
     if frame.cfa == "mono":
         return np.atleast_3d(light.astype(np.float32))

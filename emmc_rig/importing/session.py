@@ -14,6 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,8 @@ import yaml
 from numpy.typing import NDArray
 
 from drivers.camera import EXPOSURE_AGREEMENT
-from drivers.raw import RawFrame
+from drivers.capture_order import capture_order
+from drivers.raw import RawFrame, captured_at
 from emmc_rig.acquisition.checks import BRIGHT_PERCENTILE, figures
 from emmc_rig.acquisition.expand import fittings, mask_offsets_um
 from emmc_rig.acquisition.plan import Checks, Plan, planned_camera
@@ -123,8 +125,9 @@ def import_session(
         raise AppError(f"--out {out}: holds something already; name another --out")
     try:
         with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
-            items = list(_items(listed, known, planes, Path(spool), on_file))
-            return _Import(items, known, camera).write(out)
+            found = list(_items(listed, known, planes, Path(spool), on_file))
+            items, notes = _in_capture_order(found)
+            return _Import(items, known, camera, notes).write(out)
     except OSError as fault:
         why = fault.strerror or fault
         raise AppError(f"{fault.filename or out}: {why}; nothing was imported") from fault
@@ -186,6 +189,22 @@ def _items(
                 _known(own.times_s[page]),
             )
         on_file(name)
+
+
+def _in_capture_order(items: Sequence[_Item]) -> tuple[list[_Item], list[str]]:
+    """Return the frames, those of files that one glob named as captured, and what to note."""
+    ordered, notes = [], []
+    for pattern, group in groupby(items, key=lambda item: item.listed.pattern):
+        files = [list(file) for _, file in groupby(group, key=lambda item: item.listed.where)]
+        if pattern:
+            names = [file[0].listed.path.name for file in files]
+            raws = [file[0].raw for file in files]
+            times = [None if raw is None else captured_at(raw.metadata) for raw in raws]
+            order = capture_order(names, times)
+            files = [files[place] for place in order.places]
+            notes += [f"{pattern}: {note}" for note in order.notes]
+        ordered += [item for file in files for item in file]
+    return ordered, notes
 
 
 def _reader(path: Path, dtype: np.dtype, shape: tuple[int, ...]) -> Callable[[], NDArray]:
@@ -254,8 +273,10 @@ def _check_values(frames: NDArray, name: str, white_dn: int) -> None:
 class _Import:
     """A session in the making."""
 
-    def __init__(self, items: list[_Item], camera: Camera, spec: str) -> None:
-        self._notes: list[str] = []
+    def __init__(
+        self, items: list[_Item], camera: Camera, spec: str, notes: Sequence[str] = ()
+    ) -> None:
+        self._notes = list(notes)
         self._items = self._numbered(items)
         shots = [shot for item, shot in self._items if item.listed.row.kind == "shot"]
         if not shots:

@@ -8,13 +8,14 @@ import io
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
+from drivers.capture_order import natural
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import did_you_mean
 from emmc_rig.model.json_text import shown_path
@@ -65,12 +66,16 @@ class Row(Settings):
 
 @dataclass(frozen=True)
 class Listed:
-    """A row with where it stands, for messages, and the file that it names."""
+    """A row with where it stands, for messages, and the file that it names.
+
+    pattern: the glob that named it, whose files have no order of their own; "" of a table's row.
+    """
 
     row: Row
     where: str
     path: Path
     array: str = ""
+    pattern: str = ""
 
 
 def read_table(path: Path) -> list[Listed]:
@@ -137,14 +142,15 @@ def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
     found = []
     for kind, patterns in globs.items():
         for pattern in patterns:
-            names = sorted(glob.glob(pattern, recursive=True), key=_natural)
+            names = sorted(glob.glob(pattern, recursive=True), key=natural)
             files, at, array = pattern.rpartition("@")
             if at and not names:
-                matching = sorted(glob.glob(files, recursive=True), key=_natural)
+                matching = sorted(glob.glob(files, recursive=True), key=natural)
                 names = [f"{name}@{array}" for name in matching]
             if not names:
                 raise AppError(f"{pattern}: no file is called so ({kind})")
-            found += [_listed(Row(file=name, kind=kind), name, Path()) for name in names]
+            listed = (_listed(Row(file=name, kind=kind), name, Path()) for name in names)
+            found += [replace(one, pattern=pattern) for one in listed]
     return found
 
 
@@ -159,9 +165,3 @@ def _listed(row: Row, where: str, beside: Path) -> Listed:
         near = did_you_mean(path.name, os.listdir(path.parent)) if path.parent.is_dir() else ""
         raise AppError(f"{where}: {shown_path(path)}: no such file; {near}".strip(" ;"))
     return Listed(row, where, path, array)
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key by which the numbers in names sort as numbers."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if place % 2 else (0, part) for place, part in enumerate(parts)]

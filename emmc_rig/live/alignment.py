@@ -93,6 +93,7 @@ def grid_direction(plane: Array) -> tuple[float, float]:
 
 def is_dark(frame: RawFrame) -> bool:
     """Return whether a frame shows nothing but black."""
+    frame = frame.with_one_black()
     black = float(frame.black_level_dn.mean())
     bright = float(np.percentile(thinned(frame.mosaic), 99)) - black
     return bright < DARK_SHARE * max(1.0, frame.white_level_dn - black)
@@ -222,8 +223,7 @@ def _levelled(
     frame: RawFrame, channels: NDArray[np.uint8], mask: ShadowMask
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return readings over the local level of their colour, (y, x), and which to use."""
-    black = float(frame.black_level_dn.mean())
-    signal = frame.mosaic.astype(np.float32) - np.float32(black)
+    signal = frame.mosaic.astype(np.float32) - frame.black_by_place().astype(np.float32)
     usable = frame.mosaic < frame.white_level_dn
     sigma = LEVEL_CELLS * mask.cell_um / (mask.pitch_um * mask.binning)
     sigma = min(max(sigma, 4.0), min(signal.shape) / 4)

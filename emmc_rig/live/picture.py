@@ -64,6 +64,7 @@ def window(view: View, shape: tuple[int, int]) -> tuple[slice, slice]:
 
 def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
     """Return the picture (y, x, BGR): brightness as exposed, sRGB gamma, no white balance."""
+    frame = frame.with_one_black()
     rows, columns = window(view, frame.mosaic.shape)
     mosaic = frame.mosaic[rows, columns]
     black = float(frame.black_level_dn.mean())

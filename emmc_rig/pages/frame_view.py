@@ -22,11 +22,11 @@ Array = NDArray[np.floating]
 
 
 def colour_planes(frame: RawFrame) -> dict[str, list[NDArray[np.uint16]]]:
-    """Return the mosaic's pixels by colour, views `(y, x)` one for every place in the tile.
+    """Return the mosaic's pixels by colour, `(y, x)` for every place in the tile, at one black.
 
     A tile that is not Bayer counts as grey.
     """
-    mosaic = frame.mosaic
+    mosaic = frame.with_one_black().mosaic
     if frame.cfa not in BAYER:
         return {"grey": [mosaic]}
     planes: dict[str, list[NDArray[np.uint16]]] = {name: [] for name in LETTERS.values()}

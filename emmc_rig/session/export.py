@@ -27,6 +27,7 @@ import numpy as np
 
 from drivers.camera import CameraIdentity
 from drivers.dng import Facts
+from drivers.raw import captured_at
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import new_file, result_folder
 from emmc_rig.session.frame_file import dng_of
@@ -128,9 +129,9 @@ def _iso(line: FrameEntry, imported: bool) -> int | None:
 
 def _captured(line: FrameEntry, imported: bool) -> datetime | None:
     """Return when a frame was exposed; of an imported one by the camera's clock, if it says."""
+    if imported:
+        return captured_at(line.metadata)
     try:
-        if imported:
-            return datetime.strptime(line.metadata.get("captured", ""), "%Y:%m:%d %H:%M:%S")
         return datetime.fromisoformat(line.wall)
     except ValueError:
         return None

@@ -16,9 +16,9 @@ import numpy as np
 
 from drivers.camera import CameraIdentity
 from drivers.cameras import CAMERAS
-from drivers.dng import MONO, Facts, encode_dng, private_data
+from drivers.dng import LARGEST_TILE, Facts, encode_dng, private_data
 from drivers.errors import DriverError, RawFrameError
-from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
+from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, Array, RawFrame, decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Figures, FrameEntry
 
@@ -43,7 +43,7 @@ def frame_facts(frame: RawFrame) -> dict[str, Any]:
     return {
         "shape": list(frame.mosaic.shape),
         "cfa": frame.cfa,
-        "black_level_dn": frame.black_level_dn.tolist(),
+        "black_level_dn": _journal_levels(frame.black_level_dn).tolist(),
         "white_level_dn": frame.white_level_dn,
         "exposure_s": frame.exposure_s,
         "gain": frame.gain,
@@ -51,6 +51,13 @@ def frame_facts(frame: RawFrame) -> dict[str, Any]:
         "host_time_s": frame.host_time_s,
         "metadata": dict(frame.metadata),
     }
+
+
+def _journal_levels(black_dn: Array) -> Array:
+    """Return black levels, or the means of a 2x2 tile where the file alone has room for them."""
+    if black_dn.size <= LARGEST_TILE:
+        return black_dn
+    return np.array([[black_dn[row::2, column::2].mean() for column in (0, 1)] for row in (0, 1)])
 
 
 def frame_entry(frame: RawFrame, exposure_s: float, gain: float, **about: Any) -> FrameEntry:
@@ -81,10 +88,11 @@ def frame_file(frame: RawFrame) -> FrameFile:
 def decode_frame(data: bytes, entry: FrameEntry) -> RawFrame:
     """Return the frame in a session's file; entry: its journal line. Raises a `DriverError`."""
     if entry.camera_sha256 is not None:
+        frame = decode_raw(data)
+        if frame.black_level_dn.size <= LARGEST_TILE:  # in whole DN in DNGs of versions before 0.4
+            frame = replace(frame, black_level_dn=np.array(entry.black_level_dn, np.float64))
         frame = replace(
-            decode_raw(data),
-            # A DNG has whole levels.
-            black_level_dn=np.array(entry.black_level_dn, np.float64),
+            frame,
             white_level_dn=entry.white_level_dn,
             cfa=entry.cfa,
             original=private_data(data),
@@ -134,16 +142,15 @@ def dng_of(
     private: bytes | None = None,
     facts: Facts | None = None,
 ) -> bytes:
-    """Return a DNG of a frame's mosaic, see `encode_dng`: its levels in whole DN.
+    """Return a DNG of a frame's mosaic, see `encode_dng`: its levels not below 0.
 
     Raises AppError for a frame that no DNG can hold.
     """
-    black_dn = np.maximum(np.round(frame.black_level_dn), 0)
     try:
         return encode_dng(
             frame.mosaic,
             frame.cfa,
-            black_dn[0, 0] if frame.cfa == MONO else black_dn,
+            np.maximum(frame.black_level_dn, 0),
             frame.white_level_dn,
             frame.exposure_s,
             identity,

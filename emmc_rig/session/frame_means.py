@@ -89,12 +89,11 @@ def is_imported(session: Session) -> bool:
 def _imported_dark(session: Session) -> MeanFrame:
     """Return the dark that black level and read noise of the camera make."""
     noise = camera_of(session).sensor.noise
-    entry = next(iter(session.stored.values()))
-    rows, columns = entry.shape
-    black = np.tile(entry.black_level_dn, (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
+    [(frame, exposure_s)] = decoded(session, session.needed[:1])
     read_dn = noise.gain_dn_per_electron * noise.read_noise_electrons
     # Reading out in whole DN adds a twelfth.
-    return MeanFrame(black.astype(np.float32), read_dn**2 + 1 / 12, 1, entry.exposure_s)
+    black = frame.black_by_place().astype(np.float32)
+    return MeanFrame(black, read_dn**2 + 1 / 12, 1, exposure_s)
 
 
 def mean_dark(session: Session) -> MeanFrame:

@@ -66,13 +66,30 @@ def test_a_simulated_stage_is_shown_homed_and_jogged(run, rig):
     assert abs(float(out.split()[2]) - place) < 1.0
 
 
+@pytest.mark.parametrize("number", ["-1000", "-1e3", "-.5", "-0.25"])
+def test_a_number_that_begins_with_a_minus_is_no_option(run, number):
+    code, out, _ = run("jog", "--rig", "simulated:grbl", "x", number, "--home")
+    assert code == 0
+    assert float(out.split()[2]) == pytest.approx(-1000 + float(number), abs=2.6)
+    code, _, err = run("jog", "--rig", "simulated:grbl", "x", number, "--hom")
+    assert (code, "No such option" in err) == (2, True)
+
+
+def test_an_axis_that_is_not_homed_is_told_a_command_that_succeeds(run):
+    code, _, err = run("jog", "--rig", "simulated:grbl", "x", -1000)
+    assert code == 1
+    advised = one_line(err).split("`")[1].split()
+    assert advised[:2] == ["emmc-rig", "devices"]
+    assert run(*advised[2:])[0] == 0
+
+
 @pytest.mark.slow
 def test_a_real_port_works_alike(run):
     with PtyServer(ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK, (1, 2): QUICK})) as server:
         stage = f"zaber:{server.port},microstep_um=0.047625"
         assert "unknown" in run("info", "--stage", stage)[1]
         code, _, err = run("jog", "--stage", stage, "1.2", 100)
-        assert (code, "home it first" in one_line(err)) == (1, True)
+        assert (code, "home it in the same command" in one_line(err)) == (1, True)
         assert run("home", "--stage", stage, "1.2")[0] == 0
         code, out, _ = run("jog", "--stage", stage, "1.2", 100)
         assert code == 0

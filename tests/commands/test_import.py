@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import tifffile
 import yaml
 from programs import one_line, program
 
-from drivers.dng import encode_dng
+from drivers.dng import Facts, encode_dng
 from emmc_rig.files.cameras import shipped_camera_files
 from emmc_rig.importing.session import _Import as importing
 from emmc_rig.processing.reconstructing import open_frames
@@ -700,3 +701,42 @@ def test_a_white_level_that_nobody_states_is_said(tmp_path, run):
         np.save(tmp_path / row["file"], np.load(tmp_path / row["file"]) >> 4)
     _, said = imported(run, tmp_path, table_of(tmp_path, rows), "--camera", CAMERA)
     assert "white_level_dn is taken as 65535, as nothing states it" in said
+
+
+def roll(folder, levels, signal_dn, names, seconds):
+    """Write DNGs of a mono sensor with black levels by place, captured at these seconds."""
+    noise = {"black_level_dn": 64, "white_level_dn": 4095, "electrons_per_s": 1e5}
+    camera = {
+        "title": "mono",
+        "sensor": {"cfa": "mono", "noise": noise},
+        "shots": [{}] * len(names),
+    }
+    (folder / "mine.yaml").write_text(yaml.safe_dump(camera))
+    for name, second, signal in zip(names, seconds, signal_dn, strict=True):
+        facts = Facts(captured=datetime(2026, 11, 27, 10, 0, second))
+        mosaic = np.rint(np.resize(levels, (24, 32)) + signal).astype(np.uint16)
+        (folder / name).write_bytes(encode_dng(mosaic, "mono", levels, 4095, 0.02, facts=facts))
+
+
+def test_files_of_a_roll_are_shots_in_the_order_of_their_times_and_one_line_says_so(tmp_path, run):
+    names = [f"IMG_{number}.dng" for number in ("9998", "9999", "0001", "0002")]
+    textures = [n * LIT[0][:24, :32].astype(float) / LIT[0].max() for n in (1000, 1200, 1400, 1600)]
+    roll(tmp_path, np.full((24, 32), 64), textures, names, range(0, 8, 2))
+    session, said = imported(run, tmp_path, "--shots", "*.dng", "--camera", "mine.yaml")
+    stored = [session.stored[frame.id].metadata["name"] for frame in session.frames]
+    assert stored == names
+    assert "*.dng: IMG_0001.dng follows IMG_9999.dng" in said
+    assert said.count("by time, not by name") == 1
+
+
+@pytest.mark.parametrize("gain", ["1", "2"])
+def test_without_darks_readings_are_above_the_black_level_of_each_place(tmp_path, run, gain):
+    rows, columns = np.indices((24, 32))
+    levels = 64 + 40 * (rows % 2) + 3 * (columns % 4)
+    texture = 1500 * LIT[0][:24, :32].astype(float) / LIT[0].max()
+    roll(tmp_path, levels, [texture], ["s.dng"], [0])
+    table_of(tmp_path, [{"file": "s.dng", "kind": "shot", "shot": 0, "gain": gain}])
+    session, _ = imported(run, tmp_path, tmp_path / "table.csv", "--camera", "mine.yaml")
+    readings = open_frames(session.folder)[1].readings[0]
+    factor = np.median(readings / np.maximum(np.rint(texture), 1))
+    assert np.allclose(readings, factor * np.rint(texture), atol=factor)

@@ -31,8 +31,9 @@ from drivers.grbl_codec import (
         (b"\rGrbl 1.1h ['$' for help]\r\n", Banner("1.1h")),
         (b"ALARM:1\r\n", Alarm(1)),
         # "Interface", Grbl $ Settings Message
-        (b"$10=255\r\n", Setting(10, 255.0)),
-        (b"$110=500.000\r\n", Setting(110, 500.0)),
+        (b"$10=255\r\n", Setting(10, "255")),
+        (b"$110=500.000\r\n", Setting(110, "500.000")),
+        (b"$302=192.168.5.1\r\n", Setting(302, "192.168.5.1")),
         (b"$N0=G54\r\n", None),
         # "Interface", Feedback Messages
         (b"[MSG:Reset to continue]\r\n", Feedback("MSG", "Reset to continue")),
@@ -100,14 +101,12 @@ def test_work_position_is_machine_position_less_the_offset():
         (b"o\x07k\r\n", "not printable"),
         (b"<Idle|MPos:0.000,0.000,0.000|FS:0,0\r\n", "not a status report"),
         (b"<Sing|MPos:0.000,0.000,0.000>\r\n", "not a status report"),
-        (b"<Idle|FS:0,0>\r\n", "neither or both"),
-        (b"<Idle|MPos:0.000|WPos:0.000>\r\n", "neither or both"),
+        (b"<Idle|FS:0,0>\r\n", "neither"),
         (b"<Idle|MPos:0.000|MPos:1.000>\r\n", "twice"),
         (b"<Idle|MPos:0.000,,0.000>\r\n", "not a number"),
         (b"<Idle|MPos:0.0.0,1.000>\r\n", "not a number"),
         (b"<Idle|MPos:nan,0.000>\r\n", "not a number"),
         (b"<Idle|MPos:1.000,0.000|WCO:0.000>\r\n", "different length"),
-        (b"$110=fast\r\n", "not a number"),
     ],
 )
 def test_bytes_that_are_no_message_are_an_error_in_one_line(line, reason):

@@ -8,6 +8,8 @@ from drivers import grbl_codec as codec
 from drivers.errors import (
     AxisFaultError,
     CommandRefusedError,
+    FirmwareError,
+    GarbledReplyError,
     LimitExceededError,
     LimitSwitchError,
     LostPositionError,
@@ -18,7 +20,7 @@ from drivers.errors import (
 from drivers.grbl import GrblStage, identify
 from drivers.stage import DEFAULT_SETTINGS, StageSettings
 from simulators.clock import ManualClock
-from simulators.grbl import BENCH_AXES, GrblController
+from simulators.grbl import BENCH_AXES, WITH_SINGLE_AXIS_HOMING, GrblController
 
 AXES = {"x": "X", "y": "Y"}
 TRAVEL_UM = BENCH_AXES["X"].travel_um
@@ -188,12 +190,63 @@ def test_homing_that_is_switched_off_is_refused_with_what_to_do():
     assert not stage.is_homed("x")
 
 
+def test_firmware_as_it_is_shipped_homes_all_axes_where_one_is_asked_for_and_says_so(bench, caplog):
+    stage = bench.stage()
+    stage.home(["x"])
+    assert "homes all axes together: x, y" in caplog.text
+    assert stage.is_homed("x")
+    assert stage.position_um("y") == pytest.approx(-PULL_OFF_UM, abs=2.6)
+
+
+def test_settings_that_are_not_numbers_matter_only_where_they_are_needed(bench):
+    def with_settings(*lines):
+        plain = bench.device._execute_system
+
+        def execute(line):
+            plain(line)
+            for more in lines if line == "$$" else ():
+                bench.device._say(more)
+
+        bench.device._execute_system = execute
+        return bench.stage()
+
+    with_settings("$300=grblHAL", "$302=192.168.5.1", "$75=", "$341=0").home()
+    with_settings("$130=60.000 (x max travel, mm)").home()
+    with pytest.raises(GarbledReplyError, match="'fast' is not a number") as caught:
+        with_settings("$110=fast")
+    assert "cable" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("version", "advice"),
+    [
+        ("3.7 FluidNC v3.7.8:", "install Grbl 1.1 or grblHAL"),
+        ("1.1h.20190825:", "it has no axis X"),
+    ],
+)
+def test_firmware_that_does_not_state_its_speed_is_named(bench, version, advice):
+    plain = bench.device._execute_system
+
+    def execute(line):
+        if line == "$I":
+            bench.device._say(f"[VER:{version}]")
+        elif line == "$$":
+            bench.device._say("$10=1")
+        else:
+            plain(line)
+
+    bench.device._execute_system = execute
+    with pytest.raises(FirmwareError, match=f"{version.rstrip(':')} does not state.*{advice}"):
+        bench.stage()
+
+
+def test_a_grbl_of_version_0_9_is_named_by_its_report():
+    with pytest.raises(FirmwareError, match=r"older than 1\.1.*install Grbl 1\.1"):
+        codec.decode_line(b"<Idle,MPos:0.000,0.000,0.000,WPos:0.000,0.000,0.000>\r\n")
+
+
 def test_homing_some_axes_needs_firmware_that_can():
-    stage = Bench(options="V").stage()
-    with pytest.raises(CommandRefusedError, match="homes all axes together"):
-        stage.home(["x"])
-    able = Bench()
-    stage = able.stage()
+    stage = Bench(options=WITH_SINGLE_AXIS_HOMING).stage()
     stage.home(["y"])
     assert stage.is_homed("y")
     assert not stage.is_homed("x")
@@ -277,7 +330,7 @@ def test_a_controller_that_boots_slowly_is_waited_for_and_a_silent_one_is_reset_
 
 def test_an_axis_that_the_controller_does_not_have_shows_at_construction():
     two = Bench(axes={letter: BENCH_AXES[letter] for letter in "XY"})
-    with pytest.raises(CommandRefusedError, match="no such axis"):
+    with pytest.raises(FirmwareError, match="it has no axis Z"):
         two.stage({"focus": "Z"})
     with pytest.raises(ValueError, match="use one of X, Y"):
         two.stage({"focus": "Q"})
@@ -289,4 +342,4 @@ def test_a_tolerance_finer_than_its_reports_is_refused(bench):
 
 
 def test_it_says_what_it_is(bench):
-    assert identify(bench.transport, bench.clock) == ("version 1.1h.20190825:, options VH,15,128")
+    assert identify(bench.transport, bench.clock) == ("version 1.1h.20190825:, options V,15,128")

@@ -38,11 +38,11 @@ def test_each_cfa_position_keeps_its_own_black_level(cfa):
     np.testing.assert_array_equal(frame.black_level_dn, BLACK_DN)
 
 
-def test_a_monochrome_sensor_has_one_black_level():
+def test_a_monochrome_sensor_has_one_black_level_or_some_by_place():
     frame = decode_raw(encode_dng(noise(), "mono", 64, 4095, 0.01))
     np.testing.assert_array_equal(frame.black_level_dn, np.full((2, 2), 64))
-    with pytest.raises(ValueError, match="one black level"):
-        encode_dng(noise(), "mono", BLACK_DN, 4095, 0.01)
+    frame = decode_raw(encode_dng(noise(), "mono", BLACK_DN, 4095, 0.01))
+    np.testing.assert_array_equal(frame.black_level_dn, BLACK_DN)
 
 
 @pytest.mark.parametrize("tile", ["quad_bayer", "xtrans", "rgbw"])
@@ -124,7 +124,7 @@ def test_a_frame_of_the_wrong_size_is_refused_with_both_sizes():
         (np.zeros((21, 40), np.uint16), {}, "too small for LibRaw"),
         (np.zeros((40, 40), np.float32), {}, "uint16"),
         (np.zeros((40, 40, 3), np.uint16), {}, "uint16"),
-        (np.zeros((40, 40), np.uint16), {"black_level_dn": 63.5}, "whole numbers"),
+        (np.zeros((40, 40), np.uint16), {"black_level_dn": -1}, "below 0"),
         (np.zeros((40, 40), np.uint16), {"exposure_s": 0.0}, "not positive"),
         (np.zeros((40, 40), np.uint16), {"cfa": ""}, "plain text"),
     ],
