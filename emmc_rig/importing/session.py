@@ -123,8 +123,9 @@ def import_session(
         raise AppError(f"--out {out}: holds something already; name another --out")
     try:
         with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
-            items = list(_items(listed, known, planes, Path(spool), on_file))
-            return _Import(items, known, camera).write(out)
+            notes: list[str] = []
+            items = list(_items(listed, known, planes, Path(spool), on_file, notes))
+            return _Import(items, known, camera, notes).write(out)
     except OSError as fault:
         why = fault.strerror or fault
         raise AppError(f"{fault.filename or out}: {why}; nothing was imported") from fault
@@ -135,14 +136,20 @@ def import_session(
 
 def _items(
     listed: Sequence[Listed], camera: Camera, planes: bool, spool: Path,
-    on_file: Callable[[str], None],
+    on_file: Callable[[str], None], notes: list[str],
 ) -> Iterator[_Item]:  # fmt: skip
-    """Yield the frames of the files, their pixels written to `spool`; raises AppError."""
+    """Yield the frames of the files, their pixels written to `spool`; raises AppError.
+
+    A file of a series brings those of its files that no row names.
+    """
     seen: dict[object, str] = {}
     first: tuple[str, tuple[int, ...], np.dtype] | None = None
+    apart = {one.path.resolve() for one in listed}
     for one in listed:
         name = shown_path(one.path)
-        own = read_own(one.path, one.array)
+        own = read_own(one.path, one.array, apart)
+        apart.update(member.resolve() for member in own.members)
+        notes += own.notes
         frames, tell = _mosaics(own, one, planes), _telling(own, camera)
         if own.raw is not None:
             _check_phase(own.raw, camera, name)
@@ -254,8 +261,10 @@ def _check_values(frames: NDArray, name: str, white_dn: int) -> None:
 class _Import:
     """A session in the making."""
 
-    def __init__(self, items: list[_Item], camera: Camera, spec: str) -> None:
-        self._notes: list[str] = []
+    def __init__(
+        self, items: list[_Item], camera: Camera, spec: str, notes: Sequence[str] = ()
+    ) -> None:
+        self._notes = list(notes)
         self._items = self._numbered(items)
         shots = [shot for item, shot in self._items if item.listed.row.kind == "shot"]
         if not shots:

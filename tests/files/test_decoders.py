@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from emmc_rig.files.child import read_in_child
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +26,6 @@ from emmc_rig.bench.rig_config import ImagedRig, rig_description
 from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.child import read_in_child
 from emmc_rig.files.psi import SavedPsi, ShardedPsi, save_shards
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.errors import SensingError

@@ -13,8 +13,9 @@ import tifffile
 from programs import program
 
 from emmc_rig.errors import ERRORS
-from emmc_rig.files.formats import FORMATS, Export
 from emmc_rig.files.formats.displays import walk
+from emmc_rig.files.formats.format import Export
+from emmc_rig.files.formats.registry import FORMATS
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.novel_view import between, view_disparities
 from emmc_rig.model.srgb import linear_of, srgb_of
