@@ -150,11 +150,11 @@ def read_array(folder: Path, name: str = "") -> NDArray:
         if not isinstance(node, zarr.Array):
             members = dict(node.members(max_depth=None))
             copies = {
-                path for at, one in {"": node, **members}.items() for path in _copies(at, one)
+                path for at, node in {"": node, **members}.items() for path in _copies(at, node)
             }
             arrays = {
-                at: one for at, one in members.items()
-                if isinstance(one, zarr.Array) and (at not in copies or at == name)
+                at: node for at, node in members.items()
+                if isinstance(node, zarr.Array) and (at not in copies or at == name)
             }  # fmt: skip
         stored = arrays[only_array({at: array.shape for at, array in arrays.items()}, name)]
         check_fits(stored.nbytes, folder)
@@ -170,7 +170,8 @@ def _copies(at: str, group: Any) -> list[str]:
     """Return the paths of the smaller copies that a group of OME-Zarr lists."""
     attributes = dict(group.attrs)
     scales = attributes.get("ome", attributes).get("multiscales", [])
-    return [f"{at}/{one['path']}".lstrip("/") for scale in scales for one in scale["datasets"][1:]]
+    levels = (level for scale in scales for level in scale["datasets"][1:])
+    return [f"{at}/{level['path']}".lstrip("/") for level in levels]
 
 
 def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any:
@@ -192,5 +193,5 @@ def load_light_field(folder: Path) -> NDArray[np.float32]:
         check_fits(stored.nbytes, folder)
         light_field = np.asarray(stored[...])
     except FAULTS as fault:
-        raise SceneError(f"{shown_path(folder)}: damaged ({one_line(fault)})") from fault
+        raise SceneError(f"{shown_path(folder)}: cannot be read ({one_line(fault)})") from fault
     return check_light_field(light_field, shown_path(folder)).astype(np.float32)

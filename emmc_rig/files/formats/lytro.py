@@ -43,11 +43,12 @@ def _read_mat(path: Path) -> Array:
     pictures = read_stored(path, AppError, "LF").array
     if pictures.ndim == 4:  # MATLAB drops a last axis of length 1
         pictures = pictures[..., None]
-    if pictures.ndim != 5 or pictures.dtype not in (np.uint8, np.uint16):
+    if pictures.ndim != 5 or pictures.dtype.kind not in "uf":
         raise AppError(
             f"{path}: LF is {pictures.dtype} of shape {pictures.shape}, not a light field"
         )
-    light = pictures[..., :3].astype(np.float32) / np.iinfo(pictures.dtype).max
+    white = np.iinfo(pictures.dtype).max if pictures.dtype.kind == "u" else 1
+    light = pictures[..., :3].astype(np.float32) / white
     return np.repeat(light, 3, axis=-1) if light.shape[-1] == 1 else light
 
 

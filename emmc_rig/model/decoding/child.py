@@ -1,8 +1,8 @@
 """Arrays of files whose decoders take whatever a file claims: read in a child with little memory.
 
 SciPy, tifffile and OpenEXR unpack without a limit. `python -m emmc_rig.model.decoding.child` is the
-child: JSON of what to read on its input; on its output a line of JSON with what the file states,
-and the array as .npy, or one line of complaint.
+child. Its input is JSON, the files to read; its output a line of JSON, the facts that the file
+states, and then the array as .npy, or a line of complaint.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def only_array(shapes: Mapping[str, Sequence[int]], name: str) -> str:
 
     name: as asked for; "": the only one with two axes or more.
     """
-    known = [one for one, shape in shapes.items() if sum(size > 1 for size in shape) > 1]
+    known = [key for key, shape in shapes.items() if sum(size > 1 for size in shape) > 1]
     if name in shapes:
         return name
     if name or len(known) != 1:
@@ -82,7 +82,7 @@ def _reader_of_mat(name: str, apart: Collection[str]) -> Reader:
     import scipy.io
 
     def read(path: str) -> tuple[NDArray, dict[str, Any]]:
-        shapes = {one: shape for one, shape, _ in scipy.io.whosmat(path)}
+        shapes = {key: shape for key, shape, _ in scipy.io.whosmat(path)}
         wanted = only_array(shapes, name)
         return scipy.io.loadmat(path, variable_names=[wanted])[wanted], {}
 
@@ -93,7 +93,7 @@ def _reader_of_npz(name: str, apart: Collection[str]) -> Reader:
     def read(path: str) -> tuple[NDArray, dict[str, Any]]:
         with np.load(path, allow_pickle=False) as stored:
             arrays = dict(stored)
-        return arrays[only_array({one: array.shape for one, array in arrays.items()}, name)], {}
+        return arrays[only_array({key: array.shape for key, array in arrays.items()}, name)], {}
 
     return read
 
@@ -136,7 +136,7 @@ READERS: dict[str, Callable[[str, Collection[str]], Reader]] = {
 
 
 def _stacked(arrays: Sequence[NDArray], paths: Sequence[str]) -> NDArray:
-    """Return arrays on a first axis of their own; raises ValueError where one is another."""
+    """Return arrays on a new first axis; raises ValueError where shapes or types differ."""
     for array, path in zip(arrays, paths, strict=True):
         if array.shape != arrays[0].shape or array.dtype != arrays[0].dtype:
             raise ValueError(

@@ -59,7 +59,7 @@ _FOREIGN = (
     (0, rb"\x89HDF\r\n\x1a\n", "an HDF5 file"),
     (0, rb"MATLAB ", "a MAT file"),
 )  # fmt: skip
-"""Where a format's files have which bytes, and what it is; the first that fits."""
+"""A place in a file, the pattern of its bytes there, the format's name; the first match counts."""
 HEAD_BYTES = 4096
 
 

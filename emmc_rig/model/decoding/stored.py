@@ -1,7 +1,8 @@
 """What a file holds, by the format that its bytes say: the one reader of every door for files.
 
-A TIFF or a picture is read as a viewer shows it: upright, white and palette as it states, and all
-of its pages. Zarr and RAW files, which need other packages, join in `emmc_rig.files.own_arrays`.
+A TIFF or another picture is read as a viewer shows it: upright, with its palette's colours, and
+with all of its pages. Zarr and RAW files, whose packages are above the model, join in
+`emmc_rig.files.own_arrays`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """TIFF files: every page is a frame, as a viewer shows it, with what the file states of it.
 
-An OME-TIFF lists its planes: which page, of which file, is which plane. A file's own planes are
-taken, and those of further files of its series unless these are read apart; what is listed and not
-there, and a page that is not listed, is an error. tifffile's own series fill such gaps with zeros.
+An OME-TIFF lists the page, and its file, of every plane. A file's own planes are taken, and those
+of further files of its series unless these are read apart. A listed page that is missing is an
+error, and so is a page that is not listed: tifffile's own series fill such gaps with zeros.
 Runs in the child, see `emmc_rig.model.decoding.child`; whatever is wrong raises.
 """
 
@@ -43,7 +43,7 @@ _UNKNOWN = math.nan
 
 @dataclass(frozen=True, eq=False)
 class _Page:
-    """One page, and what its file states of it; NaN where it states nothing."""
+    """A page with its exposure and time, NaN where its file states none."""
 
     page: Any
     exposure_s: float = _UNKNOWN
@@ -51,7 +51,7 @@ class _Page:
 
 
 class _Block(NamedTuple):
-    """Pages of one file that are planes one after another."""
+    """Consecutive pages of a file that are consecutive planes."""
 
     file: str
     first_page: int
@@ -80,20 +80,20 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
         else:
             series = _Series(tiff, Path(path), described, apart, files)
             taken, members = series.pages()
-        taken = [_by_micro_manager(one) for one in taken]
+        taken = [_by_micro_manager(part) for part in taken]
         complaints.check()
         if described is None and len(tiff.pages) == 1 and not tiff.is_micromanager:
             codes = _planes_of_one_page(tiff, taken[0].page)
             taken = taken * len(codes)
             frames, stacked = _shown(codes, taken[0].page, tiff.is_shaped)
         else:
-            frames, stacked = _stack([one.page for one in taken], tiff.is_shaped)
+            frames, stacked = _stack([part.page for part in taken], tiff.is_shaped)
             _check_stated_count(tiff, len(frames))
         complaints.check()
         facts = {
             "full_scale": _full_scale(taken[0].page, frames.dtype),
-            "exposures_s": _each([one.exposure_s for one in taken], len(frames)),
-            "times_s": _each([one.time_s for one in taken], len(frames)),
+            "exposures_s": _each([part.exposure_s for part in taken], len(frames)),
+            "times_s": _each([part.time_s for part in taken], len(frames)),
             "members": members,
             "notes": notes,
             "stacked": stacked,
@@ -150,16 +150,16 @@ def _each(values: list[float], count: int) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values]
 
 
-def _by_micro_manager(one: _Page) -> _Page:
+def _by_micro_manager(part: _Page) -> _Page:
     """Return a page with what Micro-Manager's tag of that page states."""
-    stated = one.page.tags.valueof(_MICRO_MANAGER)
+    stated = part.page.tags.valueof(_MICRO_MANAGER)
     if not isinstance(stated, Mapping):
-        return one
+        return part
     found = {}
     for name, key in (("exposure_s", "Exposure-ms"), ("time_s", "ElapsedTime-ms")):
         if stated.get(key) is not None:
             found[name] = float(stated[key]) / 1000
-    return replace(one, **found)
+    return replace(part, **found)
 
 
 # From pages to frames.
@@ -289,14 +289,14 @@ class _Series:
         files: ExitStack,
     ) -> None:  # fmt: skip
         self._path, self._own, self._files = path, tiff, files
-        self._apart = {os.path.realpath(one) for one in apart} - {os.path.realpath(path)}
+        self._apart = {os.path.realpath(part) for part in apart} - {os.path.realpath(path)}
         self._tiffs: dict[str, tifffile.TiffFile] = {"": tiff}
         root = ElementTree.fromstring(described)
         self._uuid = root.get("UUID")
-        pointer = next((one for one in root if _tag(one) == "BinaryOnly"), None)
+        pointer = next((part for part in root if _tag(part) == "BinaryOnly"), None)
         if pointer is not None:
             root = self._elsewhere(pointer.get("MetadataFile", ""))
-        self._images = [one for one in root.iter() if _tag(one) == "Pixels"]
+        self._images = [part for part in root.iter() if _tag(part) == "Pixels"]
 
     def pages(self) -> tuple[list[_Page], list[str]]:
         """Return the pages taken, in the order of images and planes, and the files they are in."""
@@ -305,8 +305,8 @@ class _Series:
         expected = 0
         for number, pixels in enumerate(self._images):
             order = pixels.get("DimensionOrder", "XYZCT")[2:]
-            channels = [one for one in pixels if _tag(one) == "Channel"]
-            samples = [int(one.get("SamplesPerPixel", 1)) for one in channels]
+            channels = [part for part in pixels if _tag(part) == "Channel"]
+            samples = [int(part.get("SamplesPerPixel", 1)) for part in channels]
             sizes = {axis: int(pixels.get(f"Size{axis}", 1)) for axis in order}
             sizes["C"] = max(sizes["C"] // max(samples, default=1), 1)
             total = math.prod(sizes.values())
@@ -350,14 +350,14 @@ class _Series:
     def _blocks(
         self, pixels: ElementTree.Element, order: str, sizes: Mapping[str, int]
     ) -> Iterator[_Block]:
-        entries = [one for one in pixels if _tag(one) == "TiffData"]
+        entries = [part for part in pixels if _tag(part) == "TiffData"]
         if not entries:
             yield _Block("", 0, 0, None)
         for entry in entries:
             count = entry.get("PlaneCount", entry.get("NumPlanes"))
             if count is None and "IFD" in entry.attrib:
                 count = "1"
-            uuid = next((one for one in entry if _tag(one) == "UUID"), None)
+            uuid = next((part for part in entry if _tag(part) == "UUID"), None)
             yield _Block(
                 self._file_of(uuid),
                 int(entry.get("IFD", 0)),
