@@ -84,11 +84,13 @@ def _of_raw(data: bytes, shown: str) -> OwnFrames:
 
 
 def _stacked(array: NDArray, shown: str) -> NDArray:
-    """Return frames, first axis, of what a file holds, without axes of length 1."""
+    """Return frames, first axis, of what a file holds, without further axes of length 1."""
     if array.dtype.kind not in "uif":
         raise AppError(f"{shown}: holds no real numbers ({array.dtype})")
     size = "x".join(map(str, array.shape))
-    array = array.squeeze()
+    if array.ndim > 2:
+        sides = [side for side in array.shape if side != 1]
+        array = array.reshape(sides if len(sides) > 1 else array.shape[-2:])
     if array.ndim in (3, 4) and array.shape[-1] in COLOURS:
         return array.reshape(-1, *array.shape[-3:])[..., :3]
     if array.ndim not in (2, 3) or not array.size:

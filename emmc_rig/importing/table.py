@@ -27,8 +27,6 @@ ImportedKind = Literal[
 ]
 LONGEST_S = 3600.0
 MOST_TABLE_BYTES = 16_000_000
-UTF_16 = (b"\xff\xfe", b"\xfe\xff")
-"""How text begins that spreadsheets call Unicode."""
 SEPARATOR_LINE = re.compile(r'"?sep=(.)"?[,;\s]*', re.IGNORECASE)
 """The line by which spreadsheets say what separates cells."""
 DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
@@ -89,7 +87,7 @@ def read_table(path: Path) -> list[Listed]:
     if data.startswith(WORKBOOK):
         raise AppError(f"{shown}: a workbook, not a table in CSV; save it as CSV UTF-8")
     try:
-        text = data.decode("utf-16" if data.startswith(UTF_16) else "utf-8-sig")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as fault:
         raise AppError(
             f"{shown}: not text in UTF-8 (byte {fault.start}); save it as CSV UTF-8"
@@ -113,6 +111,7 @@ def read_table(path: Path) -> list[Listed]:
             f"{shown}, line {begins + 1}: names no column; the first line of a table is: "
             "file,kind,exposure_s"
         )
+    columns = max(place for place, name in enumerate(names, 1) if name)
     unknown = {name for name in names if name} - set(Row.model_fields)
     found = []
     for number, line in enumerate(lines[1:], begins + 2):
@@ -122,10 +121,10 @@ def read_table(path: Path) -> list[Listed]:
         if not any(cells):
             continue
         where = f"{shown}, line {number}"
-        # Spreadsheets write empty cells beyond the last column, or leave out those at the end.
+        # Spreadsheets write empty cells beyond the last column.
         given = {name: cell for name, cell in zip_longest(names, cells, fillvalue="") if cell}
-        if "" in given:
-            raise AppError(f"{where}: the cell '{given['']}' is in a column without a name")
+        if "" in given or len(cells) < columns:
+            raise AppError(f"{where}: {len(cells)} cells under {columns} columns")
         # A column that nobody fills is checked too: it may be misspelt.
         row = validated(Row, dict.fromkeys(unknown, "") | given, where, AppError)
         found.append(_listed(row, where, path.parent))

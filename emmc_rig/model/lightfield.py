@@ -486,7 +486,7 @@ def export_pictures(
 
 def read_picture(path: Path) -> np.ndarray:
     """Return the picture of a file as float32 (y, x, 3), 1 for white; raises SceneError."""
-    return light_of(*read_codes(path, SceneError))
+    return light_of(*read_codes(path, SceneError, opaque=True))
 
 
 def _write_codes(path: Path, codes: np.ndarray) -> None:

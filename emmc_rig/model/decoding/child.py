@@ -109,7 +109,7 @@ def _reader_of_exr(name: str, apart: Collection[str]) -> Reader:
         import OpenEXR
     except ImportError:
         raise ValueError('EXR needs OpenEXR: pip install "emmc-rig[formats]"') from None
-    from emmc_rig.model.decoding.pictures import opaque
+    from emmc_rig.model.decoding.pictures import without_alpha
 
     def read(path: str) -> tuple[NDArray, dict[str, Any]]:
         with OpenEXR.File(path) as file:
@@ -121,8 +121,10 @@ def _reader_of_exr(name: str, apart: Collection[str]) -> Reader:
                     "picture has one with R, G and B, or Y"
                 )
             codes = channels[known[0]].pixels
-        codes = opaque(codes, 1) if known[0].endswith("A") else codes
-        return codes[None], {"full_scale": None}
+        opaque = True
+        if known[0].endswith("A"):
+            codes, opaque = without_alpha(codes, 1)
+        return codes[None], {"full_scale": None, "opaque": opaque}
 
     return read
 
@@ -170,9 +172,11 @@ def main() -> int:
         resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + job["most_bytes"], hard))
         found = [read(path) for path in job["paths"]]
         array = _stacked([array for array, _ in found], job["paths"])
-        if len({facts.get("full_scale") for _, facts in found}) > 1:
+        facts = [facts for _, facts in found]
+        if len({each.get("full_scale") for each in facts}) > 1:
             raise ValueError("files of different depths")
-        _Pipe.write(json.dumps(found[0][1]).encode() + b"\n")
+        opaque = all(each.get("opaque", True) for each in facts)
+        _Pipe.write(json.dumps({**facts[0], "opaque": opaque}).encode() + b"\n")
         np.lib.format.write_array(_Pipe(), array, allow_pickle=False)
     except MemoryError:
         print("it unpacks to more than a file of its size can hold", file=sys.stderr)

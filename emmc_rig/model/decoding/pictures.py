@@ -64,22 +64,18 @@ def orientation_in(tiff: bytes) -> int:
         return 1
 
 
-def opaque(codes: NDArray, full_scale: float) -> NDArray:
-    """Return a picture (..., values a pixel) without the last value, how opaque it is.
-
-    Raises ValueError where not everything is opaque.
-    """
-    if np.any(codes[..., -1] != full_scale):
-        raise ValueError("partly transparent; save it without an alpha channel")
+def without_alpha(codes: NDArray, full_scale: float) -> tuple[NDArray, bool]:
+    """Return a picture (..., values a pixel) without the last value, and whether all is opaque."""
+    opaque = bool(np.all(codes[..., -1] == full_scale))
     codes = codes[..., :-1]
-    return codes[..., 0] if codes.shape[-1] == 1 else codes
+    return codes[..., 0] if codes.shape[-1] == 1 else codes, opaque
 
 
-def decode_picture(content: bytes, source: str, error: type[Exception]) -> NDArray:
-    """Return the codes of a picture, (y, x) or (y, x, 3) with red first.
+def decode_picture(content: bytes, source: str, error: type[Exception]) -> tuple[NDArray, bool]:
+    """Return the codes of a picture, (y, x) or (y, x, 3) with red first, and whether it is opaque.
 
     PNG is checked whole before it is decoded. Raises `error` for what is no picture, several, cut
-    short, partly transparent, or claims more pixels than its bytes can hold.
+    short, or claims more pixels than its bytes can hold.
     """
     import cv2  # a sixth of a second, which settings need not
 
@@ -92,6 +88,7 @@ def decode_picture(content: bytes, source: str, error: type[Exception]) -> NDArr
         raise error(f"{source}: {columns} x {rows} pixels, more than {len(content)} bytes can hold")
     if header.pictures > 1:
         raise error(f"{source}: an animation of {header.pictures} pictures; save each as a file")
+    opaque = True
     try:
         if content.startswith(b"\xff\xd8\xff"):
             codes = _jpeg(content)
@@ -104,12 +101,13 @@ def decode_picture(content: bytes, source: str, error: type[Exception]) -> NDArr
             if codes.ndim == 3:
                 codes = codes[..., [2, 1, 0, *range(3, codes.shape[2])]]
         if codes.ndim == 3 and codes.shape[2] in (2, 4):
-            codes = opaque(codes, np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else 1)
+            white = np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else 1
+            codes, opaque = without_alpha(codes, white)
     except error:
         raise
     except (cv2.error, *FAULTS) as fault:
         raise error(f"{source}: cannot be decoded ({one_line(fault)})") from fault
-    return np.ascontiguousarray(upright(codes, header.orientation))
+    return np.ascontiguousarray(upright(codes, header.orientation)), opaque
 
 
 def _jpeg(content: bytes) -> NDArray:

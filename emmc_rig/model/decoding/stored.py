@@ -29,6 +29,7 @@ _EXR_START = b"\x76\x2f\x31\x01"
 _NPY_START = b"\x93NUMPY"
 ARRAYS = "NPY, NPZ, MAT, HDF5, Zarr, DNG and other RAW files"
 LONGEST_START = 16
+TRANSPARENT = "partly transparent; save it without an alpha channel"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +38,13 @@ class Stored:
 
     array: of a TIFF (frame, y, x) or (frame, y, x, 3); of another picture (y, x) or (y, x, 3), red
     first; of an array's file as it is there. full_scale: the code of white of whole numbers of a
-    picture, else None. facts: what a TIFF states, see `read_tiff`.
+    picture, else None. opaque: whether no pixel of a picture is transparent. facts: what a TIFF
+    states, see `read_tiff`.
     """
 
     array: NDArray
     full_scale: int | None = None
+    opaque: bool = True
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -59,7 +62,7 @@ def read_stored(
         if start.startswith((*TIFF_STARTS, _EXR_START)):
             kind = "exr" if start.startswith(_EXR_START) else "tif"
             array, facts = read_in_child(kind, [path], name, apart)
-            return Stored(array, facts["full_scale"], facts)
+            return Stored(array, facts["full_scale"], facts["opaque"], facts)
         if h5py.is_hdf5(path):
             return Stored(_of_hdf5(path, error, name))
         if suffix in (".npz", ".mat"):
@@ -73,16 +76,22 @@ def read_stored(
         raise
     except FAULTS as fault:
         raise error(f"{shown}: cannot be read ({one_line(fault)})") from fault
-    codes = decode_picture(content, shown, error)
-    return Stored(codes, np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else None)
+    codes, opaque = decode_picture(content, shown, error)
+    white = np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else None
+    return Stored(codes, white, opaque)
 
 
-def read_codes(path: Path, error: type[Exception]) -> tuple[NDArray, int | None]:
+def read_codes(
+    path: Path, error: type[Exception], opaque: bool = False
+) -> tuple[NDArray, int | None]:
     """Return the one picture of a file, (y, x) or (y, x, 3) with red first, and its full scale.
 
-    The full scale is None of floating values. Raises `error`, also for several pictures.
+    The full scale is None of floating values. opaque: refuse a picture that is partly transparent.
+    Raises `error`, also for several pictures.
     """
     stored = read_stored(path, error)
+    if opaque and not stored.opaque:
+        raise error(f"{shown_path(path)}: {TRANSPARENT}")
     codes = stored.array
     if stored.facts:
         codes = _only_picture(codes, stored.facts, path, error)
@@ -113,6 +122,8 @@ def read_views(paths: Sequence[Path], error: type[Exception]) -> NDArray[np.floa
         raise error(
             f"{shown_path(paths[0].parent)}: views cannot be read ({one_line(fault)})"
         ) from fault
+    if not facts["opaque"]:
+        raise error(f"{shown_path(paths[0].parent)}: {TRANSPARENT}")
     array = array if len(paths) > 1 else array[None]
     return light_of(_only_picture(array, facts, paths[0], error, 1), facts["full_scale"], 4)
 

@@ -22,7 +22,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from emmc_rig.model.decoding.pictures import opaque, upright
+from emmc_rig.model.decoding.pictures import upright, without_alpha
 from emmc_rig.model.decoding.regular import check_regular
 
 SECONDS = {
@@ -65,7 +65,7 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
     apart: paths of files that are read for themselves. Facts: `full_scale` of whole numbers, else
     None; `exposures_s` and `times_s` of every frame; `members`, the files taken; `notes`, a
     sentence for what was left out by right; `stacked`, whether frames are written as the planes of
-    a colour picture.
+    a colour picture; `opaque`, whether no pixel is transparent.
     """
     with ExitStack() as files:
         complaints = files.enter_context(_Complaints())
@@ -82,23 +82,33 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
             taken, members = series.pages()
         taken = [_by_micro_manager(part) for part in taken]
         complaints.check()
-        if described is None and len(tiff.pages) == 1 and not tiff.is_micromanager:
+        is_alone = len(tiff.pages) == len(taken) == 1
+        if described is None and is_alone and not tiff.is_micromanager:
             codes = _planes_of_one_page(tiff, taken[0].page)
             taken = taken * len(codes)
-            frames, stacked = _shown(codes, taken[0].page, tiff.is_shaped)
+            shown = _shown(codes, taken[0].page, tiff.is_shaped)
         else:
-            frames, stacked = _stack([part.page for part in taken], tiff.is_shaped)
-            _check_stated_count(tiff, len(frames))
+            shown = _stack([part.page for part in taken], tiff.is_shaped)
+            _check_stated_count(tiff, len(shown.frames))
         complaints.check()
         facts = {
-            "full_scale": _full_scale(taken[0].page, frames.dtype),
-            "exposures_s": _each([part.exposure_s for part in taken], len(frames)),
-            "times_s": _each([part.time_s for part in taken], len(frames)),
+            "full_scale": _full_scale(taken[0].page, shown.frames.dtype),
+            "exposures_s": _each([part.exposure_s for part in taken], len(shown.frames)),
+            "times_s": _each([part.time_s for part in taken], len(shown.frames)),
             "members": members,
             "notes": notes,
-            "stacked": stacked,
+            "stacked": shown.stacked,
+            "opaque": shown.opaque,
         }
-    return frames, facts
+    return shown.frames, facts
+
+
+class _Shown(NamedTuple):
+    """Frames as a viewer shows them; stacked, opaque: as in the facts of `read_tiff`."""
+
+    frames: NDArray
+    stacked: bool
+    opaque: bool
 
 
 class _Complaints(logging.Handler):
@@ -193,14 +203,15 @@ def _codes(page: Any) -> NDArray:
     return page.asarray()[None]
 
 
-def _stack(pages: list[Any], is_shaped: bool) -> tuple[NDArray, bool]:
+def _stack(pages: list[Any], is_shaped: bool) -> _Shown:
     """Return the frames of pages that are all alike."""
-    first, stacked = _shown(_codes(pages[0]), pages[0], is_shaped)
+    first, stacked, opaque = _shown(_codes(pages[0]), pages[0], is_shaped)
     each = len(first)
     frames = np.empty((each * len(pages), *first.shape[1:]), first.dtype)
     frames[:each] = first
     for place, page in enumerate(pages[1:], 1):
-        shown, _ = _shown(_codes(page), page, is_shaped)
+        shown, _, solid = _shown(_codes(page), page, is_shaped)
+        opaque = opaque and solid
         if shown.shape != first.shape or shown.dtype != first.dtype:
             sizes = [
                 f"{'x'.join(map(str, codes.shape[1:]))} {codes.dtype}" for codes in (first, shown)
@@ -210,7 +221,7 @@ def _stack(pages: list[Any], is_shaped: bool) -> tuple[NDArray, bool]:
                 f"{sizes[1]}; write pages of one size and depth into a file of their own"
             )
         frames[each * place : each * (place + 1)] = shown
-    return frames, stacked
+    return _Shown(frames, stacked, opaque)
 
 
 def _bits(page: Any) -> int:
@@ -230,8 +241,8 @@ def _coding(page: Any) -> str:
     return str(getattr(page.photometric, "name", page.photometric))
 
 
-def _shown(codes: NDArray, page: Any, is_shaped: bool) -> tuple[NDArray, bool]:
-    """Return the frames of codes (plane, *page), and whether colours are frames in truth."""
+def _shown(codes: NDArray, page: Any, is_shaped: bool) -> _Shown:
+    """Return the frames of codes (plane, *page)."""
     coding, bits = _coding(page), _bits(page)
     if page.axes not in ("YX", "YXS", "SYX"):
         raise ValueError(f"a page with the axes {page.axes}, where a frame has y and x")
@@ -255,7 +266,7 @@ def _shown(codes: NDArray, page: Any, is_shaped: bool) -> tuple[NDArray, bool]:
         codes = _of_palette(codes, page.colormap)
     elif bits < _COMPLETE_BITS and 255 % (2**bits - 1) == 0:
         codes = codes * np.uint8(255 // (2**bits - 1))
-    stacked = False
+    stacked, opaque = False, True
     if "S" in page.axes:
         if page.axes == "SYX":
             codes = np.moveaxis(codes, 1, -1)
@@ -264,8 +275,10 @@ def _shown(codes: NDArray, page: Any, is_shaped: bool) -> tuple[NDArray, bool]:
         if stacked or (coding in _GREY and not any(extras)):
             codes = np.moveaxis(codes, -1, 1).reshape(-1, *codes.shape[1:3])
         elif codes.shape[-1] in (2, 4):
-            codes = opaque(codes, 1 if codes.dtype.kind == "f" else 2**bits - 1)
-    return upright(codes, int(page.tags.valueof(_ORIENTATION, 1)), (1, 2)), stacked
+            white = 1 if codes.dtype.kind == "f" else 2**bits - 1
+            codes, opaque = without_alpha(codes, white)
+    codes = upright(codes, int(page.tags.valueof(_ORIENTATION, 1)), (1, 2))
+    return _Shown(codes, stacked, opaque)
 
 
 def _of_palette(codes: NDArray, palette: NDArray) -> NDArray:
