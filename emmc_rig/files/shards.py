@@ -14,7 +14,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.decoding.child import only_array
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.json_text import one_line, shown_path
-from emmc_rig.model.lightfield import check_light_field
+from emmc_rig.model.lightfield import check_light_field, scaled
 from emmc_rig.model.reading import FAULTS, FREE_BYTES, MOST_COMPRESSED
 
 ENDING = ".zarr"
@@ -157,13 +157,18 @@ def read_array(folder: Path, name: str = "") -> NDArray:
                 if isinstance(node, zarr.Array) and (at not in copies or at == name)
             }  # fmt: skip
         stored = arrays[only_array({at: array.shape for at, array in arrays.items()}, name)]
-        check_fits(stored.nbytes, folder)
-        missing = stored.nchunks - stored.nchunks_initialized
-        if missing:
-            raise ValueError(f"{missing} of its {stored.nchunks} chunks are not there")
-        return np.asarray(stored[...])
+        return _all_of(stored, folder)
     except FAULTS as fault:
         raise AppError(f"{shown_path(folder)}: cannot be read ({one_line(fault)})") from fault
+
+
+def _all_of(stored: Any, folder: Path) -> NDArray:
+    """Return an array; raises ValueError where Zarr would fill in what is missing."""
+    check_fits(stored.nbytes, folder)
+    missing = stored.nchunks - stored.nchunks_initialized
+    if missing:
+        raise ValueError(f"{missing} of its {stored.nchunks} chunks are not there")
+    return np.asarray(stored[...])
 
 
 def _copies(at: str, group: Any) -> list[str]:
@@ -175,10 +180,11 @@ def _copies(at: str, group: Any) -> list[str]:
 
 
 def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any:
-    """Return an array of a group, not read; raises AppError where there is none."""
+    """Return an array of a group, or the array that a folder is, not read; raises AppError."""
     zarr = _zarr()
     try:
-        array = zarr.open_group(folder, mode=mode)[name]
+        node = zarr.open(folder, mode=mode)
+        array = node if isinstance(node, zarr.Array) else node[name]
     except FAULTS as fault:
         raise AppError(
             f"{shown_path(folder)}: holds no array {name} of Zarr ({one_line(fault)})"
@@ -187,11 +193,13 @@ def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any
 
 
 def load_light_field(folder: Path) -> NDArray[np.float32]:
-    """Return the array `light_field` of a group, all of it; raises AppError or SceneError."""
+    """Return the array `light_field` of a group, or the array that a folder is, all of it.
+
+    Raises AppError or SceneError.
+    """
     stored = opened_array(folder, "light_field")
     try:
-        check_fits(stored.nbytes, folder)
-        light_field = np.asarray(stored[...])
+        light_field = _all_of(stored, folder)
     except FAULTS as fault:
         raise SceneError(f"{shown_path(folder)}: cannot be read ({one_line(fault)})") from fault
-    return check_light_field(light_field, shown_path(folder)).astype(np.float32)
+    return check_light_field(scaled(light_field), shown_path(folder))

@@ -197,11 +197,16 @@ def load_hdf5(path: str | os.PathLike) -> np.ndarray:
             held = ", ".join(sorted(stored.file)) or "none"
             raise SceneError(f"{path}: no dataset '{_DATASET}'; it holds {held}")
         lf = stored.array(_DATASET)
-    if lf.dtype in (np.uint8, np.uint16):
-        full_scale = np.iinfo(lf.dtype).max
-        lf = lf.astype(np.float32)
-        lf /= full_scale
-    return check_light_field(lf, str(path))
+    return check_light_field(scaled(lf), str(path))
+
+
+def scaled(lf: np.ndarray) -> np.ndarray:
+    """Return codes of 8 or 16 bits divided by their full scale, and other values as they are."""
+    if lf.dtype not in (np.uint8, np.uint16):
+        return lf
+    light = lf.astype(np.float32)
+    light /= np.iinfo(lf.dtype).max
+    return light
 
 
 def load_view_axes(path: str | os.PathLike) -> ViewAxes:

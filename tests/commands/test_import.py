@@ -330,7 +330,7 @@ MISTAKES = {
     "complex values": (written(1, LIT[1] * 1j), "holds no real numbers"),
     "truths": (written(1, LIT[1] > 9), "holds no real numbers"),
     "a line of values": (written(1, LIT[1].ravel()), "not frames (y, x) or (frame, y, x)"),
-    "five axes": (written(1, LIT[:2, None].repeat(2, 1)[None]), "1x2x2x24x32, not frames (y, x) or"),
+    "five axes": (written(1, LIT[:2, None].repeat(2, 1)[None]), "1x2x2x24x32, not frames (y, x)"),
     "nothing in it": (written(1, LIT[1][:0]), "holds an array of 0x32"),
     "a colour picture": (picture((24, 32, 3)), "its red, green and blue are three shots"),
     "a colour array": (written(1, COLOURS), "its red, green and blue are three"),

@@ -339,6 +339,10 @@ def test_zarr_is_read_as_it_is_written_and_absent_chunks_are_named(tmp_path):
     field.create_array("1", data=STACK[:, ::2, ::2])
     field.attrs["ome"] = {"multiscales": [scales]}
     assert np.array_equal(read_own(tmp_path / "plate.zarr").frames, STACK)
+    views = np.random.default_rng(5).integers(0, 256, (2, 3, 20, 30, 3), np.uint8)
+    zarr.save_array(tmp_path / "scene.zarr", views)
+    light_field = open_scene(str(tmp_path / "scene.zarr")).light_field
+    assert np.allclose(light_field, views / 255, atol=1e-6)
     torn = zarr.create_array(
         tmp_path / "torn.zarr", shape=STACK.shape, chunks=(1, 20, 30), dtype="u2", fill_value=0
     )
