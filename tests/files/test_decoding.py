@@ -186,7 +186,7 @@ def ome(tmp_path, files=("a.ome.tif", "b.ome.tif"), listed=range(4), plane=""):
         )
         with tifffile.TiffWriter(tmp_path / name) as file:
             for k in range(each):
-                description = xml if k == 0 else None
+                description = xml.encode() if k == 0 else None
                 frame = STACK[number * each + k]
                 file.write(frame, description=description, metadata=None, contiguous=False)
     return [tmp_path / name for name in files]
