@@ -49,7 +49,7 @@ def export(
     from emmc_rig.files.exports import LIGHT_FIELD, open_export
     from emmc_rig.files.films import film_of
     from emmc_rig.files.folders import result_folder
-    from emmc_rig.files.formats import ALIASES, FORMATS
+    from emmc_rig.files.formats.registry import ALIASES, FORMATS
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
     from emmc_rig.pages.viewer import VIEWER
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.files.psi import FRAMES
 from emmc_rig.files.results import METRICS
 from emmc_rig.files.scenes import fine_scene, open_scene, path_in

@@ -7,14 +7,12 @@ OUT/
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.exports import LIGHT_FIELD, open_export
 from emmc_rig.files.folders import SESSION_RECONSTRUCTION, Listing, is_session
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Film
 from emmc_rig.files.results import METRICS
 from emmc_rig.files.scenes import path_in
 from emmc_rig.model.json_text import one_line, parse_json
@@ -22,43 +20,6 @@ from emmc_rig.model.reading import stored_arrays
 
 FRAMES = "frames"
 REMEDY = "copy the folder again, or reconstruct it again"
-
-
-@dataclass(frozen=True)
-class Film:
-    """A film of light fields, none of them in memory.
-
-    rate: Hz. times_s: of every place in time, from the first. frames: by place in time, in that
-    order, the folder of the result; places without one are missing. shape: of every light field,
-    (v, u, y, x, c). on_frame: called when one of `each` is done with.
-    """
-
-    folder: Path
-    rate: float
-    times_s: tuple[float, ...]
-    frames: Mapping[int, Path]
-    shape: tuple[int, ...]
-    on_frame: Callable[[], object] = lambda: None
-
-    @property
-    def missing(self) -> list[int]:
-        """Places in time that have no frame."""
-        return [place for place in range(len(self.times_s)) if place not in self.frames]
-
-    @property
-    def first(self) -> Export:
-        """The first frame that there is."""
-        return self.opened(min(self.frames))
-
-    def opened(self, place: int) -> Export:
-        """Return the frame of a place in time; raises AppError, or KeyError where it is missing."""
-        return open_export(str(self.frames[place]))
-
-    def each(self) -> Iterator[tuple[int, Export]]:
-        """Yield places in time with their frames, one in memory at once."""
-        for place in self.frames:
-            yield place, self.opened(place)
-            self.on_frame()
 
 
 def film_of(spec: str) -> Film | None:
@@ -86,7 +47,7 @@ def open_film(folder: Path) -> Film:
         raise AppError(f"{folder}: a film without a frame; {REMEDY}")
     with stored_arrays(next(iter(frames.values())) / LIGHT_FIELD, AppError, REMEDY) as stored:
         shape = tuple(stored.dataset("light_field").shape)
-    return Film(folder, rate, times_s, frames, shape)
+    return Film(folder, rate, times_s, frames, shape, open_export)
 
 
 def _times(folder: Path) -> tuple[float, tuple[float, ...]]:

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from drivers.errors import RawFrameError
 from drivers.raw import RAW_SUFFIXES, decode_raw
 from emmc_rig.errors import AppError
-from emmc_rig.model.reading import decode_picture
+from emmc_rig.model.decoding.pictures import orientation_in, upright
+from emmc_rig.model.decoding.regular import file_bytes
+from emmc_rig.model.decoding.stored import light_of, read_codes
 from emmc_rig.model.srgb import linear_of
 
 DEMOSAICING = {
@@ -26,22 +28,18 @@ def read_photograph(path: Path, linear: bool | None = None) -> NDArray[np.float3
     """Return a photograph's light, (y, x, colour) with one colour or three, 1 where saturated.
 
     linear: whether a picture's codes are proportional to light, else they are sRGB; None: those of
-    16 bits are. RAW files always are; their black level is taken off. Raises AppError.
+    8 bits are sRGB. RAW files are linear; their black level is taken off. Raises AppError.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as fault:
-        raise AppError(f"{path}: cannot be read ({fault.strerror or fault})") from fault
     if path.suffix.lower() in RAW_SUFFIXES:
-        return _raw_light(content, path)
-    codes = decode_picture(content, str(path), AppError)
-    if codes.dtype not in (np.uint8, np.uint16):
-        raise AppError(f"{path}: use a picture of 8 or 16 bits a channel, or a RAW file")
-    if codes.ndim == 3:
-        codes = codes[:, :, 2::-1]
-    values = np.atleast_3d(codes).astype(np.float32) / np.iinfo(codes.dtype).max
+        content = file_bytes(path, AppError)
+        return upright(_raw_light(content, path), orientation_in(content))
+    codes, full_scale = read_codes(path, AppError)
+    values = light_of(codes, full_scale)
+    values = values[..., :1] if codes.ndim == 2 else values
+    if not (values.min() >= 0 and values.max() <= 1):
+        raise AppError(f"{path}: values beyond 0 (black) to 1 (white), or no numbers")
     if linear is None:
-        linear = codes.dtype == np.uint16
+        linear = full_scale != 255
     return np.asarray(values if linear else linear_of(values), np.float32)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from emmc_rig.files import shards
-from emmc_rig.files.formats import FORMATS
+from emmc_rig.files.formats.registry import FORMATS
 from emmc_rig.model.arguments import NAMES, numbers_of, pair_of, required
 from emmc_rig.model.errors import SceneError, ViewOrderWarning, did_you_mean
 from emmc_rig.model.lightfield import (

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.decoding.child import only_array
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.json_text import one_line, shown_path
-from emmc_rig.model.lightfield import check_light_field
+from emmc_rig.model.lightfield import check_light_field, scaled
 from emmc_rig.model.reading import FAULTS, FREE_BYTES, MOST_COMPRESSED
 
 ENDING = ".zarr"
@@ -105,10 +106,6 @@ class StoredGroup:
         """Return an array, not read."""
         return self._group[name]
 
-    def arrays(self) -> Iterator[tuple[str, Any]]:
-        """Yield the arrays of the group itself by name, not read."""
-        return self._group.arrays()
-
     def array(self, name: str) -> NDArray:
         """Return an array, all of it; raises ValueError where its files cannot hold so much."""
         stored = self._group[name]
@@ -132,15 +129,62 @@ def stored_shards(folder: Path, error: type[Exception], remedy: str) -> Iterator
     except error:
         raise
     except FAULTS as fault:
-        why = f"no Zarr group, damaged or incomplete ({one_line(fault)})"
+        why = f"no Zarr group, or one that cannot be read ({one_line(fault)})"
         raise error(f"{shown_path(folder)}: {why}; {remedy}") from fault
 
 
-def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any:
-    """Return an array of a group, not read; raises AppError where there is none."""
+def is_zarr(folder: Path) -> bool:
+    """Return whether a folder is a group or an array of Zarr, of version 2 or 3."""
+    return any((folder / name).is_file() for name in (".zgroup", ".zarray", ".zattrs", "zarr.json"))
+
+
+def read_array(folder: Path, name: str = "") -> NDArray:
+    """Return an array of a group at any depth, or the array that a folder is; raises AppError.
+
+    name: of the array, where a group holds several that are no smaller copies (OME-Zarr) of one.
+    """
     zarr = _zarr()
     try:
-        array = zarr.open_group(folder, mode=mode)[name]
+        node = zarr.open(folder, mode="r")
+        arrays = {"": node}
+        if not isinstance(node, zarr.Array):
+            members = dict(node.members(max_depth=None))
+            copies = {
+                path for at, node in {"": node, **members}.items() for path in _copies(at, node)
+            }
+            arrays = {
+                at: node for at, node in members.items()
+                if isinstance(node, zarr.Array) and (at not in copies or at == name)
+            }  # fmt: skip
+        stored = arrays[only_array({at: array.shape for at, array in arrays.items()}, name)]
+        return _all_of(stored, folder)
+    except FAULTS as fault:
+        raise AppError(f"{shown_path(folder)}: cannot be read ({one_line(fault)})") from fault
+
+
+def _all_of(stored: Any, folder: Path) -> NDArray:
+    """Return an array; raises ValueError where Zarr would fill in what is missing."""
+    check_fits(stored.nbytes, folder)
+    missing = stored.nchunks - stored.nchunks_initialized
+    if missing:
+        raise ValueError(f"{missing} of its {stored.nchunks} chunks are not there")
+    return np.asarray(stored[...])
+
+
+def _copies(at: str, group: Any) -> list[str]:
+    """Return the paths of the smaller copies that a group of OME-Zarr lists."""
+    attributes = dict(group.attrs)
+    scales = attributes.get("ome", attributes).get("multiscales", [])
+    levels = (level for scale in scales for level in scale["datasets"][1:])
+    return [f"{at}/{level['path']}".lstrip("/") for level in levels]
+
+
+def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any:
+    """Return an array of a group, or the array that a folder is, not read; raises AppError."""
+    zarr = _zarr()
+    try:
+        node = zarr.open(folder, mode=mode)
+        array = node if isinstance(node, zarr.Array) else node[name]
     except FAULTS as fault:
         raise AppError(
             f"{shown_path(folder)}: holds no array {name} of Zarr ({one_line(fault)})"
@@ -149,11 +193,13 @@ def opened_array(folder: Path, name: str, mode: Literal["r", "r+"] = "r") -> Any
 
 
 def load_light_field(folder: Path) -> NDArray[np.float32]:
-    """Return the array `light_field` of a group, all of it; raises AppError or SceneError."""
+    """Return the array `light_field` of a group, or the array that a folder is, all of it.
+
+    Raises AppError or SceneError.
+    """
     stored = opened_array(folder, "light_field")
     try:
-        check_fits(stored.nbytes, folder)
-        light_field = np.asarray(stored[...])
+        light_field = _all_of(stored, folder)
     except FAULTS as fault:
-        raise SceneError(f"{shown_path(folder)}: damaged ({one_line(fault)})") from fault
-    return check_light_field(light_field, shown_path(folder)).astype(np.float32)
+        raise SceneError(f"{shown_path(folder)}: cannot be read ({one_line(fault)})") from fault
+    return check_light_field(scaled(light_field), shown_path(folder))

@@ -125,8 +125,10 @@ def import_session(
         raise AppError(f"--out {out}: holds something already; name another --out")
     try:
         with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
-            found = list(_items(listed, known, planes, Path(spool), on_file))
-            items, notes = _in_capture_order(found)
+            notes: list[str] = []
+            found = list(_items(listed, known, planes, Path(spool), on_file, notes))
+            items, order = _in_capture_order(found)
+            notes += order
             return _Import(items, known, camera, notes).write(out)
     except OSError as fault:
         why = fault.strerror or fault
@@ -138,14 +140,20 @@ def import_session(
 
 def _items(
     listed: Sequence[Listed], camera: Camera, planes: bool, spool: Path,
-    on_file: Callable[[str], None],
+    on_file: Callable[[str], None], notes: list[str],
 ) -> Iterator[_Item]:  # fmt: skip
-    """Yield the frames of the files, their pixels written to `spool`; raises AppError."""
+    """Yield the frames of the files, their pixels written to `spool`; raises AppError.
+
+    A file of a series brings those of its files that no row names.
+    """
     seen: dict[object, str] = {}
     first: tuple[str, tuple[int, ...], np.dtype] | None = None
+    apart = {one.path.resolve() for one in listed}
     for one in listed:
         name = shown_path(one.path)
-        own = read_own(one.path, one.array)
+        own = read_own(one.path, one.array, apart)
+        apart.update(member.resolve() for member in own.members)
+        notes += own.notes
         frames, tell = _mosaics(own, one, planes), _telling(own, camera)
         if own.raw is not None:
             _check_phase(own.raw, camera, name)

@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +18,7 @@ from pydantic import BeforeValidator, Field
 
 from drivers.capture_order import natural
 from emmc_rig.errors import AppError
+from emmc_rig.model.decoding.regular import check_regular, file_bytes
 from emmc_rig.model.errors import did_you_mean
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.settings import Settings, validated
@@ -26,6 +28,9 @@ ImportedKind = Literal[
 ]
 LONGEST_S = 3600.0
 MOST_TABLE_BYTES = 16_000_000
+SEPARATOR_LINE = re.compile(r'"?sep=(.)"?[,;\s]*', re.IGNORECASE)
+"""The line by which spreadsheets say what separates cells."""
+DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 WORKBOOK = b"PK\x03\x04"
 """How .xlsx and .ods begin, which are ZIP."""
 
@@ -81,57 +86,64 @@ class Listed:
 def read_table(path: Path) -> list[Listed]:
     """Return the rows of a CSV table; raises AppError with the line that is wrong."""
     shown = shown_path(path)
+    if check_regular(path, AppError) > MOST_TABLE_BYTES:
+        raise AppError(f"{shown}: larger than {MOST_TABLE_BYTES // 10**6} MB: not a table")
+    data = file_bytes(path, AppError)
+    if data.startswith(WORKBOOK):
+        raise AppError(f"{shown}: a workbook, not a table in CSV; save it as CSV UTF-8")
     try:
-        if path.stat().st_size > MOST_TABLE_BYTES:
-            raise AppError(f"{shown}: larger than {MOST_TABLE_BYTES // 10**6} MB: not a table")
-        data = path.read_bytes()
-        if data.startswith(WORKBOOK):
-            raise AppError(f"{shown}: a workbook, not a table in CSV; save it as CSV UTF-8")
         text = data.decode("utf-8-sig")
-    except FileNotFoundError as fault:
-        raise AppError(f"{shown}: no such file") from fault
-    except OSError as fault:
-        raise AppError(f"{shown}: cannot be read ({fault.strerror})") from fault
     except UnicodeDecodeError as fault:
         raise AppError(
             f"{shown}: not text in UTF-8 (byte {fault.start}); save it as CSV UTF-8"
         ) from fault
     if "\0" in text:
         raise AppError(f"{shown}: not text: it holds a zero byte; save it as CSV UTF-8")
-    head = text.partition("\n")[0]
-    separator = next((one for one in "\t;" if one in head and "," not in head), ",")
+    begins, separator = _separator(text)
     try:
-        lines = list(csv.reader(io.StringIO(text), delimiter=separator, strict=True))
+        reader = csv.reader(io.StringIO(text, newline=None), delimiter=separator, strict=True)
+        lines = list(reader)[begins:]
     except csv.Error as fault:
         raise AppError(f"{shown}: not a table in CSV ({fault})") from fault
     if not lines:
         raise AppError(f"{shown}: empty; its first line names the columns: file,kind,exposure_s")
     names = [name.strip() for name in lines[0]]
-    twice = {name for name in names if names.count(name) > 1}
+    twice = {name for name in names if name and names.count(name) > 1}
     if twice:
         raise AppError(f"{shown}: the column '{twice.pop()}' is there twice")
     if not {"file", "kind"} & {name.lower() for name in names}:
         raise AppError(
-            f"{shown}, line 1: names no column; the first line of a table is: file,kind,exposure_s"
+            f"{shown}, line {begins + 1}: names no column; the first line of a table is: "
+            "file,kind,exposure_s"
         )
+    columns = max(place for place, name in enumerate(names, 1) if name)
+    unknown = {name for name in names if name} - set(Row.model_fields)
     found = []
-    for number, line in enumerate(lines[1:], 2):
+    for number, line in enumerate(lines[1:], begins + 2):
         cells = [cell.strip() for cell in line]
-        if separator == ";":  # so write programs of countries whose decimal point is a comma
-            cells = [re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", cell) for cell in cells]
+        if separator != ",":  # so write programs of countries whose decimal point is a comma
+            cells = [DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells]
         if not any(cells):
             continue
         where = f"{shown}, line {number}"
-        if len(cells) != len(names):
-            raise AppError(f"{where}: {len(cells)} cells under {len(names)} columns")
-        given = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
+        # Spreadsheets write empty cells beyond the last column.
+        given = {name: cell for name, cell in zip_longest(names, cells, fillvalue="") if cell}
+        if "" in given or len(cells) < columns:
+            raise AppError(f"{where}: {len(cells)} cells under {columns} columns")
         # A column that nobody fills is checked too: it may be misspelt.
-        row = validated(Row, dict.fromkeys(set(names) - set(Row.model_fields), "") | given, where,
-                        AppError)  # fmt: skip
+        row = validated(Row, dict.fromkeys(unknown, "") | given, where, AppError)
         found.append(_listed(row, where, path.parent))
     if not found:
         raise AppError(f"{shown}: no row below the names of the columns")
     return found
+
+
+def _separator(text: str) -> tuple[int, str]:
+    """Return how many lines stand before the names of the columns, and what separates cells."""
+    head = text.partition("\n")[0].strip("\r")
+    if stated := SEPARATOR_LINE.fullmatch(head):
+        return 1, stated[1]
+    return 0, next((one for one in "\t;" if one in head and "," not in head), ",")
 
 
 def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:

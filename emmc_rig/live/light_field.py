@@ -29,7 +29,7 @@ from calibration.scale import Scale, exposure_of
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.files.scales import open_scale
 from emmc_rig.live.alignment import is_dark
 from emmc_rig.live.server import Picture, Pictured, Query

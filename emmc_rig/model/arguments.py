@@ -50,6 +50,12 @@ def pair_of(value: object, name: str, takes: str) -> tuple[int, int]:
 
 def numbers_of(value: object, name: str, takes: str) -> NDArray:
     """Return an array of real numbers; raises ArgumentError for anything else."""
+    masked = np.ma.count_masked(value) if isinstance(value, np.ma.MaskedArray) else 0
+    if masked:
+        raise ArgumentError(
+            f"{name}: {masked} of its values are masked, so not valid; it takes {takes}: cut them "
+            "off, or write what was measured there"
+        )
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):  # lists whose rows differ in length

@@ -17,9 +17,10 @@ import h5py
 import numpy as np
 
 from emmc_rig.model.bands import in_views
+from emmc_rig.model.decoding.stored import light_of, read_codes, read_views
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.files import whole_file
-from emmc_rig.model.reading import decode_picture, one_line, stored_arrays
+from emmc_rig.model.reading import one_line, stored_arrays
 from emmc_rig.model.view_axes import (
     ANGLES,
     ATTRIBUTE,
@@ -30,10 +31,11 @@ from emmc_rig.model.view_axes import (
 )
 
 _DATASET = "light_field"
-_VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.png")
+_VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.(png|tiff?|exr)", re.IGNORECASE)
+_LIKE_A_VIEW = re.compile(r"view|[^.].*\d\D+\d+\.(png|tiff?|exr|jpe?g|bmp|webp)$", re.IGNORECASE)
+"""Begins as a view's name, or is a picture's with two numbers."""
 _MOST_VIEWS = 10_000
 """In a grid of which most are missing; what asks for more is another number, such as a time."""
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 _SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
@@ -72,31 +74,42 @@ def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
 
 
 def load_views(folder: str | os.PathLike) -> np.ndarray:
-    """Read a folder of pictures `view_ROW_COL.png`, 8 or 16 bits, RGB or grey.
+    """Read a folder of pictures `view_ROW_COL.png`, or `.tif` or `.exr`, RGB or grey.
 
     Returns:
-        (v, u, y, x, 3), code values divided by the full scale.
+        (v, u, y, x, 3), code values divided by the full scale; floating values as they are.
 
     Raises:
-        SceneError: no such folder, no views in it, views missing, a file that is no whole PNG,
-            or pictures of different sizes.
+        SceneError: no such folder, no views in it, views missing or not named as the others, a
+            file that is no whole picture, or pictures of different sizes.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder")
     paths: dict[tuple[int, int], Path] = {}
+    odd = []
     for path in sorted(folder.iterdir()):
         if match := _VIEW_NAME.fullmatch(path.name):
             place = int(match[1]), int(match[2])
             if place in paths:
                 raise SceneError(f"{folder}: {paths[place].name} and {path.name} are the same view")
             paths[place] = path
+        elif _LIKE_A_VIEW.match(path.name):
+            odd.append(path.name)
+    names = "views are named view_ROW_COL.png, or .tif or .exr"
     if not paths:
-        raise SceneError(f"{folder}: no views; they are named view_ROW_COL.png")
-    rows, columns = grid_of_views(paths, folder, SceneError)
+        raise SceneError(f"{folder}: no views; {names}")
+    endings = {path.suffix.lower() for path in paths.values()}
+    if odd or len(endings) > 1:
+        what = f"{', '.join(odd[:6])}: named otherwise" if odd else "views of several formats"
+        raise SceneError(f"{folder}: {what}; {names}: rename or move away what is none")
+    rows, columns = grid_of_views(paths, folder)
     places = {place: paths[rows[place[0]], columns[place[1]]] for place in np.ndindex(
         len(rows), len(columns)
     )}  # fmt: skip
+    if endings != {".png"}:
+        lf = read_views(list(places.values()), SceneError)
+        return check_light_field(lf.reshape(len(rows), len(columns), *lf.shape[1:]), str(folder))
     first = read_picture(places[0, 0])
     lf = np.empty((len(rows), len(columns), *first.shape), np.float32)
 
@@ -114,10 +127,8 @@ def load_views(folder: str | os.PathLike) -> np.ndarray:
     return check_light_field(lf, str(folder))
 
 
-def grid_of_views(
-    paths: Mapping[tuple[int, int], Path], folder: Path, error: type[Exception]
-) -> tuple[range, range]:
-    """Return the rows and columns of views that files make; raises `error` where one is missing.
+def grid_of_views(paths: Mapping[tuple[int, int], Path], folder: Path) -> tuple[range, range]:
+    """Return the rows and columns of views that files make; raises SceneError where one is missing.
 
     paths: by row and column, from any first ones on.
     """
@@ -129,7 +140,7 @@ def grid_of_views(
     if count > max(_MOST_VIEWS, 4 * len(paths)):
         middle = np.median(list(paths), axis=0)
         odd = max(paths, key=lambda place: np.abs(place - middle).sum())
-        raise error(
+        raise SceneError(
             f"{folder}: {len(paths)} views do not fill {len(rows)}x{len(columns)}, as "
             f"{paths[odd].name} asks for; names are view_ROW_COL, rows and columns counted from "
             "0: rename it or move it away"
@@ -139,7 +150,7 @@ def grid_of_views(
         ending = next(iter(paths.values())).suffix
         missing = [f"view_{r}_{c}{ending}" for r, c in places if (r, c) not in paths]
         rest = f" and {len(missing) - 6} more" if len(missing) > 6 else ""
-        raise error(
+        raise SceneError(
             f"{folder}: {len(missing)} of {len(rows)}x{len(columns)} views missing: "
             f"{', '.join(missing[:6])}{rest}"
         )
@@ -186,11 +197,16 @@ def load_hdf5(path: str | os.PathLike) -> np.ndarray:
             held = ", ".join(sorted(stored.file)) or "none"
             raise SceneError(f"{path}: no dataset '{_DATASET}'; it holds {held}")
         lf = stored.array(_DATASET)
-    if lf.dtype in (np.uint8, np.uint16):
-        full_scale = np.iinfo(lf.dtype).max
-        lf = lf.astype(np.float32)
-        lf /= full_scale
-    return check_light_field(lf, str(path))
+    return check_light_field(scaled(lf), str(path))
+
+
+def scaled(lf: np.ndarray) -> np.ndarray:
+    """Return codes of 8 or 16 bits divided by their full scale, and other values as they are."""
+    if lf.dtype not in (np.uint8, np.uint16):
+        return lf
+    light = lf.astype(np.float32)
+    light /= np.iinfo(lf.dtype).max
+    return light
 
 
 def load_view_axes(path: str | os.PathLike) -> ViewAxes:
@@ -474,20 +490,8 @@ def export_pictures(
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """One PNG file as float32 (y, x, 3) in [0, 1]."""
-    content = path.read_bytes()
-    if not content.startswith(_PNG_START):
-        raise SceneError(f"{path}: not a PNG picture")
-    codes = decode_picture(content, str(path), SceneError)
-    full_scale = 255 if codes.dtype == np.uint8 else 65535
-    if codes.ndim == 3 and codes.shape[2] == 4:
-        if np.any(codes[..., 3] != full_scale):
-            raise SceneError(f"{path}: partly transparent; save it without an alpha channel")
-        codes = codes[..., :3]
-    picture = np.empty((*codes.shape[:2], 3), np.float32)
-    picture[...] = codes[..., ::-1] if codes.ndim == 3 else codes[..., np.newaxis]
-    picture /= full_scale
-    return picture
+    """Return the picture of a file as float32 (y, x, 3), 1 for white; raises SceneError."""
+    return light_of(*read_codes(path, SceneError, opaque=True))
 
 
 def _write_codes(path: Path, codes: np.ndarray) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from emmc_rig.model.decoding.stored import light_of, read_codes
 from emmc_rig.model.errors import CameraError
-from emmc_rig.model.reading import decode_picture
 from emmc_rig.model.settings import Settings
 
 FILTERS = {"R": (1, 0, 0), "G": (0, 1, 0), "B": (0, 0, 1), "W": (1, 1, 1)}
@@ -332,17 +332,9 @@ class Picture(Pattern):
 
     def draw(self, frames: int, rows: int, columns: int, cell_um: float) -> NDArray[np.float32]:
         """Return the picture scaled to [0, 1]; raises CameraError when it cannot be read."""
-        source = f"mask picture {self.path}"
-        try:
-            content = self.path.read_bytes()
-        except (OSError, ValueError) as fault:
-            raise CameraError(f"{source}: no such file, or not a picture") from fault
-        picture = decode_picture(content, source, CameraError)
-        if picture.dtype not in (np.uint8, np.uint16):
-            raise CameraError(f"{source}: use 8 or 16 bits a channel")
-        grey = picture.ndim == 2
-        levels = picture.astype(np.float64) / np.iinfo(picture.dtype).max
-        cells = _grey(levels) if grey else levels[:, :, 2::-1].astype(np.float32)
+        cells = light_of(*read_codes(self.path, CameraError))
+        if not (cells.min() >= 0 and cells.max() <= 1):
+            raise CameraError(f"{self.path}: transmittances beyond 0 to 1, or no numbers")
         if self.repeat:
             cells = _repeat(cells, rows, columns)
         return np.repeat(cells[None], frames, axis=0)

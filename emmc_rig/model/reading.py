@@ -1,16 +1,13 @@
-"""Files from outside as plain data: YAML, HDF5 and pictures, bounded in depth and memory.
+"""Files from outside as plain data: YAML and HDF5, bounded in depth and memory.
 
 Whatever is wrong with a file raises the caller's error with one line that names the file. No other
 module calls these decoders, nor JSON's beside `json_text`: `tests/files/test_decoders.py` says so.
+Pictures and what other programs wrote: `emmc_rig.model.decoding`.
 """
 
 from __future__ import annotations
 
-import io
 import math
-import struct
-import warnings
-import zlib
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from emmc_rig.model.decoding.regular import HEAD_BYTES, check_regular, file_bytes, not_read
 from emmc_rig.model.json_text import one_line, shown_path
 
 MOST_YAML_BYTES, MOST_VALUES, MOST_NESTED = 1_000_000, 1_000_000, 100
@@ -28,21 +26,14 @@ MOST_YAML_BYTES, MOST_VALUES, MOST_NESTED = 1_000_000, 1_000_000, 100
 plan of a thousand shots has 160 kB, 10,000 values and 6 within one another."""
 LONGEST_NUMBER = 4000
 """In characters; the time for one in base 60 grows with the square of its length."""
-MOST_PICTURE_PIXELS = 2**28
-MOST_DEFLATED = 1032
-"""How many equal bytes deflate packs into one (RFC 1951: 258 bytes in 2 bits)."""
-MOST_COMPRESSED, FREE_BYTES, FREE_PICTURE_BYTES = 100, 2**26, 2**30
+MOST_COMPRESSED, FREE_BYTES = 100, 2**26
 """How many times its file a data set may be, and the bytes that even a nearly empty file may hold
-unpacked: light fields pack to a tenth, even maps by lzf to a ninetieth. A picture, as float32, may
-be more, since masks have large even areas: 89 megapixels, or MOST_DEFLATED times its file."""
+unpacked: light fields pack to a tenth, even maps by lzf to a ninetieth."""
 _DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
 _FILTERS = frozenset((_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF))
 """Filters of HDF5 whose memory a chunk's size bounds; others allocate what the file says."""
-_PNG_START, _PNG_HEADER = b"\x89PNG\r\n\x1a\n", struct.Struct(">IIBBBBB")
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-_PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
-"""By colour type. Source: PNG 1.2, table 11.1 (the channels, and the depths allowed)."""
-_OTHER_PICTURES = ("BMP", "GIF", "JPEG", "JPEG2000", "PPM", "TIFF", "WEBP")
+_BLANK = ("_FillValue", "missing_value")
+"""Attributes by which NetCDF and others name the value of what is not valid."""
 FAULTS = (
     *(OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError),
     MemoryError,
@@ -70,16 +61,8 @@ class _Loader(_SafeLoader):
 
 def read_yaml(path: Path, error: type[Exception]) -> object:
     """Return the content of a YAML file; raises `error` when it cannot be read."""
-    name = shown_path(path)
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MOST_YAML_BYTES + 1)
-    except FileNotFoundError as fault:
-        raise error(f"{name}: no such file") from fault
-    except (OSError, ValueError) as fault:
-        why = getattr(fault, "strerror", None) or fault
-        raise error(f"{name}: cannot be read ({why})") from fault
-    return parse_yaml(data, name, error)
+    data = file_bytes(path, error, MOST_YAML_BYTES + 1)
+    return parse_yaml(data, shown_path(path), error)
 
 
 def parse_yaml(
@@ -190,7 +173,14 @@ class StoredArrays:
         found = self.dataset(name)
         if found.dtype.kind not in "biuf":
             raise ValueError(f"'{name}' holds no numbers")
-        return np.asarray(found[()])
+        _check_written(name, found)
+        values = np.asarray(found[()])
+        for key in _BLANK:
+            blank = found.attrs.get(key)
+            invalid = 0 if blank is None else int(np.count_nonzero(values == blank))
+            if invalid:
+                raise ValueError(f"'{name}' has {invalid} value(s) that its {key} calls not valid")
+        return values
 
     def text(self, name: str) -> str:
         """Return a data set that is one text; raises KeyError or ValueError."""
@@ -200,26 +190,34 @@ class StoredArrays:
         return str(found.asstr()[()])
 
 
+def _check_written(name: str, found: h5py.Dataset) -> None:
+    """Raise ValueError where a part was never written, which HDF5 reads as the fill value."""
+    if found.chunks is None:
+        parts, there = 1, int(found.id.get_storage_size() > 0 or not found.nbytes)
+    else:
+        sides = zip(found.shape, found.chunks, strict=True)
+        parts, there = math.prod(-(-n // side) for n, side in sides), found.id.get_num_chunks()
+    if there < parts:
+        raise ValueError(f"{parts - there} of the {parts} parts of '{name}' were never written")
+
+
 @contextmanager
 def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[StoredArrays]:
     """Yield the data sets of an HDF5 file; whatever fails in reading them raises `error`.
 
     remedy: what to do about a file that is damaged or not what was expected.
     """
-    try:
-        size = path.stat().st_size
-    except FileNotFoundError as fault:
-        raise error(f"{shown_path(path)}: no such file") from fault
-    except (OSError, ValueError) as fault:
-        why = getattr(fault, "strerror", None) or fault
-        raise error(f"{shown_path(path)}: cannot be read ({why})") from fault
+    size = check_regular(path, error)
     try:
         with h5py.File(path, "r") as file:
             yield StoredArrays(file, size)
     except error:
         raise
     except FAULTS as fault:
-        why = f"cannot be read, damaged or incomplete ({one_line(fault)})"
+        if not h5py.is_hdf5(path):
+            start = file_bytes(path, error, HEAD_BYTES)
+            raise error(f"{shown_path(path)}: {not_read(start, 'HDF5')}; {remedy}") from fault
+        why = f"cannot be read ({one_line(fault)})"
         raise error(f"{shown_path(path)}: {why}; {remedy}") from fault
 
 
@@ -232,74 +230,3 @@ def holds_array(path: Path, name: str, form: str | None = None) -> bool:
             )
     except ValueError:
         return False
-
-
-def decode_picture(content: bytes, source: str, error: type[Exception]) -> NDArray:
-    """Return the codes of a picture file, (y, x) or (y, x, channel), blue first.
-
-    PNG is checked whole before it is decoded. Raises `error` for what is no picture, is damaged, or
-    claims more pixels than its bytes can hold.
-    """
-    import cv2  # a sixth of a second, which settings need not
-
-    if content.startswith(_PNG_START):
-        rows, columns = _png_size(content, source, error)
-    else:
-        rows, columns = _picture_size(content, source, error)
-    if rows * columns > MOST_PICTURE_PIXELS:
-        raise error(f"{source}: {columns} x {rows} pixels, more than any picture here can have")
-    if 12 * rows * columns > MOST_DEFLATED * len(content) + FREE_PICTURE_BYTES:
-        raise error(f"{source}: {columns} x {rows} pixels, more than {len(content)} bytes can hold")
-    try:
-        codes = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, MemoryError) as fault:
-        raise error(f"{source}: cannot be decoded ({one_line(fault)})") from fault
-    if codes is None:
-        raise error(f"{source}: a picture cut short or damaged; copy it again")
-    return np.asarray(codes)
-
-
-def _png_size(content: bytes, source: str, error: type[Exception]) -> tuple[int, int]:
-    """Return rows and columns; raises `error` unless header, checksums and length are right."""
-    damaged = error(f"{source}: a PNG picture cut short or damaged; copy it again")
-    place, header, data_bytes, name = len(_PNG_START), b"", 0, b""
-    while name != b"IEND":
-        length = int.from_bytes(content[place : place + 4], "big")
-        name, end = content[place + 4 : place + 8], place + 8 + length
-        if end + 4 > len(content):
-            raise damaged
-        chunk = memoryview(content)[place + 4 : end]
-        if zlib.crc32(chunk) != int.from_bytes(content[end : end + 4], "big"):
-            raise damaged
-        if not header:
-            header = bytes(chunk)
-        data_bytes += length if name == b"IDAT" else 0
-        place = end + 4
-    if header[:4] != b"IHDR" or len(header) != 4 + _PNG_HEADER.size:
-        raise damaged
-    columns, rows, depth, kind, packing, filtering, interlace = _PNG_HEADER.unpack(header[4:])
-    if depth not in _PNG_DEPTHS.get(kind, ()):
-        raise error(f"{source}: {depth} bits a sample of colour type {kind}, which no PNG has")
-    if packing or filtering or interlace > 1 or not columns or not rows:
-        raise damaged
-    unpacked_bytes = rows * math.ceil(columns * _PNG_CHANNELS[kind] * depth / 8)
-    if rows * columns <= MOST_PICTURE_PIXELS and unpacked_bytes > MOST_DEFLATED * data_bytes:
-        raise error(f"{source}: {columns} x {rows} pixels, more than {len(content)} bytes can hold")
-    return rows, columns
-
-
-def _picture_size(content: bytes, source: str, error: type[Exception]) -> tuple[int, int]:
-    """Return rows and columns of a picture that is no PNG, from its header alone."""
-    from PIL import Image
-
-    try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(content), formats=_OTHER_PICTURES) as picture,
-        ):
-            columns, rows = picture.size
-    except Image.DecompressionBombError as fault:
-        raise error(f"{source}: {one_line(fault)}") from fault
-    except (SyntaxError, struct.error, *FAULTS) as fault:
-        raise error(f"{source}: not a picture, or damaged") from fault
-    return rows, columns

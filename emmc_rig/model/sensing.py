@@ -41,6 +41,9 @@ Array = NDArray[np.floating]
 WEIGHTS_TAKE = "an array (shot, v, u, y, stored colour, x), float32 or float64"
 NO_COLOUR_MAP = np.zeros((1, 1, 1), dtype=np.uint8)
 FORMAT = "emmc-rig imaging matrix 1"
+NEGATIVE_NOISE = 0.05
+"""Of the largest weight: measured weights of closed cells lie below 0 by noise, a percent or two;
+what is negative by design, such as -1 of a Hadamard code, is half of the range."""
 
 
 def checksum_of(
@@ -448,8 +451,8 @@ class ImagingMatrix(PsiLayout):
             view_axes: what v and u are: `angle`, `band` or `time`.
 
         Raises:
-            SensingError: weights that are not finite, or all 0; pixels that do not divide the
-                samples.
+            SensingError: weights that are not finite, below 0 by more than noise, or all 0; pixels
+                that do not divide the samples.
             ArgumentError: an argument of another type or number of axes.
 
         >>> opened = np.zeros((2, 1, 2, 4, 6))  # two shots, each through one of two openings
@@ -467,6 +470,11 @@ class ImagingMatrix(PsiLayout):
         given = given.astype(np.float32, copy=False)
         if not given.any():
             raise SensingError("weights that are all 0: no pixel sees any light")
+        if given.min() < -NEGATIVE_NOISE * given.max():
+            raise SensingError(
+                f"weights down to {given.min():.3g}, and a pixel sees no less than no light: a "
+                "difference of two shots is given as two shots"
+            )
         if given.ndim == 5 and cfa is None:
             red = np.zeros((len(given), *given.shape[3:]), dtype=np.uint8)
             stored = np.ascontiguousarray(given[:, :, :, :, None])

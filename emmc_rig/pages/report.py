@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.files.results import stated_words
 from emmc_rig.model.files import write_text
 from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax

@@ -23,7 +23,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError, WrongUsageError
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.model.lightfield import epi_horizontal, psnr_db, ssim
 from emmc_rig.model.view_axes import picture_name, place_name, shows_parallax
 from emmc_rig.pages.display import DisplayCurve, ends, finite, round_up, three_colours

@@ -26,8 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.files.films import Film
-from emmc_rig.files.formats import Export, Format
+from emmc_rig.files.formats.format import Export, Film, Format
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import centre_disparity, view_disparities

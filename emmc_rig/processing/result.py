@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.files.exports import LIGHT_FIELD, save_maps
 from emmc_rig.files.folders import result_folder
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import (

@@ -331,14 +331,14 @@ MISTAKES = {
     "complex values": (written(1, LIT[1] * 1j), "holds no real numbers"),
     "truths": (written(1, LIT[1] > 9), "holds no real numbers"),
     "a line of values": (written(1, LIT[1].ravel()), "not frames (y, x) or (frame, y, x)"),
-    "five axes": (written(1, LIT[1][None, None, None]), "not frames (y, x) or (frame, y, x)"),
+    "five axes": (written(1, LIT[:2, None].repeat(2, 1)[None]), "1x2x2x24x32, not frames (y, x)"),
     "nothing in it": (written(1, LIT[1][:0]), "holds an array of 0x32"),
     "a colour picture": (picture((24, 32, 3)), "its red, green and blue are three shots"),
     "a colour array": (written(1, COLOURS), "its red, green and blue are three"),
     "a grey picture in colour": (written(1, GREY), "in three equal colours"),
     "a picture of 8 bits": (picture((24, 32), np.uint8), "8 bits a pixel, which never reach"),
     "a text": (file_written(1, "t.txt", b"words"), "t.txt: "),
-    "an empty file": (file_written(1, "e.npy", b""), "e.npy: cannot be read"),
+    "an empty file": (file_written(1, "e.npy", b""), "e.npy: empty; formats read here"),
     "a torn file": (file_written(1, "e.npy", b"\x93NUMPY\x01\x00v\x00{"), "e.npy: cannot be read"),
     "a torn picture": (file_written(1, "e.png", b"\x89PNG\r\n\x1a\n123"), "cut short or damaged"),
     "a torn DNG": (file_written(1, "e.dng", b"II*\x00123"), "e.dng: unusable RAW frame"),
@@ -451,7 +451,7 @@ MISTAKES = {
     "a mask of fewer cells than the beam": (
         mask_of(12), "it has 12 cells of 36 um, the beam needs 18"
     ),
-    "a mask picture that is missing": (mask_of(None), "m.png: no such file, or not a picture"),
+    "a mask picture that is missing": (mask_of(None), "m.png: no such file"),
     "a workbook": (table_bytes(b"PK\x03\x04\x14\x00"), "save it as CSV UTF-8"),
     "UTF-16": (table_bytes(TABLE.encode("utf-16")), "not text in UTF-8 (byte 0); save it as CSV"),
     "Latin letters": (table_bytes(TABLE.replace("s0", "\xe4").encode("latin-1")), "not text in"),
@@ -684,7 +684,7 @@ def test_a_place_that_cannot_be_written_is_named(out, tmp_path, run):
         (("--shots", "*.npy", "--darks", "d*.npy"), "is there twice"),
         (("--shots", "s*.npy", "--planes"), "the camera's sensor.cfa is rggb"),
         (("table.xlsx",), "table.xlsx: no such file"),
-        ((".",), "cannot be read (Is a directory)"),
+        ((".",), ".: a folder, where a file is meant"),
     ],
 )
 def test_a_mistake_in_the_command_is_named(arguments, words, tmp_path, run):

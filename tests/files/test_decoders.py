@@ -25,22 +25,25 @@ from emmc_rig.bench.rig_config import ImagedRig, rig_description
 from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.child import read_in_child
 from emmc_rig.files.psi import StoredPsi, save_shards
 from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.decoding.child import read_in_child
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.sensing import ImagingMatrix
 
 ROOT = Path(__file__).parents[2]
-READING, CHILD, RAW = "emmc_rig/model/reading.py", "emmc_rig/files/child.py", "drivers/raw.py"
+READING, RAW = "emmc_rig/model/reading.py", "drivers/raw.py"
+CHILD, TIFF, PICTURES = (
+    f"emmc_rig/model/decoding/{name}.py" for name in ("child", "tiff", "pictures")
+)
 GUARDED = {
     "yaml": (READING, "emmc_rig/files/yaml_edit.py"),  # whose text was parsed there before
     "json.load": ("emmc_rig/model/json_text.py",),
     "h5py.File": (READING,),
-    "cv2.im": (READING, "emmc_rig/study/stability/sensor_faults.py"),  # faults: its own bytes
-    "PIL.Image.open": (READING,),
+    "cv2.im": (PICTURES, "emmc_rig/study/stability/sensor_faults.py"),  # faults: its own bytes
+    "PIL.Image.open": (PICTURES,),
     "rawpy": (RAW,),
-    "tifffile": (RAW, "drivers/dng.py", CHILD),  # drivers/dng.py: its own bytes
+    "tifffile": (RAW, "drivers/dng.py", TIFF),  # drivers/dng.py: its own bytes
     "scipy.io": (CHILD,),
     "OpenEXR": (CHILD,),
     "zarr": ("emmc_rig/files/shards.py",),
@@ -48,6 +51,8 @@ GUARDED = {
     "numpy.load": ("emmc_rig/pages/pictures.py", "emmc_rig/processing/filming.py", CHILD),
     "torch.load": (),
     "pickle.load": (),
+    "imagecodecs": (),  # which tifffile calls
+    "imageio": (),
 }
 """By decoder, the modules that may call it."""
 DECODERS = {
@@ -60,6 +65,7 @@ DECODERS = {
        ("imdecode", "imread", "imreadmulti", "imdecodemulti", "imdecodeanimation",
         "imreadanimation")},
     "PIL.Image.open": "PIL.Image.open",
+    "PIL.Image.Exif": "PIL.Image.open",
     **{f"rawpy.{name}": "rawpy" for name in ("imread", "RawPy")},
     **{f"tifffile.{name}": "tifffile" for name in ("imread", "TiffFile", "memmap")},
     "scipy.io.loadmat": "scipy.io",
@@ -67,6 +73,9 @@ DECODERS = {
     **{f"zarr.{name}": "zarr" for name in ("open", "open_group", "open_array", "load")},
     "numpy.load": "numpy.load",
     "torch.load": "torch.load",
+    **{f"imagecodecs.{name}": "imagecodecs" for name in ("imread", "tiff_decode", "png_decode")},
+    **{f"{name}.{read}": "imageio" for name in ("imageio", "imageio.v2", "imageio.v3")
+       for read in ("imread", "mimread", "volread", "imopen", "get_reader")},
     **{f"pickle.{name}": "pickle.load" for name in ("load", "loads", "Unpickler")},
 }  # fmt: skip
 
@@ -534,5 +543,5 @@ def test_arrays_come_from_the_child_whether_or_not_python_buffers_its_output(
     else:
         monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     np.savez(tmp_path / "a.npz", frames=np.arange(12).reshape(3, 4))
-    found = read_in_child("npz", [tmp_path / "a.npz"])
+    found, _ = read_in_child("npz", [tmp_path / "a.npz"])
     np.testing.assert_array_equal(found, np.arange(12).reshape(3, 4))

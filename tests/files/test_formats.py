@@ -13,8 +13,9 @@ import tifffile
 from programs import program
 
 from emmc_rig.errors import ERRORS
-from emmc_rig.files.formats import FORMATS, Export
 from emmc_rig.files.formats.displays import walk
+from emmc_rig.files.formats.format import Export
+from emmc_rig.files.formats.registry import FORMATS
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.novel_view import between, view_disparities
 from emmc_rig.model.srgb import linear_of, srgb_of
@@ -73,7 +74,12 @@ def test_what_is_written_comes_back_as_a_scene(written, export, name):
 
 
 def test_every_format_that_can_be_read_is_tried():
-    assert {one.name for one in FORMATS.values() if one.read} | {"png8", "png16"} == set(KEPT)
+    assert {one.name for one in FORMATS.values() if one.read} | {
+        "png8",
+        "png16",
+        "tiff",
+        "exr",
+    } == set(KEPT)
 
 
 def test_srgb_and_back_is_the_same_and_has_the_standard_s_values():

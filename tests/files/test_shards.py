@@ -108,7 +108,7 @@ def test_a_missing_part_of_psi_is_one_line_and_others_are_read(frames, name, mon
         ("readings/c", "a file of it is missing; copy"),
         ("deviation/c", "a file of it is missing; copy"),
         ("usable/c", "a file of it is missing; copy"),
-        ("usable", "damaged or incomplete"),
+        ("usable", "one that cannot be read"),
     ],
 )
 def test_frames_in_shards_that_lost_a_part_are_refused(tmp_path, gone, says):

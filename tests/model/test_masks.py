@@ -286,16 +286,23 @@ def test_a_file_that_is_no_picture_is_refused_in_one_line(tmp_path):
     text, empty = tmp_path / "mask.png", tmp_path / "empty.png"
     text.write_text("not a picture")
     empty.write_bytes(b"")
-    for path in (text, empty, tmp_path / "missing.png", tmp_path):
-        with pytest.raises(CameraError, match="not a picture") as fault:
+    for path, complaint in (
+        (text, r"mask\.png: of an unknown format; formats read here are PNG"),
+        (empty, r"empty\.png: empty; formats read here are PNG"),
+        (tmp_path / "missing.png", r"missing\.png: no such file"),
+        (tmp_path, "a folder, where a file is meant"),
+    ):
+        with pytest.raises(CameraError, match=complaint) as fault:
             drawn("picture", path=str(path))
         assert "\n" not in str(fault.value)
 
 
-def test_a_picture_of_floats_is_refused(tmp_path):
-    path = tmp_path / "mask.tiff"
-    assert cv2.imwrite(str(path), np.ones((4, 4), np.float32))
-    with pytest.raises(CameraError, match="8 or 16 bits"):
+def test_a_picture_of_floats_holds_transmittances(tmp_path):
+    path, cells = tmp_path / "mask.tiff", np.linspace(0, 1, 16, dtype=np.float32).reshape(4, 4)
+    assert cv2.imwrite(str(path), cells)
+    assert np.array_equal(drawn("picture", path=str(path))[0, ..., 0], cells)
+    assert cv2.imwrite(str(path), cells - 0.5)
+    with pytest.raises(CameraError, match="transmittances beyond 0 to 1"):
         drawn("picture", path=str(path))
 
 

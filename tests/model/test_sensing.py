@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import aslinearoperator, lsqr
 
+from emmc_rig.model.arguments import ArgumentError
 from emmc_rig.model.camera import Camera, build_imaging_matrix, draw_plates, sensor_response
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.masks import CFA
@@ -482,3 +483,21 @@ def test_psi_is_the_average_over_dense_rays(masks, offsets, rays, tolerance):
     modelled = psi.weights[0].transpose(0, 1, 2, 4, 3) * 3 * 4
     error = np.abs(modelled - passed)
     assert error.max() < tolerance, error.max()
+
+
+def test_weights_below_zero_by_more_than_noise_are_refused():
+    weights = np.random.default_rng(0).random((1, 2, 2, 4, 6))
+    weights[0, 1, 1, 2, 3] = -0.01
+    assert ImagingMatrix.from_weights(weights).shots == 1
+    weights[0, 1, 1, 2, 3] = -0.5
+    with pytest.raises(SensingError, match=r"weights down to -0\.5, and a pixel sees no less"):
+        ImagingMatrix.from_weights(weights)
+
+
+def test_values_that_are_masked_are_not_taken():
+    weights = np.random.default_rng(0).random((1, 2, 2, 4, 6))
+    masked = np.ma.masked_less(weights, 0.1)
+    with pytest.raises(ArgumentError, match=r"weights: \d+ of its values are masked"):
+        ImagingMatrix.from_weights(masked)
+    kept = ImagingMatrix.from_weights(np.ma.masked_array(weights))
+    assert np.array_equal(kept.weights, ImagingMatrix.from_weights(weights).weights)

@@ -9,7 +9,7 @@ from matplotlib.patches import Rectangle
 from programs import program
 
 from emmc_rig.errors import AppError, WrongUsageError
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.pages.pictures import detailed_pieces, epipolar_lines

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.pages.page import light_field_head, typed
 from emmc_rig.pages.viewer import render_viewer
 from emmc_rig.study.chart.charting import chart_page

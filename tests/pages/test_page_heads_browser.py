@@ -6,7 +6,7 @@ from browsers import MARKS
 from capture_rigs import begun, still_rig
 
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.pages.page import Head, Section, framed
 from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.viewer import render_viewer

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from browsers import MARKS, at_width, complaints, nameless
 
-from emmc_rig.files.formats import Export
+from emmc_rig.files.formats.format import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.novel_view import between, sampled
 from emmc_rig.pages import viewer

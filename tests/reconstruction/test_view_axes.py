@@ -13,7 +13,7 @@ from programs import program
 
 import emmc_rig as emmc
 from emmc_rig.files.exports import MAPS, open_export
-from emmc_rig.files.formats import FORMATS
+from emmc_rig.files.formats.registry import FORMATS
 from emmc_rig.files.psi import FRAMES, PSI, StoredPsi, save_shards
 from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
 from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning

@@ -1,14 +1,1 @@
-"""The formats that light fields are written in for others, by name; one module a family."""
-
-from emmc_rig.files.formats import displays, geometry, hci, lytro, ome_zarr, pictures
-from emmc_rig.files.formats.format import Export, Format
-
-FORMATS: dict[str, Format] = {
-    form.name: form
-    for module in (pictures, hci, lytro, ome_zarr, displays, geometry)
-    for form in module.FORMATS
-}
-ALIASES = {"video": "mp4"}
-"""Names of formats up to version 0.4, which --format still takes."""
-
-__all__ = ["ALIASES", "FORMATS", "Export", "Format"]
+"""Formats of light fields: `format` says what one is, `registry` knows all."""

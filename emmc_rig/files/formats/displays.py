@@ -10,20 +10,16 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from itertools import pairwise, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import Array, Export, Format, write_picture
+from emmc_rig.files.formats.format import Array, Export, Film, Format, write_picture
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.novel_view import between, centre_disparity, view_disparities
 from emmc_rig.model.srgb import codes_of, srgb_of
-
-if TYPE_CHECKING:
-    from emmc_rig.files.films import Film
 
 Codes = NDArray[np.uint8]
 QUILT_COLUMNS, QUILT_ROWS = 8, 6

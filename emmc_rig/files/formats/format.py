@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,9 +14,6 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, picture_name, shows_parallax
-
-if TYPE_CHECKING:
-    from emmc_rig.files.films import Film
 
 Array = NDArray[np.floating]
 
@@ -42,6 +38,45 @@ class Export:
     metrics: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     view_axes: ViewAxes = ANGLES
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film of light fields, none of them in memory.
+
+    rate: Hz. times_s: of every place in time, from the first. frames: by place in time, in that
+    order, the folder of the result; places without one are missing. shape: of every light field,
+    (v, u, y, x, c). open_result: opens the folder of a result. on_frame: called when a frame of
+    `each` is done with.
+    """
+
+    folder: Path
+    rate: float
+    times_s: tuple[float, ...]
+    frames: Mapping[int, Path]
+    shape: tuple[int, ...]
+    open_result: Callable[[str], Export]
+    on_frame: Callable[[], object] = lambda: None
+
+    @property
+    def missing(self) -> list[int]:
+        """Places in time that have no frame."""
+        return [place for place in range(len(self.times_s)) if place not in self.frames]
+
+    @property
+    def first(self) -> Export:
+        """The first frame that there is."""
+        return self.opened(min(self.frames))
+
+    def opened(self, place: int) -> Export:
+        """Return the frame of a place in time; raises AppError, or KeyError where it is missing."""
+        return self.open_result(str(self.frames[place]))
+
+    def each(self) -> Iterator[tuple[int, Export]]:
+        """Yield places in time with their frames, one in memory at once."""
+        for place in self.frames:
+            yield place, self.opened(place)
+            self.on_frame()
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def _read_folder(path: Path) -> Array:
             f"{path / PARAMETERS}: num_cams_x and num_cams_y cannot be read; copy it again"
         ) from fault
     there = sum(1 for _ in path.glob("input_Cam*.png"))
-    if not 0 < rows * columns <= there:
+    if not 0 < rows * columns == there:
         raise AppError(
             f"{path}: {there} files input_Cam###.png, but {PARAMETERS} says {rows}x{columns}"
         )

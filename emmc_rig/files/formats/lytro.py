@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.child import read_in_child
 from emmc_rig.files.formats.format import Array, Export, Format, write_picture
+from emmc_rig.model.decoding.stored import read_stored
 from emmc_rig.model.lightfield import read_picture
 from emmc_rig.model.srgb import codes_of, linear_of, srgb_of
 
@@ -36,21 +36,20 @@ def _write_mat(folder: Path, export: Export) -> None:
 
 
 def _holds_mat(path: Path) -> bool:
-    return path.suffix.lower() == ".mat" and path.is_file()
+    return path.suffix.lower() == ".mat" and path.exists()
 
 
 def _read_mat(path: Path) -> Array:
-    try:
-        pictures = read_in_child("mat", [path], "LF")
-    except (OSError, ValueError) as fault:
-        raise AppError(
-            f"{path}: no MAT file of LFToolbox that holds LF ({fault}); save it again"
-        ) from fault
-    if pictures.ndim != 5 or pictures.dtype not in (np.uint8, np.uint16):
+    pictures = read_stored(path, AppError, "LF").array
+    if pictures.ndim == 4:  # MATLAB drops a last axis of length 1
+        pictures = pictures[..., None]
+    if pictures.ndim != 5 or pictures.dtype.kind not in "uf":
         raise AppError(
             f"{path}: LF is {pictures.dtype} of shape {pictures.shape}, not a light field"
         )
-    return pictures[..., :3].astype(np.float32) / np.iinfo(pictures.dtype).max
+    white = np.iinfo(pictures.dtype).max if pictures.dtype.kind == "u" else 1
+    light = pictures[..., :3].astype(np.float32) / white
+    return np.repeat(light, 3, axis=-1) if light.shape[-1] == 1 else light
 
 
 def _write_eslf(folder: Path, export: Export) -> None:

@@ -11,17 +11,14 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import Array, Export, Format, extra_module
+from emmc_rig.files.formats.format import Array, Export, Film, Format, extra_module
 from emmc_rig.files.shards import check_fits
 from emmc_rig.model.json_text import parse_json
-
-if TYPE_CHECKING:
-    from emmc_rig.files.films import Film
 
 NAME, FILM_NAME = "light_field.ome.zarr", "film.ome.zarr"
 SCALES = 3

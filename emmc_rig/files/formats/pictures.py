@@ -6,24 +6,18 @@ scene as it looked; EXR files are linear by definition. Source: PNG 1.2, section
 
 from __future__ import annotations
 
-import re
 import struct
 import zlib
 from functools import partial
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.errors import AppError
-from emmc_rig.files.child import read_in_child
-from emmc_rig.files.formats.format import Array, Export, Format, extra_module, write_picture
-from emmc_rig.model.lightfield import grid_of_views
+from emmc_rig.files.formats.format import Export, Format, extra_module, write_picture
 from emmc_rig.model.srgb import codes_of
 
 IHDR_END = 33
 """Of every PNG: signature 8, length 4, type 4, data 13, checksum 4."""
-VIEW = re.compile(r"view_(\d+)_(\d+)\.(tif|exr)")
 
 
 def _write_png(folder: Path, export: Export, bits: int) -> None:
@@ -60,39 +54,13 @@ def _write_exr(folder: Path, export: Export) -> None:
             file.write(str(folder / f"view_{v}_{u}.exr"))
 
 
-def _views(path: Path, ending: str) -> dict[tuple[int, int], Path]:
-    if not path.is_dir():
-        return {}
-    named = ((VIEW.fullmatch(file.name), file) for file in path.iterdir())
-    return {(int(m[1]), int(m[2])): file for m, file in named if m and m[3] == ending}
-
-
-def _holds(path: Path, ending: str) -> bool:
-    return bool(_views(path, ending))
-
-
-def _read(path: Path, ending: str) -> Array:
-    views = _views(path, ending)
-    rows, columns = grid_of_views(views, path, AppError)
-    if ending == "exr":
-        extra_module("OpenEXR", "EXR")
-    try:
-        pictures = read_in_child(ending, [views[place] for place in product(rows, columns)])
-        stacked = pictures.astype(np.float32)
-    except (OSError, ValueError, TypeError) as fault:
-        raise AppError(f"{path}: views cannot be read ({fault}); copy them again") from fault
-    return stacked.reshape(len(rows), len(columns), *stacked.shape[1:])
-
-
 FORMATS = (
     Format("png8", "view_ROW_COL.png", "8 bits, linear, tagged so", partial(_write_png, bits=8)),
     Format("png16", "view_ROW_COL.png", "16 bits, linear, tagged so", partial(_write_png, bits=16)),
     Format(
         "tiff", "view_ROW_COL.tif", "32-bit floating values, linear", _write_tiff,
-        partial(_holds, ending="tif"), partial(_read, ending="tif"),
     ),
     Format(
         "exr", "view_ROW_COL.exr", "32-bit floating values, linear", _write_exr,
-        partial(_holds, ending="exr"), partial(_read, ending="exr"),
     ),
 )  # fmt: skip

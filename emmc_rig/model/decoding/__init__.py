@@ -1,0 +1,1 @@
+"""Files from outside as arrays: one reader, that every door which takes a file calls."""
