@@ -89,11 +89,12 @@ def is_imported(session: Session) -> bool:
 def _imported_dark(session: Session) -> MeanFrame:
     """Return the dark that black level and read noise of the camera make."""
     noise = camera_of(session).sensor.noise
-    [(frame, exposure_s)] = decoded(session, session.needed[:1])
+    (frame,) = decoded(session, session.needed[:1])
+    entry = session.stored[session.needed[0].id]
     read_dn = noise.gain_dn_per_electron * noise.read_noise_electrons
     # Reading out in whole DN adds a twelfth.
     black = frame.black_by_place().astype(np.float32)
-    return MeanFrame(black, read_dn**2 + 1 / 12, 1, exposure_s)
+    return MeanFrame(black, read_dn**2 + 1 / 12, 1, entry.exposure_s)
 
 
 def mean_dark(session: Session) -> MeanFrame:

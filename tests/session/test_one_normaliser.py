@@ -25,10 +25,10 @@ class Ended:
     """In place of a solver: it notes what the live page gives it."""
 
     def __init__(self):
-        self.psi, self.readings, self.usable = None, None, None
+        self.frames = None
 
-    def __call__(self, method, psi, readings, noise, dictionary, settings, usable, *rest):
-        self.psi, self.readings, self.usable, self.noise = psi, readings, usable, noise
+    def __call__(self, method, psi, frames, *rest):
+        self.frames = frames
         raise emmc.ERRORS[-1]("enough")
 
 
@@ -41,7 +41,7 @@ def shown_live(scale, raw):
     live.update(raw)
     while live.update(raw)["why"] != "enough":
         pass
-    return solver
+    return solver.frames
 
 
 def imported(folder, gain, exposure_s, black_dn, binning):
@@ -113,17 +113,14 @@ def test_session_live_page_and_scale_read_equal_bytes(
     raw = raw.__class__(**{**vars(raw), "gain": float(gain)})
     live = shown_live(live_scale(folder), raw)
     direct = session_scale(session).frames(lambda shot: [raw])
-    for other in (live.readings, direct.readings):
-        assert frames.readings.tobytes() == other.tobytes()
-    assert frames.noise_sigma == live.noise == direct.noise_sigma
+    for other in (live, direct):
+        assert frames.readings.tobytes() == other.readings.tobytes()
+        assert frames.deviation.tobytes() == other.deviation.tobytes()
+    assert frames.noise_sigma == live.noise_sigma == direct.noise_sigma
     assert frames.usable.tobytes() == live.usable.tobytes() == direct.usable.tobytes()
-    assert direct.deviation.tobytes() == frames.deviation.tobytes()
     assert frames.exposures == direct.exposures
     assert (frames.exposures[0].gain, frames.exposures[0].exposures_s) == (gain, (exposure_s,))
-    by_session, by_page = (
-        emmc.reconstruct(psi, given, "tv", noise_sigma=frames.noise_sigma, usable=good)
-        for given in (frames, live.readings)
-    )
+    by_session, by_page = (emmc.reconstruct(psi, given, "tv") for given in (frames, live))
     assert by_session.light_field.tobytes() == by_page.light_field.tobytes()
 
 
