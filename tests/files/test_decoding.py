@@ -3,6 +3,7 @@
 import os
 import shutil
 import socket
+from typing import Any
 
 import cv2
 import h5py
@@ -29,7 +30,7 @@ STACK = np.random.default_rng(2).integers(0, 4096, (4, 20, 30), np.uint16)
 
 def drawn(path):
     """What the pattern of a camera's mask makes of a picture, as codes."""
-    return Picture(kind="picture", path=path).draw(1, *COLOUR.shape[:2], 10.0)[0] * 255
+    return Picture(kind="picture", path=path).draw(1, 20, 30, 10.0)[0] * 255
 
 
 def photographed(path):
@@ -72,8 +73,10 @@ def test_every_door_reads_a_turned_picture_as_a_viewer_shows_it(tmp_path, ending
     picture, path = Image.fromarray(COLOUR), tmp_path / f"phone.{ending}"
     exif = picture.getexif()
     exif[274] = 6
-    more = {"tiffinfo": {274: 6}} if ending == "tif" else {"exif": exif}
-    picture.save(path, **more, **({"lossless": True} if ending == "webp" else {}))
+    more: dict[str, Any] = {"tiffinfo": {274: 6}} if ending == "tif" else {"exif": exif}
+    if ending == "webp":
+        more["lossless"] = True
+    picture.save(path, **more)
     wanted = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("RGB"))
     assert wanted.shape == (30, 20, 3)
     assert same(DOORS[door](path), wanted)
@@ -134,7 +137,7 @@ def test_twelve_packed_bits_are_values_to_4095_and_white_is_that(tmp_path):
 @pytest.mark.slow
 def test_colours_in_planes_are_a_picture_but_for_stacks_of_frames(tmp_path):
     planes = np.moveaxis(COLOUR, -1, 0)
-    about = {"photometric": "rgb", "planarconfig": "separate"}
+    about: dict[str, Any] = {"photometric": "rgb", "planarconfig": "separate"}
     tifffile.imwrite(tmp_path / "a.tif", planes, metadata=None, **about)
     assert np.array_equal(read_own(tmp_path / "a.tif").frames[0], COLOUR)
     tifffile.imwrite(tmp_path / "b.tif", planes, **about)  # as it writes a stack of three

@@ -101,7 +101,7 @@ def decode_picture(content: bytes, source: str, error: type[Exception]) -> tuple
             if codes.ndim == 3:
                 codes = codes[..., [2, 1, 0, *range(3, codes.shape[2])]]
         if codes.ndim == 3 and codes.shape[2] in (2, 4):
-            white = np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else 1
+            white = 2 ** (8 * codes.dtype.itemsize) - 1 if codes.dtype.kind == "u" else 1
             codes, opaque = without_alpha(codes, white)
     except error:
         raise
