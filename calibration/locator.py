@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calibration.boards import Board, Opening, Sample
 from calibration.errors import CalibrationError
-from calibration.placement import SCALARS, Placement, designed_placement
+from calibration.placement import SCALARS, Placement, Tolerances, designed_placement
 from calibration.repeats import vertex
 from calibration.robust import correlation, deviation_of, tukey_weights
 from calibration.shadow import SEARCH_UM, Shadow, ShadowMask
@@ -310,7 +310,8 @@ def _refined(
     Kaufman's simplification).
     """
     indices = [SCALARS.index(name) for name in fitted]
-    deviations, alike = np.full(len(indices), np.inf), 0.0
+    tolerances = Tolerances().deviations(mask.views)[indices]
+    deviations, alike = tolerances, 0.0
     y, x = (sample.pixels / board.reading.shape - 0.5).T
     light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     for _ in range(STEPS):
@@ -329,14 +330,11 @@ def _refined(
             rows[of] -= basis @ _least_squares(basis, rows[of], weight)
         alike = correlation(sample.reading, sample.reading - residual, sample.channels)
         weight = tukey_weights(residual / (deviation_of(residual) + 1e-12))
-        matrix = rows.T @ (rows * weight[:, None])
-        matrix[np.diag_indices_from(matrix)] *= 1 + 1e-9
-        try:
-            inverse = np.linalg.inv(matrix)
-        except np.linalg.LinAlgError as fault:
-            raise CalibrationError("the mask's shadow has no contrast here") from fault
-        variance = np.sum(weight * residual**2) / max(np.sum(weight) - len(indices), 1.0)
-        deviations = MODEL_FACTOR * np.sqrt(np.maximum(np.diag(inverse), 0) * variance)
+        variance = 1e-12 + np.sum(weight * residual**2) / max(np.sum(weight) - len(indices), 1.0)
+        # What the shadow does not show, as the place along stripes, stays where it is.
+        matrix = rows.T @ (rows * weight[:, None]) + np.diag(variance / tolerances**2)
+        inverse = np.linalg.inv(matrix)
+        deviations = MODEL_FACTOR * np.sqrt(np.diag(inverse) * variance)
         step = inverse @ (rows.T @ (weight * residual))
         move = np.zeros(len(placement.vector()))
         move[indices] = step
