@@ -24,6 +24,7 @@ from calibration.boards import Board
 from calibration.choice import white_by_view
 from calibration.fit import Fit
 from calibration.placement import SCALARS
+from calibration.robust import deviation_of
 from calibration.shadow import Shadow, ShadowMask
 from calibration.whiteboard import Calibration
 from emmc_rig.model.sensing import ImagingMatrix
@@ -100,27 +101,27 @@ def board_over_angle(
     upright = _terms(views, 0.0)
     size, flat = len(upright), upright.reshape(len(upright), -1)
     seen = {turn: _turned(psi, board, flat, shadow) for turn, board in turned.items()}
-    noise = max(1.0, float(np.mean([one.squares for one in seen.values()])))
+    noise = max(1.0, float(np.mean([measured.squares for measured in seen.values()])))
 
     def solved(sense: int) -> tuple[Array, Array, float, Array]:
         """Return terms, covariance, squared misfit and what each board leaves."""
         matrix, right = np.zeros((size, size)), np.zeros(size)
         maps = {}
-        for turn, one in seen.items():
+        for turn, measured in seen.items():
             change = (_terms(views, sense * turn) - upright).reshape(size, -1)
             # The change by its own terms.
             maps[turn] = change @ np.linalg.pinv(flat)
-            matrix += maps[turn] @ one.information @ maps[turn].T
-            right += maps[turn] @ one.information @ one.change
+            matrix += maps[turn] @ measured.information @ maps[turn].T
+            right += maps[turn] @ measured.information @ measured.change
         inverse = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
         found = inverse @ right
-        left = np.array([one.change - maps[turn].T @ found for turn, one in seen.items()])
+        left = np.array([measured.change - maps[turn].T @ found for turn, measured in seen.items()])
         pairs = zip(left, seen.values(), strict=True)
-        misfit = sum(float(off @ one.information @ off) for off, one in pairs)
+        misfit = sum(float(off @ measured.information @ off) for off, measured in pairs)
         return found, inverse * noise, misfit / noise, left
 
     both = {sense: solved(sense) for sense in (1, -1)}
-    sense = min(both, key=lambda one: both[one][2])
+    sense = min(both, key=lambda tried: both[tried][2])
     found, covariance, misfit, left = both[sense]
     freedom = size * (len(seen) - 1)
     if both[-sense][2] - misfit < CLEARLY:
@@ -131,35 +132,31 @@ def board_over_angle(
     deviation = np.sqrt(np.einsum("kvu,kl,lvu->vu", upright, covariance, upright))
     inverse = np.linalg.pinv(both[1][1], rcond=1e-9, hermitian=True)
     single = both[1][0]
-    apart = max(float(np.ptp(one @ flat)) for one in left)
+    apart = max(float(np.ptp(change @ flat)) for change in left)
     return BoardAngle(
         radiance / radiance.mean(),
         deviation.astype(np.float64),
         float(np.sqrt(single @ inverse @ single / size)),
         sense,
-        {turn: one.moved_um for turn, one in seen.items()},
+        {turn: measured.moved_um for turn, measured in seen.items()},
         (apart, float(np.sqrt(misfit / freedom)) if freedom else 0.0),
     )
 
 
 def _turned(psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None) -> _Turned:
     """Return what a board says of the change of radiance; flat: the terms, (term, view)."""
-    use = np.flatnonzero(board.usable)
-    if len(use) > SAMPLED:
-        use = np.sort(np.random.default_rng(0).choice(use, SAMPLED, replace=False))
-    channels = board.channels.ravel()[use]
-    pixels = np.stack(np.unravel_index(use, board.reading.shape), axis=1)
-    by_view = np.stack([one.ravel()[use] for one in white_by_view(psi, board.shot)], axis=1)
+    sample = board.sampled(np.inf, SAMPLED, np.random.default_rng(0))
+    channels, reading, deviation = sample.channels, sample.reading, sample.deviation
+    y, x = sample.pixels.T
+    by_view = np.stack([plane[y, x] for plane in white_by_view(psi, board.shot)], axis=1)
     even, size = by_view.sum(axis=1), len(flat)
-    deviation = np.sqrt(board.variance.ravel()[use].astype(np.float64))
-    reading = board.reading.ravel()[use]
     move = np.zeros(2)
     for _ in range(ROUNDS):
-        there, slopes = np.zeros(len(use)), np.zeros((len(use), 0))
+        there, slopes = np.zeros(len(reading)), np.zeros((len(reading), 0))
         if shadow is not None:
-            how = pixels, channels, board.views_open
-            x, y = board.stage_um
-            at = (x + float(move[0]), y + float(move[1]))
+            how = sample.pixels, channels, board.views_open
+            x_um, y_um = board.stage_um
+            at = (x_um + float(move[0]), y_um + float(move[1]))
             moved, by_all = shadow.with_slopes(*how, at, board.shot)
             there = moved - shadow.readings(*how, board.stage_um, board.shot)
             slopes = by_all[:, :2]
@@ -172,7 +169,7 @@ def _turned(psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None
             normal = columns.T @ (columns * weight[:, None])
             solution = np.linalg.lstsq(normal, columns.T @ (weight * value), rcond=None)[0]
             left = value - columns @ solution
-            limit = CLIP * 1.4826 * float(np.median(np.abs(left)))
+            limit = CLIP * deviation_of(left)
             weight = (np.abs(left) < limit).astype(np.float64)
         step = solution[size : size + slopes.shape[1]]
         if not step.size:
@@ -231,8 +228,8 @@ def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> Leaning:
     sent = board.radiance if board is not None and board.uneven else np.ones(views)
     weights = (np.array(fit.placement.aperture) * through / sent).ravel()
     weights = weights / weights.mean()
-    smooth = [np.broadcast_to(one, views).ravel() for one in (far, v[:, None], u[None, :])]
-    columns = np.stack([one - one.mean() for one in smooth], axis=1)
+    smooth = [np.broadcast_to(term, views).ravel() for term in (far, v[:, None], u[None, :])]
+    columns = np.stack([term - term.mean() for term in smooth], axis=1)
     columns = columns[:, np.ptp(columns, axis=0) > 0]
     freedom = weights.size - columns.shape[1] - 1
     if freedom < columns.shape[1] or not columns.shape[1]:
@@ -261,8 +258,10 @@ def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> Leaning:
     return Leaning(found.reshape(views), falling)
 
 
-def less_sure(known: Calibration, by_view: Array) -> None:
-    """Count a relative error of every view, (v, u), beside in the deviations of a calibration."""
-    for shot, v, u in np.ndindex(*known.psi.weights.shape[:3]):
-        more = np.square(by_view[v, u] * known.psi.weights[shot, v, u])
-        known.deviation[shot, v, u] = np.sqrt(np.square(known.deviation[shot, v, u]) + more)
+def add_error(known: Calibration, relative: Array | float) -> None:
+    """Count a relative error, common or by view (v, u), in the deviations of a calibration."""
+    weights, deviation = known.psi.weights, known.deviation
+    by_view = np.broadcast_to(relative, weights.shape[1:3])
+    for shot, v, u in np.ndindex(*weights.shape[:3]):
+        more = np.square(by_view[v, u] * weights[shot, v, u])
+        deviation[shot, v, u] = np.sqrt(np.square(deviation[shot, v, u]) + more)

@@ -13,6 +13,7 @@ from calibration.errors import CalibrationError
 from calibration.frames import MeanFrame, SensorGain, bands, dark_at, photon_transfer
 from calibration.levels import Check, Levels
 from calibration.openings import CENTRED, Window, views_open
+from calibration.robust import deviation_of
 from emmc_rig.model.sensing import PsiLayout
 
 Array = NDArray[np.floating]
@@ -28,8 +29,8 @@ Opening = tuple[NDArray[np.bool_], tuple[float, float], int]
 class BoardFrame:
     """One whiteboard setting as captured: its mean frame, and how the bench stood.
 
-    read: returns the mean frame; of a session, from its files each time, so that one whiteboard of
-    many is in memory. count: frames taken. stage_um: where the mask stage stood, x and y, from
+    read: returns the mean frame; a session reads its files each time, so that memory holds a single
+    whiteboard. count: frames taken. stage_um: where the mask stage stood, x and y, from
     where the design centres the mask; with the shot's own offset in it. pinhole: the one view (v,
     u) open, or None: those that the window leaves open, moved by so many cells (x, y). loose: a
     hand put the pinhole there, which may be a little off.
@@ -96,7 +97,7 @@ class BoardSet:
         """How many frames were taken for it."""
         # One reference may serve several shots.
         references = {id(frame): frame for frame in self.references.values()}.values()
-        return sum(one.count for one in (*self.darks, *references, *self.frames))
+        return sum(frame.count for frame in (*self.darks, *references, *self.frames))
 
     def with_frames(self, frames: Sequence[BoardFrame]) -> BoardSet:
         """Return the same dark and reference frames with other whiteboards."""
@@ -107,21 +108,22 @@ class BoardSet:
     ) -> BoardSet:
         """Return the frames as under a steady lamp and a straight response.
 
-        done: references of other sets that were levelled, by the identity of what they were; those
-        of this one are added. Sets share them, and a large sensor's fill memory.
+        done: levelled references of other sets, by the identity of the frames before; those of this
+        set are added. Sets share references, which of a large sensor fill memory.
         """
 
         def steady(frame: MeanFrame) -> MeanFrame:
             return levels.corrected(frame, self.dark_at(frame.exposure_s).mean_dn, channels)
 
-        for one in self.references.values():
-            if id(one) not in done:
-                done[id(one)] = steady(one)
+        for reference in self.references.values():
+            if id(reference) not in done:
+                done[id(reference)] = steady(reference)
         return replace(
             self,
-            references={key: done[id(one)] for key, one in self.references.items()},
+            references={key: done[id(reference)] for key, reference in self.references.items()},
             frames=tuple(
-                replace(one, read=lambda one=one: steady(one.frame)) for one in self.frames
+                replace(board, read=lambda board=board: steady(board.frame))
+                for board in self.frames
             ),
         )
 
@@ -142,6 +144,17 @@ class Rows:
     exposure_s: tuple[float, float]
     references: int
     darks: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Pixels of a whiteboard, (n, 2), the colours they see, their readings and deviations, (n,)."""
+
+    board: Board
+    pixels: NDArray[np.int64]
+    channels: NDArray[np.uint8]
+    reading: NDArray[np.float64]
+    deviation: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +194,21 @@ class Board:
         """Return the board, of which these pixels, (pixel_y, pixel_x), do not count."""
         return replace(self, variance=np.where(pixels, np.float32(np.inf), self.variance))
 
+    def sampled(self, half_px: float, limit: int, rng: np.random.Generator) -> Sample:
+        """Return at most `limit` usable pixels, drawn at random within `half_px` of the middle."""
+        y, x = (np.arange(count) - (count - 1) / 2 for count in self.reading.shape)
+        inside = (np.abs(y) <= half_px)[:, None] & (np.abs(x) <= half_px)
+        chosen = np.flatnonzero(self.usable & inside)
+        if len(chosen) > limit:
+            chosen = np.sort(rng.choice(chosen, limit, replace=False))
+        return Sample(
+            self,
+            np.stack(np.unravel_index(chosen, self.reading.shape), axis=1),
+            self.channels.ravel()[chosen],
+            self.reading.ravel()[chosen].astype(np.float64),
+            np.sqrt(self.variance.ravel()[chosen].astype(np.float64)),
+        )
+
 
 def gain_of(boards: BoardSet) -> SensorGain:
     """Return the sensor's gain from the dark and the first reference frames."""
@@ -208,25 +236,25 @@ def each_reading(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
-    for one in boards.frames:
-        reference = boards.references.get((one.shot, one.lamp)) or boards.references.get(
-            (0, one.lamp)
+    for board in boards.frames:
+        reference = boards.references.get((board.shot, board.lamp)) or boards.references.get(
+            (0, board.lamp)
         )
         if reference is None:
-            raise CalibrationError(f"{one.name}: no reference whiteboard under that lamp")
-        taken = one.frame
-        for frame, what in ((taken, one.name), (reference, "reference"), (boards.dark, "dark")):
+            raise CalibrationError(f"{board.name}: no reference whiteboard under that lamp")
+        taken = board.frame
+        for frame, what in ((taken, board.name), (reference, "reference"), (boards.dark, "dark")):
             if frame.mean_dn.shape != expected:
                 raise CalibrationError(
                     f"{what}: a frame of {frame.mean_dn.shape[0]} x {frame.mean_dn.shape[1]} "
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        yield _board(one, taken, reference, boards, gain, layout, good)
+        yield _board(board, taken, reference, boards, gain, layout, good)
 
 
 def _board(
-    one: BoardFrame,
+    board: BoardFrame,
     frame: MeanFrame,
     reference: MeanFrame,
     boards: BoardSet,
@@ -249,33 +277,33 @@ def _board(
         variance[rows] = np.where(enough & good[rows], spread, np.inf)
     if bright < 0.5 * reading.size:
         raise CalibrationError(
-            f"the reference whiteboard under the {one.lamp} lamp is less than "
+            f"the reference whiteboard under the {board.lamp} lamp is less than "
             f"{DARKEST_REFERENCE_DN:g} DN above the dark: raise the lamp or the exposure"
         )
     if float(np.median(frame.mean_dn - dark.mean_dn)) < DARKEST_REFERENCE_DN / 10:
         raise CalibrationError(
-            f"{one.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
+            f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
         )
     k = layout.binning
     if layout.colour is not None:
-        channels = layout.colour[one.shot, ::k, ::k]
-    elif one.lamp in LAMP_COLOURS:
-        channels = np.full(reading.shape, LAMP_COLOURS.index(one.lamp), dtype=np.uint8)
+        channels = layout.colour[board.shot, ::k, ::k]
+    elif board.lamp in LAMP_COLOURS:
+        channels = np.full(reading.shape, LAMP_COLOURS.index(board.lamp), dtype=np.uint8)
     else:
         channels = np.full(reading.shape, 3, dtype=np.uint8)
     return Board(
-        one.name,
+        board.name,
         reading,
         variance,
         np.ascontiguousarray(channels),
-        views_open(layout.views, one.pinhole, one.window),
-        one.stage_um,
-        one.shot,
+        views_open(layout.views, board.pinhole, board.window),
+        board.stage_um,
+        board.shot,
         frame.taken_s,
         frame.count,
         frame.unsteady2(dark.mean_dn),
         _rows(frame, reference, dark),
-        one.loose,
+        board.loose,
     )
 
 
@@ -294,9 +322,9 @@ def unsteadiness2(boards: Sequence[Board], references: Sequence[tuple[int, float
 
     references: repeats of more, and what `MeanFrame.unsteady2` says of each.
     """
-    every = [(one.repeats, one.unsteady2) for one in boards] + list(references)
+    every = [(board.repeats, board.unsteady2) for board in boards] + list(references)
     freedom = sum(count - 1 for count, _ in every)
-    return max(sum((count - 1) * one for count, one in every) / max(freedom, 1), 0.0)
+    return max(sum((count - 1) * squares for count, squares in every) / max(freedom, 1), 0.0)
 
 
 def signal_of(
@@ -331,9 +359,10 @@ def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:
     """
     dark = boards.dark.mean_dn.astype(np.float64)
     good = np.ones(dark.shape, dtype=bool)
-    for one in boards.darks:
-        level = one.mean_dn.astype(np.float64)
-        good &= np.abs(level - np.median(level)) <= 10 * max(_spread(level), 0.5)
+    for frame in boards.darks:
+        level = frame.mean_dn.astype(np.float64)
+        off = np.abs(level - np.median(level))
+        good &= off <= 10 * max(deviation_of(off), 0.5)
     for reference in boards.references.values():
         signal = reference.mean_dn - dark
         for y in range(2):
@@ -341,11 +370,6 @@ def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:
                 part = signal[y::2, x::2]
                 level = float(np.median(part))
                 off = np.abs(part - level)
-                limit = max(10 * _spread(part), 0.2 * level)
+                limit = max(10 * deviation_of(off), 0.2 * level)
                 good[y::2, x::2] &= off <= limit
     return good
-
-
-def _spread(values: Array) -> float:
-    """Return a robust standard deviation."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))

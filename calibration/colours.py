@@ -18,6 +18,7 @@ from calibration.boards import BoardSet
 from calibration.defects import mask_with_losses
 from calibration.errors import CalibrationError
 from calibration.parametric import Parametric, Stages, psi_at
+from calibration.robust import deviation_of
 from calibration.shadow import Shadow, ShadowMask
 from calibration.whiteboard import LAMP_COLOURS, Calibration
 from emmc_rig.model.sensing import PsiLayout
@@ -55,19 +56,21 @@ def crosstalk(
     CalibrationError where pixels see another colour than their own.
     """
     references = [boards.references.get((0, lamp)) for lamp in LAMP_COLOURS]
-    if any(one is None for one in references) or channels.max() >= len(LAMP_COLOURS):
+    if any(reference is None for reference in references) or channels.max() >= len(LAMP_COLOURS):
         return None
     seen, deviation = (np.empty((len(LAMP_COLOURS), len(LAMP_COLOURS))) for _ in range(2))
-    for colour, one in enumerate(references):
-        assert one is not None
-        rate = (one.mean_dn - boards.dark_at(one.exposure_s).mean_dn) / one.exposure_s
+    for colour, reference in enumerate(references):
+        assert reference is not None
+        rate = (
+            reference.mean_dn - boards.dark_at(reference.exposure_s).mean_dn
+        ) / reference.exposure_s
         for f in range(len(LAMP_COLOURS)):
             pixels = rate[good & (channels == f)]
             if pixels.size == 0:
                 return None
             level = float(np.median(pixels))
             seen[f, colour] = max(level, 0.0)
-            spread = 1.4826 * float(np.median(np.abs(pixels - level)))
+            spread = deviation_of(pixels - level)
             deviation[f, colour] = MEDIAN_DEVIATION * spread / np.sqrt(pixels.size)
     total = seen.sum(axis=1, keepdims=True)
     seen, deviation = seen / total, deviation / total

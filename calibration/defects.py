@@ -20,6 +20,7 @@ from scipy.sparse.linalg import spsolve
 
 from calibration.boards import Board
 from calibration.placement import Placement
+from calibration.robust import deviation_of
 from calibration.shadow import Shadow, ShadowMask
 from emmc_rig.model.compiling import njit
 
@@ -122,7 +123,7 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
         gradient, curvature = np.zeros(height * width), np.zeros(height * width)
         current = Shadow(_with_losses(fine, placement, lost.reshape(height, width)), placement)
         residuals = [_residual(current, board) for board in boards]
-        spread = max(1.0, 1.4826 * float(np.median(np.abs(np.concatenate(residuals)))))
+        spread = max(1.0, deviation_of(np.concatenate(residuals)))
         for board, residual in zip(boards, residuals, strict=True):
             pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
             deviations = np.sqrt(board.variance[board.usable].astype(np.float64)) * spread

@@ -19,45 +19,33 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import gaussian_filter
 from scipy.special import chdtrc
 
 from calibration.boards import Board
 from calibration.colours import mixing
 from calibration.errors import CalibrationError
 from calibration.evidence import Prior, averaged, log_evidence, plane_prior
+from calibration.locator import over_local_level, search
 from calibration.parametric import Stages
 from calibration.placement import Placement
-from calibration.registration import correlated
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
-ATTRIBUTES = {
-    "shift_x_um": "offset_x_um",
-    "shift_y_um": "offset_y_um",
-    "rotation_rad": "rotation_rad",
-    "scale": "scale",
-    "distance_share": "distance_share",
-    "tilt_x_rad": "tilt_x_rad",
-    "tilt_y_rad": "tilt_y_rad",
+KINDS = {
+    "shift_x_um": ("offset_x_um", 30.0, "a shift in x"),
+    "shift_y_um": ("offset_y_um", 30.0, "a shift in y"),
+    "rotation_rad": ("rotation_rad", 0.006, "a turn"),
+    "scale": ("scale", 0.005, "a change of scale"),
+    "distance_share": ("distance_share", 0.05, "a change of distance"),
+    "tilt_x_rad": ("tilt_x_rad", 0.003, "a tilt in x"),
+    "tilt_y_rad": ("tilt_y_rad", 0.003, "a tilt in y"),
 }
-"""Of a placement, by kinds of drift."""
-KINDS = tuple(ATTRIBUTES)
-SPREADS = (30.0, 30.0, 0.006, 0.005, 0.05, 0.003, 0.003)
-"""Of the prior of a drift around where the search of its start arrives."""
+"""Of drift: parameter of the placement, deviation of the prior around the start of the search, and
+words."""
 CROSSTALK_SPREAD = 0.05
-WORDS = {
-    "shift_x_um": "a shift in x",
-    "shift_y_um": "a shift in y",
-    "rotation_rad": "a turn",
-    "scale": "a change of scale",
-    "distance_share": "a change of distance",
-    "tilt_x_rad": "a tilt in x",
-    "tilt_y_rad": "a tilt in y",
-}
 MOST_STEPS = 12
 WIDENING = 2
 """The part of the picture that steps are taken on, from one climb to the next."""
@@ -150,8 +138,8 @@ class Drift:
         largest = max(self.by_kind_px, key=lambda kind: self.by_kind_px[kind])
         return (
             f"Psi no longer fits: the shadow has moved by {self.displacement_px:.2f} pixels, most "
-            f"of it {WORDS[largest]} ({self.by_kind_px[largest]:.2f} pixels); use the corrected "
-            f"Psi, or calibrate again ({self.searched})"
+            f"of it {KINDS[largest][-1]} ({self.by_kind_px[largest]:.2f} pixels); use the "
+            f"corrected Psi, or calibrate again ({self.searched})"
         )
 
 
@@ -315,7 +303,7 @@ def drifted(placement: Placement, drift: Array) -> Placement:
     """Return the placement after a drift (in the order of KINDS; what follows is ignored)."""
     changes = {
         name: getattr(placement, name) + float(value)
-        for name, value in zip(ATTRIBUTES.values(), drift, strict=False)
+        for (name, *_), value in zip(KINDS.values(), drift, strict=False)
     }
     return replace(placement, **changes)
 
@@ -323,7 +311,7 @@ def drifted(placement: Placement, drift: Array) -> Placement:
 def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> float:
     """Return the root mean square displacement of the shadow over picture and views, pixels.
 
-    drift: in the order of KINDS; what is not there, or follows, does not count.
+    drift: in the order of KINDS, missing values 0; values beyond KINDS are ignored.
     """
     ratio = mask.distance_um * (1 + placement.distance_share) / mask.lens_um
     y, x = ((np.linspace(0, 1, 9) - 0.5) * count * mask.pitch_um for count in mask.size)
@@ -369,7 +357,7 @@ def find_drift(
     step = 0.02 * pixel_um
     far_um = max(max(mask.views) - 1, 1) / 2 * mask.aperture_cell_um
     lean = min(step * mask.lens_um / (far_um * half_um), 1e-3)
-    names, spreads = list(KINDS), list(SPREADS)
+    names, spreads = list(KINDS), [spread for _, spread, _ in KINDS.values()]
     steps = [step, step, step / half_um, step / half_um, 0.02, lean, lean]
     if colour is not None:
         names, spreads, steps = [*names, "crosstalk"], [*spreads, CROSSTALK_SPREAD], [*steps, 0.01]
@@ -437,21 +425,9 @@ def _starts(
 ) -> list[Array]:
     """Return where to begin: no drift, and the best places of the open aperture's shadow."""
     reading, usable = frames.readings[0], frames.usable[0]
-    flat = np.zeros(reading.shape)
-    for channel in np.unique(channels):
-        seen = (channels == channel) & usable
-        total = gaussian_filter(np.where(seen, reading, 0).astype(np.float64), LOCAL_PX)
-        local = total / np.maximum(gaussian_filter(seen.astype(np.float64), LOCAL_PX), 1e-6)
-        flat[seen] = reading[seen] / np.maximum(local[seen], 1e-6)
-    board = Board(
-        "captures",
-        flat.astype(np.float32),
-        np.where(usable, 1, np.inf).astype(np.float32),
-        channels,
-        np.ones(mask.views, dtype=bool),
-        stages[0],
-        0,
-    )
+    flat, variance = over_local_level(reading, usable, channels, LOCAL_PX)
+    every = np.ones(mask.views, dtype=bool)
+    board = Board("captures", flat, variance, channels, every, stages[0], 0)
     reach_um = SPARE * settings.search_px * mask.pitch_um * mask.binning
     turns = _grid(settings.search_deg, TURN_STEP_DEG)
     scales = _grid(settings.search_scale, SCALE_STEP)
@@ -459,16 +435,16 @@ def _starts(
     for turn, scale in product(np.deg2rad(turns), scales):
         trial = np.zeros(size)
         trial[2:4] = turn, scale
-        best = correlated(board, mask, drifted(placement, trial), reach_um, START_PX)
+        best = search(board, mask, drifted(placement, trial), reach_um, START_PX)
         trial[0] = best.placement.offset_x_um - placement.offset_x_um
         trial[1] = best.placement.offset_y_um - placement.offset_y_um
         found.append((best.correlation, trial))
     middle = replace(mask, size=(START_PX, START_PX))
     chosen: list[Array] = [np.zeros(size)]
-    for _, trial in sorted(found, key=lambda one: -one[0]):
+    for _, trial in sorted(found, key=lambda place: -place[0]):
         if len(chosen) > settings.starts:
             break
-        if all(displacement_px(middle, placement, trial - one) > 1 for one in chosen):
+        if all(displacement_px(middle, placement, trial - other) > 1 for other in chosen):
             chosen.append(trial)
     return chosen
 
@@ -488,7 +464,7 @@ def _recognised(
 ) -> float:
     """Return by how many standard deviations a drift explains the captures better than decoys do.
 
-    Those are displaced by several cells of the mask, where it is an unrelated one.
+    Decoys are displaced by several cells of the mask, where the shadow is unrelated.
     """
     count = min(settings.coarse_blocks, len(blocks.pixels))
     some = blocks.some(np.sort(rng.choice(len(blocks.pixels), count, replace=False)))
@@ -497,7 +473,7 @@ def _recognised(
     angle = rng.uniform(0, 2 * np.pi, DECOYS)
     decoys = np.tile(drift, (DECOYS, 1))
     decoys[:, :2] += np.stack([far_um * np.cos(angle), far_um * np.sin(angle)], axis=1)
-    evidence = [search.total(one) for one in decoys]
+    evidence = [search.total(decoy) for decoy in decoys]
     return float((search.total(drift) - np.mean(evidence)) / max(np.std(evidence), 1e-9))
 
 
@@ -506,7 +482,7 @@ def _climb(search: _Search, drift: Array, tolerance: float) -> tuple[Array, int,
     for taken in range(1, MOST_STEPS + 1):
         slopes = search.scores(drift, central=False)
         value = search.posterior(drift)
-        # Without their mean, which far from the peak is larger than what they scatter.
+        # Centred: far from the peak the mean slope is larger than the scatter.
         centred = slopes - slopes.mean(axis=0)
         matrix = centred.T @ centred + search.penalty
         move = np.linalg.solve(matrix, slopes.sum(axis=0) - search.pull(drift))

@@ -15,6 +15,7 @@ from scipy.ndimage import binary_dilation
 
 from calibration.boards import Board
 from calibration.choice import predicted_by_shadow
+from calibration.robust import deviation_of
 from calibration.shadow import Shadow
 
 FEWEST_BOARDS = 3
@@ -22,7 +23,6 @@ SURE, LEAST_SHARE = 6.0, 0.01
 """Deviations, and share of the light, from which on a pixel's change is dust."""
 LARGEST_CHI2 = 3.0
 """Of what a change alike in all whiteboards leaves of a pixel: more, and it is no dust."""
-MEDIAN_DEVIATION = 1.4826
 SKIRT_PX = 2
 MOST_OF_SENSOR = 0.25
 """More pixels than these are not dusty: whatever it is, the model misses it."""
@@ -43,7 +43,7 @@ def moved_dust(shadow: Shadow, boards: Sequence[Board]) -> NDArray[np.bool_]:
     change = light / np.maximum(power, 1e-300)
     left = squares - change * light
     # All share the noise of the references, which the boards' own variances count anew each time.
-    common = MEDIAN_DEVIATION * float(np.median(np.abs(change[power > 0])))
+    common = deviation_of(change[power > 0])
     sure = np.abs(change) > SURE * np.maximum(common, 1 / np.sqrt(np.maximum(power, 1e-300)))
     alike = left < LARGEST_CHI2 * np.maximum(count - 1, 1)
     dusty = sure & alike & (np.abs(change) > LEAST_SHARE) & (count >= FEWEST_BOARDS)

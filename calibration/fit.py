@@ -26,34 +26,33 @@ MacKay 1992.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import correlate1d
 
-from calibration.boards import Board, Opening, unsteadiness2
+from calibration.boards import Board, Opening, Sample, unsteadiness2
 from calibration.errors import CalibrationError
+from calibration.locator import register, starting_placement
 from calibration.placement import (
     SCALARS,
     Placement,
     Tolerances,
-    designed_placement,
     labels,
     with_aperture_mean_one,
 )
-from calibration.registration import register
-from calibration.shadow import OF_VIEW, Shadow, ShadowMask
+from calibration.robust import correlation, deviation_of, tukey_loss, tukey_weights
+from calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, ShadowMask
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
-TUKEY = 4.685
-"""Times the deviation: 95 % as sure as least squares where the noise is normal."""
 CHUNK = 4096
 FIRST_WINDOW_PX = 64
 FEWEST_PIXELS = 400
@@ -64,8 +63,6 @@ LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
 MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
-SOFT_EDGES = 0.1
-"""Of a cell: how soft edges are taken to be where a fit begins."""
 OFFSETS = slice(0, 2)
 OWN = 3
 """Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
@@ -76,7 +73,7 @@ MOVES_UM = np.geomspace(0.002, 10.0, 12)
 LOOSE_UM = 0.5
 """Width of where a hand puts a pinhole, as a move of the mask: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
-"""Of the width of what they would be taken for."""
+"""Of the width of the prior of glass, which a displaced pinhole imitates."""
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
 rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
@@ -169,43 +166,6 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sample:
-    """Some pixels of one board, with what they read."""
-
-    board: Board
-    pixels: NDArray[np.int64]
-    channels: NDArray[np.uint8]
-    reading: Array
-    deviation: Array
-
-
-def _samples(
-    boards: Sequence[Board], half_px: float, limit: int, rng: np.random.Generator
-) -> list[_Sample]:
-    """Return at most `limit` usable pixels of all boards within `half_px` of the middle."""
-    found = []
-    limit = max(limit // len(boards), FEWEST_PIXELS)
-    for board in boards:
-        rows, columns = board.reading.shape
-        y, x = (np.arange(count) - (count - 1) / 2 for count in (rows, columns))
-        inside = (np.abs(y) <= half_px)[:, None] & (np.abs(x) <= half_px)
-        chosen = np.flatnonzero(board.usable & inside)
-        if len(chosen) > limit:
-            chosen = np.sort(rng.choice(chosen, limit, replace=False))
-        pixels = np.stack(np.unravel_index(chosen, board.reading.shape), axis=1)
-        found.append(
-            _Sample(
-                board,
-                pixels,
-                board.channels.ravel()[chosen],
-                board.reading.ravel()[chosen].astype(np.float64),
-                np.sqrt(board.variance.ravel()[chosen].astype(np.float64)),
-            )
-        )
-    return found
-
-
-@dataclass(frozen=True, eq=False)
 class _State:
     """The placement, and each whiteboard's own: (board, OWN)."""
 
@@ -223,14 +183,14 @@ class _State:
         return _State(self.placement.moved(step[:size]), own)
 
     def opening(self, board: Board, index: int) -> Opening:
-        """Return what `Shadow` asks of a whiteboard, the mask where it stood of that one."""
+        """Return parameters of the mask's shadow, at the mask position of one whiteboard."""
         views_open, (x, y), shot = board.opening
         return views_open, (x + float(self.own[index, 1]), y + float(self.own[index, 2])), shot
 
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """Precisions of all parameters, and where they are drawn to."""
+    """Precisions and centres of all parameters."""
 
     precision: NDArray[np.float64]
     centre: NDArray[np.float64]
@@ -245,35 +205,35 @@ def _prior(
 ) -> _Prior:
     """Return the prior of a placement (precisions, centre) and of the whiteboards' own.
 
-    own2: (board, OWN), variances beside the widths of all, see `_own2`.
+    own2: (board, OWN), variances beside the widths of all, see `_own_variances`.
     """
     own2 = own2 + np.square([widths[0], widths[1], widths[1]])
     precision = np.concatenate([placement, 1 / own2.ravel()]).astype(np.float64)
     return _Prior(precision, np.concatenate([centre, np.zeros(own2.size)]).astype(np.float64))
 
 
-def _own2(boards: Sequence[Board]) -> NDArray[np.float64]:
+def _own_variances(boards: Sequence[Board]) -> NDArray[np.float64]:
     """Return variances of the whiteboards' own brightness, as repeats show it, and places."""
     own2 = np.zeros((len(boards), OWN))
-    own2[:, 0] = unsteadiness2(boards) / np.array([one.repeats for one in boards])
-    own2[[one.loose for one in boards], 1:] = LOOSE_UM**2
+    own2[:, 0] = unsteadiness2(boards) / np.array([board.repeats for board in boards])
+    own2[[board.loose for board in boards], 1:] = LOOSE_UM**2
     return own2
 
 
 def _scaled_residuals(
-    shadow: Shadow, sample: _Sample, at: _State, index: int
+    shadow: Shadow, sample: Sample, at: _State, index: int
 ) -> NDArray[np.float64]:
     opening = at.opening(sample.board, index)
     predicted = shadow.readings(sample.pixels, sample.channels, *opening)
     return (sample.reading - (1 + at.own[index, 0]) * predicted) / sample.deviation
 
 
-def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> list[Array]:
+def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> list[Array]:
     shadow = Shadow(mask, at.placement)
-    return [_scaled_residuals(shadow, one, at, index) for index, one in enumerate(samples)]
+    return [_scaled_residuals(shadow, sample, at, index) for index, sample in enumerate(samples)]
 
 
-def _with_own(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
+def _with_own_slopes(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
     """Return the slopes by the placement and by a whiteboard's own, (n, parameter + OWN)."""
     brighter = 1 + own[0]
     rows = [brighter * slope, read, brighter * slope[:, OFFSETS]]
@@ -288,17 +248,7 @@ def _places(at: _State, index: int) -> NDArray[np.int64]:
 
 def _spread(residuals: Sequence[Array]) -> float:
     """Return the robust deviation of the residuals in units of the noise, at least 1."""
-    return max(1.0, float(1.4826 * np.median(np.abs(np.concatenate(residuals)))))
-
-
-def _loss(scaled: Array) -> float:
-    """Return Tukey's loss of residuals in deviations."""
-    within = np.clip((scaled / TUKEY) ** 2, 0, 1)
-    return float(TUKEY**2 / 6 * np.sum(1 - (1 - within) ** 3))
-
-
-def _weights(scaled: Array) -> Array:
-    return np.clip(1 - (scaled / TUKEY) ** 2, 0, None) ** 2
+    return max(1.0, deviation_of(np.concatenate(residuals)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,61 +263,64 @@ class _Normal:
     count: int
 
 
-def _normal(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> _Normal:
+def _chunks(
+    at: _State, sample: Sample, index: int, residual: Array
+) -> Iterator[tuple[Any, Array, Array]]:
+    """Yield what `Shadow` takes of some pixels, their residuals, and their deviations (n, 1)."""
+    opening = at.opening(sample.board, index)
+    for first in range(0, len(residual), CHUNK):
+        part = slice(first, first + CHUNK)
+        how = sample.pixels[part], sample.channels[part], *opening
+        yield how, residual[part], sample.deviation[part, None]
+
+
+def _normal(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> _Normal:
     shadow = Shadow(mask, at.placement)
     residuals = _all_residuals(mask, at, samples)
     spread = _spread(residuals)
     size = len(at.vector())
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
-    for index, (sample, residual) in enumerate(zip(samples, residuals, strict=True)):
-        places, opening = _places(at, index), at.opening(sample.board, index)
-        block = np.ix_(places, places)
-        for first in range(0, len(residual), CHUNK):
-            part = slice(first, first + CHUNK)
-            read, slope = shadow.with_slopes(sample.pixels[part], sample.channels[part], *opening)
-            slope = _with_own(read, slope, at.own[index])
-            slope /= sample.deviation[part, None] * spread
-            scaled = residual[part] / spread
-            weight = _weights(scaled)
-            matrix[block] += slope.T @ (slope * weight[:, None])
+    for index, sample in enumerate(samples):
+        places = _places(at, index)
+        for how, residual, deviation in _chunks(at, sample, index, residuals[index]):
+            read, slope = shadow.with_slopes(*how)
+            slope = _with_own_slopes(read, slope, at.own[index]) / (deviation * spread)
+            scaled = residual / spread
+            weight = tukey_weights(scaled)
+            matrix[np.ix_(places, places)] += slope.T @ (slope * weight[:, None])
             gradient[places] += slope.T @ (weight * scaled)
             inside = weight > 0
-            squares += float((residual[part][inside] ** 2).sum())
+            squares += float((residual[inside] ** 2).sum())
             kept += int(inside.sum())
-    count = sum(len(residual) for residual in residuals)
+    count = sum(map(len, residuals))
     return _Normal(matrix, gradient, spread, squares, kept, count)
 
 
 def _view_terms(
-    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float
+    mask: ShadowMask, at: _State, samples: Sequence[Sample], spread: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return what `bias_covariance` takes of the views' own displacements and softenings."""
     shadow = Shadow(mask, at.placement)
     size, own_size = len(at.vector()), OF_VIEW * mask.views[0] * mask.views[1]
     mixed, own = np.zeros((size, own_size)), np.zeros((own_size, own_size))
     pull = np.zeros(own_size)
-    for index, residual in enumerate(_all_residuals(mask, at, samples)):
-        sample = samples[index]
-        scaled = residual / spread
-        weight = _weights(scaled)
-        for first in range(0, len(scaled), CHUNK):
-            part = slice(first, first + CHUNK)
-            opening = at.opening(sample.board, index)
-            how = sample.pixels[part], sample.channels[part], *opening
+    residuals = _all_residuals(mask, at, samples)
+    for index, sample in enumerate(samples):
+        for how, residual, deviation in _chunks(at, sample, index, residuals[index]):
             slope, by_view = shadow.slopes_by_view(*how)
-            slope = _with_own(shadow.readings(*how), slope, at.own[index])
-            scale = 1 / (sample.deviation[part, None] * spread)
+            slope = _with_own_slopes(shadow.readings(*how), slope, at.own[index])
+            scaled, scale = residual / spread, 1 / (deviation * spread)
             slope, by_view = slope * scale, by_view * scale
-            weighted = by_view * weight[part, None]
+            weighted = by_view * tukey_weights(scaled)[:, None]
             mixed[_places(at, index)] += slope.T @ weighted
             own += by_view.T @ weighted
-            pull += weighted.T @ scaled[part]
+            pull += weighted.T @ scaled
     return mixed, own, pull
 
 
 def _rows_covariance(
-    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float, covariance: Array
+    mask: ShadowMask, at: _State, samples: Sequence[Sample], spread: float, covariance: Array
 ) -> NDArray[np.float64]:
     """Return what rows that err alike add to the covariance, as the darks' repeats show it.
 
@@ -376,11 +329,11 @@ def _rows_covariance(
     alike is counted beside.
     """
     size, height = len(covariance), len(samples[0].board.reading)
-    known = [rows for one in samples if (rows := one.board.rows) is not None]
+    known = [rows for sample in samples if (rows := sample.board.rows) is not None]
     if len(known) < len(samples):
         return np.zeros((size, size))
     own_dn2, next_dn2, noise_dn2, darks = (
-        float(np.mean([getattr(one, name) for one in known]))
+        float(np.mean([getattr(rows, name) for rows in known]))
         for name in ("own_dn2", "next_dn2", "noise_dn2", "darks")
     )
     if not own_dn2 > SURE_ROWS * noise_dn2 * np.sqrt(2 / (height * max(darks - 1, 1))):
@@ -401,14 +354,12 @@ def _rows_covariance(
     of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
     for index, residual in enumerate(_all_residuals(mask, at, samples)):
         sample, rows = samples[index], known[index]
-        weight = _weights(residual / spread) / np.square(sample.deviation * spread)
         by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
-        places, opening = _places(at, index), at.opening(sample.board, index)
-        for first in range(0, len(residual), CHUNK):
-            part = slice(first, first + CHUNK)
-            read, slope = shadow.with_slopes(sample.pixels[part], sample.channels[part], *opening)
-            pull = _with_own(read, slope, at.own[index]) * weight[part, None]
-            where = sample.pixels[part, 0][:, None], places
+        for how, left, deviation in _chunks(at, sample, index, residual):
+            read, slope = shadow.with_slopes(*how)
+            weight = tukey_weights(left / spread)[:, None] / np.square(deviation * spread)
+            pull = _with_own_slopes(read, slope, at.own[index]) * weight
+            where = how[0][:, :1], _places(at, index)
             np.add.at(by_row, where, pull)
             np.add.at(read_by_row, where, pull * read[:, None])
         by_row, read_by_row = by_row / rows.white_dn[0], read_by_row / rows.white_dn[1]
@@ -452,14 +403,14 @@ def bias_covariance(
     expected = share @ np.array(squares) / share.sum()
     moved = covariance @ mixed
     added = np.asarray((moved * expected[kind]) @ moved.T, np.float64)
-    return added, tuple(float(expected[one]) for one in KINDS)
+    return added, tuple(float(expected[place]) for place in KINDS)
 
 
 def _posterior(
-    mask: ShadowMask, at: _State, samples: Sequence[_Sample], spread: float, prior: _Prior
+    mask: ShadowMask, at: _State, samples: Sequence[Sample], spread: float, prior: _Prior
 ) -> float:
     residuals = _all_residuals(mask, at, samples)
-    return sum(_loss(one / spread) for one in residuals) + prior.loss(at)
+    return sum(tukey_loss(residual / spread) for residual in residuals) + prior.loss(at)
 
 
 def _widths(
@@ -467,7 +418,7 @@ def _widths(
 ) -> tuple[float, float]:
     """Return the widths of brightness and place that make the readings likeliest, at a fit.
 
-    placement, centre: precisions of its prior, and where it is drawn to. own2: see `_prior`.
+    placement, centre: precisions and centre of the placement's prior. own2: see `_prior`.
     """
     away = at.vector() - np.concatenate([centre, np.zeros(at.own.size)])
     pull = normal.gradient + normal.matrix @ away
@@ -481,7 +432,7 @@ def _widths(
 
     found = {widths: evidence(widths) for widths in product(BRIGHTNESSES, MOVES_UM)}
     best = max(found, key=lambda widths: found[widths])
-    # One that is hardly likelier than none is none.
+    # A width that is hardly likelier than the smallest counts as 0.
     still = best[1] < LEAST_MOVED_UM
     still = still or found[best[0], MOVES_UM[0]] > found[best] - CLEARLY_LIKELIER
     steady = found[BRIGHTNESSES[0], best[1]] > found[best] - CLEARLY_LIKELIER
@@ -505,8 +456,7 @@ def fit_placement(
     settings, tolerances = settings or FitSettings(), Tolerances()
     if not boards:
         raise CalibrationError("no whiteboard with the mask in: capture at least one")
-    designed = designed_placement(camera)
-    soft = replace(designed, blur_um=SOFT_EDGES * mask.cell_um)
+    soft = starting_placement(camera, mask)
     if start is None:
         clearest = max(boards, key=_contrast)
         registered = register(clearest, mask, soft)
@@ -515,20 +465,21 @@ def fit_placement(
         placement = start
     centre = soft.vector()
     deviations = tolerances.deviations(camera.views)
-    if any(one.loose for one in boards):
+    if any(board.loose for board in boards):
         # Pinholes a little off their holes look like glass before the mask.
         deviations[SCALARS.index("glass_um")] *= OF_LOOSE
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     of_placement = 1 / deviations**2
     widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
-    own2 = _own2(boards)
+    own2 = _own_variances(boards)
     at = _State(placement, np.zeros((len(boards), OWN)))
     rng = np.random.default_rng(settings.seed)
     steps, converged = 0, False
     normal = None
     for half_px, limit in _windows(mask, settings):
-        samples = _samples(boards, half_px, limit, rng)
+        each = max(limit // len(boards), FEWEST_PIXELS)
+        samples = [board.sampled(half_px, each, rng) for board in boards]
         prior = _prior(of_placement, centre, widths, own2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
@@ -545,12 +496,12 @@ def fit_placement(
     of_rows = _rows_covariance(mask, at, samples, normal.spread, covariance)
     covariance = (covariance + of_views + of_rows)[:size, :size]
     checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
-    correlation = _correlation(mask, at, samples)
+    alike = _fitted_correlation(mask, at, samples)
     placement = with_aperture_mean_one(at.placement)
-    if correlation < LEAST_FIT_CORRELATION:
+    if alike < LEAST_FIT_CORRELATION:
         raise CalibrationError(
             f"the fit does not explain the whiteboards: their correlation with the shadow of the "
-            f"design is {correlation:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
+            f"design is {alike:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use calibration method free"
         )
     shares = shares_of_prior(placement, covariance, tolerances)
@@ -565,13 +516,13 @@ def fit_placement(
     more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE_BOARDS))
     kept = max(normal.kept, 1)
     # A pinhole that a hand put a little off looks like a mask that moved, and is none.
-    firm = [check for check, one in zip(checks, boards, strict=True) if not one.loose]
+    firm = [check for check, board in zip(checks, boards, strict=True) if not board.loose]
     moved_um = _farthest_um(widths[1] if len(firm) == len(checks) else 0.0, firm)
     covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement,
         covariance,
-        correlation,
+        alike,
         normal.squares / kept,
         1 - normal.kept / max(normal.count, 1),
         steps,
@@ -586,15 +537,15 @@ def fit_placement(
     )
 
 
-def _farthest_um(width_um: float, boards: Sequence[BoardCheck]) -> float:
+def _farthest_um(width_um: float, checks: Sequence[BoardCheck]) -> float:
     """Return how far from the fitted place the mask may stand, um: 0 where it seems to stand still.
 
-    The largest move that is sure, as the width of all takes the one that stayed away for chance.
+    The largest significant move: the width of all moves takes a single outlier for chance.
     """
     sure = [
-        float(np.hypot(*one.moved_um))
-        for one in boards
-        if np.hypot(*one.moved_um) > max(LEAST_MOVED_UM, SURE_MOVE * one.moved_deviation_um)
+        float(np.hypot(*check.moved_um))
+        for check in checks
+        if np.hypot(*check.moved_um) > max(LEAST_MOVED_UM, SURE_MOVE * check.moved_deviation_um)
     ]
     return max([width_um if width_um > MOVES_UM[0] else 0.0, *sure])
 
@@ -638,7 +589,7 @@ def _windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]
 def _descend(
     mask: ShadowMask,
     at: _State,
-    samples: Sequence[_Sample],
+    samples: Sequence[Sample],
     prior: _Prior,
     settings: FitSettings,
 ) -> tuple[_State, int, bool, _Normal]:
@@ -668,7 +619,7 @@ def _descend(
 
 
 def _stepped(at: _State, matrix: Array, gradient: Array) -> _State:
-    """Return the state after a step; one that meets a limit lets the others move without it."""
+    """Return the state after a step; parameters at a limit are held, the others solved again."""
     here = at.vector()
     move = np.linalg.solve(matrix, gradient)
     trial = at.moved(move)
@@ -690,24 +641,21 @@ def _contrast(board: Board) -> float:
     return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
 
 
-def _correlation(mask: ShadowMask, at: _State, samples: Sequence[_Sample]) -> float:
-    """Return the correlation of readings and fit, colour by colour, outliers clipped."""
-    products = mine = theirs = 0.0
-    for sample, residual in zip(samples, _all_residuals(mask, at, samples), strict=True):
-        fitted = sample.reading - residual * sample.deviation
-        for channel in np.unique(sample.channels):
-            seen = sample.channels == channel
-            a = sample.reading[seen] - np.median(sample.reading[seen])
-            a = np.clip(a, -4 * np.std(a), 4 * np.std(a))
-            b = fitted[seen] - fitted[seen].mean()
-            a -= a.mean()
-            products += float(a @ b)
-            mine += float(a @ a)
-            theirs += float(b @ b)
-    return products / np.sqrt(max(mine * theirs, 1e-300))
+def _fitted_correlation(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> float:
+    """Return the correlation of readings and fit, every colour of a whiteboard with its level."""
+    residuals = np.concatenate(_all_residuals(mask, at, samples))
+    reading, deviation = (
+        np.concatenate([getattr(sample, name) for sample in samples])
+        for name in ("reading", "deviation")
+    )
+    channels = [
+        sample.channels.astype(np.int64) + index * (ANY_COLOUR + 1)
+        for index, sample in enumerate(samples)
+    ]
+    return correlation(reading, reading - residuals * deviation, np.concatenate(channels))
 
 
-def _check(mask: ShadowMask, at: _State, sample: _Sample, index: int) -> BoardCheck:
+def _check(mask: ShadowMask, at: _State, sample: Sample, index: int) -> BoardCheck:
     """Return how far one board's brightness and mask are off, the placement as fitted."""
     shadow = Shadow(mask, at.placement)
     board, own = sample.board, at.own[index]
@@ -722,10 +670,10 @@ def _check(mask: ShadowMask, at: _State, sample: _Sample, index: int) -> BoardCh
         matrix = rows.T @ (rows * weight[:, None])
         more = np.linalg.solve(matrix, rows.T @ (weight * residual))
         left = residual - rows @ more
-        weight = _weights(left / _spread([left]))
+        weight = tukey_weights(left / _spread([left]))
     found = own + more
     spread = _spread([residual])
-    inside = _weights(residual / spread) > 0
+    inside = tukey_weights(residual / spread) > 0
     deviation = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
     return BoardCheck(
         board.name,

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board_angle import BoardAngle
-from calibration.boards import Board, BoardSet
+from calibration.boards import Board, BoardSet, Sample
 from calibration.choice import HeldOut
 from calibration.errors import CalibrationError
 from calibration.fit import Fit
 from calibration.frames import MeanFrame
+from calibration.locator import register
 from calibration.placement import SCALARS, Placement, Tolerances, designed_placement
-from calibration.registration import register
+from calibration.robust import correlation, deviation_of
 from calibration.shadow import Shadow, ShadowMask
 from calibration.whiteboard import DARKEST_REFERENCE_DN
 from emmc_rig.model.camera import Camera
@@ -39,8 +40,7 @@ LARGEST_MISS = 0.08
 3x3 views of 32x40 samples 6 %."""
 BRIGHTNESS_DIFFERS = 0.05
 ALIKE_BRIGHTNESS, ALIKE_UM = 0.2, 5.0
-"""By how much one whiteboard may differ from the others with the mask in one place: a lamp that
-flickers, a mask that creeps."""
+"""Differences between whiteboards with the mask in one place: lamps flicker, masks creep."""
 CLEAREST = 1.05
 """What clear cells let through, of no mask; beyond 1 only by the fit's error."""
 BRIGHTEST_VIEWS = 1.12
@@ -50,8 +50,8 @@ UNLIKELY = 4.0
 LARGEST_GRADIENT = {True: 0.03, False: 0.1}
 """Over the picture, of the open aperture and of one view, whose falloff is but modelled."""
 FREE_GRADIENT = {True: 0.015, False: 0.1}
-"""The same of the free route, whose whiteboards are many: benches that are as they may be have
-at most 0.003 of the open aperture. Small pictures of few whiteboards show 0.02."""
+"""The same of the free route, whose whiteboards are many: benches within tolerances have
+at most 0.003 with the aperture open. Small pictures of few whiteboards show 0.02."""
 LARGEST_UNEVENNESS = 0.25
 LARGEST_DISAGREEMENT = 0.005
 SURE = 5.0
@@ -69,10 +69,10 @@ ORDERS = {
 
 def refuse_unfit(sets: Sequence[BoardSet]) -> None:
     """Raise CalibrationError for darks that are lit, and for frames dark or saturated."""
-    for one in sets:
-        _refuse_lit_darks(one)
-        for (_, lamp), frame in one.references.items():
-            above = _above_dn(frame, one)
+    for boards in sets:
+        _refuse_lit_darks(boards)
+        for (_, lamp), frame in boards.references.items():
+            above = _above_dn(frame, boards)
             brightest = max(np.median(above[y::2, x::2]) for y, x in np.ndindex(2, 2))
             if float(brightest) < DARKEST_REFERENCE_DN:
                 raise CalibrationError(
@@ -80,12 +80,12 @@ def refuse_unfit(sets: Sequence[BoardSet]) -> None:
                     f"{DARKEST_REFERENCE_DN:g} DN above the dark: is the lamp on? Else raise it, "
                     "or the exposure"
                 )
-        for board in one.frames:
-            if np.median(_above_dn(board.frame, one)) < DARKEST_REFERENCE_DN / 10:
+        for board in boards.frames:
+            if np.median(_above_dn(board.frame, boards)) < DARKEST_REFERENCE_DN / 10:
                 raise CalibrationError(
                     f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
                 )
-        _refuse_saturated(one)
+        _refuse_saturated(boards)
 
 
 def _refuse_lit_darks(boards: BoardSet) -> None:
@@ -156,7 +156,8 @@ def refuse_without_mask(board: Board) -> None:
         bare = np.percentile(readings, 2) > BRIGHTEST_MASK
     else:
         each = [readings[board.channels[board.usable] == c] for c in np.unique(board.channels)]
-        dark, clear = np.mean([np.percentile(one, (2, 98)) for one in each if one.size], axis=0)
+        ends = [np.percentile(colour, (2, 98)) for colour in each if colour.size]
+        dark, clear = np.mean(ends, axis=0)
         bare = board.views_open.sum() == 1 and dark > LEAST_CONTRAST * clear
     if bare:
         raise CalibrationError(
@@ -180,17 +181,12 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
         if board.views_open.sum() > 1:
             continue
         clearest.append(np.percentile(board.reading[board.usable], 98) * board.views_open.size)
-        usable = np.argwhere(board.usable)
-        pixels = usable[rng.integers(len(usable), size=min(SAMPLED, len(usable)))]
-        own.append(_correlation(board, shadow, pixels, board.views_open))
-        orders = [turned(board.views_open) for turned in ORDERS.values()]
+        sample = board.sampled(np.inf, SAMPLED, rng)
+        own.append(_correlation(sample, shadow, board.views_open))
+        orders = (turned(board.views_open) for turned in ORDERS.values())
+        own_shape = board.views_open.shape
         others.append(
-            [
-                _correlation(board, shadow, pixels, one)
-                if one.shape == board.views_open.shape
-                else -1
-                for one in orders
-            ]
+            [_correlation(sample, shadow, o) if o.shape == own_shape else -1.0 for o in orders]
         )
     assert shadow is not None
     if own:
@@ -205,17 +201,9 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
     return shadow.placement
 
 
-def _correlation(
-    board: Board, shadow: Shadow, pixels: NDArray[np.int64], views_open: NDArray[np.bool_]
-) -> float:
-    y, x = pixels.T
-    channels = board.channels[y, x]
-    drawn = shadow.readings(pixels, channels, views_open, board.stage_um, board.shot)
-    reading = board.reading[y, x].astype(np.float64)
-    for c in np.unique(channels):
-        drawn[channels == c] -= drawn[channels == c].mean()
-        reading[channels == c] -= reading[channels == c].mean()
-    return float(drawn @ reading / max(np.linalg.norm(drawn) * np.linalg.norm(reading), 1e-12))
+def _correlation(sample: Sample, shadow: Shadow, views_open: NDArray[np.bool_]) -> float:
+    how = sample.pixels, sample.channels, views_open, sample.board.stage_um, sample.board.shot
+    return correlation(sample.reading, shadow.readings(*how), sample.channels)
 
 
 def _raise_dim_references(clear: float) -> None:
@@ -240,19 +228,19 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board]) -> None:
             f"{abs(off[worst]):.1f} times as far from the design as benches are: these whiteboards "
             "are of another camera or mask, or its description is wrong"
         )
-    for one, board in zip(fit.boards, boards, strict=True):
+    for check, board in zip(fit.boards, boards, strict=True):
         alike = sum(np.allclose(board.stage_um, other.stage_um) for other in boards) > 1
-        moved_um = float(np.hypot(*one.moved_um))
-        if abs(one.brightness - 1) > max(ALIKE_BRIGHTNESS, SURE * one.brightness_deviation):
+        moved_um = float(np.hypot(*check.moved_um))
+        if abs(check.brightness - 1) > max(ALIKE_BRIGHTNESS, SURE * check.brightness_deviation):
             raise CalibrationError(
-                f"{one.name}: {one.brightness:.2f} times as bright as the others suggest: was the "
-                "aperture where it should be, the mask in the beam, and the lamp the same? "
+                f"{check.name}: {check.brightness:.2f} times as bright as the others suggest: was "
+                "the aperture where it should be, the mask in the beam, and the lamp the same? "
                 "Capture it again"
             )
-        if alike and moved_um > max(ALIKE_UM, SURE * one.moved_deviation_um):
+        if alike and moved_um > max(ALIKE_UM, SURE * check.moved_deviation_um):
             raise CalibrationError(
-                f"{one.name}: the mask stands {moved_um:.1f} um from where the others have it: it "
-                "moved between them, or this one is of another day; capture all again, in one go"
+                f"{check.name}: the mask stands {moved_um:.1f} um from where the others have it: "
+                "it moved between them, or this one is of another day; capture all again, in one go"
             )
 
 
@@ -264,8 +252,8 @@ def refuse_tilted_board(
 ) -> None:
     """Raise CalibrationError where brightness changes over the picture against the references.
 
-    model: how much rougher the shadow is than a fitted one. limits: of the change, of an aperture
-    that is open and of one that is not.
+    model: how much rougher the shadow is than a fitted one. limits: of the change, by whether
+    the whole aperture is open.
     """
     for board in boards:
         across, deviation = _gradient(shadow, board)
@@ -282,22 +270,18 @@ def refuse_tilted_board(
 
 def _gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
     """Return by how much a whiteboard's brightness changes down and across, and how sure."""
-    chosen = np.flatnonzero(board.usable)
-    if len(chosen) > SAMPLED_GRADIENT:
-        chosen = np.random.default_rng(0).choice(chosen, SAMPLED_GRADIENT, replace=False)
-    rows, columns = board.reading.shape
-    y, x = np.unravel_index(chosen, (rows, columns))
-    channels, pixels = board.channels[y, x], np.stack([y, x], axis=1)
-    at = shadow.readings(pixels, channels, *board.opening)
+    sample = board.sampled(np.inf, SAMPLED_GRADIENT, np.random.default_rng(0))
+    (rows, columns), (y, x), channels = board.reading.shape, sample.pixels.T, sample.channels
+    at = shadow.readings(sample.pixels, channels, *board.opening)
     levels = [np.where(channels == c, at, 0) for c in np.unique(channels)]
     terms = np.stack([at * (y / rows - 0.5), at * (x / columns - 0.5), *levels], axis=1)
-    value = board.reading[y, x].astype(np.float64)
+    value = sample.reading
     keep = np.ones(len(value), dtype=bool)
     for _ in range(3):
         normal = terms[keep].T @ terms[keep] + 1e-12 * np.eye(terms.shape[1])
         found = np.linalg.solve(normal, terms[keep].T @ value[keep])
         left = value - terms @ found
-        keep = np.abs(left) < 4 * 1.4826 * np.median(np.abs(left)) + 1e-12
+        keep = np.abs(left) < 4 * deviation_of(left) + 1e-12
     level = float(np.mean(found[2:]))
     spread = float(np.std(left[keep])) * float(np.sqrt(np.linalg.inv(normal)[:2, :2].max()))
     return found[:2] / level, spread / level

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import board_over_angle, leaning, less_sure, take_out
+from calibration.board_angle import add_error, board_over_angle, leaning, take_out
 from calibration.boards import (
     Board,
     BoardSet,
@@ -42,9 +42,10 @@ from calibration.findings import (
     unwatched,
     views_assumed,
 )
-from calibration.fit import MOST_MORE_BOARDS, OFFSETS, SOFT_EDGES, Fit, fit_placement
+from calibration.fit import MOST_MORE_BOARDS, OFFSETS, Fit, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
+from calibration.locator import SOFT_EDGES
 from calibration.misfit import Misfit, beyond_chance, combined, measured_misfit
 from calibration.openings import views_open
 from calibration.parametric import (
@@ -87,16 +88,16 @@ LARGEST_MOVE_UM = 1.0
 FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
 """Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 REGISTERED_MISS = 3.0
-"""Times what a fitted mask misses: what one that is but registered does."""
+"""Residual of a mask that is registered alone, over that of a fitted mask."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """Psi by every route asked for, how each does on held-out whiteboards, and the choice.
 
-    frames: exposures that each route used. findings: what is wrong with the bench and was taken
-    into account. advice: what to measure again. unwatched: what no whiteboard was there to tell,
-    and what that may cost. crosstalk: of the colour filters, where it matters.
+    frames: exposures that each route used. findings: faults of the bench that Psi takes into
+    account. advice: measurements to repeat. unwatched: influences that no whiteboard measured, with
+    the error they may leave. crosstalk: of the colour filters, where it matters.
     """
 
     chosen: str
@@ -142,18 +143,18 @@ def calibrate(
     """
     advice: list[str] = []
     turned = turned or {}
-    sets = [held_out, *(one for one in (few, pinholes) if one is not None), *turned.values()]
+    sets = [held_out, *filter(None, (few, pinholes)), *turned.values()]
     refuse_unfit(sets)
-    good = np.logical_and.reduce([sensor_blemishes(one) for one in sets])
+    good = np.logical_and.reduce([sensor_blemishes(boards) for boards in sets])
     channels = channels_of(design)
-    levels = fit_levels(list(dict.fromkeys(check for one in sets for check in one.checks)))
+    levels = fit_levels(list(dict.fromkeys(check for boards in sets for check in boards.checks)))
     findings = level_findings(levels)
     if levels is not None:
         how = levels, channels, dict[int, MeanFrame]()
         held_out = held_out.levelled(*how)
         few = None if few is None else few.levelled(*how)
         pinholes = None if pinholes is None else pinholes.levelled(*how)
-        turned = {turn: one.levelled(*how) for turn, one in turned.items()}
+        turned = {turn: boards.levelled(*how) for turn, boards in turned.items()}
     seen_colours = crosstalk(held_out, channels, good)
     judges = as_readings(held_out, design, good)
     if not judges:
@@ -193,56 +194,57 @@ def calibrate(
         if dusty.any():
             findings.append(dust_finding(dusty))
             good = good & ~dusty
-            seen, judges = ([one.without(dusty) for one in some] for some in (seen, judges))
+            seen, judges = ([board.without(dusty) for board in some] for some in (seen, judges))
             fit = fit_placement(seen, camera, mask, start=fit.placement)
         findings += _hands_finding(fit, seen, mask)
         parametric = with_misfit(Parametric(fit, mask), seen)
         if {"mixed", "combined"} & set(routes) and design.binning == 1:
             on_stage("defects of the mask")
             mixed = with_misfit(_mixed(seen, camera, parametric), seen)
-        for name, one in (("parametric", parametric), ("mixed", mixed)):
-            if one is not None:
-                one = replace(one, of_defects=_missed_at_defects(one, [*seen, *judges]))
+        for name, model in (("parametric", parametric), ("mixed", mixed)):
+            if model is not None:
+                model = replace(model, of_defects=_missed_at_defects(model, [*seen, *judges]))
                 on_stage(f"Psi, {name}")
-                bare[name] = _calibration(one, camera, design, few, good)
-                calibrations[name] = _counting_misfit(bare[name], one)
-                judged[name] = _judged(name, one, judges, seen)
+                bare[name] = _calibration(model, camera, design, few, good)
+                calibrations[name] = _with_misfit_variance(bare[name], model)
+                judged[name] = _judged(name, model, judges, seen)
                 frames[name] = few.exposures
-        refuse_tilted_board((mixed or parametric).shadow, [*judges, *seen])
-        findings += mask_findings((mixed or parametric).fit)
-        findings += [mask.repeats.words] if mask.repeats.words else []
+    best = mixed or parametric
+    if best is not None:
+        refuse_tilted_board(best.shadow, [*judges, *seen])
+        findings += mask_findings(best.fit)
+        findings += filter(None, [best.mask.repeats.words])
     if {"free", "combined"} & set(routes):
         if pinholes is None:
             raise CalibrationError("the calibration method free was given no whiteboards")
         on_stage("Psi, free")
         free = replace(measure_psi(pinholes, design, empty, on_plane), good=good)
-        if (best := mixed or parametric) is not None:
-            _put_right(free, best, seen, design)
+        if best is not None:
+            _correct_pinhole_places(free, best, seen, design)
         calibrations["free"] = free
-        still = [one for one in judges if one.shot == 0 and np.allclose(one.stage_um, stage_um)]
-        if not still:
+        at_first = (b for b in judges if b.shot == 0 and np.allclose(b.stage_um, stage_um))
+        if (still := next(at_first, None)) is None:
             raise CalibrationError(
                 "the calibration method free is judged by an open whiteboard with the mask where "
                 "the first shot has it: capture a validation whiteboard there"
             )
-        judged["free"] = _judged_measured("free", free, still[0], design.binning)
+        judged["free"] = _judged_measured("free", free, still, design.binning)
         frames["free"] = pinholes.exposures
         if "combined" in routes and best is not None and few is not None:
             on_stage("Psi, combined")
-            model = bare["mixed" if mixed is not None else "parametric"]
-            both = combined(free, model, good)
+            both = combined(free, bare["mixed" if mixed is not None else "parametric"], good)
             calibrations["combined"] = both
-            judged["combined"] = _judged_measured("combined", both, still[0], design.binning)
+            judged["combined"] = _judged_measured("combined", both, still, design.binning)
             frames["combined"] = few.exposures
-    for name, one in calibrations.items():
-        _make_less_sure(one, _unsteady(name, sets, [*judges, *seen], parametric))
+    for name, known in calibrations.items():
+        add_error(known, _unsteady(name, sets, [*judges, *seen], parametric))
         if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
-            _count_moves(one, parametric, design, shot_stages(camera))
+            _add_mask_moves(known, parametric, design, shot_stages(camera))
     chosen, why = choose([judged[name] for name in judged if name in routes])
     refuse_another_bench(chosen)
     if chosen.chi2 > LARGEST_CHI2:
         missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
-        _make_less_sure(calibrations[chosen.route], missed)
+        add_error(calibrations[chosen.route], missed)
         advice.append(
             f"the validation whiteboards differ from Psi by {chosen.relative_error:.2%} of their "
             f"level: residual {chosen.chi2:.1f} x noise variance, largest of "
@@ -253,40 +255,39 @@ def calibrate(
             f"the colour filters pass up to {seen_colours.largest:.1%} of the other colours: Psi "
             "has three colours for every pixel"
         )
-        if plain is None:
+        if plain is None or best is None:
             raise CalibrationError(
                 "the colour filters pass other colours, and the calibration method free does not "
                 "show which: add open whiteboards, for the method parametric"
             )
-        by = mixed or parametric
-        assert by is not None
-        others = other_colours(by, plain, seen_colours, design, shot_stages(camera))
-        calibrations = {name: in_three_colours(one, others) for name, one in calibrations.items()}
+        others = other_colours(best, plain, seen_colours, design, shot_stages(camera))
+        calibrations = {
+            name: in_three_colours(known, others) for name, known in calibrations.items()
+        }
     board = None
     if turned:
-        boards = {turn: as_readings(one, design, good)[0] for turn, one in turned.items()}
-        by = mixed or parametric
-        shadow = shadow if by is None else by.shadow
-        board = board_over_angle(calibrations[chosen.route].psi, boards, shadow)
+        open_boards = {turn: as_readings(own, design, good)[0] for turn, own in turned.items()}
+        shadow = shadow if best is None else best.shadow
+        board = board_over_angle(calibrations[chosen.route].psi, open_boards, shadow)
         refuse_uneven_board(board)
         findings += angle_findings(board)
         if board.uneven:
-            for one in calibrations.values():
-                take_out(board, one)
+            for known in calibrations.values():
+                take_out(board, known)
     if parametric is not None:
         leans = leaning(parametric.fit, parametric.mask, board)
         findings += leaning_findings(leans, bool(turned))
-        for one in calibrations.values():
-            less_sure(one, leans.lopsided)
+        for known in calibrations.values():
+            add_error(known, leans.lopsided)
     not_known = unwatched(_missing(sets, levels, design, bool(turned)))
-    if parametric is not None and all(board.views_open.all() for board in seen):
+    if best is not None and all(board.views_open.all() for board in seen):
         stated = calibrations[chosen.route].stated_error
-        not_known.append(views_assumed(pinhole_worth(mixed or parametric, seen, stated)))
+        not_known.append(views_assumed(pinhole_worth(best, seen, stated)))
     return Outcome(
         chosen.route,
         why,
-        {name: one for name, one in calibrations.items() if name in routes},
-        {name: one for name, one in judged.items() if name in routes},
+        {name: known for name, known in calibrations.items() if name in routes},
+        {name: held for name, held in judged.items() if name in routes},
         frames,
         parametric,
         mixed,
@@ -307,13 +308,15 @@ def _unsteady(
     frame, as repeats show, which their number averages; and slowly, as the fit shows. Of single
     views as measured through a pinhole each has its own beside.
     """
-    references = list({id(f): f for one in sets for f in one.references.values()}.values())
+    references = list({id(f): f for boards in sets for f in boards.references.values()}.values())
     dark_dn = sets[0].dark.mean_dn
-    fast2 = unsteadiness2(boards, [(one.count, one.unsteady2(dark_dn)) for one in references])
+    fast2 = unsteadiness2(
+        boards, [(reference.count, reference.unsteady2(dark_dn)) for reference in references]
+    )
     slow2 = 0.0 if parametric is None else parametric.fit.brightness_spread**2
-    spread2 = slow2 + fast2 * float(np.mean([1 / one.count for one in references]))
+    spread2 = slow2 + fast2 * float(np.mean([1 / reference.count for reference in references]))
     if route == "free":
-        pinholes = [frame.count for one in sets for frame in one.frames if frame.pinhole]
+        pinholes = [frame.count for boards in sets for frame in boards.frames if frame.pinhole]
         spread2 += slow2 + fast2 * float(np.mean([1 / count for count in pinholes]))
     return float(np.sqrt(spread2))
 
@@ -322,9 +325,9 @@ def _missing(
     sets: Sequence[BoardSet], levels: Levels | None, layout: PsiLayout, turned: bool
 ) -> list[str]:
     """Return what was not watched, by the names of `findings.UNWATCHED`."""
-    lamps = {lamp for one in sets for _, lamp in one.references}
+    lamps = {lamp for boards in sets for _, lamp in boards.references}
     coloured = layout.colour is None or layout.binning > 1 or lamps >= set(LAMP_COLOURS)
-    seen_again = any(check.masks_in for one in sets for check in one.checks)
+    seen_again = any(check.masks_in for boards in sets for check in boards.checks)
     watched = {
         "lamp": seen_again,
         "response": levels is not None and levels.bend_known,
@@ -358,8 +361,8 @@ def _unlike_the_design(
         mask = mixing(mask, crosstalk.seen)
     v, u = camera.views
     wanted = [(v // 2, u // 2), (0, 0), (v - 1, u - 1)]
-    some = [one for one in boards.frames if one.shot == 0 and one.pinhole in wanted]
-    some.sort(key=lambda one: wanted.index(one.pinhole or wanted[0]))
+    some = [frame for frame in boards.frames if frame.shot == 0 and frame.pinhole in wanted]
+    some.sort(key=lambda frame: wanted.index(frame.pinhole or wanted[0]))
     seen = as_readings(boards.with_frames(some), layout, good)
     placement = refuse_another_mask(seen or judges, camera, mask)
     refuse_tilted_board(Shadow(mask, placement), judges, REGISTERED_MISS)
@@ -370,7 +373,7 @@ def _unlike_the_design(
     fit = fit_placement(seen, camera, mask, start=start)
     refuse_odd_fit(fit, seen)
     refuse_tilted_board(Shadow(mask, fit.placement), seen, limits=FREE_GRADIENT)
-    # Finer than that, Psi as measured is what counts, and few whiteboards do not determine it well.
+    # Smaller differences are left to the measured Psi: few whiteboards do not determine them.
     return mask_findings(fit, ("distance_share", "clear")), Shadow(mask, fit.placement)
 
 
@@ -384,18 +387,18 @@ def _mixed(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Par
     return Parametric(fit, parametric.mask, find_defects(seen, parametric.mask, fit.placement))
 
 
-def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
-    """Return the model with its misfit, from what it leaves of whiteboards of few views.
+def with_misfit(model: Parametric, seen: Sequence[Board]) -> Parametric:
+    """Return the model with its misfit, from its residuals of whiteboards of few views.
 
-    A view has that of the whiteboards which open it alone; where none does, that of those which
-    open the fewest with it, whose views are taken to be missed independently. Many pixels determine
-    few parameters, so that a board the fit has seen is as good as held out.
+    The misfit of a view is measured on whiteboards that open this view alone, or else on those
+    that open the fewest views with it; their views are then taken to err independently. Many pixels
+    determine few parameters, so that a board the fit has seen is as good as held out.
     """
-    shadow = one.shadow
+    shadow = model.shadow
     found: dict[tuple[int, int], list[tuple[int, Misfit]]] = defaultdict(list)
     of_few = [board for board in seen if not board.views_open.all()]
     if not of_few:
-        return one
+        return model
     misfits = []
     for board in of_few:
         predicted = predicted_by_shadow(shadow, board)
@@ -409,24 +412,25 @@ def with_misfit(one: Parametric, seen: Sequence[Board]) -> Parametric:
     for view, several in found.items():
         fewest = min(count for count, _ in several)
         every[view] = max(
-            (misfit for count, misfit in several if count == fewest), key=lambda one: one.level
+            (misfit for count, misfit in several if count == fewest),
+            key=lambda misfit: misfit.level,
         )
     # A view that none opens has the largest of the others.
     worst_of = max(every.values(), key=lambda misfit: misfit.level)
     return replace(
-        one, misfit={view: every.get(view, worst_of) for view in np.ndindex(shadow.mask.views)}
+        model, misfit={view: every.get(view, worst_of) for view in np.ndindex(shadow.mask.views)}
     )
 
 
-def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
+def _missed_at_defects(model: Parametric, boards: Sequence[Board]) -> float:
     """Return the mean square that whiteboards miss at defects, over that of what defects take.
 
     Half cells do not draw the outline of a speck. Give it those held out as well: to those fitted
     the losses of the grains are fitted too.
     """
-    if one.defects is None or one.defects.count == 0:
+    if model.defects is None or model.defects.count == 0:
         return 0.0
-    clean, soiled = Shadow(one.mask, one.fit.placement), one.shadow
+    clean, soiled = Shadow(model.mask, model.fit.placement), model.shadow
     missed = taken = 0.0
     for board in boards:
         predicted = predicted_by_shadow(soiled, board)
@@ -442,12 +446,14 @@ def _missed_at_defects(one: Parametric, boards: Sequence[Board]) -> float:
     return max(missed / taken, 0.0) if taken > 0 else 0.0
 
 
-def _judged(name: str, one: Parametric, judges: Sequence[Board], seen: Sequence[Board]) -> HeldOut:
+def _judged(
+    name: str, model: Parametric, judges: Sequence[Board], seen: Sequence[Board]
+) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
-    slow2, fast2 = one.fit.brightness_spread**2, unsteadiness2([*judges, *seen])
+    slow2, fast2 = model.fit.brightness_spread**2, unsteadiness2([*judges, *seen])
 
     def judged(board: Board) -> HeldOut:
-        predicted = predicted_by_shadow(one.shadow, board)
+        predicted = predicted_by_shadow(model.shadow, board)
         unsteady2 = slow2 + fast2 / board.repeats
         return judge(name, board, predicted, unsteady=float(np.sqrt(unsteady2)))
 
@@ -472,24 +478,17 @@ def _judged_measured(name: str, known: Calibration, board: Board, binning: int) 
     return worst({"open aperture": judge(name, board, predicted, variance)})
 
 
-def _worst_groups(one: HeldOut) -> str:
-    order = sorted(one.groups, key=lambda name: -one.groups[name])
-    return ", ".join(f"{name} ({one.groups[name]:.1f})" for name in order[:4])
+def _worst_groups(held: HeldOut) -> str:
+    order = sorted(held.groups, key=lambda name: -held.groups[name])
+    return ", ".join(f"{name} ({held.groups[name]:.1f})" for name in order[:4])
 
 
-def _make_less_sure(known: Calibration, missed: float) -> None:
-    """Count a relative error beside in the deviations of a calibration."""
-    for place in np.ndindex(*known.deviation.shape[:3]):
-        more = np.square(missed * known.psi.weights[place])
-        known.deviation[place] = np.sqrt(np.square(known.deviation[place]) + more)
-
-
-def _cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
+def _light_cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
     """Return the share of a single pinhole's light that the aperture's edge keeps from it.
 
     moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
-    pinhole pushed outward by d the middle of what is left is d / 2 further. That is no more than a
-    guess, as the fit takes it for another distance too: it counts in the deviation.
+    pinhole pushed outward by d the middle of what is left is d / 2 further. The fit
+    takes part of it for another distance: the loss counts in the deviation.
     """
     ratio = mask.distance_um / mask.lens_um
     left = 1.0
@@ -501,22 +500,22 @@ def _cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> f
     return 1 - left
 
 
-def _put_right(
-    known: Calibration, one: Parametric, seen: Sequence[Board], layout: PsiLayout
+def _correct_pinhole_places(
+    known: Calibration, model: Parametric, seen: Sequence[Board], layout: PsiLayout
 ) -> None:
     """Take out of a measured Psi that hands put the pinhole a little off.
 
     Each view changes by what the fitted mask says that the way to its hole changes.
     """
     weights, deviation = known.psi.weights, known.deviation
-    shadow = of_samples(one.shadow)
-    for check, board in zip(one.fit.boards, seen, strict=True):
+    shadow = of_samples(model.shadow)
+    for check, board in zip(model.fit.boards, seen, strict=True):
         if not (board.loose and board.views_open.sum() == 1):
             continue
         (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
         off_x, off_y = check.moved_um
         unsure_um = check.moved_deviation_um
-        lost = _cut_off(check.moved_um, board, one.mask)
+        lost = _light_cut_off(check.moved_um, board, model.mask)
         for stored in range(layout.weights_shape[4]):
             place = board.shot, v, u, stored
 
@@ -546,66 +545,70 @@ def _hands_finding(fit: Fit, seen: Sequence[Board], mask: ShadowMask) -> list[st
     return [f"hands put pinholes up to {max(loose):.0f} um off their holes: corrected for"]
 
 
-def _count_moves(known: Calibration, one: Parametric, layout: PsiLayout, stages: Stages) -> None:
+def _add_mask_moves(
+    known: Calibration, model: Parametric, layout: PsiLayout, stages: Stages
+) -> None:
     """Count in a measured Psi's deviation that the mask may stand elsewhere: models have it."""
-    covariance = np.zeros_like(one.fit.covariance)
-    covariance[OFFSETS, OFFSETS] = np.eye(2) * one.fit.moved_um**2
-    moved = psi_deviation(one.shadow, layout, stages, covariance)
+    covariance = np.zeros_like(model.fit.covariance)
+    covariance[OFFSETS, OFFSETS] = np.eye(2) * model.fit.moved_um**2
+    moved = psi_deviation(model.shadow, layout, stages, covariance)
     np.sqrt(np.square(known.deviation) + np.square(moved), out=known.deviation)
 
 
 def _calibration(
-    one: Parametric,
+    model: Parametric,
     camera: Camera,
     layout: PsiLayout,
     boards: BoardSet,
     good: NDArray[np.bool_],
 ) -> Calibration:
     stages = shot_stages(camera)
-    psi = one.psi(layout, stages)
+    psi = model.psi(layout, stages)
     # Whiteboards of single views show what the model misses of each; sums, how far they stray.
-    astray2 = one.fit.astray2 if one.misfit is None else ()
-    deviation = psi_deviation(one.shadow, layout, stages, one.fit.covariance, astray2)
-    if one.defects is not None and one.defects.count:
-        deviation = _counting_defects(deviation, one, layout, stages)
+    astray2 = model.fit.astray2 if model.misfit is None else ()
+    deviation = psi_deviation(model.shadow, layout, stages, model.fit.covariance, astray2)
+    if model.defects is not None and model.defects.count:
+        deviation = _with_defect_variance(deviation, model, layout, stages)
     white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
 
 
-def _counting_defects(
-    deviation: NDArray[np.float32], one: Parametric, layout: PsiLayout, stages: Stages
+def _with_defect_variance(
+    deviation: NDArray[np.float32], model: Parametric, layout: PsiLayout, stages: Stages
 ) -> NDArray[np.float32]:
     """Return the deviation of Psi with what is not known of the defects of its mask."""
-    assert one.defects is not None
+    assert model.defects is not None
     clean, soiled = (
-        coefficient_planes(Shadow(mask, one.fit.placement), layout, stages)
-        for mask in (one.mask, one.defects.mask)
+        coefficient_planes(Shadow(mask, model.fit.placement), layout, stages)
+        for mask in (model.mask, model.defects.mask)
     )
     for ((shot, v, u, stored), bare), (_, plane) in zip(clean, soiled, strict=True):
         touched = np.argwhere(bare != plane)
         y, x = touched.T
-        opened = views_open(one.mask.views, (v, u))
+        opened = views_open(model.mask.views, (v, u))
         channels = np.full(len(touched), stored, dtype=np.uint8)
         if layout.colour is not None:
             channels = layout.colour[shot, y, x]
         seen = View(opened, stages[shot], shot)
-        of_losses = loss_variance(one.defects, one.mask, one.fit.placement, touched, channels, seen)
-        of_outline = one.of_defects * np.square(bare - plane)[y, x]
+        of_losses = loss_variance(
+            model.defects, model.mask, model.fit.placement, touched, channels, seen
+        )
+        of_outline = model.of_defects * np.square(bare - plane)[y, x]
         place = (shot, v, u, y, stored, x)
         more = of_losses / deviation.shape[4] ** 2 + of_outline
         deviation[place] = np.sqrt(np.square(deviation[place]) + more)
     return deviation
 
 
-def _counting_misfit(known: Calibration, one: Parametric) -> Calibration:
+def _with_misfit_variance(known: Calibration, model: Parametric) -> Calibration:
     """Return a model's calibration with its misfit in the deviations."""
-    if one.misfit is None:
+    if model.misfit is None:
         return known
     deviation = np.square(known.deviation, dtype=np.float64)
     scale = known.psi.weights.shape[4] * known.psi.binning**2
     for shot, v, u, stored in np.ndindex(deviation.shape[:3] + deviation.shape[4:5]):
         plane = known.psi.weights[shot, v, u, :, stored].astype(np.float64) * scale
-        deviation[shot, v, u, :, stored] += one.misfit[v, u].variance(plane) / scale**2
+        deviation[shot, v, u, :, stored] += model.misfit[v, u].variance(plane) / scale**2
     return replace(known, deviation=np.sqrt(deviation).astype(np.float32))
 
 
@@ -627,12 +630,12 @@ def fit_advice(fit: Fit) -> list[str]:
     """Return what the fit says to measure again: flicker, moved stage, too few frames."""
     found = []
     flickering = [
-        one
-        for one in fit.boards
-        if abs(one.brightness - 1) > max(LARGEST_FLICKER, 5 * one.brightness_deviation)
+        check
+        for check in fit.boards
+        if abs(check.brightness - 1) > max(LARGEST_FLICKER, 5 * check.brightness_deviation)
     ]
     if flickering:
-        worst_of = max(flickering, key=lambda one: abs(one.brightness - 1))
+        worst_of = max(flickering, key=lambda check: abs(check.brightness - 1))
         others = (
             f" ({len(flickering)} of {len(fit.boards)} whiteboards differ)"
             if len(flickering) > 1
@@ -660,20 +663,20 @@ def fit_advice(fit: Fit) -> list[str]:
 def _moves(fit: Fit) -> list[str]:
     """Return in words that the mask stands elsewhere than the stage says, if that matters."""
     moved = [
-        one
-        for one in fit.boards
-        if np.hypot(*one.moved_um) > max(LARGEST_MOVE_UM, 5 * one.moved_deviation_um)
+        check
+        for check in fit.boards
+        if np.hypot(*check.moved_um) > max(LARGEST_MOVE_UM, 5 * check.moved_deviation_um)
     ]
     if not moved:
         return []
-    worst = max(moved, key=lambda one: float(np.hypot(*one.moved_um)))
+    worst = max(moved, key=lambda check: float(np.hypot(*check.moved_um)))
     words = (
         f"the mask is not where the stage reports it in {len(moved)} of {len(fit.boards)} "
         f"whiteboards, by up to ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
         f"{worst.name}; Psi's deviation includes it: "
     )
-    times_s = np.array([one.taken_s for one in fit.boards])
-    places_um = np.array([one.moved_um for one in fit.boards])
+    times_s = np.array([check.taken_s for check in fit.boards])
+    places_um = np.array([check.moved_um for check in fit.boards])
     times_s, places_um = times_s - times_s.mean(), places_um - places_um.mean(axis=0)
     rate = times_s @ places_um / max(float(times_s @ times_s), 1e-12)
     left = np.square(places_um - times_s[:, None] * rate).sum() / np.square(places_um).sum()

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
+from calibration.robust import deviation_of
 
 Array = NDArray[np.floating]
 Frame = NDArray[np.uint16]
@@ -455,7 +456,7 @@ def _hot(darks: Sequence[Pair]) -> NDArray[np.bool_]:
     longest = max(darks, key=lambda one: one.exposure_s)
     mean = (longest.first.astype(np.float64) + longest.second) / 2
     off = mean - np.median(mean)
-    return np.abs(off) > HOT_DEVIATIONS * max(1.4826 * float(np.median(np.abs(off))), 0.5)
+    return np.abs(off) > HOT_DEVIATIONS * max(deviation_of(off), 0.5)
 
 
 def _dead(flat: Pair, dark: Pair) -> NDArray[np.bool_]:

@@ -86,9 +86,12 @@ def shadow_mask(camera: Camera, size: tuple[int, int]) -> ShadowMask:
     used = {camera.shot_masks(shot) for shot in range(len(camera.shots))}
     near = [name for name, mask in camera.masks.items() if mask.distance_mm < lens.distance_mm]
     if used != {tuple(camera.masks)} or len(near) != 1 or len(camera.masks) != 1:
+        what = f"this camera has {len(camera.masks)} masks"
+        if camera.masks and not near:
+            what = "this camera's masks lie at the lens"
         raise CalibrationError(
-            "calibration method parametric needs one mask between lens and sensor, the same in "
-            f"every shot; this camera has {len(camera.masks)} masks: use method free"
+            "the shadow of one mask between lens and sensor is modelled, the same in every shot; "
+            f"{what}: use method free to calibrate it"
         )
     (name,) = near
     mask = camera.masks[name]

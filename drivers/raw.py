@@ -114,6 +114,16 @@ class RawFrame:
     host_time_s: float | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def black_dn(self) -> float:
+        """Mean black level."""
+        return float(self.black_level_dn.mean())
+
+    @property
+    def span_dn(self) -> float:
+        """From black to white, at least 1."""
+        return max(1.0, self.white_level_dn - self.black_dn)
+
     def black_by_place(self) -> Array:
         """Return the black level of every pixel, `(y, x)` in DN, read-only."""
         levels = self.black_level_dn

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.plan import Boards, Checks, Darks, Plan, PlannedShot
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -41,6 +40,7 @@ from emmc_rig.pages.report import ReportContent, write_report
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.frame_means import decoded
+from emmc_rig.session.journal import Figures
 from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import shot_frames, shot_readings

@@ -1,4 +1,4 @@
-"""What hands move in a capture, and where the mask's shadow in a frame says that they put it.
+"""Places of mask and pinhole that hands set in a capture, located by the mask's shadow.
 
 A pinhole moved by du shows the shadow that the mask shows when it is moved by -rho du, rho = d / D
 (see `calibration.placement`): what is fitted to a frame is where the mask seems to stand, and the
@@ -8,17 +8,18 @@ pinhole counts as put right.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import channels_of
+from calibration.boards import Board, channels_of
 from calibration.errors import CalibrationError
+from calibration.locator import Location, frame_board, locate, starting_placement
 from calibration.openings import views_open
-from calibration.placement import SCALARS, designed_placement
-from calibration.shadow import Shadow, ShadowMask, shadow_mask
+from calibration.shadow import SEARCH_UM, ShadowMask, shadow_mask
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import FrameRefusedError
 from emmc_rig.bench.hands import APERTURE, MASK, NoAttendant, hole_name
@@ -30,17 +31,6 @@ from emmc_rig.session.planned import PlannedFrame
 
 LONGEST_PX = 96
 """Of the middle of a frame, along either side: more tells a place hardly better."""
-SEARCHED_UM, SEARCH_STEPS = 60.0, 21
-"""How far the mask is looked for to either side, and in how many steps."""
-FITTED = ("offset_x_um", "offset_y_um", "rotation_rad", "scale", "blur_um")
-ROUNDS, ENOUGH_UM = 12, 1e-3
-FEW_PIXELS = 1500
-"""To choose among places by."""
-LEAST_EXPLAINED = 0.2
-"""Of a frame's pattern, by the shadow: less is no sight of it."""
-MISSED_ALIKE = 2.0
-"""By how much more than its pixels say a fit of the shadow is off: what it misses of neighbours is
-alike."""
 FARTHEST_MASK_UM = 30.0
 """That a hand may put the mask off its place before it is asked again."""
 
@@ -66,10 +56,10 @@ class Place:
 
 
 def with_hands(rig: RigType, frames: Iterable[PlannedFrame]) -> RigType:
-    """Return the rig with the axes that it lacks and that its person moves, see `Rig.hands`.
+    """Return the rig with the missing axes that a person moves, see `Rig.hands`.
 
-    frames: all of the plan. An axis that all of them want at one place is left where it is. Raises
-    AppError where nobody moves what the frames need.
+    frames: all of the plan. An axis with the same place in all frames stays where it is. Raises
+    AppError where nobody moves an axis that the frames need.
     """
     places: dict[str, set[float]] = {}
     for frame in frames:
@@ -118,9 +108,8 @@ class HandPlaces:
             self._mask = shadow_mask(camera, size)
         except CalibrationError:
             return
-        self._pixels = np.indices(kept).reshape(2, -1).T.astype(np.int64)
         self._layout = psi_layout(camera, size)
-        self._shadow = Shadow(self._mask, designed_placement(camera))
+        self._placement = starting_placement(camera, self._mask)
         self._ratio = self._mask.distance_um / self._mask.lens_um
 
     def shows(self, planned: PlannedFrame) -> bool:
@@ -133,12 +122,15 @@ class HandPlaces:
         """Learn from a whiteboard, the first that is given, how the mask stands."""
         if self._stands_um is not None or not self.shows(planned):
             return
-        fitted = FITTED if self._first_um is None else FITTED[:2]
-        start_um = np.zeros(2) if self._first_um is None else self._first_um
-        found = self._found(planned, frame, planned.view, _around(start_um), fitted)
-        if found is not None:
-            self._stands_um, self._unsure_um = found
-            self._first_um = found[0] if self._first_um is None else self._first_um
+        board = self._board(planned, frame)
+        with suppress(CalibrationError):
+            if self._first_um is None:
+                found = locate(board, self._mask, self._placement)
+                self._placement, self._first_um = found.placement, np.array(found.offset_um)
+            else:
+                found = self._searched(board, self._first_um)
+            self._stands_um = np.array(found.offset_um)
+            self._unsure_um = found.offset_deviation_um
 
     def set_anew(self) -> None:
         """Take for unknown where the mask stands, if a hand moves it: it was set again."""
@@ -176,16 +168,15 @@ class HandPlaces:
     ) -> Place | None:  # fmt: skip
         camera = self._camera
         cell_um = camera.lens.aperture_cell_um
-        # A pinhole that much further in x and y shows the mask so much further back.
         grid_y, grid_x = (centred_grid(count, cell_um) for count in camera.views)
         asked_um = np.array([grid_x[asked[1]], grid_y[asked[0]]])
-        holes_um = [np.array([x, y]) for y in grid_y for x in grid_x]
-        starts = [stands_um - self._ratio * (hole_um - asked_um) for hole_um in holes_um]
-        found = self._found(planned, frame, asked, starts)
-        if found is None:
+        # A pinhole that much further in x and y shows the mask so much further back.
+        reach_um = max(SEARCH_UM, self._ratio * 2 * max(grid_x[-1], grid_y[-1]))
+        try:
+            found = self._searched(self._board(planned, frame), stands_um, reach_um)
+        except CalibrationError:
             return None
-        seems_um, deviation_um = found
-        x_um, y_um = map(float, asked_um - (seems_um - stands_um) / self._ratio)
+        x_um, y_um = map(float, asked_um - (found.offset_um - stands_um) / self._ratio)
         wanted = planned.bench.offsets_um
         off = np.array([x_um - wanted["aperture_x"], y_um - wanted["aperture_y"]])
         if np.abs(off).max() > cell_um / 2:
@@ -195,7 +186,7 @@ class HandPlaces:
                 f"shows the shadow through {hole_name(view, camera.views)}",
                 f"put the pinhole on {hole_name(asked, camera.views)}",
             )
-        deviation_um = float(np.hypot(deviation_um, self._unsure_um)) / self._ratio
+        deviation_um = float(np.hypot(found.offset_deviation_um, self._unsure_um)) / self._ratio
         return self._place(dict(zip(APERTURE, (x_um, y_um), strict=True)), deviation_um)
 
     def _mask_place(self, planned: PlannedFrame, stands_um: NDArray[np.float64]) -> Place:
@@ -219,89 +210,28 @@ class HandPlaces:
         places_um = {axis: um for axis, um in places_um.items() if axis in self._hands}
         return Place(places_um, deviation_um)
 
-    def _found(
-        self, planned: PlannedFrame, frame: RawFrame, view: tuple[int, int] | None,
-        starts_um: Sequence[NDArray[np.float64]], fitted: Sequence[str] = FITTED[:2],
-    ) -> tuple[NDArray[np.float64], float] | None:  # fmt: skip
-        """Return where the mask seems to stand, beyond where it should, and the deviation of that.
-
-        view: the one that is open. starts_um: places, about one of which it stands. fitted: of the
-        mask's placement; what is found of it, but for the place, holds from then on.
-        """
+    def _searched(
+        self, board: Board, stands_um: NDArray[np.float64], reach_um: float = SEARCH_UM
+    ) -> Location:
+        """Return where the mask seems to stand; raises CalibrationError where it is not seen."""
         assert self._mask is not None
-        mask, shot = self._mask, planned.bench.shot
-        cut_y, cut_x = self._cut
-        rows, columns = frame.mosaic.shape
-        frame = frame.with_one_black()
-        black = float(frame.black_level_dn.mean())
-        seen = frame.mosaic[cut_y : rows - cut_y, cut_x : columns - cut_x].ravel() - black
-        usable = (seen < (frame.white_level_dn - black)) & (seen > 0)
-        pixels, read = self._pixels[usable], seen[usable]
-        channels = channels_of(self._layout, shot).ravel()[usable]
-        offsets = planned.bench.offsets_um
-        centre_um = np.array([offsets.get(axis, 0.0) for axis in MASK])
-        how = views_open(self._camera.views, view, planned.window)
+        x_um, y_um = map(float, stands_um)
+        start = replace(self._placement, offset_x_um=x_um, offset_y_um=y_um)
+        return locate(board, self._mask, start, reach_um)
 
-        def stands(at_um: NDArray[np.float64]) -> tuple[tuple[float, float], int]:
-            x, y = centre_um + at_um
-            return (float(x), float(y)), shot % len(mask.cells)
-
-        def explained(at_um: NDArray[np.float64], every: int = 1) -> float:
-            some, seen_by = pixels[::every], channels[::every]
-            shown = self._shadow.readings(some, seen_by, how, *stands(at_um))
-            return _explained(read[::every], shown, seen_by)
-
-        few = max(1, len(read) // FEW_PIXELS)
-        at_um = max(starts_um, key=lambda one: explained(one, few))
-        chosen = [SCALARS.index(name) for name in fitted]
-        deviation_um = np.inf
-        for _ in range(ROUNDS):
-            now, slopes = self._shadow.with_slopes(pixels, channels, how, *stands(at_um))
-            step, deviation_um = _step(read, now, slopes[:, chosen], channels)
-            longest = float(np.abs(step[:2]).max())
-            step *= min(1.0, mask.cell_um / 4 / max(longest, 1e-12))
-            at_um = at_um + step[:2]
-            if len(chosen) > 2:
-                rest = np.zeros(slopes.shape[1])
-                rest[chosen[2:]] = step[2:]
-                self._shadow = Shadow(mask, self._shadow.placement.moved(rest))
-            if longest < ENOUGH_UM:
-                break
-        return (at_um, deviation_um) if explained(at_um) > LEAST_EXPLAINED else None
-
-
-def _around(place_um: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return places around one."""
-    steps = np.linspace(-SEARCHED_UM, SEARCHED_UM, SEARCH_STEPS)
-    return [place_um + np.array([x, y]) for x in steps for y in steps]
-
-
-def _by_channel(channels: NDArray[np.uint8], values: NDArray) -> NDArray[np.float64]:
-    """Return a column of values for each colour, 0 where a pixel sees another."""
-    return np.where(channels[:, None] == np.unique(channels), values[:, None], 0.0)
-
-
-def _explained(read: NDArray, modelled: NDArray, channels: NDArray[np.uint8]) -> float:
-    """Return the share of the pattern, brightness by colour taken out, that a model explains."""
-    flat = _by_channel(channels, np.ones(len(read)))
-    left = []
-    for columns in (flat, np.hstack([flat, _by_channel(channels, modelled)])):
-        fit = np.linalg.lstsq(columns, read, rcond=None)[0]
-        left.append(float(np.square(read - columns @ fit).sum()))
-    return 1 - left[1] / max(left[0], 1e-12)
-
-
-def _step(
-    read: NDArray, modelled: NDArray, slopes: NDArray, channels: NDArray[np.uint8]
-) -> tuple[NDArray[np.float64], float]:
-    """Return a step, and the deviation of its first two, the brightness of colours being free."""
-    bright = _by_channel(channels, modelled)
-    scale = np.linalg.lstsq(bright, read, rcond=None)[0]
-    columns = np.hstack([bright, ((bright > 0) @ scale)[:, None] * slopes])
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-    fit = np.linalg.lstsq(columns / size, read, rcond=None)[0] / size
-    left = read - columns @ fit
-    covariance = np.linalg.pinv((columns / size).T @ (columns / size)) * left.var()
-    first = bright.shape[1]
-    deviations = (np.sqrt(covariance.diagonal()) / size)[first : first + 2]
-    return np.asarray(fit[first:], np.float64), MISSED_ALIKE * float(deviations.max())
+    def _board(self, planned: PlannedFrame, frame: RawFrame) -> Board:
+        """Return the middle of a whiteboard's frame."""
+        assert self._mask is not None
+        middle = tuple(
+            slice(cut, side - cut) for cut, side in zip(self._cut, frame.mosaic.shape, strict=True)
+        )
+        bench, mosaic, black_dn = (
+            planned.bench,
+            frame.mosaic[middle],
+            frame.black_by_place()[middle],
+        )
+        opened = views_open(self._camera.views, planned.view, planned.window)
+        x_um, y_um = (bench.offsets_um.get(axis, 0.0) for axis in MASK)
+        channels = channels_of(self._layout, bench.shot)
+        opening = opened, (x_um, y_um), bench.shot
+        return frame_board(mosaic, black_dn, frame.white_level_dn, channels, opening)

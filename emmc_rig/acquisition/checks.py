@@ -1,12 +1,8 @@
-"""What a plan must pass before anything moves, and a frame before it counts.
-
-The checks look at some ten thousand pixels, and so take less than a millisecond.
-"""
+"""What a plan must pass before anything moves, and a frame before it counts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +13,8 @@ from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Checks
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.errors import AppError
-from emmc_rig.pages.frame_view import thinned, thinning_step
 from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
-
-BRIGHT_PERCENTILE = 99.9
-HOT_RATIO = 2.0
-"""Of a pixel over all eight of its colour around it. Where light is brighter than half of white, a
-hot pixel is not found by it: metering then exposes less and looks again."""
-LEAST_LIKENESS = 0.3
 
 
 class FrameRefusedError(DriverError):
@@ -37,42 +26,7 @@ class FrameRefusedError(DriverError):
 
 
 class SaturatedError(FrameRefusedError):
-    """A frame too bright for its exposure, which a second try at that exposure would be too."""
-
-
-def figures(frame: RawFrame) -> Figures:
-    """Return a frame's figures, from `thinned` pixels."""
-    frame = frame.with_one_black()
-    black = float(frame.black_level_dn.mean())
-    few = thinned(frame.mosaic)
-    counts = np.bincount(few.ravel())
-    total = counts.sum()
-    mean = float(counts @ np.arange(counts.size) / total)
-    median, likely_bright = np.searchsorted(np.cumsum(counts), np.array([0.5, 0.99]) * total)
-    lit = counts - np.bincount(_hot(frame.mosaic, few, likely_bright, black), minlength=counts.size)
-    bright = np.searchsorted(np.cumsum(lit), BRIGHT_PERCENTILE / 100 * lit.sum())
-    saturated = lit[frame.white_level_dn :].sum() / lit.sum()
-    return Figures(float(saturated), mean - black, float(bright) - black, float(median) - black)
-
-
-def _hot(
-    mosaic: NDArray[np.uint16], few: NDArray[np.uint16], least_dn: int, black: float
-) -> NDArray[np.uint16]:
-    """Return the values of hot pixels among a few: far brighter than all their neighbours.
-
-    few: see `thinned`. Neighbours are two pixels away, where most mosaics have the same colour, on
-    the diagonals all. Pixels below least_dn are not looked at.
-    """
-    step = thinning_step(mosaic)
-    places = np.argwhere(few >= least_dn)
-    values = few[tuple(places.T)]
-    around = []
-    for shift in product((-2, 0, 2), repeat=2):
-        if any(shift):
-            at = np.abs(places // 2 * 2 * step + places % 2 + shift)
-            at = np.minimum(at, 2 * (np.array(mosaic.shape) - 1) - at)  # mirrored at the edges
-            around.append(mosaic[tuple(at.T)])
-    return values[values - black > HOT_RATIO * np.maximum(np.max(around, axis=0) - black, 1.0)]
+    """A saturated frame: a second try at the same exposure would saturate, too."""
 
 
 def check(
@@ -87,7 +41,7 @@ def check(
 
     before: the mosaic of the frame before this one. may_saturate: a longer one of a bracket.
     """
-    span = max(1.0, frame.white_level_dn - float(frame.black_level_dn.mean()))
+    span = frame.span_dn
     if before is not None and is_same(frame.mosaic, before):
         raise FrameRefusedError(
             planned.id,
@@ -145,7 +99,7 @@ def refuse_impossible(rig: Rig, frames: Iterable[PlannedFrame]) -> None:
             if axis not in rig.hands | rig.left:
                 _refuse_place(rig, frame, axis, offset_um)
         exposure_s = frame.exposure_s
-        # A camera whose exposure cannot be chosen says for each frame what it is.
+        # A camera with a fixed exposure states it with each frame.
         chosen = exposures_s[0] < exposures_s[1]
         if chosen and exposure_s is not None and not within(exposure_s, exposures_s):
             raise AppError(

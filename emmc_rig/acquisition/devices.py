@@ -15,14 +15,16 @@ from typing import Any
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from drivers.stage import Stage, StageIdentity
-from emmc_rig.acquisition.checks import Figures, FrameRefusedError, figures
+from emmc_rig.acquisition.checks import FrameRefusedError
 from emmc_rig.acquisition.focus import FocusFound, focused, sharpness
-from emmc_rig.acquisition.metering import METERING_TRIES, better_metering_s
+from emmc_rig.acquisition.metering import METERABLE_LEVELS, METERING_TRIES
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.retries import Mending
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
 from emmc_rig.errors import AppError
+from emmc_rig.session.brightness import figures, level_of, next_exposure_s
+from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import wall_time
 
@@ -281,7 +283,8 @@ class Devices:
             high_s = min(high_s, self._plan.longest_s)
         for _ in range(METERING_TRIES):
             frame, found = self.snap(planned, exposure_s)
-            next_s = better_metering_s(frame, found, exposure_s, (low_s, high_s))
+            level = level_of(frame, found)
+            next_s = next_exposure_s(exposure_s, level, (low_s, high_s), METERABLE_LEVELS)
             if next_s is None:
                 break
             exposure_s = next_s

@@ -24,9 +24,10 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
+from emmc_rig.session.brightness import level_of
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
@@ -82,12 +83,11 @@ class EventWatcher(CaptureWatcher):
     def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
         """A frame passed its checks."""
         self._other.taken(planned, frame, found)
-        span_dn = max(1.0, frame.white_level_dn - float(frame.black_level_dn.mean()))
         self._emit(
             "frame.taken",
             **_named(planned),
             exposure_s=frame.exposure_s,
-            level=found.bright_dn / span_dn,
+            level=level_of(frame, found),
             saturated=found.saturated,
         )
 
@@ -140,7 +140,7 @@ class EventWatcher(CaptureWatcher):
         self._other.ended(session, outcome)
         reasons = exposure_reasons(shot_exposures(session))
         level = reasons[0].level if reasons else "trust"
-        self._emit("verdict", level=level, reasons=[asdict(one) for one in reasons])
+        self._emit("verdict", level=level, reasons=[asdict(reason) for reason in reasons])
         self._emit("end", **asdict(outcome), session=str(session.folder))
 
     def _emit(self, name: str, **facts: Any) -> None:

@@ -44,15 +44,15 @@ def sharpness(now: RawFrame, before: RawFrame) -> Sharpness | None:
     alike = (now.mosaic.shape, now.cfa, now.exposure_s)
     if alike != (before.mosaic.shape, before.cfa, before.exposure_s):
         return None
-    one, other = _plane(now), _plane(before)
-    noise = float(np.var(one - other, dtype=np.float64)) / 2
-    levels = float(one.mean(dtype=np.float64)), float(other.mean(dtype=np.float64))
-    surely_lit = CLEAR * np.sqrt(noise / one.size) + 0.5
+    plane, other = _plane(now), _plane(before)
+    noise = float(np.var(plane - other, dtype=np.float64)) / 2
+    levels = float(plane.mean(dtype=np.float64)), float(other.mean(dtype=np.float64))
+    surely_lit = CLEAR * np.sqrt(noise / plane.size) + 0.5
     if min(levels) <= surely_lit:
         return None
     energy, variance = 0.0, 0.0
     for axis in (0, 1):
-        first, second = np.diff(one, axis=axis), np.diff(other, axis=axis)
+        first, second = np.diff(plane, axis=axis), np.diff(other, axis=axis)
         product = float(np.vdot(first, second))
         spread = float(np.mean((first - second) ** 2, dtype=np.float64)) / 2
         energy += product / first.size
@@ -73,7 +73,7 @@ def _plane(frame: RawFrame) -> NDArray[np.float32]:
     for length in plane.shape:
         kept = min(length, LONGEST_PX)
         cuts.append(slice((length - kept) // 2, (length - kept) // 2 + kept))
-    return plane[tuple(cuts)].astype(np.float32) - np.float32(frame.black_level_dn.mean())
+    return plane[tuple(cuts)].astype(np.float32) - np.float32(frame.black_dn)
 
 
 class FocusMeter:
@@ -101,7 +101,7 @@ class FocusMeter:
         if found is None:
             return None
         seen.append((now_s, found))
-        best = max((one for _, one in seen), key=lambda one: one.value)
+        best = max((sharp for _, sharp in seen), key=lambda sharp: sharp.value)
         share = found.value / best.value
         relative = np.hypot(found.deviation / found.value, best.deviation / best.value)
         return {
@@ -147,12 +147,12 @@ def focused(
             if stopped():
                 raise _StoppedError
             stage.move_to_um({axis: float(place_um)})
-            one = sharpness()
-            if one is None:
+            sharp = sharpness()
+            if sharp is None:
                 found.append((-np.inf, np.inf))
             else:
-                found.append((np.log(one.value), one.deviation / one.value))
-        return np.array([one[0] for one in found]), np.array([one[1] for one in found])
+                found.append((np.log(sharp.value), sharp.deviation / sharp.value))
+        return np.array([value[0] for value in found]), np.array([value[1] for value in found])
 
     try:
         middle_um = begin_um

@@ -1,4 +1,4 @@
-"""From frames that meter to the exposures of those that follow: whiteboards, shots of the scene.
+"""Exposures of whiteboards and shots of the scene, from metering frames.
 
 A shot aims the brightest of its readings at a level. Where most of a scene is far darker than its
 brightest parts, longer exposures follow, each BRACKET_STEP times as long as the one before it,
@@ -13,15 +13,15 @@ import numpy as np
 
 from drivers.camera import Limits
 from drivers.errors import CameraSettingError
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Metering
+from emmc_rig.session.brightness import exposure_for_s
 from emmc_rig.session.journal import Figures, FrameEntry, MeteredEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
 METERING_TRIES = 8
-STEP = 4.0
-USABLE_LEVELS = (0.02, 0.95)
+METERABLE_LEVELS = (0.02, 0.95)
+"""Of white, of a frame from which other exposures follow."""
 BRACKET_STEP = 4.0
 """Two stops: the longer frame's shot noise is half, and still most of its readings are below white
 where the shorter one is too dark."""
@@ -29,18 +29,6 @@ MOST_STEPS = 2
 LARGEST_RANGE = 8.0
 """Of the brightest reading over the median, which one exposure is for. A reading sums many views
 through masks, so that most scenes stay below 4."""
-
-
-def better_metering_s(
-    frame: RawFrame, found: Figures, exposure_s: float, limits_s: Limits
-) -> float | None:
-    """Return a better exposure for a metering frame; None: this one will do, or none exists."""
-    level = found.bright_dn / (frame.white_level_dn - float(frame.black_level_dn.mean()))
-    low, high = USABLE_LEVELS
-    if low <= level <= high:
-        return None
-    next_s = exposure_s * (STEP if level < low else 1 / STEP)
-    return next_s if limits_s[0] <= next_s <= limits_s[1] else None
 
 
 def metered_exposure_s(metered: FrameEntry, level: float, light: float, limits_s: Limits) -> float:
@@ -54,14 +42,15 @@ def metered_exposure_s(metered: FrameEntry, level: float, light: float, limits_s
             "exposure", "cannot be metered, the board is dark: switch the lamp on"
         )
     low_s, high_s = limits_s
-    return min(max(metered.exposure_s * level / metered.level * light, low_s), high_s)
+    exposure_s = light * exposure_for_s(level, metered.exposure_s, metered.level)
+    return min(max(exposure_s, low_s), high_s)
 
 
 def first_meterings(session: Session) -> dict[str, FrameEntry]:
     """Return the first journal line of every metering frame.
 
-    The first counts even where its file is damaged by now: frames exposed by it are there, and
-    those still to come must be exposed alike.
+    The first counts even where its file is damaged by now: frames that follow are exposed like the
+    frames before.
     """
     ids = {frame.id for frame in session.frames if frame.kind == "metering"}
     found: dict[str, FrameEntry] = {}

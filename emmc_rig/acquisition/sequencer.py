@@ -27,14 +27,7 @@ from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.between import Between, HookError, plain
 from emmc_rig.acquisition.by_hand import HandPlaces, WrongPlaceError
-from emmc_rig.acquisition.checks import (
-    LEAST_LIKENESS,
-    Figures,
-    check,
-    figures,
-    is_same,
-    refuse_impossible,
-)
+from emmc_rig.acquisition.checks import check, is_same, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
 from emmc_rig.acquisition.estimate import known_exposures, pace_of
@@ -56,18 +49,20 @@ from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.acquisition.writer import Writer
 from emmc_rig.bench.environment import read_all
 from emmc_rig.bench.hardware import FOCUS, Rig
-from emmc_rig.bench.registration import Shift, registered
+from emmc_rig.bench.registration import LEAST_LIKENESS, Shift, registered
 from emmc_rig.errors import AppError, StopCapture
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import validated
+from emmc_rig.session.brightness import figures
 from emmc_rig.session.frame_file import decode_frame, frame_entry, frame_file
 from emmc_rig.session.journal import (
     ComparedEntry,
     CompleteEntry,
     DroppedEntry,
     Entry,
+    Figures,
     FilmEntry,
     FocusEntry,
     FrameEntry,

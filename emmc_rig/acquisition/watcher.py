@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import Figures
+from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
 
 if TYPE_CHECKING:

@@ -19,6 +19,8 @@ from emmc_rig.model.masks import cfa_tile
 
 SMOOTH_PX = 8.0
 """What varies more slowly than this is light, not edges."""
+LEAST_LIKENESS = 0.3
+"""Of two frames, below which their shift is not believed."""
 FURTHEST_REFINED_PX = 1.0
 MOST_STEPS, ENOUGH = 30, 1e-5
 

@@ -15,11 +15,12 @@ from rich.progress import Progress, TaskID
 from rich.text import Text
 
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.control import Control, pressed_keys
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.commands.output import columns
 from emmc_rig.files.results import shown_seconds
+from emmc_rig.session.brightness import level_of
+from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
 
 KEY_POLL_S = 0.1
@@ -97,9 +98,8 @@ class CaptureDisplay(CaptureWatcher):
         """Show how bright the frame is."""
         if self._live is None:
             return
-        span = max(1.0, frame.white_level_dn - float(frame.black_level_dn.mean()))
         self._line = Text(
-            f"{planned.id}: {frame.exposure_s or 0:g} s, brightest {found.bright_dn / span:.0%} of "
+            f"{planned.id}: {frame.exposure_s or 0:g} s, brightest {level_of(frame, found):.0%} of "
             f"white, saturated {found.saturated:.2%}"
         )
 

@@ -19,7 +19,6 @@ from emmc_rig.files.folders import new_file, refuse_inside_session
 if TYPE_CHECKING:
     from drivers.camera import Camera
     from drivers.raw import RawFrame
-    from emmc_rig.pages.frame_view import FrameFigures
 
 CameraSpec = Annotated[
     str,
@@ -70,7 +69,6 @@ def snap(
 ) -> None:
     """Take frames and save them as the camera's own files, with a PNG preview of each."""
     from emmc_rig.files.results import parse_seconds
-    from emmc_rig.pages.frame_view import frame_figures
 
     exposure_s = parse_seconds(exposure, "--exposure")
     with closing(open_camera(_chosen(camera, rig))) as device:
@@ -83,7 +81,7 @@ def snap(
                 with _followed(device, progress):
                     frame = device.snap()
                 saved.append(str(save_frame(folder, frame)))
-                tell(f"{saved[-1]}: {frame_line(frame, frame_figures(frame))}")
+                tell(f"{saved[-1]}: {frame_line(frame)}")
     give_result(out, saved=saved)
 
 
@@ -128,14 +126,17 @@ def choose(device: Camera, exposure_s: float | None, gain: float | None) -> None
         raise AppError(str(fault)) from fault
 
 
-def frame_line(frame: RawFrame, figures: FrameFigures) -> str:
+def frame_line(frame: RawFrame) -> str:
     """Return a frame's figures in one line."""
+    from emmc_rig.pages.frame_view import brightest
+    from emmc_rig.session.brightness import figures
+
     rows, columns = frame.mosaic.shape
     exposed = "" if frame.exposure_s is None else f", {frame.exposure_s:g} s"
-    brightest = ", ".join(f"{name} {level:.0%}" for name, level in figures.brightest.items())
+    levels = ", ".join(f"{name} {level:.0%}" for name, level in brightest(frame).items())
     return (
-        f"{rows}x{columns} {frame.cfa}{exposed}; brightest {brightest}; "
-        f"saturated {figures.saturated:.2%}"
+        f"{rows}x{columns} {frame.cfa}{exposed}; brightest {levels}; "
+        f"saturated {figures(frame).saturated:.2%}"
     )
 
 

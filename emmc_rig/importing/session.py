@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from drivers.camera import EXPOSURE_AGREEMENT
 from drivers.capture_order import capture_order
 from drivers.raw import RawFrame, captured_at
-from emmc_rig.acquisition.checks import BRIGHT_PERCENTILE, figures
 from emmc_rig.acquisition.expand import fittings, mask_offsets_um
 from emmc_rig.acquisition.plan import Checks, Plan, planned_camera
 from emmc_rig.bench.rig_config import IMPORTED
@@ -38,6 +37,7 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.settings import validated
+from emmc_rig.session.brightness import BRIGHT_PERCENTILE, figures
 from emmc_rig.session.frame_file import frame_entry, frame_file
 from emmc_rig.session.journal import CompleteEntry, ImportedEntry, RunEntry
 from emmc_rig.session.lock import held

@@ -31,7 +31,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats.format import Export
 from emmc_rig.files.scales import open_scale
-from emmc_rig.live.alignment import is_dark
 from emmc_rig.live.server import Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames, even_frames
@@ -39,6 +38,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.pages.display import PART_PIXELS
 from emmc_rig.pages.viewer import viewer_data
+from emmc_rig.session.brightness import is_dark
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.session import Session
 from reconstruction.adaptive.film import Film

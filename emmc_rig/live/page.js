@@ -104,7 +104,7 @@ function drawNext(hinted) {
 const DIM = 0.05;
 function drawWhy() {
   const { figures, hint, trouble } = state, gone = lostSince ? "no connection" : trouble.camera;
-  const level = figures ? Math.max(...Object.values(figures.brightest)) : 0;
+  const level = figures ? figures.level : 0;
   const what = !figures ? "" : figures.dark ? "Black" : level < DIM && !view.bright ? "Almost black" : "";
   const reason = hint?.text || "Looking for the reason.";
   write("why", gone ? `${state.frame ? "Not live, this is the last frame" : "No picture"}: ${gone}. Trying again every second.`

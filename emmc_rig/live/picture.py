@@ -67,8 +67,7 @@ def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
     frame = frame.with_one_black()
     rows, columns = window(view, frame.mosaic.shape)
     mosaic = frame.mosaic[rows, columns]
-    black = float(frame.black_level_dn.mean())
-    span = max(1.0, frame.white_level_dn - black)
+    black, span = frame.black_dn, frame.span_dn
     step = -(-max(mosaic.shape) // (2 * view.px))
     if step > 1 or max(mosaic.shape) >= 2 * view.px:
         mixing = _mixing(frame.cfa if view.kind == "colour" else "")

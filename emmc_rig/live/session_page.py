@@ -12,7 +12,6 @@ import numpy as np
 from calibration.errors import CalibrationError
 from calibration.scale import Scale
 from drivers.raw import RawFrame
-from emmc_rig.acquisition.checks import Figures
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.events import Event, EventWatcher
 from emmc_rig.acquisition.until import METHOD, light_field_so_far
@@ -25,6 +24,7 @@ from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.pages.session_sheet import HEADINGS, small_jpeg, stored_jpeg
+from emmc_rig.session.journal import Figures
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session

@@ -10,12 +10,13 @@ from typing import Any
 from emmc_rig.bench.hands import APERTURE, MASK
 from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.live.save import Found
+from emmc_rig.session.brightness import (
+    GOOD_LEVELS,
+    OVEREXPOSED,
+    exposure_for_s,
+    is_well_exposed,
+)
 
-WANTED_LEVELS = (0.7, 0.9)
-"""Of white, where the brightest readings come."""
-WANTED_LEVEL = 0.8
-LOW_LEVEL = 0.35
-"""Of white, from which on an exposure will do."""
 LONGEST_UNASKED_S = 4.0
 """Exposure of one frame that an automatic exposure takes without being asked for more."""
 AWAY_UM = 5.0
@@ -34,12 +35,12 @@ NEEDS = {
     "focus": "on the scene, where it will be captured",
     "save": "what was found in the plan and the rig",
 }
-"""Of every step, in the words that follow its name, what it needs to be done."""
+"""Condition of every step, in words that follow its name."""
 
 
 @dataclass(frozen=True)
 class Saving:
-    """What can be saved, and the files that were written."""
+    """Kinds of files that can be saved, and the files that were written."""
 
     takes: Sequence[str] = ()
     written: Sequence[str] = ()
@@ -54,7 +55,7 @@ def steps(
     saving: Saving,
     hint: Mapping[str, Any] | None,
 ) -> list[dict[str, Any]]:
-    """Return by step its name, what it needs, whether it is done, what was found, and its action.
+    """Return name, condition, state, text and action of every step.
 
     figures, mask: of the page's state. off_um: by axis, how far it stands from where it centres the
     mask or opens the aperture; None: not homed. axes: of the stage. hint: what to do next.
@@ -82,10 +83,10 @@ def _save(saving: Saving) -> dict[str, Any]:
 def _exposure(figures: Mapping[str, Any] | None, hint: Mapping[str, Any] | None) -> dict[str, Any]:
     if figures is None:
         return {"name": "exposure", "done": False, "text": "no frame yet", "action": ""}
-    level, saturated = max(figures["brightest"].values()), figures["saturated"]
-    done = level >= LOW_LEVEL and saturated <= 0.001
+    level, saturated = figures["level"], figures["saturated"]
+    done = is_well_exposed(level, saturated)
     text = f"the brightest readings reach {100 * level:.0f} % of white"
-    if saturated > 0.001:
+    if saturated > OVEREXPOSED:
         text += f", {100 * saturated:.1f} % are saturated"
     step = {"name": "exposure", "done": done, "text": text, "action": "" if done else "autoexpose"}
     if hint is not None and hint["action"] == "centre":
@@ -96,12 +97,12 @@ def _exposure(figures: Mapping[str, Any] | None, hint: Mapping[str, Any] | None)
 
 
 def exposure_hint(level: float, exposure_s: float, longest_s: float) -> dict[str, Any]:
-    """Return what to do about a picture that is not dark, and too dim to go on with.
+    """Return the hint for a picture that is underexposed, but not dark.
 
     level: its brightest reading, of white. longest_s: that the camera offers.
     """
     text = f"The brightest reading is {100 * level:.1f} % of white"
-    needed_s = exposure_s * WANTED_LEVEL / level
+    needed_s = exposure_for_s(sum(GOOD_LEVELS) / 2, exposure_s, level)
     if needed_s <= LONGEST_UNASKED_S:
         return {"text": f"{text}.", "action": "autoexpose"}
     text += f": {needed_s:.2g} s are needed"

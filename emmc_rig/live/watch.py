@@ -1,8 +1,8 @@
 """The camera behind the page, and all that is worked out of its frames: always of the newest.
 
 The camera's thread takes frame after frame while somebody looks; wishes (exposure, gain) are
-carried out between two frames. What is worked out has threads of its own, which take the newest
-frame and leave out those that came meanwhile, so that nothing slow holds up what is quick.
+carried out between two frames. Levels, mask and light field have a thread each, which takes the
+newest frame and skips frames that came meanwhile: a slow thread delays no quick one.
 """
 
 from __future__ import annotations
@@ -24,26 +24,34 @@ from drivers.raw import RawFrame
 from drivers.stage import Stage
 from emmc_rig.acquisition.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.bench.hardware import FOCUS
-from emmc_rig.bench.registration import registered
+from emmc_rig.bench.registration import LEAST_LIKENESS, registered
 from emmc_rig.errors import AppError
-from emmc_rig.live.alignment import MaskGauge, is_dark
+from emmc_rig.live.alignment import MaskGauge
 from emmc_rig.live.driving import Driving
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.save import Files, Found
 from emmc_rig.live.steps import (
     AWAY_UM,
     LONGEST_UNASKED_S,
-    LOW_LEVEL,
     NO_FOCUS,
-    WANTED_LEVEL,
-    WANTED_LEVELS,
     Saving,
     exposure_hint,
     steps,
 )
 from emmc_rig.model.camera import Camera as Design
 from emmc_rig.model.errors import CameraError
-from emmc_rig.pages.frame_view import frame_figures, histogram, thinned
+from emmc_rig.pages.frame_view import brightest, histogram
+from emmc_rig.session.brightness import (
+    GOOD_LEVELS,
+    OVEREXPOSED,
+    UNDEREXPOSED,
+    figures,
+    is_dark,
+    is_well_exposed,
+    level_of,
+    next_exposure_s,
+    thinned,
+)
 
 IDLE_S = 10.0
 """Without anybody who asks for this long, no frame is taken."""
@@ -54,10 +62,8 @@ POLL_S = 0.2
 PATIENCE_S = 10.0
 """For the threads to end. A move under way is stopped first."""
 LEVEL_PIXELS = 1 << 18
-"""Of a frame, evenly spread, for its histogram; saturated ones are counted in all."""
+"""Of a frame, evenly spread, for its histogram."""
 SHIFT_PX = 1024
-LEAST_LIKENESS = 0.3
-"""Of a frame and the reference, below which their shift is not shown."""
 SEEK_S = 10.0
 """Between two searches for a mask that is not seen while nothing changes: each takes seconds."""
 DARK = "the picture is dark"
@@ -66,7 +72,7 @@ AT_SHOT_UM = 2.0
 LONG_S = 1.0
 """An exposure that takes longer is counted down, and broken off for what is set meanwhile."""
 COUNT_S = 0.5
-EXPOSURE_TRIES, LARGEST_STEP = 8, 16.0
+EXPOSURE_TRIES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +220,7 @@ class Watch:
         self._wishes.put(lambda: self._camera.set_gain(gain))
 
     def auto_expose(self, longest_s: float = LONGEST_UNASKED_S) -> None:
-        """Let exposures follow until the brightest thousandth lies at WANTED_LEVEL of white.
+        """Let exposures follow until the brightest thousandth lies within GOOD_LEVELS.
 
         None of them takes more than `longest_s`; a picture that stays dark is not exposed on.
         """
@@ -425,7 +431,7 @@ class Watch:
         if figures is None or figures["moves"] is None or figures["moves"] != self._moved():
             return None
         away = self._away()
-        level = max(figures["brightest"].values())
+        level = figures["level"]
         if figures["dark"] and away:
             return {
                 "text": f"The picture is dark: {', '.join(away)} away from the centre.",
@@ -436,9 +442,9 @@ class Watch:
                 "text": "The picture is dark: switch the lamp on, open the aperture.",
                 "action": "",
             }
-        if figures["saturated"] > 0.001:
+        if figures["saturated"] > OVEREXPOSED:
             return {"text": "Part of the picture is saturated.", "action": "autoexpose"}
-        if level < WANTED_LEVELS[0] / 4:
+        if level < UNDEREXPOSED:
             exposure_s = figures["exposure_s"] or self._exposure_s
             longest_s = self._state["settings"]["exposure_limits_s"][1]
             return exposure_hint(level, exposure_s, longest_s)
@@ -558,18 +564,19 @@ class Watch:
             return None if self._ending.is_set() else self._shown
 
     def _show_levels(self, newest: Shown) -> None:
-        frame = newest.frame
+        frame, dark = newest.frame, is_dark(newest.frame)
         some = replace(frame, mosaic=thinned(frame.mosaic, LEVEL_PIXELS))
-        figures = frame_figures(some)
-        saturated = np.count_nonzero(frame.mosaic >= frame.white_level_dn) / frame.mosaic.size
+        found = figures(frame)
+        level = level_of(frame, found)
         with self._news:
             reference = self._reference
         self._publish(
             figures={
                 "frame": newest.number,
-                "brightest": figures.brightest,
-                "saturated": float(saturated),
-                "dark": is_dark(frame),
+                "level": level,
+                "brightest": brightest(some),
+                "saturated": found.saturated,
+                "dark": dark,
                 "moves": newest.moves,
                 "histogram": {name: row.tolist() for name, row in histogram(some).items()},
                 "focus": self._focus.add(frame, time.monotonic()),
@@ -577,46 +584,41 @@ class Watch:
                 "exposure_s": frame.exposure_s,
             }
         )
-        level, dark = max(figures.brightest.values()), is_dark(frame)
         if self._exposing and newest.moves is not None:
-            self._expose_better(frame, level, float(saturated), dark)
-        elif not dark and level >= LOW_LEVEL and saturated <= 0.001:
+            self._expose_better(frame, level, dark)
+        elif not dark and is_well_exposed(level, found.saturated):
             self._forget_unexposed()
 
     def _give_up_exposing(self, why: str) -> None:
         self._exposing, self._unexposed = 0, why
         self._publish(setting=why)
 
-    def _expose_better(self, frame: RawFrame, level: float, saturated: float, dark: bool) -> None:
+    def _expose_better(self, frame: RawFrame, level: float, dark: bool) -> None:
         """Choose the next exposure by a frame that was taken at the present one."""
-        settings, exposure_s = self._state["settings"], self._exposure_s
+        exposure_s = self._exposure_s
         if frame.exposure_s and abs(frame.exposure_s / exposure_s - 1) > 0.05:
             return
         if dark and (away := self._away()):
             where = f"{', '.join(away)} away from the centre"
             self._give_up_exposing(f"{DARK}, {where}: centre the mask first")
             return
-        low, high = WANTED_LEVELS
         self._exposing -= 1
-        if low <= level <= high and not saturated:
+        shortest_s, longest_s = self._state["settings"]["exposure_limits_s"]
+        limits_s = shortest_s, min(longest_s, self._longest_s)
+        next_s = next_exposure_s(exposure_s, level, limits_s)
+        if next_s is not None:
+            self._wishes.put(lambda: self._camera.set_exposure_s(next_s))
+        elif GOOD_LEVELS[0] <= level <= GOOD_LEVELS[1]:
             self._exposing = 0
-            return
-        factor = 1 / LARGEST_STEP if level >= 1 else WANTED_LEVEL / max(level, 1e-6)
-        factor = min(max(factor, 1 / LARGEST_STEP), LARGEST_STEP)
-        shortest_s, longest_s = settings["exposure_limits_s"]
-        chosen_s = min(max(exposure_s * factor, shortest_s), longest_s, self._longest_s)
-        if abs(chosen_s / exposure_s - 1) < 0.01:
-            if dark:
-                why = f"dark at {exposure_s:g} s too: switch the lamp on, open the aperture"
-            elif chosen_s > 0.99 * self._longest_s and chosen_s < 0.99 * longest_s:
-                why = ""  # the hint says how long an exposure is needed
-            else:
-                why = f"no better exposure within {shortest_s:g} to {longest_s:g} s"
-            self._give_up_exposing(why)
-            if dark:
-                self._wishes.put(lambda: self._camera.set_exposure_s(self._dimmest_s))
-            return
-        self._wishes.put(lambda: self._camera.set_exposure_s(chosen_s))
+        elif dark:
+            self._give_up_exposing(
+                f"dark at {exposure_s:g} s too: switch the lamp on, open the aperture"
+            )
+            self._wishes.put(lambda: self._camera.set_exposure_s(self._dimmest_s))
+        elif 0.99 * limits_s[1] < exposure_s < 0.99 * longest_s:
+            self._give_up_exposing("")  # the hint says how long an exposure is needed
+        else:
+            self._give_up_exposing(f"no better exposure within {shortest_s:g} to {longest_s:g} s")
 
     def _show_mask(self, newest: Shown) -> None:
         assert self._design is not None

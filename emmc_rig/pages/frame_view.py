@@ -1,8 +1,7 @@
-"""Views of a frame: figures, a histogram, and a preview."""
+"""Views of a frame: its levels by colour, a histogram, and a preview."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import cv2
@@ -11,12 +10,12 @@ from numpy.typing import NDArray
 
 from drivers.raw import RawFrame
 from emmc_rig.model.srgb import codes_of, srgb_of
+from emmc_rig.session.brightness import BRIGHT_PERCENTILE
 
 BAYER = ("rggb", "bggr", "grbg", "gbrg")
 LETTERS = {"r": "red", "g": "green", "b": "blue"}
 BINS = 64
 LONGEST_PREVIEW_PX = 1600
-SAMPLED_PIXELS = 1 << 16
 
 Array = NDArray[np.floating]
 
@@ -35,33 +34,18 @@ def colour_planes(frame: RawFrame) -> dict[str, list[NDArray[np.uint16]]]:
     return planes
 
 
-@dataclass(frozen=True)
-class FrameFigures:
-    """Of one frame: per colour the level of its 99.9th percentile, 1 at white; and the whole's.
-
-    saturated: share of pixels at the white level.
-    """
-
-    brightest: dict[str, float]
-    saturated: float
-
-
-def frame_figures(frame: RawFrame) -> FrameFigures:
-    """Return the figures of a frame."""
-    black = float(frame.black_level_dn.mean())
-    span = max(1.0, frame.white_level_dn - black)
-    planes = colour_planes(frame)
-    brightest = {
-        name: max((float(np.percentile(plane, 99.9)) - black) / span for plane in parts)
-        for name, parts in planes.items()
+def brightest(frame: RawFrame) -> dict[str, float]:
+    """Return the level of every colour's 99.9th percentile, 1 at white."""
+    return {
+        name: max(float(np.percentile(part, BRIGHT_PERCENTILE)) - frame.black_dn for part in parts)
+        / frame.span_dn
+        for name, parts in colour_planes(frame).items()
     }
-    saturated = float(np.mean(frame.mosaic >= frame.white_level_dn))
-    return FrameFigures(brightest, saturated)
 
 
 def histogram(frame: RawFrame, bins: int = BINS) -> dict[str, NDArray[np.int64]]:
     """Return how many pixels of each colour lie in `bins` steps from black to white."""
-    black = float(frame.black_level_dn.mean())
+    black = frame.black_dn
     limits = (black, max(black + 1, frame.white_level_dn + 1))
     return {
         name: np.sum([np.histogram(part, bins, limits)[0] for part in parts], axis=0)
@@ -81,9 +65,9 @@ def white_balance(whiteboard: RawFrame) -> Balance:
     planes = colour_planes(whiteboard)
     if "grey" in planes:
         return AS_READ
-    black = float(whiteboard.black_level_dn.mean())
     light = {
-        name: float(np.mean([part.mean() for part in planes[name]])) - black for name in planes
+        name: float(np.mean([part.mean() for part in planes[name]])) - whiteboard.black_dn
+        for name in planes
     }
     blue, red = (
         float(light["green"] / light[one]) if light[one] > 0 else 1.0 for one in ("blue", "red")
@@ -109,8 +93,7 @@ def preview(frame: RawFrame, balance: Balance = AS_READ) -> NDArray[np.uint8]:
             ],
             axis=-1,
         )
-    black = float(frame.black_level_dn.mean())
-    linear = (linear - black) / max(1.0, frame.white_level_dn - black)
+    linear = (linear - frame.black_dn) / frame.span_dn
     linear = np.clip(linear * np.asarray(balance if linear.ndim == 3 else 1, np.float32), 0, 1)
     scale = LONGEST_PREVIEW_PX / max(linear.shape[:2])
     if scale < 1:
@@ -129,18 +112,3 @@ def srgb_codes(linear: Array) -> NDArray[np.uint8]:
 @cache
 def _display_codes() -> NDArray[np.uint8]:
     return codes_of(srgb_of(np.linspace(0, 1, 1 << 16, dtype=np.float32)))
-
-
-def thinning_step(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> int:
-    """Return how many 2x2 tiles apart those are that `thinned` takes."""
-    return max(1, int(np.sqrt(mosaic.size / pixels)))
-
-
-def thinned(mosaic: NDArray[np.uint16], pixels: int = SAMPLED_PIXELS) -> NDArray[np.uint16]:
-    """Return a subset of a mosaic's pixels: whole 2x2 tiles, evenly spread."""
-    step = thinning_step(mosaic, pixels)
-    if step == 1:
-        return mosaic
-    rows, columns = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
-    tiles = mosaic[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)[::step, :, ::step]
-    return tiles.reshape(2 * tiles.shape[0], 2 * tiles.shape[2])

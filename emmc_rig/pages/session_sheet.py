@@ -19,7 +19,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import shown_bytes, write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.frame_view import AS_READ, Balance, preview, thinned, white_balance
+from emmc_rig.pages.frame_view import AS_READ, Balance, preview, white_balance
 from emmc_rig.pages.page import (
     Card,
     Head,
@@ -30,7 +30,8 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.session.exposure import GOOD_LEVEL, exposure_reasons, shot_exposures
+from emmc_rig.session.brightness import GOOD_LEVELS, thinned
+from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import DecidedEntry, FrameEntry, RetryEntry, ended, of_kind
 from emmc_rig.session.listing import reconstructed
@@ -206,7 +207,7 @@ def _exposure_cards(session: Session) -> list[Card]:
         return []
     levels = [one.level for one in shots]
     reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
-    note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVEL:.0%}"
+    note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVELS[0]:.0%}"
     tone = "watch" if exposure_reasons(shots) else "good"
     return [Card("Exposure", reached, note, tone)]
 

@@ -8,18 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calibration.frames import DARK_ELECTRONS_PER_S, dark_current_known
+from emmc_rig.session.brightness import (
+    GOOD_LEVELS,
+    OVEREXPOSED,
+    UNDEREXPOSED,
+    exposure_for_s,
+)
 from emmc_rig.session.journal import FrameEntry
 from emmc_rig.session.session import Session
 from reconstruction.verdict.rules import Reason
 
-GOOD_LEVEL = 0.7
-"""Of white, as metering aims by default: what exposures are compared with."""
-UNDEREXPOSED = 0.25
-"""Of white: 4.5 dB of the readings' noise are given away below it. A camera of full stops comes to
-half of what metering aims at."""
-OVEREXPOSED = 0.001
-"""Share of the readings that are saturated by every exposure: the rest of 99.9 %, by which frames
-are metered."""
 DARK_SHARE = 0.005
 """Of the brightest reading: twice what a good calibration is off by."""
 
@@ -40,7 +38,7 @@ class ShotExposure:
     @property
     def factor(self) -> float:
         """By how much longer it could have been exposed; 1 or more."""
-        return max(1.0, GOOD_LEVEL / max(self.level, 1e-4))
+        return max(1.0, exposure_for_s(GOOD_LEVELS[0], 1.0, self.level))
 
 
 def shot_exposures(session: Session) -> list[ShotExposure]:
@@ -59,8 +57,8 @@ def shot_exposures(session: Session) -> list[ShotExposure]:
     return [
         ShotExposure(
             shot,
-            max(one.level for one in entries),
-            min(one.figures.saturated for one in entries),
+            max(entry.level for entry in entries),
+            min(entry.figures.saturated for entry in entries),
             _dark_share(entries, darks_s, gain),
         )
         for shot, entries in sorted(frames.items())
@@ -69,7 +67,7 @@ def shot_exposures(session: Session) -> list[ShotExposure]:
 
 def _dark_share(entries: Sequence[FrameEntry], darks_s: Sequence[float], gain: float) -> float:
     """Return `ShotExposure.dark_share`; gain: DN per electron. 0 without any dark."""
-    longest = max(entries, key=lambda one: one.exposure_s)
+    longest = max(entries, key=lambda entry: entry.exposure_s)
     exposure_s = longest.exposure_s
     if not darks_s or dark_current_known(darks_s, exposure_s):
         return 0.0
@@ -80,9 +78,9 @@ def _dark_share(entries: Sequence[FrameEntry], darks_s: Sequence[float], gain: f
 def exposure_reasons(shots: Sequence[ShotExposure]) -> list[Reason]:
     """Return what speaks against the exposures of shots; nothing for good ones."""
     found = []
-    dark = [one for one in shots if one.level < UNDEREXPOSED]
+    dark = [shot for shot in shots if shot.level < UNDEREXPOSED]
     if dark:
-        worst = min(dark, key=lambda one: one.level)
+        worst = min(dark, key=lambda shot: shot.level)
         quieter_db = 10 * math.log10(worst.factor)
         found.append(
             Reason(
@@ -93,9 +91,9 @@ def exposure_reasons(shots: Sequence[ShotExposure]) -> list[Reason]:
                 "doubt",
             )
         )
-    bright = [one for one in shots if one.saturated > OVEREXPOSED]
+    bright = [shot for shot in shots if shot.saturated > OVEREXPOSED]
     if bright:
-        worst = max(bright, key=lambda one: one.saturated)
+        worst = max(bright, key=lambda shot: shot.saturated)
         found.append(
             Reason(
                 f"{worst.saturated:.1%} of the readings of {_shots(worst, bright)} are saturated "
@@ -105,9 +103,9 @@ def exposure_reasons(shots: Sequence[ShotExposure]) -> list[Reason]:
                 "doubt",
             )
         )
-    unknown = [one for one in shots if one.dark_share > DARK_SHARE]
+    unknown = [shot for shot in shots if shot.dark_share > DARK_SHARE]
     if unknown:
-        worst = max(unknown, key=lambda one: one.dark_share)
+        worst = max(unknown, key=lambda shot: shot.dark_share)
         found.append(
             Reason(
                 f"no dark frame is exposed as long as {_shots(worst, unknown)}: an unseen dark "

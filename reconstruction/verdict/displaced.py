@@ -132,17 +132,19 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced:
     for name, cause in (*_of_readings(psi, found), *others):
         fit = _regressed([cause, *shifts], found.seen - found.masks, found.weight)
         if fit is not None and not (name in changes and changes[name].gain > fit.gain):
-            changes[name] = Change(float(fit.values[0]), float(fit.deviations[0]), fit.gain)
-    tiled = None if design is None else _tiled(found, *design.shifts)
-    if design is None or tiled is None:
+            (value, *_), (deviation, *_) = fit.values[0], fit.deviations[0]
+            changes[name] = Change(float(value), float(deviation), fit.gain)
+    if design is None or (tiled := _tiled(found, *design.shifts)) is None:
         return Displaced(None, None, changes)
-    placebo = [
-        one.beyond
-        for one in (_tiled(found, *moved) for moved in _decoys(*design.shifts, found.good))
-        if one is not None
-    ]
-    beyond = tiled.beyond - (float(np.mean(placebo)) if placebo else 0.0)
-    return Displaced(tiled.mean, float(np.sqrt(max(beyond, 0))), changes)
+    decoys = (_tiled(found, *moved) for moved in _decoys(*design.shifts, found.good))
+    placebo = [decoy.excess for decoy in decoys if decoy is not None]
+    excess = tiled.excess - (float(np.mean(placebo)) if placebo else 0.0)
+    return Displaced(tiled.mean_shift, float(np.sqrt(max(excess, 0))), changes)
+
+
+def _tiled(found: Relief, shift_y: Array, shift_x: Array) -> _Regression | None:
+    """Return the shifts that each tile's readings ask for, None where no tile determines any."""
+    return _regressed([found.masks, shift_y, shift_x], found.seen, found.weight, tiles=True)
 
 
 def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
@@ -169,7 +171,7 @@ def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
     except ModelError:
         return None
     both = own[good], found.masks[good]
-    norms = [float(np.sqrt(np.mean(np.square(one)))) for one in both]
+    norms = [float(np.sqrt(np.mean(np.square(relief)))) for relief in both]
     if min(norms) < LEAST_RELIEF or float(np.mean(both[0] * both[1])) < ALIKE * norms[0] * norms[1]:
         return None
     darker = relief_of(psi, _vignetted(psi, VIGNETTING_STEP), found.picture)[1]
@@ -207,60 +209,69 @@ def _blurs(psi: ImagingMatrix, found: Relief) -> Iterator[tuple[str, Array]]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Tiled:
-    """shifts, errors: (tile, 2), by which the shadow lies off (y, x), and deviations. beyond: mean
-    square of the shifts, y and x added, less what the deviations make."""
+class _Regression:
+    """Of the tiles that determine it: values and deviations of the base, (tile, term).
 
-    shifts: NDArray[np.float64]
-    errors: NDArray[np.float64]
+    gain: fall of the mean weighted square.
+    """
+
+    values: NDArray[np.float64]
+    deviations: NDArray[np.float64]
+    gain: float
 
     @property
-    def mean(self) -> tuple[float, float]:
-        y, x = np.average(self.shifts, axis=0, weights=1 / np.square(self.errors))
+    def mean_shift(self) -> tuple[float, float]:
+        """Weighted mean over the tiles of the last two terms, the shifts (y, x)."""
+        shifts, weights = self.values[:, -2:], 1 / np.square(self.deviations[:, -2:])
+        y, x = np.average(shifts, axis=0, weights=weights)
         return float(y), float(x)
 
     @property
-    def beyond(self) -> float:
-        squares = np.square(self.shifts) - np.square(self.errors)
-        return float(np.average(squares, axis=0, weights=1 / np.square(self.errors)).sum())
+    def excess(self) -> float:
+        """Mean square of the shifts, y and x added, less what the deviations make."""
+        shifts, errors = self.values[:, -2:], self.deviations[:, -2:]
+        squares = np.square(shifts) - np.square(errors)
+        return float(np.average(squares, axis=0, weights=1 / np.square(errors)).sum())
 
 
-def _tiled(found: Relief, shift_y: Array, shift_x: Array) -> _Tiled | None:
-    """Return the shifts that each tile's readings ask for, None where no tile determines any.
+def _regressed(
+    base: Sequence[Array], seen: Array, weight: Array, tiles: bool = False
+) -> _Regression | None:
+    """Return the weighted regression of the observed on the base, tile by tile.
 
-    The regression of `_regressed`, of all tiles at once.
+    tiles: of about TILE_PX; else the picture is one. None where no tile determines it.
     """
-    rows, columns = (tile_edges(length) for length in found.good.shape[1:])
-    weight = found.weight.astype(np.float64)
-    base = [one.astype(np.float64) for one in (found.masks, shift_y, shift_x)]
+    shape = weight.shape[1:]
+    rows, columns = (tile_edges(n) if tiles else np.array([0, n]) for n in shape)
+    weight = weight.astype(np.float64)
+    base = [term.astype(np.float64) for term in base]
 
     def summed(values: NDArray) -> NDArray:
         by_rows = np.add.reduceat(values.sum(axis=0), rows[:-1], axis=0)
         return np.add.reduceat(by_rows, columns[:-1], axis=1).ravel()
 
-    def products(columns_: Sequence[Array], others: Sequence[Array]) -> Array:
-        sums = [[summed(one * other) for other in others] for one in columns_]
+    def products(terms: Sequence[Array], others: Sequence[Array]) -> Array:
+        sums = [[summed(term * other) for other in others] for term in terms]
         return np.moveaxis(np.array(sums), 2, 0)
 
-    weighted = [weight * one for one in base]
+    weighted = [weight * term for term in base]
     matrix = products(weighted, base)
-    enough = summed(weight > 0) >= FEWEST * len(base)
-    known = np.flatnonzero(enough)
+    known = np.flatnonzero(summed(weight > 0) >= FEWEST * len(base))
     known = known[np.linalg.cond(matrix[known]) <= MOST_CONDITION]
     if not known.size:
         return None
     inverse = np.zeros_like(matrix)
     inverse[known] = np.linalg.inv(matrix[known])
-    values = (inverse @ products(weighted, [found.seen]))[..., 0]
-    left = found.seen.astype(np.float64)
-    shape = len(rows) - 1, len(columns) - 1
-    for one, of_tiles in zip(base, values.T, strict=True):
-        everywhere = of_tiles.reshape(shape).repeat(np.diff(rows), 0).repeat(np.diff(columns), 1)
-        left -= one * everywhere
-    scores = [one * left for one in weighted]
+    values = (inverse @ products(weighted, [seen]))[..., 0]
+    left = seen.astype(np.float64)
+    for term, of_tiles in zip(base, values.T, strict=True):
+        by_tile = of_tiles.reshape(len(rows) - 1, len(columns) - 1)
+        left -= term * by_tile.repeat(np.diff(rows), 0).repeat(np.diff(columns), 1)
+    scores = [term * left for term in weighted]
     spread = inverse @ products(scores, scores) @ inverse
     errors = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
-    return _Tiled(values[known, 1:], errors[known, 1:])
+    gain = float((weight * (np.square(seen, dtype=np.float64) - left**2))[weight > 0].mean())
+    return _Regression(values[known], errors[known], gain)
 
 
 def _decoys(
@@ -274,9 +285,9 @@ def _decoys(
             yield moved
 
 
-def _correlation(one: Array, other: Array) -> float:
+def _correlation(own: Array, other: Array) -> float:
     """Return that of two arrays around 0, its size alone."""
-    products = np.mean(one * other), np.mean(np.square(one)) * np.mean(np.square(other))
+    products = np.mean(own * other), np.mean(np.square(own)) * np.mean(np.square(other))
     return abs(float(products[0])) / max(float(np.sqrt(products[1])), 1e-12)
 
 
@@ -290,31 +301,3 @@ def _vignetted(psi: ImagingMatrix, lost: float) -> Array:
     for v, u in np.ndindex(psi.views):
         total += passed[v, u] * psi.weights[:, v, u]
     return total
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """values, deviations: of the base's. gain: fall of the mean weighted square."""
-
-    values: NDArray[np.float64]
-    deviations: NDArray[np.float64]
-    gain: float
-
-
-def _regressed(base: Sequence[Array], seen: Array, weight: Array) -> _Fit | None:
-    """Return the weighted regression of the observed on the base; None where it is undetermined."""
-    good = weight > 0
-    if good.sum() < FEWEST * len(base):
-        return None
-    columns = np.stack([one[good] for one in base], axis=1).astype(np.float64)
-    weights, values = weight[good].astype(np.float64), seen[good].astype(np.float64)
-    matrix = columns.T @ (columns * weights[:, None])
-    if np.linalg.cond(matrix) > MOST_CONDITION:
-        return None
-    inverse = np.linalg.inv(matrix)
-    found = inverse @ (columns.T @ (weights * values))
-    left = values - columns @ found
-    scores = columns * (weights * left)[:, None]
-    spread = np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse))
-    gain = float(np.mean(weights * (values**2 - left**2)))
-    return _Fit(found, spread, gain)

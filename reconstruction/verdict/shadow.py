@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.local_mean import local_mean
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import smooth_guess
 
@@ -62,15 +62,8 @@ def channels(psi: ImagingMatrix) -> NDArray[np.int64]:
 
 def averaged(values: Array, good: NDArray, filters: NDArray[np.int64], deviation: float) -> Array:
     """Return the mean of the good pixels about each, among those with its filter; shots apart."""
-    found = np.zeros(values.shape, dtype=np.float32)
-    for shot in range(len(values)):
-        for one in np.unique(filters[shot]):
-            mine = filters[shot] == one
-            use = (mine & good[shot]).astype(np.float32)
-            top = cv2.GaussianBlur(use * values[shot].astype(np.float32), (0, 0), deviation)
-            bottom = cv2.GaussianBlur(use, (0, 0), deviation)
-            found[shot][mine] = (top / np.maximum(bottom, 1e-6))[mine]
-    return found
+    planes = zip(values, good, filters, strict=True)
+    return np.stack([local_mean(*plane, deviation) for plane in planes])
 
 
 def relief_of(

@@ -18,7 +18,7 @@ from simulated_disk import SimulatedDisk
 from drivers.dng import encode_dng
 from drivers.errors import DriverError
 from drivers.raw import decode_raw
-from emmc_rig.acquisition.checks import check, figures
+from emmc_rig.acquisition.checks import check
 from emmc_rig.acquisition.command import (
     begun_session,
     disk_faults_named,
@@ -37,6 +37,7 @@ from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.session.brightness import figures
 from emmc_rig.session.journal import ComparedEntry, FrameEntry, RetryEntry, RunEntry, of_kind
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session

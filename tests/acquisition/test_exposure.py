@@ -9,16 +9,16 @@ from capture_rigs import StopsAfter, begun, plan_and_camera, request_for
 from simulated_disk import SimulatedDisk
 
 from drivers.errors import CameraSettingError
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.amend import amendment
 from emmc_rig.acquisition.command import _frozen, planned_frames
 from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.metering import BRACKET_STEP, asked_of_scene, better_metering_s
+from emmc_rig.acquisition.metering import BRACKET_STEP, METERABLE_LEVELS, asked_of_scene
 from emmc_rig.acquisition.plan import Metering
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.session.brightness import GOOD_LEVELS, next_exposure_s
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import Figures, metered
 from emmc_rig.session.verify import verify
@@ -136,14 +136,24 @@ def test_a_dark_scene_is_refused_with_what_to_do():
         asked_of_scene(frames, {"meter-shot-0": entry}, Metering(), (1e-3, 1.0))
 
 
-@pytest.mark.parametrize(
-    ("bright_dn", "better_s"), [(30, 0.4), (100, None), (3700, None), (3900, 0.025)]
-)
-def test_a_metering_frame_too_dark_or_bright_is_taken_again_two_stops_from_it(bright_dn, better_s):
-    frame = RawFrame(np.zeros(SIZE, np.uint16), np.full((2, 2), 100), 4100, "rggb", 0.1, b"", "")
-    seen = Figures(0.0, 10.0, bright_dn)
-    assert better_metering_s(frame, seen, 0.1, (0.025, 0.4)) == better_s
-    assert better_metering_s(frame, seen, 0.1, (0.03, 0.3)) is None
+@pytest.mark.parametrize("sensitivity", [1e-3, 0.1, 1.0, 30.0, 5e3])
+@pytest.mark.parametrize("good", [METERABLE_LEVELS, GOOD_LEVELS])
+def test_a_good_exposure_is_found_in_four_frames_whatever_the_light(sensitivity, good):
+    exposure_s = 0.1
+    for _ in range(4):
+        level = min(1.0, sensitivity * exposure_s)
+        next_s = next_exposure_s(exposure_s, level, (1e-6, 1e6), good)
+        if next_s is None:
+            break
+        exposure_s = next_s
+    assert good[0] <= sensitivity * exposure_s <= good[1]
+
+
+def test_no_exposure_beyond_the_limits_is_tried_and_none_twice():
+    assert next_exposure_s(0.1, 0.01, (0.03, 0.3)) == 0.3
+    assert next_exposure_s(0.3, 0.03, (0.03, 0.3)) is None
+    assert next_exposure_s(0.1, 1.0, (0.03, 0.3)) == 0.03
+    assert next_exposure_s(0.03, 1.0, (0.03, 0.3)) is None
 
 
 def test_a_bracket_has_two_stops_for_each_four_times_that_the_range_is_above_eight(session):

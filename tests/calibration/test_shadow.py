@@ -199,5 +199,5 @@ def test_a_footprint_list_gives_the_same_reading():
 
 def test_a_camera_without_one_mask_before_its_sensor_is_sent_to_method_free():
     camera = camera_of(masks={}, shots=[{}])
-    with pytest.raises(CalibrationError, match="use method free"):
+    with pytest.raises(CalibrationError, match="0 masks: use method free"):
         shadow_mask(camera, SIZE)

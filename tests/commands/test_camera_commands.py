@@ -20,12 +20,8 @@ from emmc_rig.bench.hardware import open_camera, scene_simulator
 from emmc_rig.commands import device_cameras
 from emmc_rig.commands.device_cameras import register, save_frame
 from emmc_rig.errors import AppError, WrongUsageError
-from emmc_rig.pages.frame_view import (
-    frame_figures,
-    histogram,
-    preview,
-    white_balance,
-)
+from emmc_rig.pages.frame_view import brightest, histogram, preview, white_balance
+from emmc_rig.session.brightness import figures, level_of
 from simulators.clock import ManualClock
 from simulators.ptp import PtpUsbFunction
 from simulators.usb import SimulatedUsb
@@ -159,15 +155,16 @@ def test_a_name_from_the_camera_never_leaves_the_folder(tmp_path):
 
 def test_half_the_light_is_half_way_to_white():
     mosaic = np.full((40, 40), BLACK + 500)
-    figures = frame_figures(frame_of(mosaic))
-    assert figures.brightest == pytest.approx({"red": 0.5, "green": 0.5, "blue": 0.5})
-    assert figures.saturated == 0
+    frame = frame_of(mosaic)
+    assert brightest(frame) == pytest.approx({"red": 0.5, "green": 0.5, "blue": 0.5})
+    assert level_of(frame, figures(frame)) == pytest.approx(0.5)
+    assert figures(frame).saturated == 0
 
 
 def test_the_saturated_share_counts_pixels_at_white():
     mosaic = np.full((40, 40), BLACK)
     mosaic[:10] = WHITE
-    assert frame_figures(frame_of(mosaic)).saturated == 0.25
+    assert figures(frame_of(mosaic)).saturated == 0.25
 
 
 @pytest.mark.parametrize(

@@ -402,6 +402,25 @@ def test_automatic_exposure_brings_the_brightest_near_white_but_not_to_it(light)
         )
 
 
+def test_a_hot_pixel_is_no_reason_to_give_up_an_automatic_exposure():
+    class Hot(FakeCamera):
+        shape = (64, 64)
+
+        def snap(self):
+            frame = super().snap()
+            mosaic = np.full(self.shape, frame.mosaic[0, 0])
+            mosaic[20, 30] = WHITE
+            return replace(frame, mosaic=mosaic)
+
+    with watching(Hot()) as watch:
+        until(watch, lambda state: state["figures"])
+        watch.auto_expose()
+        reported = until(watch, lambda state: 0.7 <= state["figures"]["level"] <= 0.9)
+        done = until(watch, lambda state: state["frame"] > reported["frame"] + 2)
+        assert done["trouble"]["setting"] == ""
+        assert done["steps"][1]["done"]
+
+
 def test_an_exposure_beyond_the_camera_is_said_to_be():
     camera = FakeCamera()
     camera.light = 1e-4

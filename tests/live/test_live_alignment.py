@@ -3,38 +3,22 @@
 import cv2
 import numpy as np
 import pytest
+from mask_frames import BLACK, CAMERAS, SIZE, WHITE, bench_frame, frame_of
 
 from calibration.errors import CalibrationError
+from calibration.locator import edge_direction
 from calibration.repeats import Repeats, repeats_of
-from drivers.raw import RawFrame
 from emmc_rig.acquisition import focus
 from emmc_rig.acquisition.focus import REMEMBERED_S, FocusMeter, sharpness
-from emmc_rig.files.scenes import fine_scene
-from emmc_rig.live.alignment import MaskGauge, grid_direction
-from emmc_rig.model.camera import Camera, shipped_cameras
-from simulators.bench import Bench, MountingErrors
+from emmc_rig.live.alignment import MaskGauge
+from emmc_rig.model.camera import Camera
 
-SIZE = (72, 96)
-CAMERAS = shipped_cameras()
 WITH_SHADOW = sorted(
     name
     for name, camera in CAMERAS.items()
     if [mask.distance_mm < camera.lens.distance_mm for mask in camera.masks.values()] == [True]
 )
 WITHOUT_SHADOW = sorted(CAMERAS.keys() - set(WITH_SHADOW))
-BLACK, WHITE = 256, 4095
-
-
-def frame_of(mosaic, cfa="rggb", white=WHITE):
-    return RawFrame(
-        mosaic=mosaic.astype(np.uint16),
-        cfa=cfa,
-        black_level_dn=np.full(4, BLACK, np.float64),
-        white_level_dn=white,
-        exposure_s=0.01,
-        original=b"",
-        sha256="",
-    )
 
 
 def with_pattern(**pattern):
@@ -43,26 +27,6 @@ def with_pattern(**pattern):
     (mask,) = described["masks"].values()
     mask["pattern"] = pattern
     return Camera.model_validate(described)
-
-
-def bench_frame(camera, target="whiteboard", exposure_s=0.05, lamp="white", **errors):
-    """A frame of a bench whose mask is misplaced by that much."""
-    fine = fine_scene("near-planar", 2, 2, size=SIZE, views=camera.views)
-    aperture_um = max(camera.views) * camera.lens.aperture_cell_um
-    standing = {"mask_x": 0.0, "mask_y": 0.0, "aperture_x": 2 * aperture_um, "aperture_y": 0.0}
-    bench = Bench(
-        camera,
-        fine.samples,
-        SIZE,
-        lambda: standing,
-        2 * aperture_um,
-        np.random.default_rng(0),
-        MountingErrors(**errors),
-        rays_per_view=32,
-    )
-    bench.lamp, bench.target = lamp, target
-    noise = camera.sensor.noise
-    return frame_of(bench.expose(exposure_s), camera.sensor.cfa_name, noise.white_level_dn)
 
 
 @pytest.mark.slow
@@ -167,8 +131,8 @@ def test_nothing_is_said_of_the_mask_in_a_dark_picture_or_through_other_filters(
 
 def test_edges_in_all_directions_have_no_straightness():
     noise = np.random.default_rng(0).normal(size=(300, 400)).astype(np.float32)
-    assert grid_direction(noise)[1] < 0.1
-    assert grid_direction(np.ones((20, 20), np.float32)) == (0.0, 0.0)
+    assert edge_direction(noise)[1] < 0.1
+    assert edge_direction(np.ones((20, 20), np.float32)) == (0.0, 0.0)
 
 
 def noisy(blur, seed, level=1500.0, sigma=40.0, shape=(120, 160)):

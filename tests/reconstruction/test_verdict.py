@@ -28,7 +28,7 @@ from reconstruction.screening import screened
 from reconstruction.tv import TVSettings, reconstruct_tv
 from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.compression import blockiness, quantised
-from reconstruction.verdict.displaced import _regressed, _tiled, displaced
+from reconstruction.verdict.displaced import _tiled, displaced
 from reconstruction.verdict.evidence import Evidence, FittedFrames, gathered
 from reconstruction.verdict.kept import (
     compare_held_out,
@@ -85,7 +85,7 @@ def test_masks_half_as_strong_show_at_half_strength(three):
     np.testing.assert_allclose(shadow(relief_in(three, halved)).strength, 0.53, atol=0.06)
 
 
-def test_all_tiles_at_once_are_regressed_as_one_by_one():
+def test_tiles_are_regressed_as_by_least_squares_of_each():
     rng = np.random.default_rng(0)
     shape = (2, 50, 80)
     masks, read, seen, shift_y, shift_x = rng.normal(size=(5, *shape)).astype(np.float32)
@@ -95,20 +95,24 @@ def test_all_tiles_at_once_are_regressed_as_one_by_one():
     found = Relief(level, masks, read, seen, good, weight, np.ones((50, 80, 3)))
     tiled = _tiled(found, shift_y, shift_x)
     rows, columns = (tile_edges(length) for length in shape[1:])
-    alone = [
-        _regressed(
-            [one[:, top:bottom, left:right] for one in (masks, shift_y, shift_x)],
-            seen[:, top:bottom, left:right],
-            weight[:, top:bottom, left:right],
-        )
-        for top, bottom in itertools.pairwise(rows)
-        for left, right in itertools.pairwise(columns)
-    ]
-    known = [fit for fit in alone if fit is not None]
-    assert len(known) == len(alone) - 1
+    values, deviations = [], []
+    for (top, bottom), (left, right) in itertools.product(
+        itertools.pairwise(rows), itertools.pairwise(columns)
+    ):
+        tile = (slice(None), slice(top, bottom), slice(left, right))
+        w = weight[tile].ravel().astype(np.float64)
+        if not w.any():
+            continue
+        terms = np.stack([term[tile].ravel() for term in (masks, shift_y, shift_x)], axis=1)
+        root = np.sqrt(w)[:, None]
+        values.append(np.linalg.lstsq(root * terms, root[:, 0] * seen[tile].ravel())[0])
+        scores = terms * (w * (seen[tile].ravel() - terms @ values[-1]))[:, None]
+        inverse = np.linalg.inv(terms.T @ (w[:, None] * terms))
+        deviations.append(np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse)))
+    assert len(values) == (len(rows) - 1) * (len(columns) - 1) - 1
     assert tiled is not None
-    np.testing.assert_allclose(tiled.shifts, [fit.values[1:] for fit in known], rtol=1e-6)
-    np.testing.assert_allclose(tiled.errors, [fit.deviations[1:] for fit in known], rtol=1e-6)
+    np.testing.assert_allclose(tiled.values, values, rtol=1e-5)
+    np.testing.assert_allclose(tiled.deviations, deviations, rtol=1e-5)
 
 
 def test_an_even_scene_behind_a_displaced_mask_shows_the_displacement():

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from calibration.boards import Board
+from calibration.locator import register
 from calibration.placement import designed_placement
-from calibration.registration import register
 from calibration.shadow import shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix, load_camera
 from emmc_rig.model.lightfield import OPPONENT
