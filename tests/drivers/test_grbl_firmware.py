@@ -10,6 +10,7 @@ import pytest
 from drivers.clock import SYSTEM_CLOCK
 from drivers.errors import LimitExceededError, NotHomedError
 from drivers.grbl import GrblStage, identify
+from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 
 pytestmark = [pytest.mark.peers, pytest.mark.slow]
@@ -18,6 +19,7 @@ AXES = {"x": "X", "y": "Y"}
 SETTINGS = {22: 1, 20: 1, 21: 1, 23: 0, 24: 300, 25: 1200, 27: 1, 10: 1, 13: 0}
 OF_AXES = {100: 200, 110: 1500, 120: 200, 130: 50}
 """200 steps/mm and 50 mm of travel."""
+CARE = StageSettings(tolerance_um=5.0)
 SPEED = "3"
 """Times real time."""
 
@@ -62,7 +64,7 @@ def test_the_firmware_as_it_is_shipped_homes_moves_and_is_homed_anew_by_each_con
     link, true_mm = firmware
     with closing(opened(link)) as port:
         assert identify(port) == "version 1.1h.20190830:, options V,15,128"
-        stage = GrblStage(port, AXES, SYSTEM_CLOCK)
+        stage = GrblStage(port, AXES, SYSTEM_CLOCK, CARE)
         with pytest.raises(NotHomedError):
             stage.move_to_um({"x": -5000.0})
         stage.home(["x"])
@@ -78,4 +80,4 @@ def test_the_firmware_as_it_is_shipped_homes_moves_and_is_homed_anew_by_each_con
             stage.move_to_um({"x": 0.0})
     with closing(opened(link)) as port:
         # It is idle, as it is after $X too: nobody knows that it was homed.
-        assert not GrblStage(port, AXES, SYSTEM_CLOCK).is_homed("x")
+        assert not GrblStage(port, AXES, SYSTEM_CLOCK, CARE).is_homed("x")
