@@ -14,10 +14,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import is_session
-from emmc_rig.files.lock_file import TakenError, take_lock
+from emmc_rig.model.files import PART
 from emmc_rig.session.session import KNOWN, LOCK
-from emmc_rig.session.storage import PART
+from emmc_rig.store.folders import is_session, made_folder
+from emmc_rig.store.locks import TakenError, take_lock
 
 OURS = re.compile(r"\.?(\d{5}|amended-\d+)-")
 """How frames and amended files are called, parts of them too."""
@@ -42,7 +42,12 @@ def held(folder: Path) -> Iterator[None]:
     beside = folder.with_name(f".{folder.name}.lock")
     with ExitStack() as locks:
         while not is_session(folder):
-            locks.enter_context(_made_above(folder))
+            try:
+                locks.enter_context(made_folder(folder.parent))
+            except OSError as fault:
+                raise AppError(
+                    f"{folder}: cannot be made ({fault.strerror}); name another folder"
+                ) from fault
             locks.enter_context(_locked(beside, folder))
             if not is_session(folder):
                 _remove_stale_temporaries(folder)
@@ -75,24 +80,6 @@ def _locked(path: Path, folder: Path) -> Iterator[None]:
         yield
     finally:
         release()
-
-
-@contextmanager
-def _made_above(folder: Path) -> Iterator[None]:
-    """Make the folders above; those that are empty at the end go again."""
-    made = [above for above in folder.parents if not above.exists()]
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        raise AppError(
-            f"{folder}: cannot be made ({fault.strerror}); name another folder"
-        ) from fault
-    try:
-        yield
-    finally:
-        for above in made:
-            with suppress(OSError):
-                above.rmdir()
 
 
 def _stale_temporaries(folder: Path) -> list[Path]:
