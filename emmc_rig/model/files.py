@@ -1,8 +1,7 @@
 """Files and folders that appear whole under their name, or not at all, and are on the disk then.
 
-The one way in which anything is written that outlives a crash: under another name beside its own,
-then synced, renamed, and the folder above it synced. What tests let fail goes through a `Disk`, so
-that one can lose its power between any two operations.
+A file is written under another name beside its own, synced and renamed; then its folder is synced.
+A session writes through a `Disk`: that of a test can lose its power between any two operations.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class Disk:
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
     def make_folder(self, path: Path) -> None:
-        """Make a folder and those above it; one that is there already is left alone."""
+        """Make a folder and those above it, where they are missing."""
         path.mkdir(parents=True, exist_ok=True)
 
     def sync(self, path: Path) -> None:
@@ -98,7 +97,7 @@ def _write(path: Path, data: bytes | memoryview, flags: int) -> None:
 
 
 def part_of(path: Path) -> Path:
-    """Return the name under which a file is written before it takes its own, another each time."""
+    """Return a temporary name for a file before it takes its own; each call returns another."""
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{PART}")
 
 
@@ -183,9 +182,9 @@ def write_whole(disk: Disk, path: Path, data: bytes | memoryview) -> None:
 
 
 def make_folder_whole(disk: Disk, folder: Path, files: Mapping[str, bytes]) -> None:
-    """Make a folder with files in it, all of it or nothing; a name in `files` may end with /.
+    """Make a folder with its files, whole or not at all; a name that ends with / is a folder.
 
-    Raises `OSError`, with nothing left; the folder must not be there.
+    Raises `OSError`, with nothing left. The folder must not exist.
     """
     _make_synced(disk, folder.parent)
     with whole(folder, disk) as part:

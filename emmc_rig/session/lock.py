@@ -1,8 +1,8 @@
-"""The lock of a session: one program writes at a time, and a second one names it in its error.
+"""The lock of a session: one program writes at a time, and the error of a second names the first.
 
-A session is locked by `session.lock` in it; one that is yet to be made by `.NAME.lock` beside it.
-The file says who holds it and is removed at the end; what a killed program leaves of it is in
-nobody's way, but for disks that cannot lock files (see `lock_file`).
+A session is locked by `session.lock` in it, a session that is not made yet by `.NAME.lock` beside
+its folder. The file names the holder and is removed at the end. The file of a killed program blocks
+nobody, except on disks that cannot lock files (see `emmc_rig.store.locks`).
 """
 
 from __future__ import annotations
@@ -86,18 +86,19 @@ def _stale_temporaries(folder: Path) -> list[Path]:
     """Return folders of sessions that a killed program left before they got their name."""
     name = re.compile(rf"\.{re.escape(folder.name)}\.(\d+-[0-9a-f]+\.)?{PART[1:]}")
     try:
-        return [one for one in folder.parent.iterdir() if name.fullmatch(one.name) and one.is_dir()]
+        beside = list(folder.parent.iterdir())
     except OSError:
         return []
+    return [part for part in beside if name.fullmatch(part.name) and part.is_dir()]
 
 
 def _remove_stale_temporaries(folder: Path) -> None:
-    """Remove these folders; one that holds anything else stays."""
-    for one in _stale_temporaries(folder):
+    """Remove these folders, except those with files of other programs."""
+    for part in _stale_temporaries(folder):
         with suppress(OSError):
-            for file in list(one.rglob("*")):
+            for file in list(part.rglob("*")):
                 if file.is_file() and (file.name in KNOWN or OURS.match(file.name)):
                     file.unlink()
-            for inside in one.iterdir():
+            for inside in part.iterdir():
                 inside.rmdir()
-            one.rmdir()
+            part.rmdir()

@@ -40,7 +40,7 @@ SESSION_RECONSTRUCTION = "reconstruction"
 
 @dataclass(frozen=True)
 class Listing:
-    """What a result knows of itself: the command that wrote it, and its files' SHA-256 by name.
+    """The command that wrote a result, and the SHA-256 of its files by name.
 
     Names are relative to the folder, with slashes.
     """
@@ -58,7 +58,7 @@ class Listing:
     def read(cls, folder: Path) -> Listing | None:
         """Return what a folder's files.json says; None where there is none.
 
-        Raises AppError for one that no command wrote like that.
+        Raises AppError for a file that was edited.
         """
         path = folder / FILES
         try:
@@ -195,7 +195,7 @@ def _free(path: Path) -> Path:
 
 
 def refuse_missing(folder: Path, remedy: str) -> None:
-    """Raise AppError, with what to do, where there is no such folder."""
+    """Raise AppError, with the remedy, where the folder is missing."""
     if not folder.exists():
         raise AppError(f"{folder}: no such folder; {remedy}")
 
@@ -233,10 +233,10 @@ def _refuse_holding(folder: Path, out: Path) -> None:
 
 @contextmanager
 def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
-    """Make a hidden folder that is this program's alone; it goes at the end with all in it.
+    """Make a hidden folder that is this program's alone, and remove it with its files at the end.
 
-    What a killed program left in it goes too, but for a result that takes its place, and what is
-    kept where `resumes`. Raises AppError where another program works in it, and OSError.
+    Files that a killed program left in it are removed too, except a result that takes its place,
+    and kept files where `resumes`. Raises AppError where another program works in it, and OSError.
     """
     release = None
     while release is None:
@@ -265,7 +265,7 @@ def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
 def _clear(place: Path, spared: str | None = None) -> None:
     """Empty a hidden folder, unless a result in it takes its place; links are not followed.
 
-    spared: the one folder in it that stays, unless it is empty.
+    spared: the name of a folder in it that stays, unless it is empty.
     """
     if (place / FILES).exists() or (place / MOVES).exists():
         return
@@ -301,7 +301,7 @@ def refuse_edited(out: Path, command: str) -> None:
 
 
 def _refuse_foreign(folder: Path, out: Path, names: Iterable[str], earlier: Listing) -> None:
-    """Raise AppError where something at one of these names is not what the earlier result wrote."""
+    """Raise AppError where a file of these names is not the file of the earlier result."""
     for name in names:
         for path in (folder / name, *_above(folder, name)):
             is_in_the_way = path.is_file() or path == folder / name

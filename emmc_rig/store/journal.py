@@ -1,6 +1,6 @@
 """Journals: files of lines that are only ever appended to, each on the disk once it is added.
 
-A line that a crash tore is closed by the next one, so that it swallows nothing.
+A line that a crash tore is closed before the next line is added, which stays readable.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from emmc_rig.model.files import SYSTEM_DISK, Disk
 
 
 class Lines:
-    """The lines of a journal, and a way to add to them; lines: those there when it was opened."""
+    """The lines of a journal file, as it was opened, and a way to add a line."""
 
     def __init__(self, path: Path, disk: Disk = SYSTEM_DISK) -> None:
         """Read the file; raises `OSError`."""

@@ -1,8 +1,8 @@
 """A lock on any disk, for one program at a time: the operating system's, or a file of that name.
 
-The system's lock, taken by `filelock`, goes with its program, however that ends. Where files cannot
-be locked (some network disks) the file itself is the lock, for only one program can make it; it
-stays when that program is killed, and whoever meets it is told which file to delete.
+The library `filelock` takes the system's lock, which ends with its program, also after a kill. Some
+network disks cannot lock files. There the file itself is the lock, because only one program can
+make it. After a kill it stays, and the error of the next program names the file to delete.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TRIES, WAIT_S = 200, 0.01
 
 
 class TakenError(Exception):
-    """Another program has the lock; `holder` says which one, `advice` what to do."""
+    """Another program has the lock: `holder` is its name, `advice` the remedy."""
 
     def __init__(self, path: Path, holder: Mapping[str, Any], by_file: bool) -> None:
         self.holder = "another program"

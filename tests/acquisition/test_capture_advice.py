@@ -50,7 +50,7 @@ SCANNED = (
     HOUSE / "commands" / "capture.py",
     HOUSE / "bench" / "rig_config.py",
 )
-FOLDERS, WRITING_A_PLAN = HOUSE / "files" / "folders.py", ("new_file", "_free")
+FOLDERS, WRITING_A_PLAN = HOUSE / "store" / "folders.py", ("new_file", "_free")
 NO_CAPTURE = ("direct.py", "simulate.py")
 """Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
 GUARDS = (

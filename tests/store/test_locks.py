@@ -1,4 +1,4 @@
-"""Locks: who holds one, what a kill leaves of it, and disks that cannot lock files."""
+"""Locks: their holders, kills, and disks that cannot lock files."""
 
 import errno
 import fcntl
