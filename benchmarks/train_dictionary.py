@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from training_patches import PatchSettings, training_patches
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.files.folders import new_file
 from emmc_rig.files.results import command_line, parse_size, versions
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.files import whole_file
+from emmc_rig.store.folders import new_file
 from reconstruction.dictionary import Dictionary
 
 CHECKPOINT_INTERVAL_S = 60.0

@@ -36,11 +36,11 @@ from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.rig_config import AnyRig, Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
 from emmc_rig.errors import AppError, StoppedError
-from emmc_rig.files.folders import is_session, new_file, refuse_inside_session
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.arguments import NAMES, path_of, required
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.files import SYSTEM_DISK, Disk
 from emmc_rig.model.settings import validated
 from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
 from emmc_rig.session.journal import UntilEntry, metered
@@ -53,7 +53,7 @@ from emmc_rig.session.session import (
     Session,
     wall_time,
 )
-from emmc_rig.session.storage import SYSTEM_DISK, Disk
+from emmc_rig.store.folders import is_session, new_file, refuse_inside_session
 
 DISK_RESERVE_BYTES = 100_000_000
 

@@ -14,7 +14,7 @@ import typer
 from drivers.cameras import CAMERA_HELP
 from emmc_rig.commands.output import Quiet, give_result, show_table, shown_progress, tell
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import new_file, refuse_inside_session
+from emmc_rig.store.folders import new_file, refuse_inside_session
 
 if TYPE_CHECKING:
     from drivers.camera import Camera

@@ -48,10 +48,10 @@ def export(
     """Export a light field or Psi to other programs, or as a viewer."""
     from emmc_rig.files.exports import LIGHT_FIELD, open_export
     from emmc_rig.files.films import film_of
-    from emmc_rig.files.folders import result_folder
     from emmc_rig.files.formats.registry import ALIASES, FORMATS
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
     from emmc_rig.pages.viewer import VIEWER
+    from emmc_rig.store.folders import result_folder
 
     if of is not None and result != "psi":
         raise typer.BadParameter(f"'{of}': export one light field at a time")
@@ -105,10 +105,10 @@ def export(
 def _export_psi(source: Path, form: str, out: Path | None) -> None:
     """Write the Psi of a file or folder, and its frames if it has any, as a sparse matrix."""
     import emmc_rig as emmc
-    from emmc_rig.files.folders import is_session, result_folder
     from emmc_rig.files.psi import FRAMES, FRAMES_GROUP, PSI_GROUP, StoredPsi, psi_beside
     from emmc_rig.files.psi_exports import PSI_FORMATS
     from emmc_rig.files.results import shown_bytes, write_metrics
+    from emmc_rig.store.folders import is_session, result_folder
 
     if form not in PSI_FORMATS:
         raise typer.BadParameter(f"no format {form!r} of psi; there are {', '.join(PSI_FORMATS)}")

@@ -41,9 +41,9 @@ def figure(
 ) -> None:
     """Draw results of one capture side by side, for a paper."""
     from emmc_rig.files.exports import open_export
-    from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size, write_metrics
     from emmc_rig.pages.result_figure import FigureSettings, draw_results
+    from emmc_rig.store.folders import result_folder
 
     settings = FigureSettings(
         None if view is None else _pair("--view", view),

@@ -36,8 +36,8 @@ def simulate(
 ) -> None:
     """Simulate the frames that a camera takes of a light field."""
     import emmc_rig as emmc
-    from emmc_rig.files.folders import result_folder
     from emmc_rig.files.results import parse_size
+    from emmc_rig.store.folders import result_folder
 
     described = emmc.camera(camera, shots)
     with result_folder(out, "simulate") as folder, shown_progress("simulate"):

@@ -10,7 +10,6 @@ import h5py
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session
 from emmc_rig.files.formats.format import Export
 from emmc_rig.files.psi import FRAMES
 from emmc_rig.files.results import METRICS
@@ -20,6 +19,7 @@ from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.lightfield import load_hdf5, load_view_axes
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxes, stored_as
+from emmc_rig.store.folders import SESSION_RECONSTRUCTION, is_session
 from simulators.scenes import SCENES
 
 LIGHT_FIELD, MAPS = "light_field.h5", "maps.h5"

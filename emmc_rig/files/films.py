@@ -11,12 +11,12 @@ from pathlib import Path
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.exports import LIGHT_FIELD, open_export
-from emmc_rig.files.folders import SESSION_RECONSTRUCTION, Listing, is_session
 from emmc_rig.files.formats.format import Film
 from emmc_rig.files.results import METRICS
 from emmc_rig.files.scenes import path_in
 from emmc_rig.model.json_text import one_line, parse_json
 from emmc_rig.model.reading import stored_arrays
+from emmc_rig.store.folders import SESSION_RECONSTRUCTION, Listing, is_session
 
 FRAMES = "frames"
 REMEDY = "copy the folder again, or reconstruct it again"

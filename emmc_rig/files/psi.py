@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import refuse_missing
 from emmc_rig.files.shards import (
     CHUNK,
     SHARD,
@@ -25,6 +24,7 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiLayout, checksum_of
 from emmc_rig.model.view_axes import ATTRIBUTE, axes_from, stored_as
+from emmc_rig.store.folders import refuse_missing
 
 PSI_GROUP = "psi.zarr"
 AGAIN = "measure Psi again"

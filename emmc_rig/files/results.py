@@ -6,7 +6,6 @@ import json
 import math
 import platform
 import re
-import sys
 from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import WrongUsageError
 from emmc_rig.files.shards import ENDING, save_arrays
+from emmc_rig.store.locks import command_line
 from emmc_rig.version import __version__
 
 METRICS = "metrics.json"
@@ -142,8 +142,3 @@ def shown_bytes(count: float) -> str:
             return f"{count:.3g} {unit}"
         count /= 1000
     return f"{count:.3g} TB"
-
-
-def command_line() -> str:
-    """Return the command as it was typed."""
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

@@ -8,11 +8,9 @@ that is not known do (see `emmc_rig.session.frame_file`); of a file of several, 
 from __future__ import annotations
 
 import hashlib
-import shutil
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -29,11 +27,11 @@ from emmc_rig.acquisition.plan import Checks, Plan, planned_camera
 from emmc_rig.bench.rig_config import IMPORTED
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.folders import refuse_inside_session
 from emmc_rig.files.own_arrays import OwnFrames, read_own
 from emmc_rig.files.results import command_line, versions
 from emmc_rig.importing.table import LONGEST_S, Listed
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
+from emmc_rig.model.files import whole
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.settings import validated
@@ -43,8 +41,8 @@ from emmc_rig.session.journal import CompleteEntry, ImportedEntry, RunEntry
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import SHOT_DARK, VALIDATION, Bench, PlannedFrame
 from emmc_rig.session.session import Frozen, Session, wall_time
-from emmc_rig.session.storage import part_of
 from emmc_rig.session.verify import verify_frames
+from emmc_rig.store.folders import refuse_inside_session
 
 KIND_ORDER = ("dark", "reference", "whiteboard", "open", "check", "turned", VALIDATION, "shot")
 TOP_DN = 65_535
@@ -632,15 +630,9 @@ class _Import:
             "command": command_line(),
             "versions": versions(),
         }
-        part = part_of(out)
-        try:
+        with whole(out) as part:
             session = Session.create(part, frozen, about)
             self._store(session, planned, scale)
-            session.disk.replace(part, out)
-            session.disk.sync_folder(out.parent)
-        finally:
-            with suppress(OSError):
-                shutil.rmtree(part)
         return Imported(Session(out), tuple(self._notes))
 
     def _check_light(

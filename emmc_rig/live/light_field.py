@@ -28,7 +28,6 @@ from calibration.errors import CalibrationError
 from calibration.scale import Scale, exposure_of
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import is_session
 from emmc_rig.files.formats.format import Export
 from emmc_rig.files.scales import open_scale
 from emmc_rig.live.server import Picture, Pictured, Query
@@ -41,6 +40,7 @@ from emmc_rig.pages.viewer import viewer_data
 from emmc_rig.session.brightness import is_dark
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.session import Session
+from emmc_rig.store.folders import is_session
 from reconstruction.adaptive.film import Film
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD, find_method

@@ -14,7 +14,6 @@ Of several processes that need a kernel, one compiles it: the others wait, and l
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import hashlib
 import os
@@ -31,6 +30,7 @@ from typing import Any
 
 import llvmlite
 import numba
+from filelock import FileLock
 from numba.core import config
 from numba.core.registry import CPUDispatcher
 
@@ -109,11 +109,10 @@ def _locked(path: Path) -> Iterator[None]:
     _within.kernel = True
     try:
         with ExitStack() as held:
-            with suppress(OSError):  # the folder is gone, or its disk cannot lock
-                descriptor = held.enter_context(path.open("w")).fileno()
-                _take(descriptor)
-                # A process that was forked meanwhile has the file open, too.
-                held.callback(fcntl.flock, descriptor, fcntl.LOCK_UN)
+            with suppress(OSError):  # the folder is gone, its disk cannot lock, or WAIT_S are over
+                held.enter_context(
+                    FileLock(path, WAIT_S, poll_interval=LOOK_S, fallback_to_soft=False)
+                )
             yield
     finally:
         _within.kernel = False
@@ -129,17 +128,6 @@ def _uncollected() -> Iterator[None]:
     finally:
         if was_enabled:
             gc.enable()
-
-
-def _take(descriptor: int) -> None:
-    until = time.monotonic() + WAIT_S
-    while time.monotonic() < until:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            time.sleep(LOOK_S)
-        else:
-            return
 
 
 def is_kept(file: str) -> bool:

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from calibration.mask_photo import MaskReading
-from emmc_rig.files.folders import new_file
 from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.srgb import codes_of, srgb_of
 from emmc_rig.pages.drawing import ACCENT, COLOURS, FAINT, save_publication, sheet, titled
+from emmc_rig.store.folders import new_file
 
 MARK = COLOURS[1]
 MOST_LINES = 16

@@ -16,7 +16,6 @@ import cv2
 from drivers.errors import DriverError
 from drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import shown_bytes, write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.frame_view import AS_READ, Balance, preview, white_balance
@@ -37,6 +36,7 @@ from emmc_rig.session.journal import DecidedEntry, FrameEntry, RetryEntry, ended
 from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
+from emmc_rig.store.folders import result_folder
 
 LONGEST_PX, JPEG_QUALITY = 176, 80
 MOST_PICTURES, FIRST_PICTURES = 200, 12

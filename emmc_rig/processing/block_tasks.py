@@ -1,6 +1,6 @@
 """Blocks of a capture as tasks for workers, each on the disk once it is done.
 
-    KEPT/                       see `emmc_rig.files.folders.kept_folder`
+    KEPT/                       see `emmc_rig.store.folders.kept_folder`
         frames.h5               the frames, and what was settled for all blocks
         block-000-001.h5        the arrays of a block's part, its figures and evidence
 
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,7 +25,6 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.folders import emptied
 from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.shards import create_array, created_group, opened_array
 from emmc_rig.model.files import whole_file
@@ -36,6 +34,7 @@ from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.processing.memory import peak_memory_mib, task_bytes
 from emmc_rig.processing.pool import Pool
+from emmc_rig.store.folders import emptied
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import MethodSettings, find_method
@@ -133,12 +132,9 @@ def fingerprint_of(
 def _write(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) -> None:
     """Write arrays with their checksums, and plain data, as HDF5: whole and on the disk."""
     text = np.frombuffer(json.dumps(about, default=float).encode(), np.uint8)
-    with whole_file(path) as partial:
-        with h5py.File(partial, "w") as file:
-            for name, values in {**arrays, ABOUT: text}.items():
-                file.create_dataset(name, data=values, fletcher32=True)
-        with open(partial, "rb+") as file:
-            os.fsync(file.fileno())
+    with whole_file(path) as partial, h5py.File(partial, "w") as file:
+        for name, values in {**arrays, ABOUT: text}.items():
+            file.create_dataset(name, data=values, fletcher32=True)
 
 
 def _read(path: Path, fingerprint: str) -> dict[str, Any] | None:

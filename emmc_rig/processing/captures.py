@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from emmc_rig.files.folders import is_session
 from emmc_rig.files.psi import StoredPsi, psi_beside, read_frames
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.store.folders import is_session
 
 if TYPE_CHECKING:
     from reconstruction.verdict.rules import Reason

@@ -3,7 +3,7 @@
 Segments of a film do not depend on each other: each is a task for a worker, which goes on after the
 last frame that was done.
 
-KEPT/                   see `emmc_rig.files.folders.kept_folder`
+KEPT/                   see `emmc_rig.store.folders.kept_folder`
     psi.h5, scale.npz   what readings are made by, and what all frames are of
     next-001.npz        what the next frame of segment 1 goes on from
     frames/000007/      the result of frame 7, whole
@@ -33,16 +33,11 @@ from calibration.frames import MeanFrame, SensorGain
 from calibration.scale import Scale
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.films import FRAMES
-from emmc_rig.files.folders import (
-    emptied,
-    kept_folder,
-    placed,
-    result_folder,
-)
 from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.results import METRICS, PSI_ASSUMED, write_metrics
 from emmc_rig.model.arguments import refusal, required
 from emmc_rig.model.camera import camera_of, json_of_shots
+from emmc_rig.model.files import PART, whole_file, whole_folder
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix, SensingError
@@ -68,6 +63,11 @@ from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
 from emmc_rig.session.readings import FilmPlace, film_frames, film_places
 from emmc_rig.session.session import Session
+from emmc_rig.store.folders import (
+    emptied,
+    kept_folder,
+    result_folder,
+)
 from emmc_rig.version import __version__
 from reconstruction.adaptive.film import Film
 from reconstruction.adaptive.parts import put_together, taken_apart
@@ -78,6 +78,8 @@ from reconstruction.verdict.rules import LEVELS
 from reconstruction.verdict.run import reconstruct_judged
 
 SCALE, ABOUT = "scale.npz", "plain"
+DONE = "[0-9]*"
+"""The folders of frames that are done; others are of frames that are being written, or were."""
 DAMAGED = (
     OSError, ValueError, LookupError, TypeError, EOFError, MemoryError, zlib.error, BadZipFile,
     ReconstructionError, SensingError,
@@ -138,10 +140,9 @@ class Latest:
 
 def _save(path: Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> None:
     """Write plain data and arrays, whole and on the disk."""
-    partial = path.with_suffix(".part.npz")
     named = {ABOUT: np.array(json.dumps(about)), **arrays}
-    np.savez(partial, **named)  # pyright: ignore[reportArgumentType]
-    placed(partial, path)
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez(file, **named)  # pyright: ignore[reportArgumentType]
 
 
 def _open(path: Path) -> tuple[dict[str, Any], dict[str, NDArray]]:
@@ -246,7 +247,7 @@ class FilmJob:
         with suppress(*DAMAGED):
             if _open(path)[0]["fingerprint"] == fingerprint:
                 StoredPsi(self.kept / PSI).verify()
-                done = len(list((self.kept / FRAMES).iterdir()))
+                done = len(list((self.kept / FRAMES).glob(DONE)))
                 on_note(f"goes on with an earlier run; frames done: {done}")
                 return
         if path.exists():
@@ -324,12 +325,8 @@ def _write(result: Result, frame: FilmPlace, task: SegmentTask) -> None:
         "shot": frame.shot + 1,
         "peak_gib": peak_memory_mib() / 2**10,
     }
-    partial = task.path.with_suffix(".part")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir()
-    result.write(partial, {**result.metrics(), **of_film})
-    placed(partial, task.job.kept / FRAMES / f"{frame.place:06d}")
+    with whole_folder(task.job.kept / FRAMES / f"{frame.place:06d}") as partial:
+        result.write(partial, {**result.metrics(), **of_film})
 
 
 def reconstruct_film_session(
@@ -362,7 +359,7 @@ def reconstruct_film_session(
         tasks = _segments(job, places)
 
         def on_frame() -> None:
-            on_step(Progress(len(list((kept / FRAMES).iterdir())), None, None, count))
+            on_step(Progress(len(list((kept / FRAMES).glob(DONE))), None, None, count))
 
         try:
             failed = _computed(job, tasks, workers, cluster, memory, on_frame, on_note)
@@ -373,7 +370,8 @@ def reconstruct_film_session(
             ) from stop
         times_s = {at.place: at.time_s for at in places}
         metrics = _metrics(job, session, count, times_s, failed)
-        shutil.copytree(kept / FRAMES, new / FRAMES, copy_function=_linked)
+        whole = shutil.ignore_patterns(f".*{PART}")
+        shutil.copytree(kept / FRAMES, new / FRAMES, ignore=whole, copy_function=_linked)
         if psi_path is None:
             _linked(kept / PSI, new / PSI)
             metrics |= {"assumed": PSI_ASSUMED} if capture.assumed else {}
@@ -459,7 +457,7 @@ def _metrics(
     failed: Mapping[int, str],
 ) -> dict[str, Any]:
     """Return the metrics of a film of which all frames are done."""
-    done = [_figures(path / METRICS) for path in sorted((job.kept / FRAMES).iterdir())]
+    done = [_figures(path / METRICS) for path in sorted((job.kept / FRAMES).glob(DONE))]
     if not done:
         raise AppError(f"{session.folder}: {next(iter(failed.values()), 'no frame')}")
     rate = of_kind(session.journal.entries, FilmEntry)[0].rate_hz

@@ -18,11 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.exports import LIGHT_FIELD, MAPS
-from emmc_rig.files.folders import (
-    KEPT,
-    kept_folder,
-    result_folder,
-)
 from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics
 from emmc_rig.files.scenes import open_scene
@@ -45,6 +40,11 @@ from emmc_rig.processing.memory import (
 )
 from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures
+from emmc_rig.store.folders import (
+    KEPT,
+    kept_folder,
+    result_folder,
+)
 from reconstruction.dictionary import Dictionary
 from reconstruction.inputs import check_frames
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.files.exports import LIGHT_FIELD, save_maps
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.formats.format import Export
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.frames import Frames
@@ -27,6 +26,7 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ATTRIBUTE, grid_name, stored_as
+from emmc_rig.store.folders import result_folder
 from reconstruction.result import Reconstruction
 from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict

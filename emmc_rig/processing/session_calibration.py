@@ -19,7 +19,6 @@ from calibration.scale import Scale
 from calibration.sensor import SensorSheet, characterise
 from calibration.whiteboard import Calibration, NewArray, in_memory
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.psi import PSI
 from emmc_rig.files.results import METRICS, command_line, metrics_text, versions, write_metrics
 from emmc_rig.files.scales import CALIBRATION_FILE, open_scale, write_scale
@@ -43,6 +42,7 @@ from emmc_rig.session.measured_psi import (
     stored_scale,
 )
 from emmc_rig.session.session import CALIBRATION, Session
+from emmc_rig.store.folders import result_folder
 from emmc_rig.store.products import record_product
 from reconstruction.inputs import check_frames
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from calibration.scale import Scale
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import SESSION_RECONSTRUCTION
 from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.scales import CALIBRATION_FILE, open_scale
 from emmc_rig.model.frames import Frames
@@ -20,6 +19,7 @@ from emmc_rig.session.frame_means import frame_shape, session_darks, taken_shots
 from emmc_rig.session.measured_psi import psi_is_assumed
 from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import CALIBRATION, Session
+from emmc_rig.store.folders import SESSION_RECONSTRUCTION
 from reconstruction.verdict.rules import Reason
 
 

@@ -21,13 +21,13 @@ from calibration.parametric import SAMPLED, Stages, psi_at, shot_stages
 from calibration.placement import SCALARS, Placement, with_aperture_mean_one
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import refuse_missing
 from emmc_rig.files.psi import FRAMES, PSI, read_frames
 from emmc_rig.files.results import command_line, versions, write_metrics
 from emmc_rig.model.camera import camera_of, psi_layout
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.session_calibration import CALIBRATION_FILE
+from emmc_rig.store.folders import refuse_missing
 
 Array = NDArray[np.floating]
 

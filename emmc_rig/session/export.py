@@ -29,12 +29,12 @@ from drivers.camera import CameraIdentity
 from drivers.dng import Facts
 from drivers.raw import captured_at
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import new_file, result_folder
 from emmc_rig.session.frame_file import dng_of
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import FrameEntry, ImportedEntry, RunEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import CAMERA, RIG, Session
+from emmc_rig.store.folders import new_file, result_folder
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
 BASE_ISO = 100

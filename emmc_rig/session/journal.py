@@ -20,8 +20,9 @@ from typing import Any, Literal, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict
 
 from emmc_rig.files.results import shown_seconds
+from emmc_rig.model.files import Disk
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.session.storage import Disk, read_whole
+from emmc_rig.store.journal import Lines
 
 
 @dataclass(frozen=True)
@@ -418,25 +419,14 @@ class Journal:
 
     def __init__(self, disk: Disk, path: Path) -> None:
         """Read the file; raises `OSError`."""
-        self._disk, self._path = disk, path
-        data = read_whole(disk, path)
-        self._torn = bool(data) and not data.endswith(b"\n")
-        decoded = [decode_line(line) for line in data.split(b"\n") if line]
+        self._lines = Lines(path, disk)
+        decoded = [decode_line(line) for line in self._lines.lines]
         self.entries: list[Entry] = [entry for entry in decoded if entry is not None]
         self.unreadable = len(decoded) - len(self.entries)
 
     def append(self, entry: Entry) -> None:
         """Add an entry: it is on the disk when this returns. Raises `OSError`."""
-        line = encode_line(entry)
-        # A torn line is closed first, so that it cannot swallow this one.
-        start, self._torn = (b"\n" if self._torn else b""), True
-        file = self._disk.append(self._path)
-        try:
-            file.write(start + line)
-            file.sync()
-        finally:
-            file.close()
-        self._torn = False
+        self._lines.append(encode_line(entry))
         self.entries.append(entry)
 
 

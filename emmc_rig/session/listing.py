@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import SESSION_RECONSTRUCTION, is_session, refuse_missing
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.session.session import Session
+from emmc_rig.store.folders import SESSION_RECONSTRUCTION, is_session, refuse_missing
 
 
 @dataclass(frozen=True)

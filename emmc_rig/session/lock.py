@@ -1,8 +1,8 @@
-"""The lock of a session: one program writes at a time, and a second one names it in its error.
+"""The lock of a session: one program writes at a time, and the error of a second names the first.
 
-A session is locked by `session.lock` in it; one that is yet to be made by `.NAME.lock` beside it.
-The file says who holds it and is removed at the end; what a killed program leaves of it is in
-nobody's way, but for disks that cannot lock files (see `lock_file`).
+A session is locked by `session.lock` in it, a session that is not made yet by `.NAME.lock` beside
+its folder. The file names the holder and is removed at the end. The file of a killed program blocks
+nobody, except on disks that cannot lock files (see `emmc_rig.store.locks`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import is_session
-from emmc_rig.files.lock_file import TakenError, take_lock
+from emmc_rig.model.files import PART
 from emmc_rig.session.session import KNOWN, LOCK
-from emmc_rig.session.storage import PART
+from emmc_rig.store.folders import is_session, made_folder
+from emmc_rig.store.locks import TakenError, take_lock
 
 OURS = re.compile(r"\.?(\d{5}|amended-\d+)-")
 """How frames and amended files are called, parts of them too."""
@@ -42,7 +42,12 @@ def held(folder: Path) -> Iterator[None]:
     beside = folder.with_name(f".{folder.name}.lock")
     with ExitStack() as locks:
         while not is_session(folder):
-            locks.enter_context(_made_above(folder))
+            try:
+                locks.enter_context(made_folder(folder.parent))
+            except OSError as fault:
+                raise AppError(
+                    f"{folder}: cannot be made ({fault.strerror}); name another folder"
+                ) from fault
             locks.enter_context(_locked(beside, folder))
             if not is_session(folder):
                 _remove_stale_temporaries(folder)
@@ -77,40 +82,23 @@ def _locked(path: Path, folder: Path) -> Iterator[None]:
         release()
 
 
-@contextmanager
-def _made_above(folder: Path) -> Iterator[None]:
-    """Make the folders above; those that are empty at the end go again."""
-    made = [above for above in folder.parents if not above.exists()]
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        raise AppError(
-            f"{folder}: cannot be made ({fault.strerror}); name another folder"
-        ) from fault
-    try:
-        yield
-    finally:
-        for above in made:
-            with suppress(OSError):
-                above.rmdir()
-
-
 def _stale_temporaries(folder: Path) -> list[Path]:
     """Return folders of sessions that a killed program left before they got their name."""
     name = re.compile(rf"\.{re.escape(folder.name)}\.(\d+-[0-9a-f]+\.)?{PART[1:]}")
     try:
-        return [one for one in folder.parent.iterdir() if name.fullmatch(one.name) and one.is_dir()]
+        beside = list(folder.parent.iterdir())
     except OSError:
         return []
+    return [part for part in beside if name.fullmatch(part.name) and part.is_dir()]
 
 
 def _remove_stale_temporaries(folder: Path) -> None:
-    """Remove these folders; one that holds anything else stays."""
-    for one in _stale_temporaries(folder):
+    """Remove these folders, except those with files of other programs."""
+    for part in _stale_temporaries(folder):
         with suppress(OSError):
-            for file in list(one.rglob("*")):
+            for file in list(part.rglob("*")):
                 if file.is_file() and (file.name in KNOWN or OURS.match(file.name)):
                     file.unlink()
-            for inside in one.iterdir():
+            for inside in part.iterdir():
                 inside.rmdir()
-            one.rmdir()
+            part.rmdir()

@@ -43,16 +43,17 @@ from typing import Any
 
 from calibration.frames import MeanFrame
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import (
-    FILES,
-    PARTIAL,
-    SESSION_HEADER,
-    SESSION_JOURNAL,
-    SESSION_RECONSTRUCTION,
-    refuse_missing,
-)
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of
+from emmc_rig.model.files import (
+    SYSTEM_DISK,
+    Disk,
+    is_abandoned,
+    is_part,
+    make_folder_whole,
+    part_of,
+    write_whole,
+)
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import parse_yaml
 from emmc_rig.session.frame_file import FrameFile
@@ -77,15 +78,13 @@ from emmc_rig.session.journal import (
     of_kind,
 )
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.storage import (
-    SYSTEM_DISK,
-    Disk,
-    is_abandoned,
-    is_part,
-    make_folder_whole,
-    part_of,
-    read_whole,
-    write_whole,
+from emmc_rig.store.folders import (
+    FILES,
+    PARTIAL,
+    SESSION_HEADER,
+    SESSION_JOURNAL,
+    SESSION_RECONSTRUCTION,
+    refuse_missing,
 )
 
 HEADER, JOURNAL = SESSION_HEADER, SESSION_JOURNAL
@@ -190,8 +189,8 @@ class Session:
             # Whole or not at all: what a crash leaves of it is cleared like one never made.
             part = part_of(self.folder)
             self.disk.replace(self.folder, part)
-            self.disk.remove_folder(part)
-            self.disk.sync_folder(part.parent)
+            self.disk.remove(part)
+            self.disk.sync(part.parent)
 
     @cached_property
     def created(self) -> CreatedEntry:
@@ -227,7 +226,7 @@ class Session:
         """Return a frozen file's bytes; raises AppError when it was changed."""
         path = self.folder / name
         try:
-            data = read_whole(self.disk, path)
+            data = self.disk.read(path)
         except OSError as fault:
             raise AppError(
                 f"{path}: cannot be read ({fault.strerror}); restore it from a copy"
@@ -358,7 +357,7 @@ class Session:
             raise AppError(f"{self.folder}: frame {frame_id} was not captured yet; resume it")
         path = self.path_of(entry)
         try:
-            data = read_whole(self.disk, path)
+            data = self.disk.read(path)
         except OSError as fault:
             raise AppError(f"{path}: cannot be read ({fault.strerror}); resume it") from fault
         if hashlib.sha256(data).hexdigest() != entry.sha256:
@@ -400,7 +399,7 @@ class Session:
         Parts that a killed program left go.
         """
         self.disk.make_folder(self.folder / FRAMES)
-        self.disk.sync_folder(self.folder)
+        self.disk.sync(self.folder)
         for name in self.parts():
             self.disk.remove(self.folder / name)
 

@@ -86,16 +86,14 @@ def verify_frames(
 
 def _fault(session: Session, entry: FrameEntry) -> str:
     try:
-        with session.disk.reader(session.path_of(entry)) as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-            size = file.seek(0, os.SEEK_END)
+        data = session.disk.read(session.path_of(entry))
     except FileNotFoundError:
         return f"{entry.file} is gone"
     except OSError as fault:
         return f"{entry.file} cannot be read ({fault.strerror})"
-    if size != entry.bytes:
-        return f"{entry.file} has {size} bytes instead of {entry.bytes}"
-    if digest != entry.sha256:
+    if len(data) != entry.bytes:
+        return f"{entry.file} has {len(data)} bytes instead of {entry.bytes}"
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
         return f"{entry.file} is damaged: its SHA-256 is not the journal's"
     return ""
 

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.pages.page import number
 from emmc_rig.processing.pool import Pool
 from emmc_rig.progress import Silent, Watcher
+from emmc_rig.store.folders import Listing, refuse_edited, refuse_inside_session
+from emmc_rig.store.journal import Lines
 from emmc_rig.study.rows import described, digest_of, plain
 from emmc_rig.version import __version__
 
@@ -84,12 +85,10 @@ class Journal:
     """The results so far, by digest."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         self._results: dict[str, dict] = {}
         path.touch()
-        text = path.read_bytes().decode("utf-8", errors="replace")
-        self._torn = bool(text) and not text.endswith("\n")
-        for line in text.splitlines():
+        self._lines = Lines(path)
+        for line in self._lines.lines:
             try:
                 entry = parse_json(line, path.name, ValueError)
                 self._results[entry["digest"]] = entry["result"]
@@ -106,13 +105,7 @@ class Journal:
     def add(self, digest: str, inputs: Mapping[str, object], result: dict) -> None:
         """Keep a result: it is on the disk when this returns. Raises OSError when it cannot be."""
         entry = {"digest": digest, "inputs": inputs, "result": result}
-        line = json.dumps(entry, allow_nan=False) + "\n"
-        start, self._torn = (b"\n" if self._torn else b""), True
-        with open(self._path, "ab") as file:
-            file.write(start + line.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        self._torn = False
+        self._lines.append(f"{json.dumps(entry, allow_nan=False)}\n".encode())
         self._results[digest] = result
 
 

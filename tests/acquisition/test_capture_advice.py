@@ -34,12 +34,12 @@ from emmc_rig.acquisition.checks import SaturatedError
 from emmc_rig.acquisition.retries import HOPELESS
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.rig_config import opened_rig
+from emmc_rig.model.files import Disk
 from emmc_rig.session import session as session_module
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.journal import RetryEntry, of_kind
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
-from emmc_rig.session.storage import Disk
 from emmc_rig.session.verify import verify
 
 HOUSE = Path(emmc_rig.__file__).parent
@@ -50,7 +50,7 @@ SCANNED = (
     HOUSE / "commands" / "capture.py",
     HOUSE / "bench" / "rig_config.py",
 )
-FOLDERS, WRITING_A_PLAN = HOUSE / "files" / "folders.py", ("new_file", "_free")
+FOLDERS, WRITING_A_PLAN = HOUSE / "store" / "folders.py", ("new_file", "_free")
 NO_CAPTURE = ("direct.py", "simulate.py")
 """Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
 GUARDS = (
@@ -553,7 +553,7 @@ def raises(code):
 def a_journal_that_cannot_be_read(bench):
     bench.begun()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Disk, "reader", raises(errno.EIO))
+        patch.setattr(Disk, "read", raises(errno.EIO))
         line = bench.refused()
     yield line
 
@@ -600,15 +600,15 @@ def a_small_disk(bench):
 
 @walk(", then run the same command to go on; ")
 def a_disk_that_fills(bench):
-    honest = Disk.create
+    honest = Disk.write
 
-    def filling(disk, path):
+    def filling(disk, path, data):
         if AGAIN in path.name:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return honest(disk, path)
+        return honest(disk, path, data)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Disk, "create", filling)
+        patch.setattr(Disk, "write", filling)
         line = bench.refused()
     assert "9 of 10 frames are safe" in line
     yield line

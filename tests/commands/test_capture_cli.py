@@ -350,7 +350,7 @@ def test_a_session_that_another_program_holds_is_left_to_it(captured, run):
 
 
 def test_a_disk_without_room_is_reported_before_anything_is_made(run, tmp_path, monkeypatch):
-    from emmc_rig.session.storage import Disk
+    from emmc_rig.model.files import Disk
 
     plan_file(tmp_path)
     monkeypatch.setattr(Disk, "free_bytes", lambda self, folder: 4_190_000)

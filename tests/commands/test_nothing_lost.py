@@ -17,8 +17,8 @@ from programs import program
 
 from emmc_rig import cli
 from emmc_rig.commands import output
-from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import save_hdf5
+from emmc_rig.store.folders import result_folder
 
 SIZE, SHAPE = ("--size", "24x32"), (24, 32)
 RIG = ("--rig", "simulated", "--scene", "near-planar", *SIZE)

@@ -12,12 +12,12 @@ from programs import one_line, program
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.films import film_of, open_film
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.formats.displays import in_time
 from emmc_rig.files.formats.registry import FORMATS
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.srgb import codes_of, srgb_of
+from emmc_rig.store.folders import result_folder
 
 
 @pytest.fixture(scope="module")

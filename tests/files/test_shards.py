@@ -15,10 +15,10 @@ from emmc_rig.errors import AppError
 from emmc_rig.files import psi as psis
 from emmc_rig.files import shards
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.psi import StoredPsi, read_frames
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.processing.reconstructing import open_frames, reconstruct_folder
+from emmc_rig.store.folders import result_folder
 from reconstruction.methods import BlockSettings, MethodSettings
 from reconstruction.tv import TVSettings
 

@@ -21,9 +21,11 @@ from emmc_rig.acquisition.between import Between
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
-from emmc_rig.session import journal, lock, session, storage
+from emmc_rig.model import files
+from emmc_rig.session import journal, lock, session
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
+from emmc_rig.store import journal as lines
 from simulators.still import StillStage
 
 PLAN = """
@@ -43,7 +45,7 @@ def hook(rig, frame, note):
     note(power_w=0.5, frame=None if frame is None else frame.id)
 
 
-WATCHED = frozenset(module.__file__ for module in (storage, journal, lock, session, writer))
+WATCHED = frozenset(module.__file__ for module in (files, lines, journal, lock, session, writer))
 
 
 class Countdown(CaptureWatcher):
@@ -100,7 +102,7 @@ def capture_into(folder, watcher=None):
         try:
             opened, plan = Session(folder / "s"), plan_and_camera(PLAN)[0]
         except AppError:
-            opened, plan = begun(folder, storage.SYSTEM_DISK, rig, PLAN)
+            opened, plan = begun(folder, files.SYSTEM_DISK, rig, PLAN)
         Sequencer(opened, plan, rig, watcher, between=between).run()
     return opened
 

@@ -2,7 +2,7 @@
 
 import hashlib
 
-from emmc_rig.files.folders import FILES, Listing
+from emmc_rig.store.folders import FILES, Listing
 
 
 def files_of(folder):

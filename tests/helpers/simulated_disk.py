@@ -9,16 +9,14 @@ changed, as on a journaling file system; the bytes of a file that grew may read 
 from __future__ import annotations
 
 import errno
-import io
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
-from emmc_rig.session.storage import Disk, OpenFile
+from emmc_rig.model.files import Disk
 
 
 class PowerCutError(BaseException):
@@ -92,7 +90,16 @@ class SimulatedDisk(Disk):
         survived._root = _survivor(self._root, rng)
         return survived
 
-    def create(self, path: Path) -> _Writer:
+    def write(self, path: Path, data: bytes | memoryview) -> None:
+        """Write a file, one of that name anew, and put its bytes on the platter."""
+        self._grow(self.create(path), data)
+
+    def append(self, path: Path, data: bytes) -> None:
+        """Write at the end of a file, made where missing, and put its bytes on the platter."""
+        there = self._folder(path.parent).entries.get(path.name)
+        self._grow(there if isinstance(there, _File) else self.create(path), data)
+
+    def create(self, path: Path) -> _File:
         """Begin an empty file; one of that name is emptied."""
         self._operate("create")
         folder = self._folder(path.parent)
@@ -101,22 +108,32 @@ class SimulatedDisk(Disk):
             raise _fault(errno.EISDIR)
         if isinstance(there, _File):
             del there.data[:]
-            return _Writer(self, there)
+            return there
         file = _File()
         folder.change({path.name: file})
-        return _Writer(self, file)
+        return file
 
-    def append(self, path: Path) -> _Writer:
-        """Begin to write at the end of a file, made where missing."""
-        there = self._folder(path.parent).entries.get(path.name)
-        return _Writer(self, there) if isinstance(there, _File) else self.create(path)
+    def _grow(self, file: _File, data: bytes | memoryview) -> None:
+        """Add bytes, half of them when the power goes meanwhile or the disk is full; sync them."""
+        half = len(data) // 2
+        full = self.free_bytes(Path("/")) < len(data)
+        try:
+            self._operate("write")
+            if full:
+                raise _fault(errno.ENOSPC)
+        except BaseException:
+            file.data += data[:half]
+            raise
+        file.data += data
+        self._operate("sync")
+        file.synced = bytes(file.data)
 
-    def reader(self, path: Path) -> BinaryIO:
-        """Open a file for reading."""
+    def read(self, path: Path) -> bytes:
+        """Return the bytes of a file."""
         node = self._folder(path.parent).entries.get(path.name)
         if not isinstance(node, _File):
             raise _fault(errno.ENOENT if node is None else errno.EISDIR)
-        return io.BytesIO(bytes(node.data))
+        return bytes(node.data)
 
     def replace(self, source: Path, target: Path) -> None:
         """Rename within a folder, replacing at once what has the name."""
@@ -131,16 +148,12 @@ class SimulatedDisk(Disk):
         folder.change({source.name: None, target.name: folder.entries[source.name]})
 
     def remove(self, path: Path) -> None:
-        """Remove a file."""
+        """Remove a file, or a folder and what is in it."""
         self._operate("remove")
         folder = self._folder(path.parent)
         if path.name not in folder.entries:
             raise _fault(errno.ENOENT)
         folder.change({path.name: None})
-
-    def remove_folder(self, path: Path) -> None:
-        """Remove a folder and what is in it."""
-        self.remove(path)
 
     def make_folder(self, path: Path) -> None:
         """Make a folder and those above it."""
@@ -155,7 +168,7 @@ class SimulatedDisk(Disk):
                 raise _fault(errno.ENOTDIR)
             above = node
 
-    def sync_folder(self, path: Path) -> None:
+    def sync(self, path: Path) -> None:
         """Put the names in a folder on the platter."""
         self._operate("sync folder")
         self._folder(path).sync()
@@ -189,34 +202,6 @@ class SimulatedDisk(Disk):
         if not isinstance(node, _Folder):
             raise _fault(errno.ENOTDIR)
         return node
-
-
-class _Writer(OpenFile):
-    """A file open for writing."""
-
-    def __init__(self, disk: SimulatedDisk, file: _File) -> None:
-        self._disk, self._file = disk, file
-
-    def write(self, data: bytes | memoryview) -> None:
-        """Write at the end; half of it when the power goes meanwhile, or the disk is full."""
-        half = len(data) // 2
-        full = self._disk.free_bytes(Path("/")) < len(data)
-        try:
-            self._disk._operate("write")
-            if full:
-                raise _fault(errno.ENOSPC)
-        except BaseException:
-            self._file.data += data[:half]
-            raise
-        self._file.data += data
-
-    def sync(self) -> None:
-        """Put the bytes on the platter."""
-        self._disk._operate("sync")
-        self._file.synced = bytes(self._file.data)
-
-    def close(self) -> None:
-        """Let go of the file; that syncs nothing."""
 
 
 def _survivor(node: _Folder, rng: np.random.Generator) -> _Folder:

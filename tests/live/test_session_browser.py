@@ -4,9 +4,9 @@ import pytest
 from capture_rigs import begun, still_rig
 
 from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.pages.session_sheet import write_sheet
 from emmc_rig.session.session import REPORT
-from emmc_rig.session.storage import SYSTEM_DISK
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: extra `browser`")
 from browsers import CHROMEDRIVER, CHROMIUM, MARKS  # noqa: E402

@@ -7,10 +7,10 @@ from capture_rigs import begun, still_rig
 
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.files.formats.format import Export
+from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.pages.page import Head, Section, framed
 from emmc_rig.pages.session_sheet import sheet
 from emmc_rig.pages.viewer import render_viewer
-from emmc_rig.session.storage import SYSTEM_DISK
 
 pytestmark = MARKS
 WIDTHS_PX = 1600, 800, 390

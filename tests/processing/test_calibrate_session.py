@@ -15,13 +15,13 @@ from simulated_calibration import CalibrateSettings, rig_to_calibrate, true_psi
 from emmc_rig.acquisition.plan import load_plan
 from emmc_rig.bench.hardware import NO_FLAWS
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.folders import Listing
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.session import frame_means
 from emmc_rig.session.frame_means import camera_of
 from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import Session
+from emmc_rig.store.folders import Listing
 from simulators.bench import MountingErrors
 from simulators.effects import flawed
 

@@ -17,13 +17,13 @@ from programs import program
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.folders import result_folder
 from emmc_rig.processing import block_tasks
 from emmc_rig.processing import pool as pools
 from emmc_rig.processing.block_tasks import BlockJob, BlockTask
 from emmc_rig.processing.pool import WorkersError, opened_pool
 from emmc_rig.processing.reconstructing import reconstruct_folder
 from emmc_rig.progress import Silent
+from emmc_rig.store.folders import result_folder
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.stability_run import run_stability
 from emmc_rig.study.stability.stability_study import stability_settings

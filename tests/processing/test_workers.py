@@ -20,11 +20,11 @@ from programs import program
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.folders import result_folder
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.processing import block_tasks
 from emmc_rig.processing.memory import parse_memory
 from emmc_rig.processing.reconstructing import load_settings, reconstruct_folder
+from emmc_rig.store.folders import result_folder
 from reconstruction.errors import ReconstructionError
 
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"

@@ -13,10 +13,10 @@ from drivers.dng import Facts, encode_dng
 from drivers.raw import decode_raw
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.errors import AppError
+from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.session.export import export_dng
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.session import Session
-from emmc_rig.session.storage import SYSTEM_DISK
 
 needs_exiftool = pytest.mark.skipif(shutil.which("exiftool") is None, reason="no exiftool")
 

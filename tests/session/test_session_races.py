@@ -15,9 +15,9 @@ import pytest
 from capture_rigs import frame_bytes
 from programs import line_server
 
+from emmc_rig.model.files import part_of
 from emmc_rig.session.journal import FrameEntry, of_kind
 from emmc_rig.session.session import FRAMES, Session
-from emmc_rig.session.storage import part_of
 from emmc_rig.session.verify import verify
 
 OFFSETS = int(os.environ.get("EMMC_RACES", "5"))

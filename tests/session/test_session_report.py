@@ -17,13 +17,13 @@ from drivers.raw import RawFrame, decode_raw
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.commands.capture_display import CaptureDisplay
+from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.pages.session_sheet import run_times, sheet
 from emmc_rig.session.brightness import figures, thinned
 from emmc_rig.session.exposure import ShotExposure, exposure_reasons
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry
 from emmc_rig.session.journal import RetryEntry
 from emmc_rig.session.session import Session
-from emmc_rig.session.storage import SYSTEM_DISK
 from simulators.still import StillStage
 
 ROOT = Path("/disk")

@@ -31,6 +31,7 @@ from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
+from emmc_rig.model.files import SYSTEM_DISK, part_of, write_whole
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import (
     FrameEntry,
@@ -44,7 +45,6 @@ from emmc_rig.session.journal import (
 )
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
-from emmc_rig.session.storage import SYSTEM_DISK, part_of, read_whole, write_whole
 from emmc_rig.session.verify import verify
 
 ROOT = Path("/disk")
@@ -207,7 +207,7 @@ def test_without_syncs_a_power_cut_does_lose_what_was_counted(undisturbed):
     operations, _ = undisturbed
 
     class Forgetful(SimulatedDisk):
-        def sync_folder(self, path):
+        def sync(self, path):
             self.operations += 1
 
     rng = np.random.default_rng(0)
@@ -229,10 +229,8 @@ def test_without_syncs_a_power_cut_does_lose_what_was_counted(undisturbed):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's full device")
 def test_a_disk_that_is_really_full_is_reported_by_the_system():
-    file = SYSTEM_DISK.append(Path("/dev/full"))
     with pytest.raises(OSError, match="space"):
-        file.write(b"one byte too many")
-    file.close()
+        SYSTEM_DISK.append(Path("/dev/full"), b"one byte too many")
 
 
 def test_bytes_not_synced_may_be_lost_and_synced_ones_never_are():
@@ -241,11 +239,11 @@ def test_bytes_not_synced_may_be_lost_and_synced_ones_never_are():
     for _ in range(200):
         disk = SimulatedDisk()
         write_whole(disk, Path("/kept"), b"kept")
-        disk.create(Path("/loose")).write(b"loose")
+        disk.create(Path("/loose")).data += b"loose"
         survived = disk.after_power_cut(rng)
-        assert read_whole(survived, Path("/kept")) == b"kept"
+        assert survived.read(Path("/kept")) == b"kept"
         names = survived.sizes(Path("/"))
-        outcomes.add(read_whole(survived, Path("/loose")) if "loose" in names else None)
+        outcomes.add(survived.read(Path("/loose")) if "loose" in names else None)
     assert {None, b"", b"loose"} <= outcomes
     assert any(data and data != b"loose" for data in outcomes)
 
@@ -490,14 +488,15 @@ with held(pathlib.Path(sys.argv[1])):
 """
 
 
+def refuse_to_lock(descriptor, how):
+    raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+
 @pytest.fixture
 def no_locks(monkeypatch):
     """A disk on which files cannot be locked, as some in a network."""
 
-    def refuse(descriptor, how):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr("fcntl.flock", refuse)
+    monkeypatch.setattr("fcntl.flock", refuse_to_lock)
 
 
 @pytest.mark.usefixtures("no_locks")
@@ -522,7 +521,7 @@ def test_a_killed_capture_where_files_cannot_be_locked_says_what_to_delete(on_di
 
 def test_a_lock_by_file_holds_also_for_a_program_that_can_lock_files(on_disk):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fcntl.flock", lambda *given: os.open("/nowhere/at/all", 0))
+        patch.setattr("fcntl.flock", refuse_to_lock)
         lock = held(on_disk.folder)
         lock.__enter__()
     with pytest.raises(AppError, match="held by"), held(on_disk.folder):

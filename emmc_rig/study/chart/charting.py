@@ -11,7 +11,6 @@ from statistics import mean
 from matplotlib.axes import Axes
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import (
@@ -35,6 +34,7 @@ from emmc_rig.pages.page import (
     provenance_section,
 )
 from emmc_rig.progress import Watcher
+from emmc_rig.store.folders import result_folder
 from emmc_rig.study.chart.chart_points import ChartSettings, Point, charted_points
 from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts
 from emmc_rig.study.chart.measure import ChartStudy

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.progress import Watcher
+from emmc_rig.store.folders import result_folder
 from emmc_rig.study.design.bench import DesignBench, bench_text
 from emmc_rig.study.design.design_page import Table, design_page
 from emmc_rig.study.design.expected import SIZE, expected

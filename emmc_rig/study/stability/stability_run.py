@@ -18,7 +18,6 @@ from matplotlib.lines import Line2D
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.folders import result_folder
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.drawing import (
@@ -33,6 +32,7 @@ from emmc_rig.pages.drawing import (
 from emmc_rig.pages.page import Head, Section, embedded, fragment, framed, provenance_section
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
+from emmc_rig.store.folders import result_folder
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, machine, provenance
 from emmc_rig.study.stability.curves import (

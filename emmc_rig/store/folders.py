@@ -18,15 +18,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.lock_file import TakenError, take_lock
+from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.model.json_text import parse_json
+from emmc_rig.store.locks import TakenError, take_lock
 
 FILES = "files.json"
 PARTIAL = ".emmc-rig.partial"
@@ -40,7 +40,7 @@ SESSION_RECONSTRUCTION = "reconstruction"
 
 @dataclass(frozen=True)
 class Listing:
-    """What a result knows of itself: the command that wrote it, and its files' SHA-256 by name.
+    """The command that wrote a result, and the SHA-256 of its files by name.
 
     Names are relative to the folder, with slashes.
     """
@@ -58,7 +58,7 @@ class Listing:
     def read(cls, folder: Path) -> Listing | None:
         """Return what a folder's files.json says; None where there is none.
 
-        Raises AppError for one that no command wrote like that.
+        Raises AppError for a file that was edited.
         """
         path = folder / FILES
         try:
@@ -112,11 +112,11 @@ def result_folder(
             there, or nothing can be written.
     """
     folder = Path(os.path.realpath(out))
-    made: list[Path] = []
+    refuse_inside_session(out, belongs_to)
+    if os.path.isfile(folder):
+        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
     try:
-        refuse_inside_session(out, belongs_to)
-        made = _make_folders(folder, out)
-        with _workplace(folder / PARTIAL, resumes):
+        with made_folder(folder), _workplace(folder / PARTIAL, resumes):
             _finish(folder)
             earlier = _replaceable(folder, out, command, adds)
             if not adds:
@@ -129,10 +129,22 @@ def result_folder(
                 _clear(folder / PARTIAL)
     except OSError as fault:
         raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
+
+
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; those that were missing and are empty at the end go again.
+
+    Raises OSError.
+    """
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
     finally:
-        for path in made:
+        for place in missing:
             with suppress(OSError):
-                path.rmdir()
+                place.rmdir()
 
 
 def kept_folder(new: Path) -> Path:
@@ -148,26 +160,7 @@ def kept_folder(new: Path) -> Path:
 def emptied(folder: Path) -> None:
     """Remove all in a folder; links are not followed."""
     for path in list(folder.iterdir()):
-        _remove(path)
-
-
-def placed(new: Path, path: Path) -> None:
-    """Give a file or a folder of files its name, once it is on the disk; return when that is, too.
-
-    What had the name is replaced.
-    """
-    for one in new.rglob("*") if new.is_dir() else [new]:
-        _sync(one)
-    if new.is_dir():
-        _sync_folders(new, [])
-    if path.exists():
-        _remove(path)
-    os.replace(new, path)
-    _sync_folders(path.parent, [])
-
-
-def _remove(path: Path) -> None:
-    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+        SYSTEM_DISK.remove(path)
 
 
 @contextmanager
@@ -182,7 +175,7 @@ def new_file(path: Path) -> Iterator[Path]:
     try:
         with _workplace(place):
             yield place / path.name
-            _sync(place / path.name)
+            SYSTEM_DISK.sync(place / path.name)
             try:
                 os.link(place / path.name, path)
             except OSError:
@@ -202,7 +195,7 @@ def _free(path: Path) -> Path:
 
 
 def refuse_missing(folder: Path, remedy: str) -> None:
-    """Raise AppError, with what to do, where there is no such folder."""
+    """Raise AppError, with the remedy, where the folder is missing."""
     if not folder.exists():
         raise AppError(f"{folder}: no such folder; {remedy}")
 
@@ -238,25 +231,12 @@ def _refuse_holding(folder: Path, out: Path) -> None:
             )
 
 
-def _make_folders(folder: Path, out: Path) -> list[Path]:
-    """Make a folder and those above it; return those that were missing, the innermost first."""
-    if os.path.isfile(folder):
-        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
-    missing = []
-    for place in (folder, *folder.parents):
-        if os.path.exists(place):
-            break
-        missing.append(place)
-    folder.mkdir(parents=True, exist_ok=True)
-    return missing
-
-
 @contextmanager
 def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
-    """Make a hidden folder that is this program's alone; it goes at the end with all in it.
+    """Make a hidden folder that is this program's alone, and remove it with its files at the end.
 
-    What a killed program left in it goes too, but for a result that takes its place, and what is
-    kept where `resumes`. Raises AppError where another program works in it, and OSError.
+    Files that a killed program left in it are removed too, except a result that takes its place,
+    and kept files where `resumes`. Raises AppError where another program works in it, and OSError.
     """
     release = None
     while release is None:
@@ -285,7 +265,7 @@ def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
 def _clear(place: Path, spared: str | None = None) -> None:
     """Empty a hidden folder, unless a result in it takes its place; links are not followed.
 
-    spared: the one folder in it that stays, unless it is empty.
+    spared: the name of a folder in it that stays, unless it is empty.
     """
     if (place / FILES).exists() or (place / MOVES).exists():
         return
@@ -293,7 +273,7 @@ def _clear(place: Path, spared: str | None = None) -> None:
         is_folder = path.is_dir() and not path.is_symlink()
         if path.name == LOCK or (path.name == spared and is_folder and any(path.iterdir())):
             continue
-        _remove(path)
+        SYSTEM_DISK.remove(path)
 
 
 def _replaceable(folder: Path, out: Path, command: str, adds: bool) -> Listing:
@@ -321,7 +301,7 @@ def refuse_edited(out: Path, command: str) -> None:
 
 
 def _refuse_foreign(folder: Path, out: Path, names: Iterable[str], earlier: Listing) -> None:
-    """Raise AppError where something at one of these names is not what the earlier result wrote."""
+    """Raise AppError where a file of these names is not the file of the earlier result."""
     for name in names:
         for path in (folder / name, *_above(folder, name)):
             is_in_the_way = path.is_file() or path == folder / name
@@ -355,7 +335,7 @@ def _take_place(folder: Path, out: Path, earlier: Listing, adds: bool) -> None:
     new, partial, files = folder / PARTIAL / NEW, folder / PARTIAL, {}
     for path in sorted(new.rglob("*")):
         if not path.is_dir():
-            _sync(path)
+            SYSTEM_DISK.sync(path)
             files[path.relative_to(new).as_posix()] = _digest(path)
     kept = {name: sha for name, sha in earlier.files.items() if adds and name not in files}
     # Somebody may have edited it since the command began.
@@ -363,7 +343,7 @@ def _take_place(folder: Path, out: Path, earlier: Listing, adds: bool) -> None:
         raise AppError(f"--out {out}: {FILES} is not what `emmc-rig {earlier.command}` wrote")
     _refuse_foreign(folder, out, {**earlier.files, **files}, earlier)
     (new / FILES).write_bytes(Listing(earlier.command, {**kept, **files}).text().encode())
-    _sync(new / FILES)
+    SYSTEM_DISK.sync(new / FILES)
     os.replace(new / FILES, partial / FILES)
     try:
         _finish(folder)
@@ -403,20 +383,12 @@ def _finish(folder: Path) -> None:
     _sync_folders(folder, [*obsolete, *left])
     os.replace(partial / FILES, folder / FILES)
     _sync_folders(folder, [FILES])
-    shutil.rmtree(partial / NEW, ignore_errors=True)
-
-
-def _sync(path: Path) -> None:
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
+    with suppress(OSError):
+        SYSTEM_DISK.remove(partial / NEW)
 
 
 def _sync_folders(folder: Path, names: Iterable[str]) -> None:
     """Return when the names are on the disk."""
     for place in {folder, *((folder / name).parent for name in names)}:
         with suppress(FileNotFoundError):
-            descriptor = os.open(place, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            SYSTEM_DISK.sync(place)

@@ -10,7 +10,7 @@ from contextlib import suppress
 import pytest
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.folders import FILES, PARTIAL, new_file, result_folder
+from emmc_rig.store.folders import FILES, PARTIAL, new_file, result_folder
 
 OPERATIONS = ("rename", "replace", "unlink", "rmdir", "mkdir", "link", "fsync")
 
@@ -152,8 +152,11 @@ def test_a_session_is_refused_by_every_way_to_it(tmp_path):
 @pytest.mark.parametrize("can_lock", [True, False])
 def test_two_commands_never_write_into_one_folder_at_a_time(tmp_path, monkeypatch, can_lock):
     if not can_lock:
-        # As some network disks do; opening nothing raises OSError.
-        monkeypatch.setattr("fcntl.flock", lambda *given: os.open("/nowhere/at/all", 0))
+
+        def refuse(descriptor, how):
+            raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+        monkeypatch.setattr("fcntl.flock", refuse)  # as on some network disks
     with result_folder(tmp_path / "out", "simulate") as folder:
         (folder / "metrics.json").write_text("first")
         with pytest.raises(AppError, match="another emmc-rig command"):
