@@ -16,7 +16,7 @@ def frame_of(mosaic, cfa="rggb", white=WHITE):
     return RawFrame(
         mosaic=mosaic.astype(np.uint16),
         cfa=cfa,
-        black_level_dn=np.full(4, BLACK, np.float64),
+        black_level_dn=np.full((2, 2), BLACK, np.float64),
         white_level_dn=white,
         exposure_s=0.01,
         original=b"",
