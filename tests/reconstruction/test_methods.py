@@ -54,12 +54,13 @@ USED = textwrap.dedent("""
     import numpy as np
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.model.camera import build_imaging_matrix
+    from emmc_rig.model.frames import even_frames
     from reconstruction.methods import MethodSettings, reconstruct
 
     psi = build_imaging_matrix(find_camera("rgbw-mono"), (8, 8))
     settings = MethodSettings.model_validate({"mean": {"gain": 0.5}})
-    frames = np.full(psi.frames_shape, 0.2, np.float32)
-    result = reconstruct("mean", psi, frames, 0.01, settings=settings)
+    frames = even_frames(np.full(psi.frames_shape, 0.2, np.float32), 0.01)
+    result = reconstruct("mean", psi, frames, settings=settings)
     print(result.method, round(float(result.light_field.mean()), 3))
     try:
         MethodSettings.model_validate({"mean": {"gian": 0.5}})

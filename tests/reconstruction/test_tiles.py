@@ -192,13 +192,13 @@ def test_shots_that_do_not_fit_are_left_out_and_evened_for_all_blocks_alike(rand
     psi, frames, _ = scene(random_psi, shots=4)
     frames[1] = 0.0
     frames[2] *= 1.2
-    usable = np.ones(frames.shape, dtype=bool)
-    survey = surveyed("tv", psi, even_frames(frames, 0.01, usable))
+    given = even_frames(frames, 0.01)
+    survey = surveyed("tv", psi, given)
     assert survey.left_out == (1,)
     assert survey.gains[2] / survey.gains[0] == pytest.approx(1.2, rel=0.05)
-    readings, kept = survey.applied(frames, usable)
-    assert not kept[1].any()
-    assert readings[2].mean() / readings[0].mean() == pytest.approx(
+    evened = survey.applied(given)
+    assert not evened.usable[1].any()
+    assert evened.readings[2].mean() / evened.readings[0].mean() == pytest.approx(
         frames[2].mean() / frames[0].mean() / 1.2, rel=0.05
     )
 
