@@ -174,7 +174,7 @@ def read_mask(
     if start.pitch_px() < FEWEST_PX:
         raise CalibrationError(
             f"{start.pitch_px():.1f} pixels a cell of {_shown(cells)}, at least {FEWEST_PX:g} are "
-            "needed: photograph it closer, or correct --cells"
+            "needed: photograph it closer, or correct the number of cells"
         )
     grid = _fitted(light, _bowed(light, start))
     _check_count(_line_spectra(light, grid), cells)
@@ -209,7 +209,7 @@ def find_corners(light: Array, cells: tuple[int, int]) -> Array:
     differs = _differs_from_surround(light)
     points = np.argwhere(differs)
     nothing = CalibrationError(
-        "no mask with an even surround on all sides is seen: give its --corners, clockwise from "
+        "no mask with an even surround on all sides is seen: give its corners, clockwise from "
         "its top left"
     )
     if len(points) < 100:
@@ -341,8 +341,8 @@ def _bowed(light: Array, start: Grid) -> Grid:
 def _other_count(seen: tuple[int, ...], asked: tuple[int, int]) -> CalibrationError:
     turned = seen == asked[::-1]
     remedy = (
-        "the photograph is turned, or --cells are columns x rows" if turned
-        else "correct --cells, or give --corners to a third of a cell"
+        "the photograph is turned, or the cells are given as columns x rows" if turned
+        else "correct their number, or give the corners to a third of a cell"
     )  # fmt: skip
     return CalibrationError(
         f"about {_shown(seen)} cells are seen (rows x columns), not {_shown(asked)}: {remedy}"
@@ -429,7 +429,7 @@ def _fitted(light: Array, start: Grid) -> Grid:
     if abs(found.x[:8]).max() > FARTHEST:
         raise CalibrationError(
             f"a grid of {_shown(start.cells)} cells fits only {abs(found.x[:8]).max():.1f} cells "
-            "beside the corners: correct --cells, or give --corners to a third of a cell"
+            "beside the corners: correct their number, or give the corners to a third of a cell"
         )
     return grid_of(found.x)
 
@@ -596,7 +596,7 @@ def _check_face(cells: Array, ordered: Array | None) -> None:
     if best:
         raise CalibrationError(
             f"the photograph shows the mask as ordered only when it is {best}: turn or mirror it, "
-            "or give the --corners from the mask's own top left"
+            "or give the corners from the mask's own top left"
         )
 
 

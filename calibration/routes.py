@@ -655,7 +655,7 @@ def fit_advice(fit: Fit) -> list[str]:
         )
         found.append(
             f"too few whiteboards to measure {len(fit.undecided)} parameter(s) ({shown}), which "
-            f"keep the design's values: {more}; `emmc-rig calibrate --plan` writes a plan"
+            f"keep the design's values: {more}"
         )
     return found
 

@@ -198,7 +198,7 @@ class NotHomedError(DriverError):
     def __init__(self, axis: str, why: str = "") -> None:
         super().__init__(
             f"{axis} does not know where it is{f', {why}' if why else ''}",
-            f"home it first: `emmc-rig devices home {axis} --stage STAGE`",
+            "home it first",
             axis=axis,
         )
         self.why = why
@@ -209,7 +209,7 @@ class AxisFaultError(DriverError):
 
     loses_position = True
     usual_fault = "unnamed"
-    usual_advice = "clear the fault, then home the axis: `emmc-rig devices home`"
+    usual_advice = "clear the fault, then home the axis"
 
     def __init__(self, axis: str, fault: str = "", advice: str = "") -> None:
         what = f"{axis} reports a fault, {fault or self.usual_fault}"
@@ -220,34 +220,28 @@ class StalledError(AxisFaultError):
     """The motor was blocked during a move."""
 
     usual_fault = "stalled"
-    usual_advice = "clear the obstacle, then home the axis: `emmc-rig devices home`"
+    usual_advice = "clear the obstacle, then home the axis"
 
 
 class EmergencyStopError(AxisFaultError):
     """The emergency stop was pressed, or the motor driver is off."""
 
     usual_fault = "emergency stop"
-    usual_advice = (
-        "make the bench safe, release the stop, then home the axis: `emmc-rig devices home`"
-    )
+    usual_advice = "make the bench safe, release the stop, then home the axis"
 
 
 class LimitSwitchError(AxisFaultError):
     """The axis ran into the end of its travel."""
 
     usual_fault = "limit switch reached"
-    usual_advice = (
-        "check the limits and what is in the way, then home the axis: `emmc-rig devices home`"
-    )
+    usual_advice = "check the limits and what is in the way, then home the axis"
 
 
 class LostPositionError(AxisFaultError):
     """The axis no longer knows where it is."""
 
     usual_fault = "position lost"
-    usual_advice = (
-        "home the axis (`emmc-rig devices home`), and repeat what was done since it was last homed"
-    )
+    usual_advice = "home the axis, and repeat what was done since it was last homed"
 
 
 class MoveTimeoutError(DriverError):
@@ -269,7 +263,7 @@ class PositionMismatchError(DriverError):
         super().__init__(
             f"{axis} was sent to {commanded_um:.3f} um but reads {read_um:.3f} um "
             f"(tolerance {tolerance_um:g} um)",
-            "see that nothing blocks it, then home the axis: `emmc-rig devices home`",
+            "see that nothing blocks it, then home the axis",
             axis=axis,
         )
         self.commanded_um = commanded_um

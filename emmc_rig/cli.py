@@ -10,6 +10,7 @@ from typing import Annotated, Any, NoReturn, cast
 
 import typer
 
+from emmc_rig.commands.advice import in_shell
 from emmc_rig.commands.calibrate import calibrate
 from emmc_rig.commands.cameras import cameras
 from emmc_rig.commands.capture import capture
@@ -82,11 +83,11 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         _fail("stopped by Ctrl-C; nothing was written", INTERRUPTED)
     except StoppedError as stop:
-        _fail(str(stop), INTERRUPTED)
+        _fail(in_shell(stop), INTERRUPTED)
     except WrongUsageError as fault:
-        _fail(str(fault), 2)
+        _fail(in_shell(fault), 2)
     except ERRORS as fault:
-        _fail(str(fault), 1)
+        _fail(in_shell(fault), 1)
     except MemoryError:
         _fail("not enough memory: use a smaller --size or fewer shots", 1)
     except UsageError as fault:
@@ -113,6 +114,5 @@ def _warnings_as_notes() -> Iterator[None]:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-
     say("emmc-rig", message, "bold red")
     sys.exit(code)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from calibration.errors import CalibrationError
 from drivers.errors import DriverError
+from emmc_rig.model.advice import AdvisedError
 from emmc_rig.model.errors import ModelError
 from reconstruction.errors import ReconstructionError
 
 
-class AppError(Exception):
+class AppError(AdvisedError):
     """Root of the application's errors; shown to the user as one line."""
 
 

@@ -1,7 +1,9 @@
 """Errors of the reconstruction: each message says what is wrong and what to do, in one line."""
 
+from emmc_rig.model.advice import AdvisedError
 
-class ReconstructionError(Exception):
+
+class ReconstructionError(AdvisedError):
     """Root of the reconstruction's errors; shown to the user as one line."""
 
 

@@ -48,7 +48,7 @@ class Given:
         """Return the dictionary; raises ReconstructionError when there is none."""
         if self.dictionary is None:
             raise ReconstructionError(
-                f"'{method}' needs a dictionary: give --dictionary lambertian, or a file"
+                f"'{method}' needs a dictionary: give lambertian, or the file of one"
             )
         return self.dictionary
 

@@ -22,7 +22,7 @@ from emmc_rig.model.settings import validated
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
-REMEDY = "take that edit back, or name another --out"
+REMEDY = "take that edit back, or begin another session"
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Amendment:
         shown = "; ".join(self.changes[:3]) + ("; ..." if len(self.changes) > 3 else "")
         stay = f"{stored} frames taken stay"
         if self.kept:
-            stay += f", {self.kept} of them exposed as before (another --out takes them anew)"
+            stay += f", {self.kept} of them exposed as before (another session takes them anew)"
         return f"the plan was edited ({shown}): {stay}, the others follow it"
 
 

@@ -72,13 +72,14 @@ def with_hands(rig: RigType, frames: Iterable[PlannedFrame]) -> RigType:
         pinholes = {*moved} <= {*APERTURE}
         without = (
             "write `views: []` and `open:` boards under whiteboards in the plan, which need no "
-            "pinhole (emmc-rig calibrate --plan --skip aperture)"
+            "pinhole"
             if pinholes
             else "plan shots at one place of the mask"
         )
         raise AppError(
             f"the plan moves {' and '.join(moved)}, the rig has the axes {known}, and nothing is "
-            f"moved by hand (by_hand: false): write by_hand: true, or {without}"
+            f"moved by hand (by_hand: false): write by_hand: true, or {without}",
+            "plan-open-whiteboards" if pinholes else None,
         )
     return replace(rig, hands=frozenset(moved), left=frozenset(lacking) - frozenset(moved))
 

@@ -150,17 +150,15 @@ def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session 
         if session.stored and asked != AnyRig.under_new_names(session.rig):
             raise AppError(
                 f"session {session.folder.name} was begun with another rig: "
-                f"{json.dumps(session.rig)}; leave --rig out, or name another --out"
+                f"{json.dumps(session.rig)}; name no rig, or begin another session"
             )
         return session
     if (request.out / HEADER).is_file():
         raise AppError(
-            f"{request.out}: its {JOURNAL} is gone; restore it from a copy, or name another --out"
+            f"{request.out}: its {JOURNAL} is gone; restore it from a copy, or name another folder"
         )
     if request.out.exists() and (request.out.is_file() or any(request.out.iterdir())):
-        raise AppError(
-            f"--out {request.out}: holds something else than a session; name another --out"
-        )
+        raise AppError(f"{request.out}: holds something else than a session; name another folder")
     refuse_inside_session(request.out)
     return None
 
@@ -206,7 +204,7 @@ def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -
         raise AppError(
             f"{out}: {expected.frames} frames need about {shown_bytes(expected.bytes)}, and "
             f"{shown_bytes(DISK_RESERVE_BYTES)} stay reserved: {shown_bytes(lacking)} more than "
-            f"the {shown_bytes(free)} that are free; make room, or name another --out"
+            f"the {shown_bytes(free)} that are free; make room, or name another folder"
         )
 
 
@@ -220,14 +218,15 @@ def refuse_other_devices(session: Session, rig: Rig, meant: bool = False) -> Non
     if last is None or not session.stored:
         return
     then, now = last.camera, rig.camera.identity
-    way = "connect that one, name another --out, or say that it is meant by --other-devices"
+    way = "connect that one, begin another session, or say that other devices are meant"
     same_shape = then["shape"] == list(rig.camera.shape)
     if not same_shape or (then["serial"] != now.serial and not meant):
         raise AppError(
             f"session {session.folder.name} was begun with camera {then['model']} "
             f"{then['serial']} of {then['shape'][0]}x{then['shape'][1]} pixels, this is "
             f"{now.model} {now.serial} of {rig.camera.shape[0]}x{rig.camera.shape[1]}: "
-            f"{way if same_shape else 'connect that one, or name another --out'}"
+            f"{way if same_shape else 'connect that one, or begin another session'}",
+            "other-devices" if same_shape else None,
         )
     for axis in () if meant else rig.stage.axes:
         earlier = last.stage.get(axis, {}).get("identity", {})
@@ -235,7 +234,8 @@ def refuse_other_devices(session: Session, rig: Rig, meant: bool = False) -> Non
         if earlier.get("serial") and own.serial and earlier["serial"] != own.serial:
             raise AppError(
                 f"session {session.folder.name} was begun with {axis} on {earlier['model']} "
-                f"{earlier['serial']}, now it is on {own.model} {own.serial}: {way}"
+                f"{earlier['serial']}, now it is on {own.model} {own.serial}: {way}",
+                "other-devices",
             )
 
 
@@ -271,16 +271,10 @@ def way_on_named(request: CaptureRequest, session: Session) -> Iterator[None]:
             session.forget()
         if not isinstance(fault, GaveUpError):
             raise
-        if not is_session(session.folder):
-            way = "nothing was captured; correct it, then run the same command"
-        elif is_session(request.plan_path):
-            way = (
-                f"{kept} frames are kept: correct it, then run the same command, or with a copy of "
-                f"the plan that you edited: emmc-rig capture COPY.yaml --out {request.out}"
-            )
-        else:
-            way = f"{kept} frames are kept: correct it, then run the same command"
-        raise AppError(f"{fault}; {way}") from fault
+        way = f"{kept} frames are kept" if kept else "nothing was captured"
+        line = f"{fault}; {way}: correct it, then run the same command"
+        edited = kept and is_session(request.plan_path)
+        raise AppError(line, "capture-edited" if edited else None, request.out) from fault
 
 
 def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunEnd] | None:
@@ -291,7 +285,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
     watcher, plan = front.watcher, request.plan
     if request.until_db is not None:
         if plan.film is not None:
-            raise AppError("--until: a film is taken to its end: leave --until or film out")
+            raise AppError("a film is taken to its end: leave the target PSNR or film out")
         refuse_unless_shots_can_be_spared(plan, request.camera)
     with ExitStack() as open_things:
         session = begun_session(request)
@@ -370,7 +364,7 @@ def asked_for(
     if rig is None and is_session(folder):
         rig = Session(folder).rig
     if rig is None:
-        raise AppError("say which rig: --rig simulated, or --rig and a YAML file of devices")
+        raise AppError("say which rig: simulated, or a YAML file of devices", "name-rig")
     return request_from_plan(plan, folder, rig, until_db)
 
 
@@ -388,18 +382,18 @@ def capture_session(
     captured is kept, and the same call goes on.
     """
     if not plan.exists():
-        raise AppError(f"{plan}: no such file; write a plan with: emmc-rig capture --new CAMERA")
+        raise AppError(f"{plan}: no such file; write a plan", "new-plan")
     folder = asked_folder(plan, out)
-    go_on = f"go on with: emmc-rig capture {folder}"
     with held(folder):
         request = asked_for(plan, folder, rig, until_db)
         request = replace(request, other_devices=other_devices)
         try:
             captured = run_capture(request, front)
         except (KeyboardInterrupt, StoppedError) as stop:
-            begun = is_session(folder)
-            kept = f"what was captured is kept, {go_on}" if begun else "nothing was begun"
-            raise StoppedError(f"stopped at once; {kept}") from stop
+            if not is_session(folder):
+                raise StoppedError("stopped at once; nothing was begun") from stop
+            kept = "stopped at once; what was captured is kept"
+            raise StoppedError(kept, "capture", folder) from stop
         if captured is None:
             return None
         session, outcome = captured
@@ -410,8 +404,9 @@ def capture_session(
     front.watcher.ended(session, outcome)
     if not outcome.complete:
         raise StoppedError(
-            f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken; "
-            f"{go_on}"
+            f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken",
+            "capture",
+            folder,
         )
     return captured
 

@@ -236,7 +236,7 @@ class Plan(Settings):
 
     removed: ClassVar = ("suspend",)
     title: str = ""
-    camera: str = Field(description="a shipped camera (`emmc-rig cameras`), or a YAML file")
+    camera: str = Field(description="a shipped camera, or a YAML file")
     shots: tuple[PlannedShot, ...] = Field(min_length=1)
     whiteboards: Boards | None = Boards()
     darks: Darks | None = Darks()
@@ -379,10 +379,10 @@ def new_plan(name: str, camera: Camera) -> str:
     rows, columns = camera.views
     shots = "\n".join(_shot(camera, place) for place in range(len(camera.shots)))
     return f"""\
-# A capture for `emmc-rig capture`. Comments show defaults and examples.
+# A plan of a capture. Comments show defaults and examples.
 
 title: {name}
-camera: {name}              # a shipped camera (`emmc-rig cameras`), or a YAML file beside this one
+camera: {name}              # a shipped camera, or a YAML file beside this one
 
 # The shots of the scene. Each takes masks, mask place and filter from the camera's own shot.
 #   mask_um: [x, y]         moves the mask stage elsewhere; or in cells: mask_cells: [x, y]
@@ -397,8 +397,8 @@ shots:
 whiteboards:
   views: all                # or a list: [[0, 0], [2, 2]]
   open:                     # masks in, whole aperture
-    - {{validation: true}}    # not used for Psi: `emmc-rig calibrate` judges Psi by it
-    # - {{mask_um: [0, 0]}}   # to fit the mask from few frames, see `calibrate --plan`
+    - {{validation: true}}    # not used for Psi: calibration judges Psi by it
+    # - {{mask_um: [0, 0]}}   # to fit the mask from few frames
   # lamps: [white]          # default: what the sensor needs
   repeats: 2
   references: 4

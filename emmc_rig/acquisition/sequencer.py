@@ -235,7 +235,7 @@ class Sequencer:
         )
         raise AppError(
             f"the bench has changed: frame {planned.id}, captured again, {what}; put "
-            "the masks back and check lamp and board, or begin another session with --out"
+            "the masks back and check lamp and board, or begin another session"
         )
 
     def _hand_places(self) -> HandPlaces:

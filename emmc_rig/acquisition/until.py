@@ -24,7 +24,6 @@ from emmc_rig.session.session import Session
 from reconstruction.methods import reconstruct
 from reconstruction.result import Progress, Reconstruction
 
-PLANNED_BY = "`emmc-rig calibrate --plan` writes a plan that has them"
 SMALLEST = (16, 16)
 METHOD = "adaptive-fast"
 
@@ -36,21 +35,21 @@ def refuse_unless_shots_can_be_spared(plan: Plan, camera: Camera) -> None:
     """
     if len(plan.shots) < 2:
         raise AppError(
-            "--until: the plan has one shot, so that no shot can be saved; list the others that "
+            "the plan has one shot, so that no shot can be saved; list the others that "
             "may be taken, each with its mask_um"
         )
     boards = plan.whiteboards
     if boards is None or plan.darks is None:
         wanting = "darks" if boards is not None else "whiteboards"
         raise AppError(
-            f"--until: the plan has no {wanting}, so that the Psi of its shots cannot be measured; "
-            f"{PLANNED_BY}"
+            f"the plan has no {wanting}, so that the Psi of its shots cannot be measured",
+            "plan-whiteboards",
         )
     if any(not board.validation for board in boards.open):
         if not any(board.validation for board in boards.open):
             raise AppError(
-                "--until: no open whiteboard of the plan has `validation: true`, to judge Psi by; "
-                f"{PLANNED_BY}"
+                "no open whiteboard of the plan has `validation: true`, to judge Psi by: plan one",
+                "plan-whiteboards",
             )
         shadow_mask(camera, SMALLEST)
         return
@@ -61,8 +60,9 @@ def refuse_unless_shots_can_be_spared(plan: Plan, camera: Camera) -> None:
         shots is not None and len(shots) < len(plan.shots)
     ):
         raise AppError(
-            "--until: the plan has neither open whiteboards nor the pinhole before every view of "
-            f"every shot, so that the Psi of its shots cannot be measured; {PLANNED_BY}"
+            "the plan has neither open whiteboards nor the pinhole before every view of every "
+            "shot, so that the Psi of its shots cannot be measured: plan either",
+            "plan-whiteboards",
         )
 
 

@@ -50,7 +50,7 @@ def parse_camera(spec: str) -> CameraChoice:
     """
     if not spec.endswith((".yaml", ".yml")) or ":" in spec:
         driver, _, address = spec.partition(":")
-        return CameraChoice(driver, address, source=f"--camera {shown_path(spec)}")
+        return CameraChoice(driver, address, source=f"camera {shown_path(spec)}")
     read = read_yaml(Path(spec), AppError)
     options = {str(key): value for key, value in read.items()} if isinstance(read, dict) else {}
     named = next((key for key in DRIVER_KEYS if isinstance(options.get(key), str)), None)

@@ -248,7 +248,7 @@ def simulated_rig(
     if min(size) // k < SMALLEST_SIDE_PX:
         least = SMALLEST_SIDE_PX * k
         raise AppError(
-            f"--size {size[0]}x{size[1]}: the simulated camera's RAW files hold at least "
+            f"size {size[0]}x{size[1]}: the simulated camera's RAW files hold at least "
             f"{SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels: use {least}x{least} or more"
         )
     clock = clock or ManualClock()

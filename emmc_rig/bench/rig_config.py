@@ -175,7 +175,7 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
         return _described(SIMULATED, imaged)
     if not spec.endswith((".yaml", ".yml")):
         raise AppError(
-            f"--rig {shown_path(spec)}: write simulated, or the name of a YAML file of devices"
+            f"rig {shown_path(spec)}: write simulated, or the name of a YAML file of devices"
         )
     read = read_yaml(Path(spec), AppError)
     if isinstance(read, dict) and read.get("kind") == SIMULATED:

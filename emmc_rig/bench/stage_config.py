@@ -154,7 +154,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
         data = dict(read)
     else:
         raise AppError(
-            f"--stage {shown}: write PROTOCOL:PORT with one of {', '.join(known)}, such as "
+            f"stage {shown}: write PROTOCOL:PORT with one of {', '.join(known)}, such as "
             "zaber:/dev/ttyUSB0, or the name of a YAML file"
         )
     return stage_of(data | dict(overrides or {}), shown)
@@ -176,8 +176,8 @@ def _option(spec: str, text: str) -> tuple[str, Any]:
     """Return name and value of one `NAME=VALUE` behind a port; raises AppError."""
     name, equals, value = text.partition("=")
     if not (equals and name and value):
-        raise AppError(f"--stage {spec}: write NAME=VALUE behind the port, not {text!r}")
-    return name.strip(), parse_yaml(value, f"--stage {spec}", AppError)
+        raise AppError(f"stage {spec}: write NAME=VALUE behind the port, not {text!r}")
+    return name.strip(), parse_yaml(value, f"stage {spec}", AppError)
 
 
 def stage_of(data: dict[str, Any], source: str) -> StageConfig:

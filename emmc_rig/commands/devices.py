@@ -290,7 +290,6 @@ def udev_rule() -> None:
 @contextmanager
 def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     """Yield the chosen stage; a stage that moves is stopped when the block is left by an error."""
-    from drivers.errors import DriverError
     from emmc_rig.bench.hardware import open_stage
 
     if (stage is None) == (rig is None):
@@ -305,9 +304,6 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
             notes = getattr(stop, "__notes__", ["the stage was stopped"])
             say("stopped", "; ".join(notes))
             raise
-        except DriverError as fault:
-            notes = getattr(fault, "__notes__", [])
-            raise AppError("; ".join([str(fault), *notes])) from fault
 
 
 def _show(stage: Stage) -> None:

@@ -115,8 +115,8 @@ def live(
         try:
             words = ("emmc-rig", "capture", str(plan), "--rig", rig or "")
             following = shlex.join(words) if plan and rig else ""
-            page = SetupPage(watch, following)
-            Server(application(page, token, read_only, hosts)).run(sockets=[listening])
+            page, to_act = SetupPage(watch, following), "start `emmc-rig live` without --read-only"
+            Server(application(page, token, read_only, hosts, to_act)).run(sockets=[listening])
         except KeyboardInterrupt:
             tell("ended; the stage does not move")
 

@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperCommand
 from typer.main import get_command
 
+from emmc_rig.commands.advice import in_shell
 from emmc_rig.commands.output import emit, json_wanted
 from emmc_rig.errors import ERRORS
 
@@ -63,7 +64,7 @@ class ModalCommand(TyperCommand):
             return self._run(ctx)
         except ERRORS as fault:
             if json_wanted.get():
-                emit("error", text=str(fault))
+                emit("error", text=in_shell(fault))
             raise
         finally:
             json_wanted.reset(before)

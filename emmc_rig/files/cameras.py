@@ -80,7 +80,7 @@ def camera_file(spec: str) -> Path:
     if spec in shipped:
         return shipped[spec]
     raise CameraError(
-        f"no camera is called '{spec}': {did_you_mean(spec.lower(), shipped)}`emmc-rig cameras` "
-        "lists them; "
-        "a camera of your own is given by the path of its .yaml file"
+        f"no camera is called '{spec}': {did_you_mean(spec.lower(), shipped)}a camera of "
+        "your own is given by the path of its .yaml file",
+        "list-cameras",
     )

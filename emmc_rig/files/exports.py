@@ -37,14 +37,14 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     if is_session(folder):
         folder = folder / SESSION_RECONSTRUCTION
         if not (folder / LIGHT_FIELD).is_file():
-            raise AppError(f"{spec}: not reconstructed yet; run: emmc-rig reconstruct {spec}")
+            raise AppError(f"{spec}: not reconstructed yet", "reconstruct", spec)
     if (folder / LIGHT_FIELD).is_file():
         light_field, maps = load_hdf5(folder / LIGHT_FIELD), read_maps(folder)
         axes = load_view_axes(folder / LIGHT_FIELD)
         metrics = _metrics(folder)
         caption = _caption(metrics)
     elif (folder / FRAMES).is_file():
-        raise AppError(f"{spec}: holds frames, no light field; run: emmc-rig reconstruct {spec}")
+        raise AppError(f"{spec}: holds frames to reconstruct first", "reconstruct", spec)
     elif not folder.exists() and spec not in SCENES:
         near = nearest_of(spec, SCENES)
         raise AppError(f"no folder or file '{spec}', and no built-in scene: {near}")

@@ -31,7 +31,7 @@ AGAIN = "measure Psi again"
 FRAMES, PSI = "frames.h5", "psi.h5"
 FRAMES_GROUP = "frames.zarr"
 FRAMES_AGAIN = "make the frames again"
-WRITTEN_BY = "name one that `emmc-rig demo`, `simulate` or `capture` wrote"
+WRITTEN_BY = "name a session, or the folder of simulated frames"
 
 
 class StoredPsi(PsiLayout):

@@ -43,7 +43,7 @@ def write_mat(folder: Path, psi: ImagingMatrix, frames: Frames | None) -> None:
     matrix = psi.to_scipy().astype(np.float64).tocsc()
     if matrix.data.nbytes >= LARGEST_MAT_BYTES:
         raise AppError(
-            f"Psi has {matrix.nnz} entries, more than a MAT file holds: use --format npz, or a "
+            f"Psi has {matrix.nnz} entries, more than a MAT file holds: export npz, or a "
             "window of it"
         )
     # Of double precision: MATLAB does not multiply a sparse matrix with singles.

@@ -30,7 +30,7 @@ VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless"
 
 
 def parse_size(
-    text: str | None, option: str = "--size", example: str = "192x256"
+    text: str | None, option: str = "size", example: str = "192x256"
 ) -> tuple[int, int] | None:
     """Return rows and columns from ROWSxCOLUMNS; raises AppError."""
     if text is None:

@@ -43,9 +43,7 @@ def open_scale(place: Path) -> Scale:
     """
     file = place / PSI if place.is_dir() else place
     if not file.is_file():
-        raise AppError(
-            f"{place}: no Psi; name a session, a folder of `emmc-rig calibrate` or psi.h5"
-        )
+        raise AppError(f"{place}: no Psi; name a session, the folder of a calibration or psi.h5")
     psi, beside = ImagingMatrix.load(file), file.parent / CALIBRATION_FILE
     if not beside.is_file():
         return designed_scale(psi)

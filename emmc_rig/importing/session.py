@@ -113,14 +113,14 @@ def import_session(
     known = find_camera(camera)
     if planes and known.sensor.cfa_name not in ("mono", "custom"):
         raise AppError(
-            f"--planes: three shots of a monochrome sensor, and the camera's sensor.cfa is "
-            f"{known.sensor.cfa_name}: leave --planes out, or write cfa: mono"
+            f"planes are three shots of a monochrome sensor, and the camera's sensor.cfa is "
+            f"{known.sensor.cfa_name}: take no planes, or write cfa: mono"
         )
     refuse_inside_session(out)
     if out.exists() and not out.is_dir():
-        raise AppError(f"--out {out}: a file, where a folder is meant; name another --out")
+        raise AppError(f"{out}: a file, where a folder is meant; name another")
     if out.exists() and any(out.iterdir()):
-        raise AppError(f"--out {out}: holds something already; name another --out")
+        raise AppError(f"{out}: holds something already; name another folder")
     try:
         with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
             notes: list[str] = []
@@ -233,8 +233,8 @@ def _mosaics(own: OwnFrames, one: Listed, planes: bool) -> NDArray:
         raise AppError(f"{name}: a grey picture in three equal colours; write it with one")
     if not planes:
         raise AppError(
-            f"{name}: colours of every pixel, which no mosaic has: export the RAW file, or with "
-            "--planes its red, green and blue are three shots of a monochrome sensor"
+            f"{name}: colours of every pixel, which no mosaic has: export the RAW file, or take "
+            "its planes, red, green and blue, as three shots of a monochrome sensor"
         )
     return np.moveaxis(frames, -1, 1).reshape(-1, *frames.shape[1:3])
 
@@ -286,7 +286,7 @@ class _Import:
         self._items = self._numbered(items)
         shots = [shot for item, shot in self._items if item.listed.row.kind == "shot"]
         if not shots:
-            raise AppError("no file is a shot: name one at least, kind shot or --shots")
+            raise AppError("no file is a shot: name one at least, of kind shot")
         count = max(shots) + 1
         for shot in range(count):
             if shot not in shots:

@@ -275,9 +275,7 @@ class LiveLightField:
         stage, verdict = "preview", None
         if self._refined is not None:
             found, judged = self._refined
-            stage = (
-                f"{found.method}: {found.status} in {found.seconds:.1f} s, as emmc-rig reconstruct"
-            )
+            stage = f"{found.method}: {found.status} in {found.seconds:.1f} s, as by reconstruct"
             verdict = {"level": judged.level, "words": judged.words}
         seconds = 0 if run is None else self._clock() - run.begun_s
         if run is not None and (verdict is None or seconds > COMPILING_S):

@@ -129,7 +129,7 @@ def application(
     token: str,
     read_only: bool = False,
     hosts: tuple[str, ...] = LOCAL_HOSTS,
-    to_act: str = "start `emmc-rig live` without --read-only",
+    to_act: str = "start a page that may act",
 ) -> Starlette:
     """Return the ASGI application; hosts: names under which it may be asked for ("*": any).
 
@@ -267,7 +267,7 @@ def listening_socket(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
     except (OSError, OverflowError) as fault:
         why = getattr(fault, "strerror", None) or str(fault)
         raise AppError(
-            f"cannot serve at {host} port {port} ({why}): choose another --port or --host"
+            f"cannot serve at {host} port {port} ({why}): choose another port or host"
         ) from fault
 
 

@@ -75,7 +75,7 @@ def _save(saving: Saving) -> dict[str, Any]:
     if not saving.written:
         text = f"{', '.join(takes)} can be written into your files"
     if not takes:
-        text = "to write it into your files start with --plan plan.yaml, --rig rig.yaml"
+        text = "to write it into your files start the page with a plan and a file of devices"
     action = "preview" if takes else ""
     return {"name": "save", "done": bool(saving.written), "text": text, "action": action}
 

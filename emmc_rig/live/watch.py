@@ -384,7 +384,7 @@ class Watch:
 
     def _move(self, what: str, *steps: Callable[[Stage], object]) -> None:
         if self._driving is None:
-            raise AppError("no stage here: name one with --stage or --rig")
+            raise AppError("no stage here: start the page with a stage or a rig")
         self._driving.ask(what, *steps)
         self._start_anew()
 

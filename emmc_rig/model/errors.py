@@ -3,6 +3,8 @@
 import difflib
 from collections.abc import Iterable
 
+from emmc_rig.model.advice import AdvisedError
+
 
 def nearest_of(name: str, known: Iterable[str]) -> str:
     """Return a hint for a name that is not known: the nearest one, if any is near, and all."""
@@ -16,7 +18,7 @@ def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.5) -> str:
     return f"did you mean '{near[0]}'? " if near else ""
 
 
-class ModelError(Exception):
+class ModelError(AdvisedError):
     """Root of the model's errors; shown to the user as one line."""
 
 

@@ -396,7 +396,7 @@ def compute_blocks(
         if computed is None:
             raise AppError(
                 f"{task.path}: a worker wrote it, but it cannot be read here; put frames, "
-                "Psi and --out on a disk that all workers share"
+                "Psi and results on a disk that all workers share"
             )
         done[task.block.name] = computed
         on_block(len(done), len(tasks))

@@ -39,8 +39,8 @@ from emmc_rig.model.camera import Camera
 
 PLAN = "plan.yaml"
 PLAN_HEAD = """\
-# Whiteboards of every view and of all together, then shots: emmc-rig capture plan.yaml --rig ...
-# and after it: emmc-rig calibrate plan-session, or emmc-rig reconstruct plan-session.
+# Whiteboards of every view and of all together, then shots: capture this plan, then calibrate or
+# reconstruct its session.
 """
 METERING_DARKS, BOARD_DARKS, SHOT_DARKS = 2, 1, 2
 LAMP_CHECKS, COLOUR_REPEATS, TURNED_REPEATS = 6, 2, 2
@@ -87,7 +87,7 @@ class PlanSettings:
     def __post_init__(self) -> None:
         for name in sorted(self.skip):
             if name not in WATCHES:
-                raise AppError(f"--skip {name}: use some of {', '.join(WATCHES)}")
+                raise AppError(f"skip {name}: use some of {', '.join(WATCHES)}")
 
     @property
     def moves_masks(self) -> bool:
@@ -174,9 +174,9 @@ def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> Pla
     most = MOST_FRAMES if most_frames is None else (most_frames - others) // len(views)
     if most < 1:
         raise AppError(
-            f"--frames {most_frames}: a plan opens each of the {len(views)} views at least once, "
-            f"and takes {others} frames besides: allow {len(views) + others} or more, or plan for "
-            "less by --skip"
+            f"{most_frames} frames: a plan opens each of the {len(views)} views at least once, "
+            f"and takes {others} frames besides: allow {len(views) + others} or more, or skip "
+            "whiteboards of some kinds"
         )
     soft = soft_design(camera, mask)
     planned = plan_combined(mask, soft, light, target, most)
@@ -185,7 +185,7 @@ def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> Pla
             f"a relative error of Psi of {target:.3%} cannot be reached"
             f"{'' if most_frames is None else f' with {most_frames} frames'}: the best is "
             f"{planned.expected_error:.3%}, with {others + most * len(views)} frames; raise "
-            f"--target{'' if most_frames is None else ' or --frames'}"
+            f"the target{'' if most_frames is None else ' or the number of frames'}"
         )
     return replace(planned, counts={**opened, **planned.counts})
 
@@ -214,8 +214,8 @@ def few_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> PlannedF
     if taken > max(most, 0) or planned.expected_error > target:
         raise AppError(
             f"a relative error of Psi of {target:.3%} cannot be reached by few whiteboards: the "
-            f"best is {planned.expected_error:.3%}, with {others + taken} frames; raise --target "
-            f"or --frames, or plan without {'--skip aperture' if whole else '--few'}"
+            f"best is {planned.expected_error:.3%}, with {others + taken} frames; raise the "
+            f"target or the frames, or plan {'the aperture' if whole else 'every view'}, too"
         )
     return planned
 

@@ -27,7 +27,7 @@ def method_within(psi: ImagingMatrix, frames: Frames, budget: str) -> tuple[str,
 
     Raises WrongUsageError for what is no time, ReconstructionError for frames that do not fit Psi.
     """
-    budget_s = parse_seconds(budget, "--budget")
+    budget_s = parse_seconds(budget, "budget")
     assert budget_s is not None
     unit_s = timed(psi, frames)
     within = [method for method, cost in COST.items() if cost * unit_s <= budget_s]

@@ -185,8 +185,7 @@ def _of_arrays(
         turned={},
     )
     k, (rows, columns) = camera.sensor.binning, dark[0].mean_dn.shape
-    where = "poses: they have", "capture them, and give their arrays and poses"
-    outcome = boards_outcome(camera, (k * rows, k * columns), boards, where)
+    outcome = boards_outcome(camera, (k * rows, k * columns), boards, "poses: they have")
     metrics = calibration_metrics(outcome, camera.title, "", "auto", started)
     chosen = outcome.calibration
     good = outcome.good if chosen.good is None else chosen.good

@@ -215,7 +215,8 @@ def reconstruct_film(
 def _refuse_without_films(method: str) -> None:
     if not find_method(method).films:
         able = " or ".join(film_methods())
-        raise AppError(f"'{method}' takes no films: choose {able}, or a single frame by --frame")
+        line = f"'{method}' takes no films: choose {able}, or a single frame"
+        raise AppError(line, "name-frame")
 
 
 @dataclass(frozen=True)
@@ -261,7 +262,7 @@ class FilmJob:
         if not is_one_block(psi.size, self.settings):
             raise AppError(
                 f"frames of {'x'.join(map(str, psi.size))} are more than one block, and films are "
-                "reconstructed as a whole: raise blocks: {whole: SAMPLES} by --settings"
+                "reconstructed as a whole: raise the setting blocks: {whole: SAMPLES}"
             )
         psi.save(self.kept / PSI)
         (self.kept / FRAMES).mkdir()
@@ -405,7 +406,7 @@ def _computed(
     """
     if len(tasks) == 1 and (cluster is not None or (workers or 1) > 1):
         on_note(
-            "one segment, which workers cannot share: film: {segment: 50} by --settings makes "
+            "one segment, which workers cannot share: the setting film: {segment: 50} makes "
             "segments of 50 frames, the first of each without those before it"
         )
     shared = cluster is not None or (workers is not None and len(tasks) > 1)

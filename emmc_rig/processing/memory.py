@@ -50,9 +50,8 @@ class Ceiling:
             # Rounded up, so that the ceiling named is one that works.
             least = -(-(self.own + task_bytes) // 2**20)
             raise AppError(
-                f"--memory of {self.total / 2**20:.0f} MiB: this program and one worker need "
-                f"{least} MiB; give --memory {least}MiB, or smaller blocks by --settings (blocks: "
-                "side, whole)"
+                f"memory of {self.total / 2**20:.0f} MiB: this program and one worker need "
+                f"{least} MiB; allow {least}MiB, or set smaller blocks (blocks: side, whole)"
             )
         return count
 
@@ -65,7 +64,7 @@ def parse_memory(text: str) -> int:
     """Return the bytes of "2GiB" or "800MB"; raises WrongUsageError."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMG]?I?)B?", text.strip().upper())
     if match is None or match[2] not in UNITS:
-        raise WrongUsageError(f"--memory {text}: write bytes with a unit, for instance 2GiB")
+        raise WrongUsageError(f"memory {text}: write bytes with a unit, for instance 2GiB")
     return int(float(match[1]) * UNITS[match[2]])
 
 

@@ -161,9 +161,8 @@ class Processes(Pool):
                         "" if self.ceiling is None else f" {self.ceiling.share(1) / 2**20:.0f} MiB"
                     )
                     raise WorkersError(
-                        f"one worker alone needs more memory than the{limit} there is: give more "
-                        "by --memory, or smaller blocks by --settings (blocks: side, whole); the "
-                        "same command goes on"
+                        f"one worker alone needs more memory than the{limit} there is: allow more, "
+                        "or set smaller blocks (blocks: side, whole); the same command goes on"
                     ) from fault
                 self.size -= 1
             elif isinstance(fault, BrokenProcessPool):
@@ -171,8 +170,8 @@ class Processes(Pool):
                 if self._losses_in_a_row >= MOST_LOSSES:
                     raise WorkersError(
                         f"workers were killed {self._losses_in_a_row} times in a row, as when "
-                        "memory runs out: give fewer --workers, or --memory; the same command "
-                        "goes on"
+                        "memory runs out: take fewer workers, or set a limit of memory; the same "
+                        "command goes on"
                     ) from fault
             else:
                 raise fault
@@ -219,8 +218,8 @@ class Cluster(Pool):
             from distributed.comm.core import CommClosedError
         except ImportError as fault:
             raise WorkersError(
-                "--cluster needs Dask: pip install 'emmc-rig[cluster]'; --workers needs nothing "
-                "more"
+                "a cluster needs Dask: pip install 'emmc-rig[cluster]'; workers of this computer "
+                "need nothing more"
             ) from fault
         self.losses = KilledWorker, Cancelled, CancelledError, CommClosedError
         self._address = address
@@ -228,7 +227,7 @@ class Cluster(Pool):
             self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError, RuntimeError) as fault:
             raise WorkersError(
-                f"--cluster {address}: no Dask scheduler answers there; start one by `dask "
+                f"cluster {address}: no Dask scheduler answers there; start one by `dask "
                 "scheduler`, or see docs/scale.md"
             ) from fault
         try:
@@ -245,7 +244,7 @@ class Cluster(Pool):
         except Exception as fault:  # whatever a worker without this program raises
             kind = type(fault).__name__
             raise WorkersError(
-                f"--cluster {self._address}: no worker there runs emmc-rig "
+                f"cluster {self._address}: no worker there runs emmc-rig "
                 f"({kind}: {one_line(fault)}); install emmc-rig {__version__} where the workers run"
             ) from fault
         own = fingerprint()
@@ -256,7 +255,7 @@ class Cluster(Pool):
                     for versions in (theirs, own)
                 )
                 raise WorkersError(
-                    f"--cluster {self._address}: the worker {worker} has {what}, this program "
+                    f"cluster {self._address}: the worker {worker} has {what}, this program "
                     f"{mine}: install the same there"
                 )
 
@@ -265,7 +264,7 @@ class Cluster(Pool):
 
     def _mend(self, executor: Executor, fault: BaseException) -> None:
         raise WorkersError(
-            f"--cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
+            f"cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
         ) from fault
 
     def run(

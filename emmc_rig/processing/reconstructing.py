@@ -458,7 +458,7 @@ def open_frames(
     session's film, by its place in time from 0. Raises AppError, SensingError, CalibrationError, or
     ArgumentError for what is no path.
     """
-    takes = "the folder of a session, or one that `emmc-rig simulate` or `demo` wrote"
+    takes = "the folder of a session, or of frames with their Psi"
     folder = path_of(folder, "folder", takes)
     if psi is not None:
         psi = path_of(psi, "psi", "the file of an imaging matrix, psi.h5")
@@ -479,7 +479,7 @@ def _without(frames: Frames, shots: Sequence[int]) -> Frames:
     wrong = [shot for shot in shots if not 1 <= shot <= count]
     if wrong or len(set(shots)) == count:
         raise AppError(
-            f"--without-shots {' '.join(map(str, wrong or shots))}: the capture has shots 1 to "
+            f"without shots {' '.join(map(str, wrong or shots))}: the capture has shots 1 to "
             f"{count}, and one of them must be left"
         )
     out = np.isin(np.arange(1, count + 1), shots)[:, None, None]

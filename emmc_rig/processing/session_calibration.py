@@ -226,7 +226,7 @@ def _calibrated(
     session: Session, method: str, sensor: bool, watcher: Watcher, empty: NewArray
 ) -> SessionCalibration:
     if method not in METHODS:
-        raise AppError(f"--method {method}: use one of {', '.join(METHODS)}")
+        raise AppError(f"method {method}: use one of {', '.join(METHODS)}")
     started = time.perf_counter()
     watcher.begin("frames", None)
     whiteboards = (frame for frame in session.frames if frame.kind == "whiteboard")

@@ -63,9 +63,9 @@ class Known:
 
 
 def read_calibration(folder: Path) -> Known:
-    """Read a folder of `emmc-rig calibrate`; raises AppError when it is none, or damaged."""
+    """Read the folder of a calibration; raises AppError when it is none, or damaged."""
     path = folder / CALIBRATION_FILE
-    remedy = "name one that `emmc-rig calibrate` wrote"
+    remedy = "name the folder of a calibration"
     refuse_missing(folder, remedy)
     if not path.is_file() or not (folder / PSI).is_file():
         raise AppError(f"{folder}: holds no {CALIBRATION_FILE} and {PSI}; {remedy}")

@@ -132,9 +132,9 @@ def sensor_pairs(session: Session) -> tuple[list[Pair], Iterator[Pair]]:
     )
     if len(darks) < 2 or len(flats) < 4:
         raise AppError(
-            f"{session.folder}: --sensor takes two darks at each of two exposures at least, and "
-            f"two references at each of four (it has {len(darks)} and {len(flats)}): "
-            "`emmc-rig calibrate --plan` writes a plan that has them, without --skip response"
+            f"{session.folder}: calibrating the sensor needs two darks at each of two exposures "
+            f"at least, and two references at each of four (it has {len(darks)} and {len(flats)})",
+            "plan-whiteboards",
         )
 
     def pairs(groups: Mapping[float, list[PlannedFrame]]) -> Iterator[Pair]:

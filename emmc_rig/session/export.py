@@ -58,7 +58,9 @@ def export_hdf5(
     if missing:
         raise AppError(
             f"{session.folder}: {len(missing)} of {len(session.needed)} frames are missing; "
-            "resume it with `emmc-rig capture` first"
+            "resume it first",
+            "capture",
+            session.folder,
         )
     frames = session.needed
     lines = [session.stored[frame.id] for frame in frames]

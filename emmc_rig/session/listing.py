@@ -75,7 +75,7 @@ def sessions_in(folder: Path) -> Iterator[Summary]:
 
     Hidden folders, and what lies in sessions, are passed over. Raises AppError.
     """
-    refuse_missing(folder, "`emmc-rig capture PLAN` makes sessions")
+    refuse_missing(folder, "name a folder that holds sessions")
     try:
         next(folder.iterdir(), None)
     except OSError as fault:

@@ -64,7 +64,7 @@ def session_outcome(
     rows, columns = frame_shape(session)
     size = k * rows, k * columns
     boards = board_sets(session, channels_of(psi_layout(camera, size)))
-    where = f"{session.folder}: its plan has", "`emmc-rig calibrate --plan` writes a plan that has"
+    where = f"{session.folder}: its plan has"
     return boards_outcome(camera, size, boards, where, routes, on_stage, empty, on_plane)
 
 
@@ -72,7 +72,7 @@ def boards_outcome(
     camera: Camera,
     size: tuple[int, int],
     boards: SessionBoards,
-    where: tuple[str, str],
+    where: str,
     routes: Sequence[str] | None = None,
     on_stage: Callable[[str], None] = lambda name: None,
     empty: NewArray = in_memory,
@@ -80,8 +80,8 @@ def boards_outcome(
 ) -> Outcome:
     """Return Psi of whiteboards, see `session_outcome`.
 
-    size: rows and columns of the light field. where: the beginning of an error's line, what has not
-    the whiteboards that a method needs, and its end, what to do.
+    size: rows and columns of the light field. where: the beginning of an error's line, what lacks
+    whiteboards that a method needs.
     """
     # Only where a pixel has several samples does the design say more than its layout.
     whole = camera.sensor.binning > 1
@@ -102,8 +102,9 @@ def boards_outcome(
     ]
     if wanting:
         raise AppError(
-            f"{where[0]} no {' and no '.join(wanting)}, which this calibration method needs; "
-            f"{where[1]}"
+            f"{where} no {' and no '.join(wanting)}, which this calibration method needs; "
+            "capture them",
+            "plan-whiteboards",
         )
     assert held_out is not None
     return calibrate(

@@ -172,7 +172,8 @@ def session_frames(
     if place is None and not shot_frames(session) and _film(session):
         raise AppError(
             f"{session.folder}: holds a film, whose frames are no shots of one light field: "
-            "choose one, such as --frame 0"
+            "name one of them",
+            "name-frame",
         )
     scale = session_scale(session) if scale is None else scale
     if place is None:

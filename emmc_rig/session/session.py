@@ -84,7 +84,6 @@ from emmc_rig.store.folders import (
     SESSION_HEADER,
     SESSION_JOURNAL,
     SESSION_RECONSTRUCTION,
-    refuse_missing,
 )
 
 HEADER, JOURNAL = SESSION_HEADER, SESSION_JOURNAL
@@ -98,7 +97,6 @@ KNOWN = {
     PARTIAL,
 }  # fmt: skip
 FORMAT = 1
-LISTED = "`emmc-rig session list` shows the sessions there are"
 
 
 @dataclass(frozen=True)
@@ -126,8 +124,9 @@ class Session:
         try:
             self.journal = Journal(disk, self.folder / JOURNAL)
         except (FileNotFoundError, NotADirectoryError) as fault:
-            refuse_missing(Path(folder), LISTED)
-            raise AppError(f"{folder}: no session, it holds no {JOURNAL}; {LISTED}") from fault
+            what = f"no session, it holds no {JOURNAL}"
+            what = what if self.folder.exists() else "no such folder"
+            raise AppError(f"{folder}: {what}", "list-sessions") from fault
         except OSError as fault:
             raise AppError(f"{folder}: cannot be read ({fault.strerror}); correct that") from fault
 
@@ -234,7 +233,9 @@ class Session:
         if hashlib.sha256(data).hexdigest() != self.digests.get(name):
             raise AppError(
                 f"{path}: was changed after the session began; restore it from a copy, and to "
-                "change the plan edit another copy and name this session as its --out"
+                "change the plan edit another copy and capture it into this session",
+                "capture-edited",
+                self.folder,
             )
         return data
 

@@ -128,7 +128,7 @@ def result_folder(
             if resumes:
                 _clear(folder / PARTIAL)
     except OSError as fault:
-        raise AppError(f"--out {out}: cannot be written ({fault.strerror or fault})") from fault
+        raise AppError(f"{out}: cannot be written ({fault.strerror or fault})") from fault
 
 
 @contextmanager
@@ -226,8 +226,7 @@ def _refuse_holding(folder: Path, out: Path) -> None:
     for place, _, names in os.walk(folder):
         if SESSION_JOURNAL in names or SESSION_HEADER in names:
             raise AppError(
-                f"--out {out}: holds the session {os.path.relpath(place, folder)}; choose another "
-                "folder"
+                f"{out}: holds the session {os.path.relpath(place, folder)}; choose another folder"
             )
 
 
@@ -282,14 +281,12 @@ def _replaceable(folder: Path, out: Path, command: str, adds: bool) -> Listing:
     if earlier is None:
         if not adds and any(path.name != PARTIAL for path in folder.iterdir()):
             raise AppError(
-                f"--out {out}: the folder holds something else than an earlier result; choose "
+                f"{out}: the folder holds something else than an earlier result; choose "
                 "another folder or empty it"
             )
         return Listing(command)
     if earlier.command != command:
-        raise AppError(
-            f"--out {out}: holds the result of `emmc-rig {earlier.command}`; choose another folder"
-        )
+        raise AppError(f"{out}: holds the result of {earlier.command}; choose another folder")
     _refuse_foreign(folder, out, earlier.files, earlier)
     return earlier
 
@@ -310,11 +307,11 @@ def _refuse_foreign(folder: Path, out: Path, names: Iterable[str], earlier: List
                 is_in_the_way and path.exists() and _digest(path) != earlier.files.get(inside)
             ):
                 what = (
-                    f"{name} is not what `emmc-rig {earlier.command}` wrote"
+                    f"{name} is not what {earlier.command} wrote"
                     if name in earlier.files
                     else f"{inside} is there and of no earlier result"
                 )
-                raise AppError(f"--out {out}: {what}; move it away or choose another folder")
+                raise AppError(f"{out}: {what}; move it away or choose another folder")
 
 
 def _above(folder: Path, name: str) -> list[Path]:
@@ -340,7 +337,7 @@ def _take_place(folder: Path, out: Path, earlier: Listing, adds: bool) -> None:
     kept = {name: sha for name, sha in earlier.files.items() if adds and name not in files}
     # Somebody may have edited it since the command began.
     if (Listing.read(folder) or Listing(earlier.command)) != earlier:
-        raise AppError(f"--out {out}: {FILES} is not what `emmc-rig {earlier.command}` wrote")
+        raise AppError(f"{out}: {FILES} is not what {earlier.command} wrote")
     _refuse_foreign(folder, out, {**earlier.files, **files}, earlier)
     (new / FILES).write_bytes(Listing(earlier.command, {**kept, **files}).text().encode())
     SYSTEM_DISK.sync(new / FILES)

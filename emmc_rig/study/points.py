@@ -49,11 +49,11 @@ def study_folder(out: Path, journal: str, command: str) -> Iterator[Path]:
     refuse_inside_session(out)
     folder = Path(os.path.abspath(out))
     if folder.is_file():
-        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
+        raise AppError(f"{out}: a file of that name exists; choose another folder")
     known = (folder / journal).is_file() or Listing.read(folder) is not None
     if folder.is_dir() and any(folder.iterdir()) and not known:
         raise AppError(
-            f"--out {out}: the folder holds something else than an earlier `emmc-rig {command}`; "
+            f"{out}: the folder holds something else than an earlier {command}; "
             "choose another folder or empty it"
         )
     with _stopped_with_words(out):
@@ -76,7 +76,7 @@ def _stopped_with_words(out: Path, what: Callable[[], str] = lambda: "what was m
         ) from stop
     except OSError as fault:
         raise AppError(
-            f"--out {out}: cannot be written ({fault.strerror or fault}); {what()} kept: "
+            f"{out}: cannot be written ({fault.strerror or fault}); {what()} kept: "
             "make room and run the same command again to go on"
         ) from fault
 

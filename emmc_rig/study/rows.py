@@ -64,12 +64,12 @@ def provenance(settings: Settings, seconds: float, **more: str) -> dict[str, str
     }
 
 
-def check_scene_names(specs: Sequence[str], option: str = "--scene") -> None:
-    """Raise AppError when two scenes (or cameras, by `option`) have one name."""
+def check_scene_names(specs: Sequence[str], kind: str = "scenes") -> None:
+    """Raise AppError when two scenes (or cameras, by `kind`) have one name."""
     names = [Path(spec).stem for spec in specs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise AppError(f"{option}: two are called '{twice}'; name each once, or rename one")
+        raise AppError(f"two {kind} are called '{twice}'; name each once, or rename one")
 
 
 SMALLEST_PX = 16
@@ -78,7 +78,7 @@ SMALLEST_PX = 16
 def check_size(size: tuple[int, int] | None) -> None:
     """Raise AppError for a picture too small to be judged."""
     if size is not None and min(size) < SMALLEST_PX:
-        raise AppError(f"--size {size[0]}x{size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more")
+        raise AppError(f"size {size[0]}x{size[1]}: needs {SMALLEST_PX}x{SMALLEST_PX} or more")
 
 
 def available_cores() -> int:

@@ -128,7 +128,7 @@ def reconstruct(
     method = find_method(name)
     if (film is not None or moving) and not method.films:
         able = ", ".join(film_methods())
-        raise ReconstructionError(f"'{name}' takes no films: --method one of {able}")
+        raise ReconstructionError(f"'{name}' takes no films: choose one of {able}")
     settings = settings or MethodSettings()
     frames = frames.of_one_deviation()
     given = Given(psi, frames, dictionary, on_step, estimates, film, moving)

@@ -121,7 +121,7 @@ LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
 """For methods that lose little with one shot."""
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
-DRIFT = "run `emmc-rig calibrate --drift`, or calibrate again"
+DRIFT = "calibrate the drift of the masks since then, or calibrate again"
 ANOTHERS = 0.5
 """Strength of another shot's masks above which, and of its own below which, shots are confused."""
 LEAST_STRENGTH = 0.25
@@ -209,7 +209,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         yield Reason(
             f"shot {dark[0]} is dark",
             bright[dark[0] - 1],
-            f"capture it again, or `emmc-rig reconstruct --without-shots {dark[0]}`",
+            f"capture it again, or reconstruct without shot {dark[0]}",
             "do not use",
         )
         return
@@ -239,7 +239,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         what, remedy = "shots saw different scenes", "hold scene and camera still"
         if shot is not None:
             what = f"shot {shot + 1} saw another scene than the others"
-            remedy += f", or `emmc-rig reconstruct --without-shots {shot + 1}`"
+            remedy += f", or reconstruct without shot {shot + 1}"
         excluded = ", and is excluded there" if shot is not None and e.moved else ""
         yield Reason(
             f"{what} in {e.moved_px[0]}x{e.moved_px[1]} pixels about row {y}, column {x}{excluded}",

@@ -75,7 +75,7 @@ def test_what_the_stage_lacks_is_asked_of_a_person_or_left_where_it_is():
 def test_nobody_there_to_move_an_axis_is_told_what_works_without_it():
     rig, _, camera, _ = bench_of(["mask_x", "mask_y"])
     frames = expand(Plan.model_validate(PLAN), camera, rig.window_um)
-    with pytest.raises(AppError, match=r"moves aperture_x and aperture_y.*--skip aperture"):
+    with pytest.raises(AppError, match=r"moves aperture_x and aperture_y.*`views: \[\]`"):
         with_hands(replace(rig, attendant=NoAttendant()), frames)
 
 

@@ -242,7 +242,7 @@ def test_a_resume_refuses_another_stage_unless_it_is_meant():
 
     with pytest.raises(AppError, match=r"begun with mask_y on .*, now it is on .* 999") as refused:
         refuse_other_devices(session, of_serial("999"))
-    assert "--other-devices" in str(refused.value)
+    assert refused.value.advice == "other-devices"
     # Meant, it goes on, and later runs are compared with that one.
     refuse_other_devices(session, of_serial("999"), meant=True)
     again = Session(session.folder, session.disk)
@@ -261,11 +261,11 @@ def test_another_camera_is_taken_where_it_is_meant_and_has_the_same_frames():
     Sequencer(session, plan, rig).run()
     wire = rig.camera
     other = replace(rig, camera=SimpleCamera(wire, "8", wire.shape))
-    with pytest.raises(AppError, match="--other-devices"):
+    with pytest.raises(AppError, match="say that other devices are meant"):
         refuse_other_devices(session, other)
     refuse_other_devices(session, other, meant=True)
     larger = replace(rig, camera=SimpleCamera(wire, "7", (48, 64)))
-    with pytest.raises(AppError, match="48x64: connect that one, or name another --out"):
+    with pytest.raises(AppError, match="48x64: connect that one, or begin another session"):
         refuse_other_devices(session, larger, meant=True)
 
 

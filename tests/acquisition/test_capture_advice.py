@@ -60,7 +60,6 @@ GUARDS = (
     "is damaged, its SHA-256 is not the journal's",
     "estimates no accuracy",  # its method does
     "); resume it",
-    "no session, it holds no",  # a folder that is none is a plan, or the place for one
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
     ": the stage has no such axis, only ",  # a rig is opened before a session is made
     " is moved by plans: give its zero_um instead",  # likewise
@@ -289,7 +288,7 @@ def accepted_with_a_target(bench):
     assert code == 0, err
 
 
-@walk("--until: the plan has one shot")
+@walk("the plan has one shot, so that no shot can be saved")
 def a_target_without_a_choice(bench):
     bench.plan(shots=[{"exposure_s": 0.01}])
     yield bench.refused(*CAPTURE, "--until", "30dB")
@@ -298,21 +297,21 @@ def a_target_without_a_choice(bench):
     bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.01, "mask_um": [270, 162]}])
 
 
-@walk("--until: the plan has no ")
+@walk(", so that the Psi of its shots cannot be measured")
 def a_target_without_darks(bench):
     bench.small_camera(darks=None)
     yield bench.refused(*CAPTURE, "--until", "30dB")
     calibration_plan(bench)
 
 
-@walk("--until: the plan has neither open whiteboards nor the pinhole")
+@walk("the plan has neither open whiteboards nor the pinhole")
 def a_target_without_boards(bench):
     bench.small_camera()
     yield bench.refused(*CAPTURE, "--until", "30dB")
     calibration_plan(bench)
 
 
-@walk("--until: no open whiteboard of the plan has `validation: true`")
+@walk("no open whiteboard of the plan has `validation: true`")
 def a_target_without_a_judge(bench):
     bench.small_camera(whiteboards={**PLAN["whiteboards"], "open": [{"repeats": 1}]})
     yield bench.refused(*CAPTURE, "--until", "30dB")
@@ -483,7 +482,7 @@ def no_argument(bench):
     yield " ".join(err.split())
 
 
-@walk(": no such file; write a plan with: emmc-rig capture --new CAMERA")
+@walk(": no such file; write a plan")
 def no_plan(bench):
     (bench.folder / "plan.yaml").unlink()
     yield bench.refused()
@@ -492,12 +491,12 @@ def no_plan(bench):
     bench.plan(camera=written["camera"])
 
 
-@walk("say which rig: --rig simulated")
+@walk("say which rig: simulated")
 def no_rig(bench):
     yield bench.refused("capture", "plan.yaml")
 
 
-@walk("holds something else than a session; name another --out")
+@walk("holds something else than a session; name another folder")
 def a_folder_of_something_else(bench):
     (bench.folder / "mine").mkdir()
     (bench.folder / "mine" / "thesis.txt").write_text("mine")
@@ -521,7 +520,7 @@ def damage_journal(session):
 
 
 HARM = {
-    " is gone; restore it from a copy, or name another --out": (
+    " is gone; restore it from a copy, or name another folder": (
         lambda session: (session / "journal.jsonl").unlink()
     ),
     ": its first line is damaged; restore it from a copy": damage_journal,
@@ -589,7 +588,7 @@ def another_program_at_work(bench):
     yield line
 
 
-@walk(" are free; make room, or name another --out")
+@walk(" are free; make room, or name another folder")
 def a_small_disk(bench):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Disk, "free_bytes", lambda disk, folder: 1000)
@@ -617,7 +616,7 @@ def a_disk_that_fills(bench):
 # Going on with something else than what frames were taken by.
 
 
-@walk("; leave --rig out, or name another --out")
+@walk("; name no rig, or begin another session")
 def another_rig(bench):
     bench.begun()
     yield bench.refused(*CAPTURE, "--scene", "dark")
@@ -662,7 +661,7 @@ def more_shots_of_changing_patterns(bench):
 # What somebody did.
 
 
-@walk(" frames are still to be taken; ")
+@walk(" frames are still to be taken")
 def a_stop_after_the_frame(bench):
     honest = sequencer.check
 
@@ -707,7 +706,7 @@ def work_by_hand_without_a_terminal(bench):
     bench.patch.setattr("sys.stdin", terminal)
 
 
-@walk("--until: a film is taken to its end")
+@walk("a film is taken to its end")
 def a_film_with_a_target(bench):
     bench.plan(film=FILM, shots=[ONE])
     yield bench.refused(*CAPTURE, "--until", "30dB")

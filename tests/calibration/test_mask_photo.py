@@ -163,7 +163,7 @@ def test_given_corners_serve_where_no_outline_is_seen():
     # What lies left of the mask, and a little of it, is another bright thing.
     disturbed = whole.copy()
     disturbed[:, : edge - 20] = 0.7 * np.random.default_rng(0).random((len(whole), edge - 20))
-    with pytest.raises(CalibrationError, match="--corners"):
+    with pytest.raises(CalibrationError, match="corners"):
         read_mask(disturbed, CELLS)
     by_hand = found + np.array([(2, -2), (-2, 1), (1, 2), (-2, -2)])
     assert rms(read_mask(disturbed, CELLS, by_hand).cells[..., 0] - binary()) < ACCURACY
@@ -210,7 +210,9 @@ def test_cells_that_are_not_as_ordered_are_defects():
     ],
 )
 def test_another_number_of_cells_is_refused_with_the_one_seen(asked):
-    with pytest.raises(CalibrationError, match=r"about (39|40|41)x(51|52|53) cells.*--cells"):
+    with pytest.raises(
+        CalibrationError, match=r"about (39|40|41)x(51|52|53) cells.*(turned|number)"
+    ):
         read_mask(plain(), asked)
 
 
@@ -273,7 +275,7 @@ def test_wrong_corners_are_refused(corners, complaint):
         (lambda: np.clip(1.6 * plain(), 0, 1), "saturated: .* less exposure"),
         (lambda: np.full((300, 300), 0.5), "no mask"),
         (lambda: np.random.default_rng(0).random((300, 300)), "no mask"),
-        (lambda: plain()[70:], "--corners"),
+        (lambda: plain()[70:], "corners"),
         (lambda: photograph(binary(), blur_px=6), "sharp"),
         (lambda: np.where(plain() > 0.5, np.nan, plain()), "1 where saturated"),
         (lambda: 255 * plain(), "1 where saturated"),

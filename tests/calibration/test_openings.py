@@ -72,7 +72,7 @@ def test_where_the_aperture_stays_open_only_the_mask_moves(run, tmp_path):
     assert "aperture" in metrics["left_out"]
     code, _, said = run(*asked, "--target", "0.0001", "--out", tmp_path / "none")
     assert code == 1
-    assert "or plan without --skip aperture" in said
+    assert "or plan the aperture, too" in said
     assert not (tmp_path / "none" / "plan.yaml").exists()
 
 

@@ -264,4 +264,4 @@ def test_drift_refuses_frames_of_another_size(run, calibrated, tmp_path):
     assert "this calibration is for 1 of 48 x 64" in " ".join(error.split())
     code, _, error = run("calibrate", "--drift", frames, "--known", tmp_path)
     assert code == 1
-    assert "name one that `emmc-rig calibrate` wrote" in " ".join(error.split())
+    assert "name the folder of a calibration" in " ".join(error.split())

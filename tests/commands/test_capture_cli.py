@@ -148,7 +148,7 @@ def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(
     code, _, err = run("capture", copy)
     assert code == 1
     assert "was begun with mask_x on" in one_line(err)
-    assert "901: connect that one, name another --out, or say" in one_line(err)
+    assert "or say that other devices are meant; say so by --other-devices" in one_line(err)
     assert (copy / "journal.jsonl").read_bytes() == journal
     assert run("capture", copy, "--other-devices")[0] == 0
     assert run("capture", copy)[0] == 0

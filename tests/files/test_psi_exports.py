@@ -151,5 +151,5 @@ def test_what_is_no_psi_is_refused_and_nothing_is_written(tmp_path, monkeypatch,
 def test_a_psi_that_mat_files_do_not_hold_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(psi_exports, "LARGEST_MAT_BYTES", 100)
     psi = emmc.Psi.from_weights(np.ones((1, 1, 3, 4, 6)))
-    with pytest.raises(AppError, match="more than a MAT file holds: use --format npz"):
+    with pytest.raises(AppError, match="more than a MAT file holds: export npz"):
         psi_exports.write_mat(tmp_path, psi, None)

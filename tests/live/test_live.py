@@ -784,4 +784,4 @@ def test_a_port_in_use_is_reported(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert exit_code("live", "--rig", "simulated", "--port", port) == 1
-    assert "choose another --port" in capsys.readouterr().err
+    assert "choose another port" in capsys.readouterr().err

@@ -131,7 +131,7 @@ def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
     turned.send_keys("+", "+")
     looked = text(page, "viewer-status").split(";")[0]
     assert looked != "View v 2.00, u 2.00"
-    wait(page, lambda: "as emmc-rig reconstruct" in text(page, "field-stage"))
+    wait(page, lambda: "as by reconstruct" in text(page, "field-stage"))
     assert re.search("trust|cannot tell|doubt|do not use", text(page, "field-stage"))
     # The reconstruction takes the preview's place, seen from where the hand had turned it.
     wait(page, lambda: page.execute_script(WIDTH) == 64)

@@ -185,7 +185,7 @@ def test_what_stands_still_becomes_exactly_what_reconstruct_gives(one_shot):
     )
     assert np.abs(refined[0].light_field - expected.light_field).max() < 1e-5
     assert reported["verdict"]["level"] == expected.verdict.level
-    assert "as emmc-rig reconstruct" in reported["stage"]
+    assert "as by reconstruct" in reported["stage"]
     shown = live.pictures()
     assert shown is not None
     assert shown.export.light_field is refined[0].light_field
@@ -382,7 +382,7 @@ def test_of_a_scene_that_stands_still_one_frame_is_reconstructed_until_it_change
     for second in range(5):
         clock.now += 1
         reported = live.update(replace(frames[0], mosaic=frames[0].mosaic + second % 2))
-        assert reported["stage"] == "adaptive: converged in 1.2 s, as emmc-rig reconstruct"
+        assert reported["stage"] == "adaptive: converged in 1.2 s, as by reconstruct"
     assert len(solver.asked) == 1
     drawn = live.pictures().number
     live.update(frames[1])

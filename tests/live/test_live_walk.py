@@ -113,7 +113,7 @@ def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
             assert not driver.find_element(By.ID, "diff").is_displayed()
             click("[data-show=views]")
             wait(lambda: "adaptive: " in text("#field-stage"))
-            assert "as emmc-rig reconstruct" in text("#field-stage")
+            assert "as by reconstruct" in text("#field-stage")
             assert re.search("trust|doubt|do not use", text("#field-stage"))
             wait(lambda: driver.find_element(By.ID, "viewer").get_attribute("data-complete"))
             pictured(driver, "light-field")

@@ -293,7 +293,7 @@ def test_the_command_says_how_a_film_went_and_where_it_is_worst(session, run):
         (["--truth", "moving-toys"], "--truth: not of a film"),
         (["--zarr"], "--zarr: not of a film"),
         (["--frame", "99"], "no frame 99"),
-        (["--memory", "100MiB"], "--memory of 100 MiB"),
+        (["--memory", "100MiB"], "memory of 100 MiB"),
         (["--psi", "absent.h5"], "absent.h5"),
     ],
 )

@@ -30,7 +30,7 @@ def test_as_many_workers_run_as_fit_beside_the_program():
     ceiling = Ceiling(1000 * MIB, 400 * MIB)
     assert [ceiling.workers(need * MIB) for need in (600, 301, 300, 100)] == [1, 1, 2, 6]
     assert ceiling.share(3) == 200 * MIB
-    with pytest.raises(AppError, match=r"1000 MiB: .* need 1001 MiB; give --memory 1001MiB"):
+    with pytest.raises(AppError, match=r"1000 MiB: .* need 1001 MiB; allow 1001MiB"):
         ceiling.workers(600 * MIB + 1)
 
 
@@ -122,7 +122,7 @@ def test_the_ceiling_that_a_refusal_names_works_and_is_kept(tmp_path):
     refused = started("300MiB")
     _, err = refused.communicate(timeout=300)
     assert refused.returncode == 1
-    least = re.search(r"give --memory (\d+)MiB", err)
+    least = re.search(r"allow (\d+)MiB", err)
     assert least is not None, err
     assert not (tmp_path / "out").exists()
     running = started(f"{least[1]}MiB")

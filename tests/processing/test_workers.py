@@ -282,7 +282,7 @@ def test_ceilings_and_places_that_cannot_be_are_reported_in_one_line(place):
         parse_memory("2")
     code, _, err = reconstructed(place, "small", "--memory", "10MB")
     assert code == 1
-    assert "give --memory" in err
+    assert "set smaller blocks" in err
     code, _, err = reconstructed(place, "both", "--workers", 2, "--cluster", "tcp://localhost:1")
     assert code == 2
     assert not (place / "both").exists()

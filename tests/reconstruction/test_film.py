@@ -242,6 +242,6 @@ def test_a_film_of_another_size_is_refused(psi, followed):
 def test_a_method_that_takes_no_films_says_which_do(psi):
     frames = np.full(psi.frames_shape, 0.2, np.float32)
     with pytest.raises(
-        ReconstructionError, match="'tv' takes no films: --method one of adaptive, adaptive-fast"
+        ReconstructionError, match="'tv' takes no films: choose one of adaptive, adaptive-fast"
     ):
         reconstruct("tv", psi, even_frames(frames, 0.01), film=Film())

@@ -204,5 +204,5 @@ def test_every_method_runs_by_its_name_and_says_so(random_psi, scene, name):
 
 def test_a_missing_dictionary_says_how_to_make_one(random_psi):
     psi = random_psi()
-    with pytest.raises(ReconstructionError, match="--dictionary lambertian"):
+    with pytest.raises(ReconstructionError, match="give lambertian"):
         reconstruct("dict-omp", psi, even_frames(np.zeros(psi.frames_shape), 0.0))

@@ -747,7 +747,7 @@ def test_a_shot_is_left_out_where_something_moved_in_it_and_the_place_is_doubted
     assert verdict.level == "doubt"
     assert "shot 2 saw another scene than the others in " in verdict.words
     assert "excluded there" in verdict.words
-    assert "--without-shots 2" in verdict.words
+    assert "or reconstruct without shot 2" in verdict.words
     assert verdict.evidence.moved_at is not None
     _, row, column = verdict.evidence.moved_at
     np.testing.assert_allclose((row, column), (22, 35), atol=5)
@@ -783,7 +783,7 @@ def test_of_two_shots_either_may_have_seen_what_moved():
     result, verdict = reconstruct_judged("tv", psi, even_frames(frames, 0.003), settings=QUICK)
     assert verdict.level in ("doubt", "do not use")
     assert "shots saw different scenes in " in verdict.words
-    assert "without-shots" not in verdict.words
+    assert "without shot" not in verdict.words
     assert _differing(np.array([9.0, 1.0]), np.arange(2)) is None
     assert _differing(np.array([1.0, 9.0, 1.0]), np.arange(3)) == 1
     assert _differing(np.array([8.0, 9.0, 1.0]), np.arange(3)) is None
@@ -837,7 +837,7 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     assert last.startswith(verdict["reasons"][-1]["level"])
     assert verdict["level"] == "do not use"
     assert "\x1b" not in last
-    assert "calibrate --drift" in verdict["reasons"][0]["remedy"]
+    assert "calibrate the drift" in verdict["reasons"][0]["remedy"]
     assert not any(" saw " in reason["what"] for reason in verdict["reasons"])
 
 

@@ -97,7 +97,7 @@ HARMS = {
     "frames.h5 is not what": _replace_by_folder,
     "pictures/a.png is not what": _edit,
     "files.json: was edited": _edit_listing,
-    "is not what `emmc-rig simulate` wrote": _link_pictures_elsewhere,
+    "is not what simulate wrote": _link_pictures_elsewhere,
     "light_field.h5 is there and of no earlier": _take_a_new_name,
     "pictures/b is there and of no earlier": _take_a_new_folder,
     "holds the session deep/plan-session": _hold_a_session,
@@ -116,7 +116,7 @@ def test_what_a_command_did_not_write_makes_it_refuse_and_stays(out, message):
 
 def test_a_result_of_another_command_and_foreign_folders_are_refused(out, tmp_path):
     before = contents(tmp_path)
-    with pytest.raises(AppError, match="holds the result of `emmc-rig simulate`"):
+    with pytest.raises(AppError, match="holds the result of simulate"):
         write(out, NEW, command="reconstruct")
     with pytest.raises(AppError, match="something else"):
         write(tmp_path, NEW)
@@ -283,7 +283,7 @@ def test_an_edit_after_a_kill_between_two_moves_is_kept_and_reported(out, name):
     killed_after(out, 1)
     (out / name).write_text("edited")
     for _ in range(2):
-        with pytest.raises(AppError, match=f"{name} is not what `emmc-rig simulate` wrote"):
+        with pytest.raises(AppError, match=f"{name} is not what simulate wrote"):
             write(out, OLD)
         assert (out / name).read_text() == "edited"
     (out / name).rename(out.parent / "mine")

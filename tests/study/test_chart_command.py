@@ -107,11 +107,11 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
     [
         (["--method", "tv-dic"], "did you mean 'tv-dict'", 1),
         (["--scene", "nowhere"], "no scene 'nowhere'", 1),
-        (["--scene", "dark", "--scene", "./dark"], "two are called 'dark'", 1),
+        (["--scene", "dark", "--scene", "./dark"], "two scenes are called 'dark'", 1),
         (["--camera", "no-camera"], "no-camera", 1),
         (["--size", "big"], "write ROWSxCOLUMNS", 2),
         (["--size", "8x8"], "needs 16x16", 1),
-        (["--out", "mine"], "something else than an earlier `emmc-rig chart`", 1),
+        (["--out", "mine"], "something else than an earlier chart", 1),
     ],
 )
 def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, reported, expected):

@@ -266,12 +266,12 @@ def test_the_command_lists_its_faults(run):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (("--fault", "flikker"), "--fault flikker: did you mean 'flicker'?"),
+        (("--fault", "flikker"), "fault flikker: did you mean 'flicker'?"),
         (("--method", "tvv"), "no method 'tvv': did you mean 'tv'?"),
-        (("--size", "8x8"), "--size 8x8: needs 16x16 or more"),
+        (("--size", "8x8"), "size 8x8: needs 16x16 or more"),
         (("--camera", "rgbw-mono-1"), "rgbw-mono"),
         (("--scene", "nowhere"), "nowhere"),
-        (("--scene", "dark", "--scene", "dark"), "two are called 'dark'"),
+        (("--scene", "dark", "--scene", "dark"), "two scenes are called 'dark'"),
         (("--method", "dict-omp", "--dictionary", "none.h5"), "none.h5"),
         (
             ("--fault", "mask-shift", "--method", "tv", "--camera", "coded-aperture-random"),

@@ -108,8 +108,9 @@ class Format:
         """Write a film; raises AppError as `write_whole`, and where the format has no time."""
         if self.write_film is None:
             raise AppError(
-                f"--format {self.name} has no time: choose one that `emmc-rig export --list` marks "
-                f"films, or export a single frame, such as {film.first.source}"
+                f"format {self.name} has no time: choose one for films, or export a single frame, "
+                f"such as {film.first.source}",
+                "list-formats",
             )
         self._refuse_without_parallax(film.first)
         self.write_film(folder, film)
@@ -118,7 +119,7 @@ class Format:
         if self.parallax and not shows_parallax(export.view_axes):
             named = picture_name(export.view_axes)
             raise AppError(
-                f"--format {self.name} shows parallax, and {export.title} has {named}s for views: "
+                f"format {self.name} shows parallax, and {export.title} has {named}s for views: "
                 "choose another format"
             )
 

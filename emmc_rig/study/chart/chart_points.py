@@ -127,7 +127,7 @@ def check_methods(names: Sequence[str]) -> None:
     """Raise AppError naming the nearest for a method that is not known."""
     for name in names:
         if name not in METHODS:
-            raise AppError(f"--method {name}: {nearest_of(name, METHODS)}")
+            raise AppError(f"method {name}: {nearest_of(name, METHODS)}")
 
 
 def configurations(settings: ChartSettings) -> list[Configuration]:

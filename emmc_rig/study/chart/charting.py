@@ -232,7 +232,7 @@ def run_chart(settings: ChartSettings, out: Path, watcher: Watcher) -> ChartOutc
     """
     started = time.perf_counter()
     check_scene_names(settings.scenes)
-    check_scene_names(settings.cameras, "--camera")
+    check_scene_names(settings.cameras, "cameras")
     check_size(settings.size)
     points = charted_points(settings)
     for capture in dict.fromkeys(point.capture for point in points):

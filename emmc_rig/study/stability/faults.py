@@ -18,7 +18,7 @@ def find_fault(name: str) -> Fault:
     """Return a fault by name; raises AppError naming the nearest."""
     if name in FAULTS:
         return FAULTS[name]
-    raise AppError(f"--fault {name}: {nearest_of(name, FAULTS)}")
+    raise AppError(f"fault {name}: {nearest_of(name, FAULTS)}")
 
 
 @dataclass(frozen=True)

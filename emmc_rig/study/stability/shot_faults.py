@@ -55,7 +55,7 @@ def camera_motion(capture: Capture, px: float) -> Trial:
     except SceneError as fault:
         raise NotApplicableError(
             f"needs {margin} samples of the scene around what is reconstructed: choose a smaller "
-            "--size"
+            "size"
         ) from fault
     across, down = px * np.array(DIRECTION)
     inside = np.s_[:, :, margin:-margin, margin:-margin]

@@ -132,9 +132,9 @@ def chosen_parts(only: str | None) -> tuple[Part, ...]:
     names = [name.strip().lower() for name in only.split(",") if name.strip()]
     for name in names:
         if name not in known:
-            raise AppError(f"--only {name}: {nearest_of(name, known)}")
+            raise AppError(f"table {name}: {nearest_of(name, known)}")
     if not names:
-        raise AppError(f"--only names nothing: known are {', '.join(known)}")
+        raise AppError(f"no table is named: known are {', '.join(known)}")
     return tuple(part for part in PARTS if part.name in names)
 
 

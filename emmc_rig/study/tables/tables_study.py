@@ -84,11 +84,9 @@ def scene_specs(folder: Path | None) -> dict[str, str]:
     if folder is None:
         return {name: name for name in STILL_SCENES}
     if not folder.is_dir():
-        raise AppError(f"--scenes {folder}: no such folder")
+        raise AppError(f"{folder}: no such folder")
     if any(folder.glob("view_*_*.png")):
-        raise AppError(
-            f"--scenes {folder}: is itself a scene; give the folder that holds it and others"
-        )
+        raise AppError(f"{folder}: is itself a scene; give the folder that holds it and others")
     specs: dict[str, str] = {}
     for path in sorted(folder.iterdir()):
         is_folder = path.is_dir() and any(path.glob("view_*_*.png"))
@@ -96,11 +94,11 @@ def scene_specs(folder: Path | None) -> dict[str, str]:
             continue
         name = path.name if is_folder else path.stem
         if name in specs:
-            raise AppError(f"--scenes {folder}: two scenes are called '{name}'; rename one")
+            raise AppError(f"{folder}: two scenes are called '{name}'; rename one")
         specs[name] = str(path.resolve())
     if not specs:
         raise AppError(
-            f"--scenes {folder}: no scenes; needed is a folder of view_ROW_COL.png, or an HDF5 "
+            f"{folder}: no scenes; needed is a folder of view_ROW_COL.png, or an HDF5 "
             "light field, for each"
         )
     return specs
@@ -127,22 +125,22 @@ def check_dictionary(
     rows, columns = dictionary.patch_shape[2:4]
     if rows % binning or columns % binning:
         raise AppError(
-            f"--dictionary {spec}: pixels of {binning}x{binning} samples (r = 1/{binning**2}) need "
+            f"dictionary {spec}: pixels of {binning}x{binning} samples (r = 1/{binning**2}) need "
             f"patches that are a multiple of {binning}, these are {rows}x{columns}; leave those "
-            "tables out with --only"
+            "tables out"
         )
     names = _trained_on(dictionary)
     if names is None:
         raise AppError(
-            f"--dictionary {spec}: does not say which scenes it was trained on, so nothing can be "
+            f"dictionary {spec}: does not say which scenes it was trained on, so nothing can be "
             "scored with it; train it with benchmarks/train_dictionary.py"
         )
     trained = {paper.known_as(name) or name.lower() for name in names}
     for scene in scenes:
         if (paper.known_as(scene) or scene.lower()) in trained:
             raise AppError(
-                f"--dictionary {spec}: was trained on '{scene}', which is to be scored; train "
-                "without it, or leave --dictionary out"
+                f"dictionary {spec}: was trained on '{scene}', which is to be scored; train "
+                "without it, or use another"
             )
 
 

@@ -1,0 +1,98 @@
+"""Errors carry their advice as data: only the command line names its commands and flags."""
+
+import ast
+import re
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import typer
+
+from drivers.errors import LimitExceededError, NotHomedError, StalledError
+from emmc_rig import cli
+from emmc_rig.commands.advice import HOME, WORDS, in_shell
+from emmc_rig.errors import AppError
+from emmc_rig.model.advice import Advice
+
+ROOT = Path(__file__).parents[2]
+COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
+PRODUCT = ("reconstruction", "calibration", "drivers", "simulators", "emmc_rig")
+OURS = ("emmc_rig/commands/", "emmc_rig/cli.py")
+TYPED = re.compile(rf"emmc-rig (?:{'|'.join(COMMANDS)})\b|`emmc-rig $|(?<![\w-])--[a-z]")
+SHOWN = {
+    "emmc_rig/conformance/named.py": "the option is pytest's",
+    "emmc_rig/pages/calibration_page.py": "a report's next command",
+    "emmc_rig/pages/page.py": "a report's next command",
+    "emmc_rig/pages/session_sheet.py": "a report's next command",
+    "emmc_rig/session/export.py": "what made a file is stored in it",
+    "emmc_rig/study/chart/charting.py": "a report's next command",
+    "emmc_rig/study/design/design_page.py": "a report's next command",
+    "emmc_rig/study/design/search.py": "what made a camera is stored in it",
+    "emmc_rig/study/stability/stability_run.py": "a report's next command",
+    "emmc_rig/study/tables/tables_page.py": "a report's next command",
+}
+"""Files that name commands and flags, and why."""
+OF_OTHERS = re.compile(r"(udevadm|systemctl|gphoto2)[a-z ]* --[a-z-]+")
+"""Commands of other programs."""
+
+
+def string_literals(path):
+    """Yield line and text of every string of a file; what stands alone documents the code."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in alone:
+            yield node.lineno, node.value
+
+
+def mentions():
+    """Yield file, line and text of strings outside the command line that name a command or flag."""
+    for path in (path for folder in PRODUCT for path in sorted((ROOT / folder).rglob("*.py"))):
+        name = path.relative_to(ROOT).as_posix()
+        if not name.startswith(OURS):
+            for line, text in string_literals(path):
+                if TYPED.search(OF_OTHERS.sub("", text)):
+                    yield name, line, text
+
+
+def test_no_text_of_the_library_names_a_command_or_a_flag():
+    found = [found for found in mentions() if found[0] not in SHOWN]
+    assert not found, "\n".join(f"{name}:{line}: {text!r}" for name, line, text in found)
+
+
+def test_every_file_that_may_name_commands_does():
+    assert set(SHOWN) <= {name for name, _, _ in mentions()}
+
+
+def test_the_command_line_words_every_advice_by_commands_and_flags_that_there_are():
+    assert set(WORDS) == set(get_args(Advice))
+    groups = [command for command in COMMANDS.values() if hasattr(command, "commands")]
+    every = [
+        *COMMANDS.values(),
+        *(member for group in groups for member in group.commands.values()),
+    ]
+    flags = {flag for command in every for parameter in command.params for flag in parameter.opts}
+    for words in (*WORDS.values(), HOME):
+        assert set(re.findall(r"--[a-z-]+", words)) <= flags
+        assert all(name in COMMANDS for name in re.findall(r"emmc-rig (\w+)", words))
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        (AppError("s: no light field yet", "reconstruct", "my s"),
+         "s: no light field yet; run `emmc-rig reconstruct 'my s'`"),
+        (AppError("a damaged file"), "a damaged file"),
+        (LimitExceededError("mask_x", 9, (0, 1)), "mask_x cannot go to 9 um: choose 0 to 1 um"),
+        (NotHomedError("mask_x"), "mask_x does not know where it is: home it first; "
+         "home by `emmc-rig devices home mask_x --stage STAGE`"),
+    ],
+)  # fmt: skip
+def test_an_error_is_shown_with_what_to_type(fault, line):
+    assert in_shell(fault) == line
+
+
+def test_the_advice_of_an_error_is_shown_with_the_one_that_it_caused():
+    caused = AppError("frame 3: the stage stopped")
+    caused.__cause__ = StalledError("mask_y")
+    assert in_shell(caused).endswith("`emmc-rig devices home mask_y --stage STAGE`")
