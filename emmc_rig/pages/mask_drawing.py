@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.mask_photo import MaskReading
 from emmc_rig.files.folders import new_file
-from emmc_rig.files.results import command_line, metrics_text, versions
+from emmc_rig.files.results import metrics_text, provenance
 from emmc_rig.model.srgb import codes_of, srgb_of
 from emmc_rig.pages.drawing import ACCENT, COLOURS, FAINT, save_publication, sheet, titled
 
@@ -45,8 +45,7 @@ def write_mask(
         "light_sigma": mask.light_sigma,
         "defects": [asdict(one) for one in mask.defects],
         "sigma": np.round(mask.sigma.astype(float), 5).tolist(),
-        "command": command_line(),
-        "versions": versions(),
+        **provenance(),
     }
     with ExitStack() as files:
         picture, figures, drawing = (
