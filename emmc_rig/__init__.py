@@ -10,7 +10,7 @@
 ((5, 5, 24, 32, 3), True)
 
 Functions: `camera`, `scene`, `frames`, `reconstruct`, `reconstruct_film`, `rig`, `capture`,
-`calibrate`, `open_frames`.
+`calibrate`, `open_frames`, `open_result`.
 What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. Faults that the user can
 mend are of the classes in `ERRORS`, each one line that says what to do. A hook that a plan calls
 between frames raises `StopCapture` to end the capture.
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from emmc_rig.processing.filming import reconstruct_film
     from emmc_rig.processing.raw_frames import frames
     from emmc_rig.processing.reconstructing import open_frames, reconstruct
-    from emmc_rig.processing.result import Result
+    from emmc_rig.processing.result import Result, open_result
     from emmc_rig.session.session import Session
 
 _HOME = {
@@ -48,6 +48,7 @@ _HOME = {
     "rig": "emmc_rig.bench.rig_config:rig",
     "scene": "emmc_rig.files.scenes:open_scene",
     "open_frames": "emmc_rig.processing.reconstructing:open_frames",
+    "open_result": "emmc_rig.processing.result:open_result",
     "reconstruct": "emmc_rig.processing.reconstructing:reconstruct",
     "reconstruct_film": "emmc_rig.processing.filming:reconstruct_film",
     "Camera": "emmc_rig.model.camera:Camera",
@@ -76,6 +77,7 @@ __all__ = [
     "capture",
     "frames",
     "open_frames",
+    "open_result",
     "reconstruct",
     "reconstruct_film",
     "rig",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,21 +22,14 @@ from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.exports import save_maps
-from emmc_rig.files.results import command_line, save_frames, versions, write_metrics
+from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import (
-    export_pictures,
-    focus_disparities,
     psnr_db,
-    replicate_centre,
-    save_hdf5,
-    ssim,
 )
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
-from emmc_rig.pages.report import ReportContent, write_report
+from emmc_rig.processing.result import Result
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.frame_means import decoded
@@ -47,7 +40,6 @@ from emmc_rig.session.readings import shot_frames, shot_readings
 from emmc_rig.session.session import Session
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.kept import missed_readings
 from reconstruction.verdict.rules import Verdict
 from reconstruction.verdict.run import reconstruct_judged
 from simulators.bench import Bench
@@ -133,7 +125,7 @@ def place_rig(rig: Rig, frame: PlannedFrame) -> None:
 def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = None) -> dict:
     """Run the demo into an existing folder and return its metrics.
 
-    Writes light_field.h5, psi.h5, frames.h5, metrics.json, report.html and pictures/. Raises the
+    Writes light_field.h5, psi.h5, frames.h5, maps.h5, metrics.json and report.html. Raises the
     errors of the layers below, each one line.
     """
     watcher = watcher or Silent()
@@ -178,7 +170,6 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         frames_dn = np.stack([raw.mosaic for raw in decoded(session, of_shots)])
         exposures_s = np.array([exposure.exposures_s[0] for exposure in taken.exposures])
     with stages("reconstruct"):
-        readings, usable, sigma = taken.readings, taken.usable, taken.noise_sigma
 
         def light_field(psi: ImagingMatrix) -> tuple[Reconstruction, Verdict]:
             return reconstruct_judged(
@@ -190,77 +181,45 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
                 lambda p: watcher.step(_progress_words(p)),
             )
 
-        result, verdict = light_field(calibration.psi)
+        result = Result(
+            *light_field(calibration.psi), calibration.psi, taken,
+            None if dictionary is None else dictionary.kind, settings.solver,
+        )  # fmt: skip
     exact_psnr = None
     if settings.exact_psi:
         with stages("exact Psi, for comparison"):
             compared, _ = light_field(exact.psi)
             exact_psnr = psnr_db(compared.light_field, truth)
     with stages("evaluate"):
-        estimate = result.light_field
-        psnr = psnr_db(estimate, truth)
+        psnr = psnr_db(result.light_field, truth)
         metrics = {
+            **result.metrics(),
             "scene": settings.scene,
             "scene_provenance": fine.scene.provenance,
             "finer": [fine.aperture_factor, fine.pixel_factor],
             "camera": settings.camera_name,
-            "shots": design.shots,
-            "size": list(size),
-            "view_axes": list(camera.view_axes),
-            "psnr_db": psnr,
-            "ssim": ssim(estimate, truth),
-            "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
-            **result.stated,
+            **result.compare(truth),
             "psi_relative_error": psi_error,
             "design_relative_error": design_error,
             "psi_mean_deviation": float(calibration.deviation.mean()),
             "exact_psi_psnr_db": exact_psnr,
             "calibration_cost_db": None if exact_psnr is None else exact_psnr - psnr,
-            "noise_sigma": sigma,
-            "saturated_share": float(1 - usable.mean()),
+            "saturated_share": float(1 - taken.usable.mean()),
             "whiteboard_frames": len(frames) - design.shots,
-            "method": result.method,
-            "status": result.status,
-            "advice": result.advice,
-            "verdict": verdict.as_dict(),
-            "steps": result.steps,
-            "parameters": result.parameters,
             "seed": settings.seed,
             "warnings": camera.warnings(),
-            "command": command_line(),
-            "versions": versions(),
         }
     with stages("write"):
-        axes = camera.view_axes
-        facts = {"psnr_db": psnr, ATTRIBUTE: stored_as(axes)}
-        save_hdf5(folder / "light_field.h5", estimate, facts)
-        focus = focus_disparities(truth)
-        export_pictures(folder / "pictures", estimate, focus, axes)
-        save_frames(
-            folder / "frames.h5",
-            frames_dn,
-            readings,
-            exposures_s,
-            deviation=taken.deviation,
-            usable=usable,
-        )
-        calibration.psi.save(folder / "psi.h5")
-        missed = missed_readings(calibration.psi, estimate, readings, sigma, usable)
-        maps = {**result.maps, "misfit": missed}
-        save_maps(folder, maps, axes)
         metrics["seconds"] = dict(stages.seconds)
-        write_report(
-            folder / "report.html",
-            _report(
-                settings,
-                metrics,
-                truth,
-                result,
-                readings,
-                pictures,
-                maps,
-            ),
-        )
+        result.write(folder, metrics, frames_dn=frames_dn, exposures_s=exposures_s)
+        calibration.psi.save(folder / "psi.h5")
+        peak = max(float(np.percentile(board, 99.9)) for _, board in pictures)
+        result.draw(
+            folder, metrics, truth, settings.out,
+            title=f"{settings.scene} through {settings.camera_name}",
+            whiteboards=[(label, board / peak) for label, board in pictures],
+            stage_s=metrics["seconds"],
+        )  # fmt: skip
     metrics["seconds"] = dict(stages.seconds)
     write_metrics(folder, metrics)
     return metrics
@@ -293,34 +252,3 @@ def _progress_words(progress: Progress) -> str:
     if progress.relative_change is None:
         return f"{progress.step} of {progress.total} patches"
     return f"change {progress.relative_change:.1e}"
-
-
-def _report(
-    settings: DemoSettings,
-    metrics: dict,
-    truth: Array,
-    result: Reconstruction,
-    readings: Array,
-    pictures: list[tuple[str, Array]],
-    maps: Mapping[str, NDArray],
-) -> ReportContent:
-    camera = settings.camera
-    peak = max(float(np.percentile(board, 99.9)) for _, board in pictures)
-    return ReportContent(
-        title=f"{settings.scene} through {settings.camera_name}",
-        scene=settings.scene,
-        camera=settings.camera_name,
-        camera_line=camera.title,
-        camera_reference=camera.reference,
-        estimate=result.light_field,
-        truth=truth,
-        frames=readings,
-        cfa=camera.sensor.cfa_name,
-        whiteboards=[(label, board / peak) for label, board in pictures],
-        metrics=metrics,
-        stage_s=metrics["seconds"],
-        warnings=metrics["warnings"],
-        command=metrics["command"],
-        maps=maps,
-        source=settings.out,
-    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,10 +15,8 @@ from reconstruction.adaptive.film import Film
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.result import Progress, Reconstruction
-from reconstruction.sparse import PatchEstimates
-
-if TYPE_CHECKING:
-    from reconstruction.methods import MethodSettings
+from reconstruction.settings import ShippedSettings
+from reconstruction.sparse import PatchEstimates, SparseSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +64,10 @@ class Sensitivity:
     one_shot: bool = False
 
 
+def _no_patches(psi: ImagingMatrix, settings: ShippedSettings) -> None:
+    return None
+
+
 @dataclass(frozen=True, eq=False)
 class Method:
     """One way to reconstruct, as a module of `reconstruction.methods` offers it.
@@ -75,6 +76,11 @@ class Method:
     the settings of all methods. part, settings: the name and type of its own part of the settings.
     films: whether it takes scenes that move: films, frame after frame, and shots.
     package: what it needs beyond the core installation; it is then learned, for some views only.
+
+    factor: seconds over those of the method of factor 1; a time budget chooses the largest factor
+    that fits, so the costlier method has to be the more accurate; None: a budget does not choose
+    this method. scout, patches: for light fields in blocks, the method whose disparities set the
+    overlap of blocks, and the sparse patches that this method averages with.
     """
 
     name: str
@@ -82,13 +88,16 @@ class Method:
     assumes: str
     cost: str
     when: str
-    solve: Callable[[Given, MethodSettings], Reconstruction]
+    solve: Callable[[Given, ShippedSettings], Reconstruction]
     part: str
     settings: type[Settings]
     needs_dictionary: bool = False
     films: bool = False
     sensitivity: Sensitivity = field(default_factory=Sensitivity)
     package: str | None = None
+    factor: float | None = None
+    scout: str | None = None
+    patches: Callable[[ImagingMatrix, ShippedSettings], SparseSettings | None] = _no_patches
 
     @property
     def installed(self) -> bool:

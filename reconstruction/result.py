@@ -40,6 +40,7 @@ class Reconstruction:
     objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
     it found, by name: `disparity` (y, x) in pixels per view step, ... screening: what was
     done to the frames before, in words. film: of a frame of a film, what the next one goes on from.
+    seconds: without compiling_seconds, in which kernels were compiled or loaded.
     """
 
     method: str
@@ -53,6 +54,7 @@ class Reconstruction:
     maps: Mapping[str, NDArray] = field(default_factory=dict)
     screening: tuple[str, ...] = ()
     film: Any = None
+    compiling_seconds: float = 0.0
 
     @property
     def stated(self) -> dict[str, Any]:

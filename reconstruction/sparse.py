@@ -13,7 +13,6 @@ per atom, `ista`, `fista` and `sl0` 4 n m per step; putting the patch together 2
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
@@ -279,7 +279,7 @@ def reconstruct_sparse(
     inputs that do not fit each other, and a light field smaller than a patch.
     """
     settings = settings or SparseSettings()
-    started = time.perf_counter()
+    started = running_s()
     frames = checked_inputs(psi, frames)
     if found is None:
         found = estimate_patches(psi, frames, dictionary, settings, on_step)
@@ -303,7 +303,7 @@ def reconstruct_sparse(
         advice="; ".join(advice),
         steps=round(found.passes),
         objective=(),
-        seconds=time.perf_counter() - started,
+        seconds=running_s() - started,
         parameters={
             "noise_sigma": frames.noise_sigma,
             "patches": len(found.atoms),

@@ -10,7 +10,6 @@ Up to `BlockSettings.whole` samples a light field is one block: the method itsel
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,19 +19,20 @@ from math import ceil, lcm
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
-from reconstruction.adaptive.settings import SIDES, AdaptiveSettings, Side
+from reconstruction.adaptive.settings import SIDES, Side
 from reconstruction.adaptive.survey import contrast_of
 from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import check_frames
-from reconstruction.methods import BlockSettings, MethodSettings, find_method, reconstruct
-from reconstruction.methods.surfaces import sparse_patches, takes_patches
+from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.methods.variational import patched_weights
 from reconstruction.result import Progress, Reconstruction, Status
 from reconstruction.screening import screened
+from reconstruction.settings import BlockSettings
 from reconstruction.sparse import SparseSettings
 from reconstruction.verdict.blocks import JudgedBlock, judged_together
 from reconstruction.verdict.rules import Verdict
@@ -260,9 +260,11 @@ def multiple_of(binning: int, dictionary: Dictionary | None, settings: MethodSet
     return lcm(2 * binning, settings.sparse.stride if dictionary is not None else 1)
 
 
-def _largest_disparity(psi: ImagingMatrix, frames: Frames, settings: MethodSettings) -> float:
-    """Return the largest disparity, in size, that `adaptive-fast` is sure of in a window."""
-    maps = reconstruct("adaptive-fast", psi, frames, None, settings).maps
+def _largest_disparity(
+    scout: str, psi: ImagingMatrix, frames: Frames, settings: MethodSettings
+) -> float:
+    """Return the largest disparity, in size, that a method is sure of in a window."""
+    maps = reconstruct(scout, psi, frames, None, settings).maps
     sure = maps["disparity"][maps["disparity_sigma"] < SURE_PX]
     return float(np.percentile(np.abs(sure), COVERED)) if sure.size else 0.0
 
@@ -297,9 +299,9 @@ def surveyed(
         # Bad pixels and lines are left to the blocks.
         words = found.notes[: len(found.notes) - bool(found.bad.any()) - bool(found.lines.any())]
         read = found.frames
-    halo, largest = REACH, 0.0
-    patched = name == "adaptive" and takes_patches(mosaic, settings.adaptive)
-    if method.settings is AdaptiveSettings:
+    halo, largest, scout = REACH, 0.0, method.scout
+    sparse = method.patches(mosaic, settings)
+    if scout is not None:
         firsts = np.cumsum([0, *(one.frames_shape[2] for one in windows)])
         parts = [
             (window, np.s_[:, :, first : first + window.frames_shape[2]])
@@ -307,13 +309,13 @@ def surveyed(
         ]
         largest = max(
             (
-                _largest_disparity(window, read.cut(part), settings)
+                _largest_disparity(scout, window, read.cut(part), settings)
                 for window, part in parts
                 if read.usable[part].any()
             ),
             default=0.0,
         )
-        reach = PATCHED_REACH if patched else TEXTURE_REACH
+        reach = TEXTURE_REACH if sparse is None else PATCHED_REACH
         halo = reach * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
         picture = smooth_guess(mosaic, read.readings, read.usable).astype(np.float32)
         noise = np.full(read.shape, read.noise_sigma**2)
@@ -321,14 +323,11 @@ def surveyed(
             mosaic, read.readings, picture, noise, read.usable
         )
         # What a block would decide by its own size is decided for all.
-        count = settings.adaptive.patches if patched else None
+        count = None if sparse is None else settings.adaptive.patches
         adaptive = settings.adaptive.model_copy(update={"contrast": own, "patches": count})
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
-    sparse = settings.sparse if name == "tv-dict" else None
-    if patched:
-        sparse = sparse_patches(settings.sparse, k)
     settled = _settled(mosaic, read, settings, sparse)
     return CaptureSurvey(settled, halo, left_out, gains, words, largest)
 
@@ -456,7 +455,7 @@ def reconstruct_in_blocks(
 
     Raises ReconstructionError as `reconstruct` does.
     """
-    started = time.perf_counter()
+    started = running_s()
     check_frames(psi.frames_shape, frames.readings)
     if not frames.usable.any():
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
@@ -477,7 +476,7 @@ def reconstruct_in_blocks(
         if on_step is not None:
             on_step(Progress(done, None, None, len(grid)))
     arrays = _whole(grid, parts)
-    whole = summed_up(name, results, survey, time.perf_counter() - started)
+    whole = summed_up(name, results, survey, running_s() - started)
     light_field = arrays.pop("light_field")
     return replace(whole, light_field=light_field, maps=arrays), judged_together(verdicts)
 

@@ -21,7 +21,6 @@ per value.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -31,6 +30,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from emmc_rig.model.settings import Settings
@@ -100,7 +100,7 @@ def reconstruct_tv(
     ReconstructionError for frames that do not fit Psi, see `checked_inputs`.
     """
     settings = settings or TVSettings()
-    started = time.perf_counter()
+    started = running_s()
     if settings.rho == 0:
         patch_term = None
     frames = checked_inputs(psi, frames)
@@ -140,7 +140,7 @@ def reconstruct_tv(
         advice="" if converged else "raise max_steps or loosen rtol",
         steps=step,
         objective=tuple(history),
-        seconds=time.perf_counter() - started,
+        seconds=running_s() - started,
         parameters={
             "mu": float(mu),
             "chroma_weight": settings.chroma_weight,

@@ -46,16 +46,17 @@ def export(
     ] = None,
 ) -> None:
     """Export a light field or Psi to other programs, or as a viewer."""
-    from emmc_rig.files.exports import LIGHT_FIELD, open_export
+    from emmc_rig.files.exports import open_export
     from emmc_rig.files.films import film_of
     from emmc_rig.files.formats.registry import ALIASES, FORMATS
+    from emmc_rig.files.result_files import holds_light_field
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
     from emmc_rig.pages.viewer import VIEWER
     from emmc_rig.store.folders import result_folder
 
     if of is not None and result != "psi":
         raise typer.BadParameter(f"'{of}': export one light field at a time")
-    if result == "psi" and (of is not None or not Path("psi", LIGHT_FIELD).is_file()):
+    if result == "psi" and (of is not None or not holds_light_field(Path("psi"))):
         _export_psi(of or Path("psi" if Path("psi").exists() else "."), form or "npz", out)
         return
     known = {VIEWER.name: VIEWER, **FORMATS}
@@ -105,7 +106,12 @@ def export(
 def _export_psi(source: Path, form: str, out: Path | None) -> None:
     """Write the Psi of a file or folder, and its frames if it has any, as a sparse matrix."""
     import emmc_rig as emmc
-    from emmc_rig.files.psi import FRAMES, FRAMES_GROUP, PSI_GROUP, StoredPsi, psi_beside
+    from emmc_rig.files.psi import (
+        PSI_GROUP,
+        StoredPsi,
+        holds_frames,
+        psi_beside,
+    )
     from emmc_rig.files.psi_exports import PSI_FORMATS
     from emmc_rig.files.results import shown_bytes, write_metrics
     from emmc_rig.store.folders import is_session, result_folder
@@ -118,7 +124,7 @@ def _export_psi(source: Path, form: str, out: Path | None) -> None:
         shown_progress("read") as bars,
     ):
         frames = None
-        if is_session(source) or any((source / name).exists() for name in (FRAMES, FRAMES_GROUP)):
+        if is_session(source) or holds_frames(source):
             psi, frames = emmc.open_frames(source)
         else:
             inside = source.is_dir() and source.name != PSI_GROUP

@@ -40,8 +40,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from emmc_rig.errors import AppError, StoppedError
-from emmc_rig.model.json_text import parse_json
+from emmc_rig.errors import StoppedError
 
 if TYPE_CHECKING:
     from reconstruction.result import Progress as SolverProgress
@@ -92,9 +91,10 @@ def give_result(out: Path | None = None, **facts: Any) -> None:
     if not json_wanted.get():
         return
     if out is not None:
-        metrics = out / "metrics.json"
-        if metrics.is_file():
-            facts = {"metrics": parse_json(metrics.read_bytes(), str(metrics), AppError), **facts}
+        from emmc_rig.files.result_files import METRICS, read_metrics
+
+        if (out / METRICS).is_file():
+            facts = {"metrics": read_metrics(out), **facts}
         facts = {"out": str(out), **facts}
     emit("result", **facts)
 

@@ -247,7 +247,7 @@ def _say_result(metrics: dict, out: Path) -> None:
         f"{metrics['method']}: {metrics['status']} in {metrics['seconds']:.1f} s{compared}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
-    written = ("pictures", "light_field.h5", "result.zarr")
+    written = ("report.html", "light_field.h5", "result.zarr")
     shown = next(out / name for name in written if (out / name).exists())
     tell(f"open {shown}")
 

@@ -76,11 +76,9 @@ def simulate_into(
     frames = camera.expose(scene, seed, psi)
     save_frames(
         folder / (FRAMES_GROUP if as_zarr else FRAMES),
-        frames.frames_dn,
-        frames.readings,
-        camera.exposures_s(),
-        deviation=frames.deviation,
-        usable=frames.usable,
+        frames,
+        frames_dn=frames.frames_dn,
+        exposures_s=camera.exposures_s(),
         noise_free=frames.noise_free,
     )
     if as_zarr:

@@ -10,16 +10,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.exports import LIGHT_FIELD, open_export
+from emmc_rig.files.exports import open_export
 from emmc_rig.files.formats.format import Film
+from emmc_rig.files.result_files import AGAIN, LIGHT_FIELD, read_metrics
 from emmc_rig.files.results import METRICS
 from emmc_rig.files.scenes import path_in
-from emmc_rig.model.json_text import one_line, parse_json
+from emmc_rig.model.json_text import one_line
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION, Listing, is_session
 
 FRAMES = "frames"
-REMEDY = "copy the folder again, or reconstruct it again"
 
 
 def film_of(spec: str) -> Film | None:
@@ -40,25 +40,26 @@ def open_film(folder: Path) -> Film:
     listing = Listing.read(folder)
     gone = [name for name in listing.files if not (folder / name).is_file()] if listing else []
     if gone:
-        raise AppError(f"{folder}: {gone[0]} is missing; {REMEDY}")
+        raise AppError(f"{folder}: {gone[0]} is missing; {AGAIN}")
     paths = ((place, folder / FRAMES / f"{place:06d}") for place in range(len(times_s)))
     frames = {place: path for place, path in paths if path.is_dir()}
     if not frames:
-        raise AppError(f"{folder}: a film without a frame; {REMEDY}")
-    with stored_arrays(next(iter(frames.values())) / LIGHT_FIELD, AppError, REMEDY) as stored:
+        raise AppError(f"{folder}: a film without a frame; {AGAIN}")
+    with stored_arrays(next(iter(frames.values())) / LIGHT_FIELD, AppError, AGAIN) as stored:
         shape = tuple(stored.dataset("light_field").shape)
     return Film(folder, rate, times_s, frames, shape, open_export)
 
 
 def _times(folder: Path) -> tuple[float, tuple[float, ...]]:
     """Return the rate, Hz, and the times of all places, s, that metrics.json has."""
-    path = folder / METRICS
+    known = read_metrics(folder)
     try:
-        about = parse_json(path.read_bytes(), METRICS, ValueError)["film"]
+        about = known["film"]
         count, rate = int(about["frames"]), float(about["rate"])
         times_s = tuple(float(time_s) for time_s in about["times_s"])
         if not (rate > 0 and count == len(times_s)):
             raise ValueError(f"{len(times_s)} times of {count} frames at {rate:g} Hz")
-    except (OSError, ValueError, KeyError, TypeError) as fault:
-        raise AppError(f"{path}: not that of a film ({one_line(fault)}); {REMEDY}") from fault
+    except (ValueError, KeyError, TypeError) as fault:
+        what = f"{folder / METRICS}: not that of a film ({one_line(fault)})"
+        raise AppError(f"{what}; {AGAIN}") from fault
     return rate, times_s

@@ -120,6 +120,11 @@ def save_shards(psi: ImagingMatrix, folder: Path) -> None:
     )  # fmt: skip
 
 
+def holds_frames(folder: Path) -> bool:
+    """Return whether a folder holds frames as `read_frames` reads them."""
+    return (folder / FRAMES).is_file() or (folder / FRAMES_GROUP).is_dir()
+
+
 def read_frames(folder: Path) -> Frames:
     """Read the frames of a folder; raises AppError when they are missing, damaged or incomplete."""
     refuse_missing(folder, WRITTEN_BY)

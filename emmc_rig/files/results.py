@@ -6,19 +6,25 @@ import json
 import math
 import platform
 import re
+import subprocess
+import sys
 from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
-import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import WrongUsageError
 from emmc_rig.files.shards import ENDING, save_arrays
 from emmc_rig.store.locks import command_line
 from emmc_rig.version import __version__
+
+if TYPE_CHECKING:
+    from emmc_rig.model.frames import Frames
+    from emmc_rig.model.settings import Settings
 
 METRICS = "metrics.json"
 PSI_ASSUMED = (
@@ -63,9 +69,8 @@ def parse_seconds(text: str | None, option: str) -> float | None:
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
-    """Write metrics.json, with the command and the versions; see `metrics_text`."""
-    text = metrics_text({**metrics, "command": command_line(), "versions": versions()})
-    (folder / METRICS).write_text(text, encoding="utf-8")
+    """Write metrics.json, with what made the figures: see `provenance` and `metrics_text`."""
+    (folder / METRICS).write_text(metrics_text({**provenance(), **metrics}), encoding="utf-8")
 
 
 def metrics_text(metrics: Mapping[str, object]) -> str:
@@ -94,24 +99,48 @@ def stated_words(metrics: Mapping[str, object]) -> str:
     return f"{stated_db:.1f} dB"
 
 
-def save_frames(
-    path: Path,
-    frames_dn: NDArray[np.uint16],
-    readings: NDArray[np.floating],
-    exposures_s: NDArray[np.floating],
-    **more: NDArray,
-) -> None:
-    """Write frames (shot, y, x): frames_dn, readings, exposures_s (shot,), and more.
+def save_frames(path: Path, frames: Frames, **more: NDArray) -> None:
+    """Write frames with more arrays (shot, y, x), such as frames_dn, and exposures_s (shot,).
 
     path: a Zarr group where it ends in .zarr, else an HDF5 file.
     """
-    arrays = {"frames_dn": frames_dn, "readings": readings, "exposures_s": exposures_s, **more}
+    own = {"readings": frames.readings, "deviation": frames.deviation, "usable": frames.usable}
+    arrays = {**own, **more}
     if path.suffix == ENDING:
         save_arrays(path, arrays)
         return
     with h5py.File(path, "w") as file:
         for name, array in arrays.items():
             file[name] = array
+
+
+def provenance(settings: Settings | None = None) -> dict[str, object]:
+    """Return what makes a figure again: command, versions, commit of a checkout, threads.
+
+    settings: only those that are not default are stated. Threads are those of compiled kernels.
+    """
+    known: dict[str, object] = {"command": command_line(), "versions": versions()}
+    if commit := _commit():
+        known["commit"] = commit
+    if numba := sys.modules.get("numba"):
+        known["threads"] = numba.get_num_threads()
+    if settings is not None:
+        known["settings"] = settings.model_dump(mode="json", exclude_defaults=True)
+    return known
+
+
+@cache
+def _commit() -> str:
+    """Return the commit that runs, `-dirty` after it where files differ; "" without a checkout."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return ""
+    git = ("git", "--no-optional-locks", "-C", str(root))
+    asked = (*git, "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty")
+    try:
+        return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
 
 
 def versions() -> dict[str, str]:

@@ -330,6 +330,13 @@ def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
     return camera.model_copy(update={"shots": tuple(chosen)}).model_dump_json()
 
 
+def psi_of_shot(psi: ImagingMatrix, shot: int) -> ImagingMatrix:
+    """Return the Psi of one shot, counted from 0, with its camera."""
+    if psi.shots == 1:
+        return psi
+    return psi.of_shots([shot], json_of_shots(camera_of(psi), [shot]) if psi.camera_json else "")
+
+
 @dataclass(frozen=True)
 class Plate:
     """A mask as manufactured: cells (frame, row, column, colour), their side and distance."""

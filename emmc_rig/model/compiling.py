@@ -10,6 +10,7 @@ more, and a process calls whichever copy it met first: one that compiles that of
 one that loads from the disk that of the first caller. The two may round differently.
 
 Of several processes that need a kernel, one compiles it: the others wait, and load what it wrote.
+The clock `running_s` stands still meanwhile: the seconds of a method are those of its work.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
             return helper
         folder = _folder(Path(kernel.__code__.co_filename), _user_folder()) if cache else None
         if folder is None:
-            return numba.njit(*arguments, **options)(kernel)
+            return _metered(numba.njit(*arguments, **options)(kernel))
         with _placing:  # Numba reads the folder once, here, and offers no other way to choose it
             before, _numba.CACHE_DIR = _numba.CACHE_DIR, str(folder)
             try:
@@ -91,9 +92,65 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
                 return compile_or_load(sig)
 
         made.compile = one_compiles
-        return made
+        return _metered(made)
 
     return compiled
+
+
+class _Meter:
+    """Seconds in which any thread compiled or loaded a kernel, or waited for one."""
+
+    def __init__(self) -> None:
+        self.lock, self.at_once, self.since, self.total_s = threading.Lock(), 0, 0.0, 0.0
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self.lock:
+            self.since = self.since if self.at_once else time.perf_counter()
+            self.at_once += 1
+        try:
+            yield
+        finally:
+            with self.lock:
+                self.at_once -= 1
+                if not self.at_once:
+                    self.total_s += time.perf_counter() - self.since
+
+    def read(self) -> tuple[float, float]:
+        """Return the time now, by `time.perf_counter`, and the seconds until then."""
+        with self.lock:
+            now = time.perf_counter()
+            return now, self.total_s + (now - self.since if self.at_once else 0.0)
+
+
+_meter = _Meter()
+os.register_at_fork(after_in_child=_meter.__init__)  # the thread that compiled is not there
+
+
+def compiling_s() -> float:
+    """Return the seconds in which this process compiled or loaded kernels so far."""
+    return _meter.read()[1]
+
+
+def running_s() -> float:
+    """Return the time of a clock that stands still while a kernel is compiled or loaded.
+
+    It does for all threads: Numba holds Python's lock meanwhile.
+    """
+    now, compiling = _meter.read()
+    return now - compiling
+
+
+def _metered(kernel: Any) -> Any:
+    """Return a kernel that adds to `compiling_s` what its machine code takes."""
+    compile_or_load = kernel.compile
+
+    def compiled(sig: Any) -> Any:
+        with _meter():
+            return compile_or_load(sig)
+
+    kernel.compile = compiled
+    return kernel
 
 
 @contextmanager

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,6 +58,13 @@ class Frames:
     def shape(self) -> tuple[int, ...]:
         """(shot, pixel_y, pixel_x)."""
         return self.readings.shape
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of the readings and of which are usable."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.readings))
+        digest.update(np.ascontiguousarray(self.usable))
+        return digest.hexdigest()
 
     @property
     def noise_sigma(self) -> float:

@@ -8,7 +8,7 @@ linear values themselves, with no gamma.
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -22,12 +22,9 @@ from emmc_rig.model.errors import SceneError
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.reading import one_line, stored_arrays
 from emmc_rig.model.view_axes import (
-    ANGLES,
     ATTRIBUTE,
     ViewAxes,
     axes_from,
-    picture_name,
-    shows_parallax,
 )
 
 _DATASET = "light_field"
@@ -157,31 +154,6 @@ def grid_of_views(paths: Mapping[tuple[int, int], Path], folder: Path) -> tuple[
     return rows, columns
 
 
-def save_views(folder: str | os.PathLike, lf: np.ndarray) -> None:
-    """Write every view as an 8-bit `view_ROW_COL.png`; values outside [0, 1] are clipped.
-
-    Args:
-        folder: created where missing.
-        lf: (v, u, y, x, 3).
-
-    Raises:
-        SceneError: the folder holds views of a larger grid, which would mix with these, or it
-            cannot be written.
-    """
-    folder = _make_folder(folder)
-    _save_views(folder, {place: _to_codes(lf[place]) for place in np.ndindex(lf.shape[:2])})
-
-
-def _save_views(folder: Path, codes: Mapping[tuple[int, ...], np.ndarray]) -> None:
-    """Write views, by row and column, into an existing folder: see `save_views`."""
-    pictures = {f"view_{v}_{u}.png": view for (v, u), view in codes.items()}
-    for path in sorted(folder.iterdir()):
-        if _VIEW_NAME.fullmatch(path.name) and path.name not in pictures:
-            raise SceneError(f"{folder}: already holds {path.name} of another grid; empty it first")
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(_write_codes, (folder / name for name in pictures), pictures.values()))
-
-
 def load_hdf5(path: str | os.PathLike) -> np.ndarray:
     """Read the dataset `light_field` of an HDF5 file: floating in [0, 1], or 8- or 16-bit codes.
 
@@ -261,11 +233,6 @@ def epi_horizontal(lf: np.ndarray, v: int, y: int) -> np.ndarray:
     return lf[v, :, y]
 
 
-def epi_vertical(lf: np.ndarray, u: int, x: int) -> np.ndarray:
-    """Column `x` of every view of column `u`: (v, y, c); disparity is the lines' slope dy/dv."""
-    return lf[:, u, :, x]
-
-
 def shear(lf: np.ndarray, disparity_px: float) -> np.ndarray:
     """Shift every view so that points of this disparity stay where the centre view has them.
 
@@ -318,24 +285,6 @@ def shifted(view: np.ndarray, shift_y_px: float, shift_x_px: float) -> np.ndarra
     return blended[1 : 1 + height, 1 : 1 + width].reshape(view.shape)
 
 
-def refocus(lf: np.ndarray, disparity_px: float) -> np.ndarray:
-    """The photograph of a full aperture focused on this disparity: the mean over `shear`ed views.
-
-    Ng et al. 2005, "Light field photography with a hand-held plenoptic camera", eq. 5.
-
-    Args:
-        lf: (v, u, y, x, c).
-        disparity_px: pixels per view step.
-
-    Returns:
-        (y, x, c) float32.
-    """
-    total = np.zeros(lf.shape[2:], np.float32)
-    for v, u in np.ndindex(lf.shape[:2]):
-        total += _aligned_view(lf, v, u, disparity_px)
-    return total / (lf.shape[0] * lf.shape[1])
-
-
 def small_grey_views(lf: np.ndarray, most_columns: int) -> tuple[np.ndarray, float]:
     """Return the views (v, u, y, x, 1), grey, at most so many columns wide, and the shrinkage."""
     shrink = max(1.0, lf.shape[3] / most_columns)
@@ -351,7 +300,7 @@ def small_grey_views(lf: np.ndarray, most_columns: int) -> tuple[np.ndarray, flo
 
 
 BACK_TO_FRONT = 5, 50, 95
-"""Percentiles of a scene's disparity on which pictures are focused."""
+"""Percentiles of a scene's disparity."""
 
 
 def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
@@ -435,85 +384,9 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     return float(means.mean())
 
 
-def export_pictures(
-    folder: str | os.PathLike,
-    lf: np.ndarray,
-    disparities_px: tuple[float, float, float] | None = None,
-    view_axes: ViewAxes = ANGLES,
-) -> dict[str, Path]:
-    """Write what a person wants to see of a light field, for any picture viewer.
-
-    Args:
-        folder: created where missing.
-        lf: (v, u, y, x, 3); values outside [0, 1] are clipped.
-        disparities_px: back, middle and front focus in pixels per view step; by default
-            `focus_disparities(lf)`.
-        view_axes: what rows and columns of views are.
-
-    Returns:
-        What was written: `views` (a folder), `parallax`, `epi_horizontal`, `epi_vertical`
-        (through the centre, each view's line repeated to be visible), `refocus_back`,
-        `refocus_middle`, `refocus_front`. Of bands or times `views`, and `bands` or `times`, an
-        animation of all in order.
-
-    Raises:
-        SceneError: something cannot be written.
-    """
-    folder = _make_folder(folder)
-    n_v, n_u, height, width, _ = lf.shape
-    codes = {place: _to_codes(lf[place]) for place in np.ndindex(n_v, n_u)}
-    parallax = shows_parallax(view_axes)
-    animated = "parallax" if parallax else f"{picture_name(view_axes)}s"
-    walk = _circular_walk(n_v, n_u) if parallax else list(codes)
-    with ThreadPoolExecutor(1) as beside:  # it takes as long as all the others
-        animation = folder / f"{animated}.webp"
-        drawn = beside.submit(_write_walk, animation, [codes[place] for place in walk])
-        _save_views(_make_folder(folder / "views"), codes)
-        if not parallax:
-            drawn.result()
-            return {"views": folder / "views", animated: animation}
-        pictures = {
-            "epi_horizontal": np.repeat(epi_horizontal(lf, n_v // 2, height // 2), 8, axis=0),
-            "epi_vertical": np.repeat(epi_vertical(lf, n_u // 2, width // 2), 8, axis=0),
-        }
-        disparities_px = disparities_px or focus_disparities(lf)
-        for name, disparity_px in zip(("back", "middle", "front"), disparities_px, strict=True):
-            pictures[f"refocus_{name}"] = refocus(lf, disparity_px)
-        for name, picture in pictures.items():
-            _write_codes(folder / f"{name}.png", _to_codes(picture))
-        drawn.result()
-    return {
-        "views": folder / "views",
-        "parallax": folder / "parallax.webp",
-        **{name: folder / f"{name}.png" for name in pictures},
-    }
-
-
 def read_picture(path: Path) -> np.ndarray:
     """Return the picture of a file as float32 (y, x, 3), 1 for white; raises SceneError."""
     return light_of(*read_codes(path, SceneError, opaque=True))
-
-
-def _write_codes(path: Path, codes: np.ndarray) -> None:
-    """Write what `_to_codes` returns as a PNG."""
-    if not cv2.imwrite(str(path), codes):
-        raise SceneError(f"{path}: cannot be written")
-
-
-def _write_walk(path: Path, pictures: Sequence[np.ndarray]) -> None:
-    """Write an endless animation of pictures, as `_to_codes` returns them."""
-    animation = cv2.Animation()
-    animation.frames = pictures
-    animation.durations = [max(60, 1600 // len(pictures))] * len(pictures)
-    if not cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, 92]):
-        raise SceneError(f"{path}: cannot be written")
-
-
-def _to_codes(picture: np.ndarray) -> np.ndarray:
-    """(y, x, 3) RGB values, clipped to [0, 1], as OpenCV's 8-bit BGR."""
-    scaled = np.clip(picture, 0, 1)
-    scaled *= 255
-    return cv2.cvtColor(np.rint(scaled, out=scaled).astype(np.uint8), cv2.COLOR_RGB2BGR)
 
 
 def _make_folder(folder: str | os.PathLike) -> Path:
@@ -580,12 +453,3 @@ def _plane_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
         (means_squares + _SSIM_C1) * (variances + _SSIM_C2)
     )
     return float(similarity.mean())
-
-
-def _circular_walk(n_v: int, n_u: int) -> list[tuple[int, int]]:
-    """The views nearest to an ellipse through the outer views, once around, none twice in a row."""
-    angles = np.linspace(0, 2 * np.pi, 8 * max(n_v, n_u), endpoint=False)
-    rows = np.rint((n_v - 1) / 2 * (1 + np.sin(angles))).astype(int)
-    columns = np.rint((n_u - 1) / 2 * (1 + np.cos(angles))).astype(int)
-    walk = list(zip(rows.tolist(), columns.tolist(), strict=True))
-    return [place for i, place in enumerate(walk) if place != walk[i - 1]]

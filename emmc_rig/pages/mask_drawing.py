@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from calibration.mask_photo import MaskReading
-from emmc_rig.files.results import command_line, metrics_text, versions
+from emmc_rig.files.results import metrics_text, provenance
 from emmc_rig.model.srgb import codes_of, srgb_of
 from emmc_rig.pages.drawing import ACCENT, COLOURS, FAINT, save_publication, sheet, titled
 from emmc_rig.store.folders import new_file
@@ -45,8 +45,7 @@ def write_mask(
         "light_sigma": mask.light_sigma,
         "defects": [asdict(one) for one in mask.defects],
         "sigma": np.round(mask.sigma.astype(float), 5).tolist(),
-        "command": command_line(),
-        "versions": versions(),
+        **provenance(),
     }
     with ExitStack() as files:
         picture, figures, drawing = (

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.files.formats.format import Export
 from emmc_rig.files.results import stated_words
+from emmc_rig.model.camera import Camera
 from emmc_rig.model.files import write_text
 from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
 from emmc_rig.pages.display import (
@@ -24,7 +25,7 @@ from emmc_rig.pages.display import (
     reduced,
     round_up,
 )
-from emmc_rig.pages.page import Card, fragment, light_field_head
+from emmc_rig.pages.page import Card, estimated, fragment, light_field_head
 from emmc_rig.pages.viewer import poster, viewer_data
 from reconstruction.verdict.rules import NOISE, UNEXPLAINED
 
@@ -40,24 +41,18 @@ class ReportContent:
     """What the report shows. Pictures are linear, float, nominally in [0, 1].
 
     Shapes: light fields (v, u, y, x, c) with c 1 or 3; frames (shot, y, x); whiteboards (y, x).
-    maps: what is laid over the picture in the viewer, by name, see `Export`. source: the result's
-    folder, as typed.
+    metrics: as in metrics.json. maps: what is laid over the picture in the viewer, by name, see
+    `Export`. described: the camera, where Psi knows it. source: the result's folder, as typed.
     """
 
     title: str
-    scene: str
-    camera: str
-    camera_line: str
-    camera_reference: str
     estimate: Array
-    frames: Array
-    cfa: str
-    metrics: Mapping[str, object]
+    metrics: Mapping[str, Any]
+    frames: Array | None = None
+    described: Camera | None = None
     truth: Array | None = None
     whiteboards: Sequence[tuple[str, Array]] = ()
     stage_s: Mapping[str, float] = field(default_factory=dict)
-    warnings: Sequence[str] = ()
-    command: str = ""
     source: str = ""
     maps: Mapping[str, NDArray] = field(default_factory=dict)
 
@@ -75,6 +70,8 @@ def render(content: ReportContent) -> str:
     rows, columns, height, width, _ = content.estimate.shape
     disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
     axes, listed = axes_of(content.metrics), _figures(content.metrics)
+    frames = content.frames
+    shots = content.metrics.get("shots", 0 if frames is None else len(frames))
     export = Export(
         content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
         view_axes=axes,
@@ -89,7 +86,8 @@ def render(content: ReportContent) -> str:
         warnings=_warnings(content),
         summary=light_field_head(content.metrics, content.source),
         cards=_cards(content),
-        frames=_frames(content.frames),
+        cfa=None if content.described is None else content.described.sensor.cfa_name,
+        frames=None if frames is None else _frames(frames),
         whiteboards=[
             (label, _frames(frame[None])["pictures"][0]) for label, frame in content.whiteboards
         ],
@@ -97,7 +95,7 @@ def render(content: ReportContent) -> str:
         picture=picture_name(axes),
         views={"rows": rows, "columns": columns, "height": height, "width": width},
         error=None if content.truth is None else _error(content.estimate, content.truth),
-        shots="1 shot" if len(content.frames) == 1 else f"{len(content.frames)} shots",
+        shots="1 shot" if shots == 1 else f"{shots} shots",
         timings=_timings(content.stage_s),
         total_s=sum(content.stage_s.values()),
         figures=[row for row in listed if not row["of_method"]],
@@ -170,8 +168,9 @@ FIGURES = {
     "whiteboard_frames": Figure("Whiteboard frames", meaning="exposures taken to measure Psi"),
     "status": Figure("Status", meaning="how the solver stopped"),
     "advice": Figure("Advice", meaning="what the solver suggests"),
-    "seed": Figure("Seed", meaning="same seed, same result"),
     "steps": Figure("Steps", meaning="of the solver"),
+    "seconds": Figure("Time of the method", ".2f", "s", "without compilation"),
+    "compiling_seconds": Figure("Compilation", ".2f", "s", "of kernels, once for every version"),
     "size": Figure("Size", meaning="height and width of a {picture}, pixels"),
     "scene_provenance": Figure("Origin of the scene"),
     "finer": Figure("Finer scene",
@@ -211,7 +210,22 @@ FIGURES = {
 }  # fmt: skip
 """By the name in metrics.json; a figure without a row here is listed under its own name. In braces:
 what pictures are called, the one in the middle, what it is to fall short of it."""
-SHOWN_ELSEWHERE = {"verdict", "versions", "seconds", "warnings", "command"}
+PROVENANCE = {
+    "command": "Command line",
+    "commit": "Commit",
+    "threads": "Threads",
+    "seed": "Seed",
+    "source": "Frames",
+    "scene": "Scene",
+    "camera": "Camera",
+    "frames_sha256": "SHA-256 of the frames",
+    "psi_sha256": "SHA-256 of Psi",
+    "psi_file": "Psi",
+}
+"""Rows of where a result came from, by the name in metrics.json."""
+SHOWN_ELSEWHERE = {
+    "verdict", "versions", "warnings", "assumed", "estimated_from_frames", *PROVENANCE
+}  # fmt: skip
 
 
 def _number(value: object) -> float | None:
@@ -273,9 +287,10 @@ def _cards(content: ReportContent) -> list[Card]:
 
 
 def _warnings(content: ReportContent) -> list[str]:
+    warnings = content.metrics.get("warnings") or ()
     broken = int(content.estimate.size - np.count_nonzero(np.isfinite(content.estimate)))
     more = f"The estimate holds {broken} values that are not finite; drawn black."
-    return [*content.warnings, *([more] if broken else [])]
+    return [*warnings, *estimated(content.metrics), *([more] if broken else [])]
 
 
 def _timings(stage_s: Mapping[str, float]) -> list[tuple[str, str, str]]:
@@ -290,7 +305,9 @@ def _timings(stage_s: Mapping[str, float]) -> list[tuple[str, str, str]]:
 def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, object]]:
     rows = []
     for key, value in metrics.items():
-        if not prefix and key in SHOWN_ELSEWHERE:
+        if not prefix and (
+            key in SHOWN_ELSEWHERE or (key == "seconds" and isinstance(value, dict))
+        ):
             continue
         if isinstance(value, Mapping):
             rows += _flat(value, f"{prefix}{key}.")
@@ -319,14 +336,13 @@ def _figures(metrics: Mapping[str, object]) -> list[dict[str, Any]]:
 
 
 def _provenance(content: ReportContent) -> dict[str, object]:
-    versions = content.metrics.get("versions")
-    named = versions if isinstance(versions, Mapping) else {}
-    return {
-        "Command line": content.command or "not recorded",
-        "Seed": _written(content.metrics.get("seed")),
-        "Scene": content.scene,
-        "Camera": f"{content.camera}: {content.camera_line}",
-        "Reference": content.camera_reference,
-        "Colour filter": content.cfa,
-        **{f"Version of {name}": version for name, version in named.items()},
-    }
+    known, camera = content.metrics, content.described
+    rows = {label: known.get(key) for key, label in PROVENANCE.items()}
+    if camera is not None:
+        rows |= {
+            "Description": camera.title,
+            "Reference": camera.reference,
+            "Colour filter": camera.sensor.cfa_name,
+        }
+    rows |= {f"Version of {name}": version for name, version in known.get("versions", {}).items()}
+    return {label: value for label, value in rows.items() if value not in (None, "")}

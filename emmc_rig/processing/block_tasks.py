@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -27,6 +26,7 @@ from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.shards import create_array, created_group, opened_array
+from emmc_rig.model.compiling import running_s
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.json_text import parse_json
@@ -160,7 +160,7 @@ def block_task(task: BlockTask) -> None:
 
     Raises AppError naming the block where it fails, and OSError where it cannot be written.
     """
-    started = time.perf_counter()
+    started = running_s()
     try:
         solved = _solved(task)
     except ERRORS as fault:
@@ -180,7 +180,7 @@ def block_task(task: BlockTask) -> None:
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
             "variance": _variance(task.block, solved.arrays),
-            "seconds": time.perf_counter() - started,
+            "seconds": running_s() - started,
             "peak_mib": peak_memory_mib(),
         },
     )
@@ -378,7 +378,7 @@ def compute_blocks(
     on_block: called with the blocks done and their number. Raises WorkersError, AppError, and what
     a block raises.
     """
-    started = time.perf_counter()
+    started = running_s()
     psi, dictionary = job.psi, job.opened_dictionary()
     multiple = multiple_of(psi.binning, dictionary, job.settings)
     grid = Grid(psi.size, multiple, 0, job.settings.blocks)
@@ -401,5 +401,5 @@ def compute_blocks(
         done[task.block.name] = computed
         on_block(len(done), len(tasks))
     ordered = [done[block.name] for block in grid]
-    took_s = time.perf_counter() - started
+    took_s = running_s() - started
     return Blocks(job, grid, survey, ordered, took_s, pool.size)

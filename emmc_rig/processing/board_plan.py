@@ -34,7 +34,7 @@ from emmc_rig.acquisition.plan import (
     PlannedShot,
 )
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera
 
 PLAN = "plan.yaml"
@@ -264,8 +264,6 @@ def write_plan(settings: PlanSettings, folder: Path) -> dict:
         "frames": counts.total(),
         "left_out": {name: WATCHES[name] for name in sorted(settings.skip)},
         "expected_relative_error": planned.expected_error,
-        "command": command_line(),
-        "versions": versions(),
     }
     to_capture = capture_plan(settings, planned).model_dump(mode="json", exclude_defaults=True)
     text = yaml.safe_dump(to_capture, sort_keys=False, default_flow_style=None)

@@ -1,9 +1,10 @@
 """Which method to take for a time: the most accurate that a cost formula says to end in it.
 
-The seconds of a method are those of `adaptive-fast` on a window of these frames, on this machine,
-times the light field's values over the window's, times COST of the method. COST is from the charts
-docs/results/chart-group-*.csv and group-b-chart.csv (64x80 and 128x160 views, one and three shots):
-there it lies within 0.6 and 1.6 times these for any scene, camera and size.
+The seconds of a method are those of the method of factor 1 on a window of these frames, on this
+machine, times the light field's values over the window's, times the factor of the method, see
+`reconstruction.method.Method`. Factors are from the charts docs/results/chart-group-*.csv and
+group-b-chart.csv (64x80 and 128x160 views, one and three shots): there they lie within 0.6 and 1.6
+times these for any scene, camera and size.
 """
 
 from __future__ import annotations
@@ -13,11 +14,10 @@ import numpy as np
 from emmc_rig.files.results import parse_seconds
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.methods import reconstruct
+from reconstruction.methods import METHODS, reconstruct
 
-COST = {"adaptive": 3.5, "adaptive-fast": 1.0, "tv": 0.4}
-"""Seconds over those of TIMED; the most accurate first, as in every chart of `emmc-rig chart`."""
-TIMED = "adaptive-fast"
+FACTORS = {name: method.factor for name, method in METHODS.items() if method.factor is not None}
+TIMED = next(name for name, factor in FACTORS.items() if factor == 1)
 WINDOW = 96
 """Samples a side of the window that is timed, at most."""
 
@@ -30,10 +30,11 @@ def method_within(psi: ImagingMatrix, frames: Frames, budget: str) -> tuple[str,
     budget_s = parse_seconds(budget, "budget")
     assert budget_s is not None
     unit_s = timed(psi, frames)
-    within = [method for method, cost in COST.items() if cost * unit_s <= budget_s]
-    method = within[0] if within else min(COST, key=COST.__getitem__)
+    within = [method for method, factor in FACTORS.items() if factor * unit_s <= budget_s]
+    choose = max if within else min
+    method = choose(within or FACTORS, key=FACTORS.__getitem__)
     why = "the most accurate within" if within else "the quickest: none is done within"
-    takes_s = COST[method] * unit_s
+    takes_s = FACTORS[method] * unit_s
     return method, f"{method}: {why} {budget_s:g} s; about {takes_s:.2g} s on this machine"
 
 

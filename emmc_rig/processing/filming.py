@@ -34,9 +34,10 @@ from calibration.scale import Scale
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.films import FRAMES
 from emmc_rig.files.psi import PSI, StoredPsi
-from emmc_rig.files.results import METRICS, PSI_ASSUMED, write_metrics
+from emmc_rig.files.result_files import read_metrics
+from emmc_rig.files.results import PSI_ASSUMED, write_metrics
 from emmc_rig.model.arguments import refusal, required
-from emmc_rig.model.camera import camera_of, json_of_shots
+from emmc_rig.model.camera import psi_of_shot
 from emmc_rig.model.files import PART, whole_file, whole_folder
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
@@ -114,12 +115,12 @@ class Latest:
         on_step: OnStep | None = None,
     ) -> tuple[Result, Latest]:
         """Return the result of the next frame, taken as a shot of Psi, and what follows from it."""
-        one = _one_shot(psi, shot)
+        one = psi_of_shot(psi, shot)
         solved, verdict = reconstruct_judged(
             method, one, frames, None, settings, on_step, self.film
         )
         shots = (*self.shots, shot)[-len(solved.film.known.earlier) :]
-        result = Result(replace(solved, film=None), verdict, one, frames)
+        result = Result(replace(solved, film=None), verdict, one, frames, settings=settings)
         return result, replace(self, film=solved.film, shots=shots)
 
     def saved(self, path: Path, psi: ImagingMatrix) -> Latest:
@@ -127,13 +128,13 @@ class Latest:
         arrays = self.film.arrays()
         _save(path, {"shots": self.shots, "place": self.place, "failed": self.failed}, arrays)
         # As after a kill: what follows must not depend on how arrays lie in memory.
-        return replace(self, film=Film.restored(arrays, [_one_shot(psi, s) for s in self.shots]))
+        return replace(self, film=Film.restored(arrays, [psi_of_shot(psi, s) for s in self.shots]))
 
     @classmethod
     def opened(cls, path: Path, psi: ImagingMatrix) -> Latest:
         """Return what was written there; raises one of DAMAGED."""
         about, arrays = _open(path)
-        film = Film.restored(arrays, [_one_shot(psi, shot) for shot in about["shots"]])
+        film = Film.restored(arrays, [psi_of_shot(psi, shot) for shot in about["shots"]])
         failed = {int(place): why for place, why in about["failed"].items()}
         return cls(film, tuple(about["shots"]), about["place"], failed)
 
@@ -150,13 +151,6 @@ def _open(path: Path) -> tuple[dict[str, Any], dict[str, NDArray]]:
     with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
     return parse_json(str(arrays[ABOUT]), str(path), ValueError), arrays
-
-
-def _one_shot(psi: ImagingMatrix, shot: int) -> ImagingMatrix:
-    if psi.shots == 1:
-        return psi
-    camera = json_of_shots(camera_of(psi), [shot]) if psi.camera_json else ""
-    return psi.of_shots([shot], camera)
 
 
 def reconstruct_film(
@@ -205,7 +199,7 @@ def reconstruct_film(
                 latest = first
             shot = place % psi.shots
             one = frame if isinstance(frame, Frames) else np.asarray(frame)[np.newaxis]
-            taken = as_frames(_one_shot(psi, shot), one, noise_sigma, None)
+            taken = as_frames(psi_of_shot(psi, shot), one, noise_sigma, None)
             result, latest = latest.next(psi, shot, taken, method, chosen, on_step)
             yield result
 
@@ -458,7 +452,7 @@ def _metrics(
     failed: Mapping[int, str],
 ) -> dict[str, Any]:
     """Return the metrics of a film of which all frames are done."""
-    done = [_figures(path / METRICS) for path in sorted((job.kept / FRAMES).glob(DONE))]
+    done = [read_metrics(path) for path in sorted((job.kept / FRAMES).glob(DONE))]
     if not done:
         raise AppError(f"{session.folder}: {next(iter(failed.values()), 'no frame')}")
     rate = of_kind(session.journal.entries, FilmEntry)[0].rate_hz
@@ -491,10 +485,6 @@ def _metrics(
         "peak_gib": max(one["peak_gib"] for one in done),
         "program_peak_gib": peak_memory_mib() / 2**10,
     }
-
-
-def _figures(path: Path) -> dict[str, Any]:
-    return parse_json(path.read_bytes(), str(path), AppError)
 
 
 def _doubt(figures: Mapping[str, Any]) -> tuple[int, float]:

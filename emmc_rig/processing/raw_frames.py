@@ -53,6 +53,9 @@ deviations the two are apart at least; the variance, DN^2, that may be rounding 
 above which what differs is texture. Noise of a linear sensor that grows by 15 % over 20 deviations
 has a read noise above 100 electrons, which none has; of codes of gamma 2.2 it falls by a fifth of
 what light grows."""
+MOST_LAST = 16
+"""Length of a last axis that is shorter than both others, up to which it is one of shots or colours
+rather than columns of a sensor."""
 CLIPPED = 4
 """Times as many pixels as at each of as many levels below read the level where they saturate."""
 
@@ -86,7 +89,8 @@ def frames(
     that it can be, as the structure of mask and scene is in it.
 
     Args:
-        dn: (shot, y, x), or (y, x) of one shot, raw values of the sensor.
+        dn: (shot, y, x), or (y, x) of one shot, raw values of the sensor. What a masked array
+            masks is not usable.
         dark: the lamp off or the lens covered, at the same exposure: (y, x), (repeat, y, x), or the
             black level, a number. DN.
         white_level: the value at which the sensor saturates. DN.
@@ -100,9 +104,10 @@ def frames(
             one, of which `white` is to be. Default: all alike.
 
     Raises:
-        AppError: values that are not finite, of another size, or above the white level; darks that
-            are brighter than the frames; frames too small to estimate their noise; exposures that
-            are no times, or not one a shot.
+        AppError: axes in another order; values that are not finite, of another size, below 0
+            without a dark, or above the white level; darks that are brighter than the frames;
+            frames too small to estimate their noise; exposures that are no times, or not one a
+            shot.
         ArgumentError: an argument of another type.
 
     >>> import emmc_rig as emmc
@@ -116,15 +121,28 @@ def frames(
     ('noise (at most): variance 0.819 DN per DN of signal and 13.4 DN^2',)
     """
     takes = "raw values, an array (shot, y, x) or (y, x) of real numbers"
-    taken = numbers_of(dn, "dn", takes)
+    taken = numbers_of(np.ma.getdata(dn) if np.ma.isMaskedArray(dn) else dn, "dn", takes)
     if taken.ndim not in (2, 3) or not taken.size:
         raise refusal(dn, "dn", takes)
+    _refuse_other_axes(taken.shape)
+    masked = np.broadcast_to(np.ma.getmask(dn), taken.shape)
+    if masked.any():
+        if masked.all():
+            raise AppError("dn: all values are masked: none of them is usable")
+        # So that no estimate sees them.
+        taken = np.where(masked, np.median(taken[~masked]).astype(taken.dtype), taken)
     for name, number in (("white_level", white_level), ("gain", gain), ("gamma", gamma)):
         if number is not None and not (isinstance(number, Real) and 0 < number < np.inf):
             raise refusal(number, name, "a number above 0")
     if read_noise is not None and not (isinstance(read_noise, Real) and 0 <= read_noise < np.inf):
         raise refusal(read_noise, "read_noise", "electrons, 0 or more")
-    taken = _finite(taken.reshape(-1, *taken.shape[-2:]), "dn")
+    taken, masked = (values.reshape(-1, *taken.shape[-2:]) for values in (taken, masked))
+    taken = _finite(taken, "dn")
+    if dark is None and taken.min() < 0:
+        raise AppError(
+            f"dn: values down to {taken.min():g} DN: a sensor reads none below 0; where a black "
+            "level was subtracted before, give dark=0"
+        )
     longer = _longer(exposure_s, len(taken))
     estimates: list[str] = []
     whole, top = not np.mod(taken, 1).any(), float(taken.max())
@@ -134,7 +152,7 @@ def frames(
         estimates.append(words)
     elif top > white_level:
         raise AppError(f"dn: values up to {top:g} DN, above the white level, {white_level:g}")
-    usable = taken < (np.inf if saturates is None else saturates)
+    usable = (taken < (np.inf if saturates is None else saturates)) & ~masked
     if not usable.any():
         raise AppError(f"dn: every pixel reads the white level, {saturates:g} DN, or more")
 
@@ -176,11 +194,27 @@ def frames(
     if not lit.mean() > 0.5:
         raise AppError("white, or the white level, is no brighter than the dark: was the lamp on?")
     safe = np.where(span > 0, span, 1)
-    readings = np.where(lit, signal / safe, 0)
+    readings = np.where(lit & ~masked, signal / safe, 0)
     deviation = np.sqrt(variance + np.square(readings) * span_variance) / safe
     readings, deviation = (values / longer for values in (readings, deviation))
     return MeasuredFrames(
         readings.astype(np.float32), deviation.astype(np.float32), usable & lit, tuple(estimates)
+    )
+
+
+def _refuse_other_axes(shape: tuple[int, ...]) -> None:
+    """Raise AppError for frames that look like (y, x, shot), or like a picture's colours."""
+    *size, last = shape
+    if len(size) < 2 or last > MOST_LAST or last >= min(size):
+        return
+    if last in (3, 4):
+        raise AppError(
+            f"dn: shape {shape} looks like a picture (y, x, colour), where a sensor's mosaic is "
+            "meant: give one colour, dn[..., 1], of a monochrome sensor; or like (y, x, shot), "
+            "where shots come first: np.moveaxis(dn, -1, 0)"
+        )
+    raise AppError(
+        f"dn: shape {shape} looks like (y, x, shot), where shots come first: np.moveaxis(dn, -1, 0)"
     )
 
 
@@ -202,8 +236,8 @@ def _finite(values: NDArray, name: str) -> Array:
     if len(wrong):
         place = tuple(int(i) for i in wrong[0])
         raise AppError(
-            f"{name}: {len(wrong)} values are not finite, the first at {place}: put numbers there, "
-            "and leave these pixels out by `usable` of `reconstruct`"
+            f"{name}: {len(wrong)} values are not finite, the first at {place}: of frames mask "
+            "them, by numpy.ma.masked_invalid; elsewhere put numbers there"
         )
     return values.astype(np.float64)
 
@@ -333,7 +367,7 @@ def _by_level(level: Array) -> list[NDArray[np.intp]]:
 def _blocks(signal: Array, usable: NDArray[np.bool_]) -> Array:
     """Return mean and mean square of the second difference of every block, (block, 2)."""
     found = []
-    for frame, good in zip(signal, usable, strict=True):
+    for frame, good in zip(signal, usable, strict=True) if min(signal.shape[1:]) >= 5 else ():
         apart = convolve2d(convolve2d(frame, SECOND[None], "valid"), SECOND[:, None], "valid")
         for y, x in np.ndindex(*(side // BLOCK_PX for side in apart.shape)):
             rows, columns = (slice(i * BLOCK_PX, (i + 1) * BLOCK_PX) for i in (y, x))

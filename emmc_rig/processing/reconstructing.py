@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.exports import LIGHT_FIELD, MAPS
-from emmc_rig.files.psi import StoredPsi
-from emmc_rig.files.results import PSI_ASSUMED, write_metrics
+from emmc_rig.files.psi import FRAMES, StoredPsi
+from emmc_rig.files.result_files import LIGHT_FIELD, MAPS, RESULT_GROUP, holds_light_field
+from emmc_rig.files.results import PSI_ASSUMED, save_frames, write_metrics
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.files.shards import opened_array
 from emmc_rig.model.arguments import NAMES, numbers_of, path_of, refusal, required
@@ -39,7 +40,7 @@ from emmc_rig.processing.memory import (
     task_bytes,
 )
 from emmc_rig.processing.pool import Pool, opened_pool
-from emmc_rig.processing.result import Result, compared, figures
+from emmc_rig.processing.result import Result, compared, figures, open_result
 from emmc_rig.store.folders import (
     KEPT,
     kept_folder,
@@ -62,8 +63,6 @@ LARGEST_READING = 8.0
 """A white board without masks reads 1; a reading that large is none."""
 CODES, FEW_CODES = 255, 32
 """Of pictures of 8 bits; fewer different ones may be a drawing in readings."""
-RESULT_GROUP = "result.zarr"
-"""Light field and maps, where they are written as Zarr."""
 Place = tuple[Capture, Path]
 """A capture, and the folder to write: in a session only the one it has for this."""
 
@@ -142,7 +141,8 @@ def _solved(
         dictionary = open_dictionary(dictionary, psi.views, psi.binning)
     solve = reconstruct_judged if is_one_block(psi.size, settings) else reconstruct_in_blocks
     solved, verdict = solve(method, psi, frames, dictionary, settings, on_step)
-    return Result(solved, verdict, psi, frames, None if dictionary is None else dictionary.kind)
+    kind = None if dictionary is None else dictionary.kind
+    return Result(solved, verdict, psi, frames, kind, settings)
 
 
 def as_frames(
@@ -188,7 +188,7 @@ def _refuse_codes(readings: NDArray) -> None:
     if top > LARGEST_READING and not np.mod(finite, 1).any():
         gamma = "; codes of a picture have a gamma: gamma=2.2" if top <= CODES else ""
         raise AppError(
-            f"frames: whole numbers up to {top:.0f} are raw values, no readings: "
+            f"frames: whole numbers up to {top:.6g} are raw values, no readings: "
             f"emmc_rig.frames(dn, dark=..., white_level=...) makes readings of them{gamma}"
         )
     codes = CODES * finite
@@ -226,9 +226,9 @@ def reconstruct_folder(folder: Path, out: Path, *given: Any, **named: Any) -> di
 
     given, named: the further arguments of `reconstruct_undrawn`.
     """
-    metrics, result = reconstruct_undrawn(opened_capture(folder), out, *given, **named)
-    if result is not None:
-        result.draw(out)
+    metrics, draw = reconstruct_undrawn(opened_capture(folder), out, *given, **named)
+    if draw is not None:
+        draw(out, source=str(out))
     return metrics
 
 
@@ -247,16 +247,17 @@ def reconstruct_undrawn(
     without_shots: Sequence[int] = (),
     frame: int | None = None,
     on_note: Callable[[str], None] = lambda text: None,
-) -> tuple[dict, Result | None]:
-    """Reconstruct a capture's frames into an existing folder `out`, all but the pictures.
+) -> tuple[dict, Callable[..., None] | None]:
+    """Reconstruct a capture's frames into an existing folder `out`, all but the page.
 
-    Returns the metrics, and what to draw: None of a light field that is not drawn.
+    Returns the metrics, and what writes the page, given its folder: None of a light field that is
+    too large for one.
 
     A light field of more than one block, see `reconstruction.tiles`, is computed by the pool, from
     what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
-    as_zarr: write light field and maps as one Zarr group, by the pool, and no pictures.
+    as_zarr: write light field and maps as one Zarr group, by the pool, and no page.
     without_shots: counted from 1, that are not used. frame: of a session's film, alone. on_note:
     told which Psi it is.
     """
@@ -267,7 +268,9 @@ def reconstruct_undrawn(
     frames = _without(frames, without_shots)
     saved = StoredPsi(psi_path)
     in_memory = is_one_block(saved.size, settings) and not as_zarr
-    further: dict[str, Any] = {"chosen": chosen}
+    further: dict[str, Any] = {"chosen": chosen, "source": str(capture.folder)}
+    if psi_path.parent != out:
+        further["psi_file"] = str(psi_path.absolute())
     if assumed:
         further["assumed"] = PSI_ASSUMED
     if in_memory and pool is None:
@@ -296,12 +299,12 @@ def reconstruct_undrawn(
             blocks.write(name, array)
         light_field = arrays.pop("light_field")
         solved = replace(blocks.result(), light_field=light_field, maps=arrays)
-        result = Result(solved, blocks.verdict(), saved.load(), frames)
+        result = Result(solved, blocks.verdict(), saved.load(), frames, settings=settings)
     result = replace(result, verdict=result.verdict.with_reasons(capture.exposure_reasons()))
-    compared_with = _compared(result.light_field, truth, result.psi)
-    metrics = {**result.metrics(), **further, **compared_with}
+    true = None if truth is None else _true(truth, result.psi)
+    metrics = {**result.metrics(), **further, **_compared(result.light_field, truth, true)}
     result.write(out, metrics)
-    return metrics, result
+    return metrics, partial(result.draw, metrics=metrics, truth=true)
 
 
 def _write_blocks(
@@ -318,7 +321,7 @@ def _write_blocks(
     """
     psi, verdict = blocks.job.psi, blocks.verdict().with_reasons(capture.exposure_reasons())
     metrics = {
-        **figures(blocks.result(), verdict, frames),
+        **figures(blocks.result(), verdict, frames, blocks.job.settings),
         "shots": psi.shots,
         "size": list(psi.size),
         "view_axes": list(psi.view_axes),
@@ -326,8 +329,10 @@ def _write_blocks(
         "dictionary": blocks.job.dictionary,
         **further,
     }
+    true = None if truth is None else _true(truth, psi)
+    save_frames(out / FRAMES, frames)
     if (out / RESULT_GROUP).exists():
-        metrics |= _compared(opened_array(out / RESULT_GROUP, "light_field"), truth, psi)
+        metrics |= _compared(opened_array(out / RESULT_GROUP, "light_field"), truth, true)
     else:
         with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
             file.attrs["method"] = blocks.job.method
@@ -338,17 +343,19 @@ def _write_blocks(
                 if home is file:
                     made.attrs[ATTRIBUTE] = stored_as(psi.view_axes)
                 blocks.write(name, made)
-            metrics |= _compared(file["light_field"], truth, psi)
+            metrics |= _compared(file["light_field"], truth, true)
     write_metrics(out, metrics)
     return metrics
 
 
-def _compared(light_field: Any, truth: str | None, psi: PsiLayout) -> dict[str, Any]:
+def _true(truth: str, psi: PsiLayout) -> NDArray:
+    """Return the true light field of a scene that was captured."""
+    return np.asarray(open_scene(truth, size=psi.size, views=psi.views))
+
+
+def _compared(light_field: Any, truth: str | None, true: NDArray | None) -> dict[str, Any]:
     """Return how near a light field, an array or dataset, is to the scene captured, if known."""
-    if truth is None:
-        return {}
-    scene = open_scene(truth, size=psi.size, views=psi.views)
-    return {"truth": truth, **compared(light_field, np.asarray(scene))}
+    return {} if true is None else {"truth": truth, **compared(light_field, true)}
 
 
 def ceiling_for(
@@ -430,7 +437,7 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
             out, "reconstruct", belongs_to=capture.own_place, resumes=True
         ) as folder:
             try:
-                metrics, result = reconstruct_undrawn(capture, folder, **given)
+                metrics, draw = reconstruct_undrawn(capture, folder, **given)
             except KeyboardInterrupt as stop:
                 if not (folder.parent / KEPT).is_dir():
                     raise
@@ -438,11 +445,11 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
                     f"stopped by Ctrl-C; blocks that are done are kept in {out}, and the same "
                     "command goes on"
                 ) from stop
-        if result is not None:  # the result is on the disk, whatever happens to its pictures
+        if draw is not None:  # the result is on the disk, whatever happens to its page
             with result_folder(
                 out, "reconstruct", belongs_to=capture.own_place, adds=True
             ) as folder:
-                result.draw(folder)
+                draw(folder, source=str(out))
         return metrics
     except ERRORS as fault:
         return fault
@@ -451,7 +458,7 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
 def open_frames(
     folder: str | Path, psi: str | Path | None = None, frame: int | None = None
 ) -> tuple[ImagingMatrix, Frames]:
-    """Return Psi and the frames of a folder: a session, or what `simulate` or `demo` wrote.
+    """Return Psi and the frames of a folder: a session, a result, or what `simulate` wrote.
 
     psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, its
     calibration, which is measured and stored there first where there is none). frame: of a
@@ -467,6 +474,10 @@ def open_frames(
             f"{folder}: a file; open_frames takes {takes}; readings of your own are given to "
             "`reconstruct` as an array (shot, pixel_y, pixel_x)"
         )
+    if holds_light_field(folder):
+        result = open_result(folder)
+        frames = result.frames
+        return (result.psi if psi is None else StoredPsi(Path(psi)).load()), frames
     return opened_capture(folder).loaded(None if psi is None else Path(psi), frame)
 
 

@@ -22,7 +22,7 @@ from calibration.placement import SCALARS, Placement, with_aperture_mean_one
 from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import FRAMES, PSI, read_frames
-from emmc_rig.files.results import command_line, versions, write_metrics
+from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import camera_of, psi_layout
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
@@ -188,9 +188,8 @@ def run_drift(
         raise AppError(f"{frames_folder}: {drift.words}")
     mended = known.psi_after(drift.placement) if drift.drifted else known.psi
     mended.save(out / PSI)
-    metrics = {**_figures(drift), "command": command_line(), "versions": versions()}
-    write_metrics(out, metrics)
-    return metrics
+    write_metrics(out, _figures(drift))
+    return _figures(drift)
 
 
 def _figures(drift: Drift) -> dict:

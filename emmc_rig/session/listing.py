@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import METRICS
-from emmc_rig.model.json_text import parse_json
+from emmc_rig.files.result_files import read_metrics
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION, is_session, refuse_missing
 
@@ -61,12 +60,11 @@ def summary(session: Session) -> Summary:
 
 def reconstructed(session: Path) -> tuple[str, float | None]:
     """Return verdict and stated PSNR of its reconstruction, "" and None where there is none."""
-    metrics = session / SESSION_RECONSTRUCTION / METRICS
     try:
-        read = parse_json(metrics.read_bytes(), str(metrics), AppError)
+        read = read_metrics(session / SESSION_RECONSTRUCTION)
         stated_db = read.get("stated_db")
         return str(read["verdict"]["level"]), None if stated_db is None else float(stated_db)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, AppError):
+    except (ValueError, KeyError, TypeError, AppError):
         return "", None
 
 

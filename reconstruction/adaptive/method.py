@@ -20,7 +20,6 @@ Nothing is trained: a mask, sensor or number of shots enters through Psi alone.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -28,6 +27,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.adaptive import search
@@ -76,14 +76,14 @@ def reconstruct_adaptive(
     Raises ReconstructionError for inputs that do not fit each other.
     """
     settings = settings or AdaptiveSettings()
-    started = time.perf_counter()
+    started = running_s()
     total = len(settings.misfits) * settings.texture.steps + 3
     searched_s = 0.0
 
     def report(step: int) -> None:
         nonlocal searched_s
         if step == 2:
-            searched_s = time.perf_counter() - started
+            searched_s = running_s() - started
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
@@ -120,7 +120,7 @@ def reconstruct_next(
     frames: of one shot. film: after the frame before. Where earlier frames do not predict this one,
     or mislead its fit, a film is returned that begins with it.
     """
-    started = time.perf_counter()
+    started = running_s()
     whole = checked(psi, frames)
     if shown := film.shown(whole.psi):
         return _among(whole, shown, settings, on_step, film)
@@ -176,7 +176,7 @@ def _among(
     patches: Patches | None = None,
 ) -> Reconstruction:
     """Return the light field of a frame, from other times, too; shown: see `others_of`."""
-    started = time.perf_counter()
+    started = running_s()
     given, edges = _without_edges(whole, settings)
     total = len(settings.misfits) * settings.texture.steps + 3
 
@@ -222,7 +222,7 @@ def _put_together(
     """Return the mean of fits, with its maps.
 
     believed: the less sure of two searches, which knows better how sure to be. whole: the readings
-    with dark edges. started: by `time.perf_counter`.
+    with dark edges. started: by `running_s`.
     """
     given, psi = survey.given, survey.given.psi
     size, k = psi.size, psi.binning
@@ -246,7 +246,7 @@ def _put_together(
         advice="",
         steps=steps,
         objective=(),
-        seconds=time.perf_counter() - started,
+        seconds=running_s() - started,
         parameters={
             "noise_sigma": given.typical,
             "lowest_px": float(fits.scene.centre.min()),

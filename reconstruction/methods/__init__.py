@@ -8,31 +8,28 @@ from __future__ import annotations
 
 import dataclasses
 import pkgutil
-import time
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
-from pydantic import Field, create_model
+from pydantic import create_model
 
 from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.compiling import compiling_s, running_s
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.model.settings import Settings
-from reconstruction.adaptive.film import Film, FilmSettings
-from reconstruction.adaptive.settings import AdaptiveSettings
+from reconstruction.adaptive.film import Film
 from reconstruction.dictionary import Dictionary
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import checked_inputs
 from reconstruction.method import Given, Method
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
-from reconstruction.sparse import PatchEstimates, SparseSettings
-from reconstruction.tv import TVSettings
+from reconstruction.settings import ShippedSettings
+from reconstruction.sparse import PatchEstimates
 
-Part = TypeVar("Part", bound=Settings)
 DEFAULT_METHOD = "adaptive"
 ENTRY_POINTS = "emmc_rig.methods"
 
@@ -46,36 +43,6 @@ def offered() -> Iterator[Method]:
 
 
 METHODS = {method.name: method for method in sorted(offered(), key=lambda one: one.name)}
-
-
-class BlockSettings(Settings):
-    """The grid of blocks of a large light field, see `reconstruction.tiles`: part of the method."""
-
-    whole: int = Field(
-        default=2**19, ge=1, description="samples up to which a light field is one block"
-    )
-    side: int = Field(default=384, ge=16, description="rows and columns of a block, at most")
-    blend: int = Field(
-        default=16, ge=1, description="samples to both sides over which neighbours are averaged"
-    )
-
-
-class ShippedSettings(Settings):
-    """Settings of every method; each takes its own part.
-
-    screening: whether frames are screened first, see `reconstruction.screening`.
-    """
-
-    screening: bool = True
-    blocks: BlockSettings = Field(default_factory=BlockSettings)
-    tv: TVSettings = Field(default_factory=TVSettings)
-    sparse: SparseSettings = Field(default_factory=SparseSettings)
-    adaptive: AdaptiveSettings = Field(default_factory=AdaptiveSettings)
-    film: FilmSettings = Field(default_factory=FilmSettings)
-
-    def of(self, kind: type[Part]) -> Part:
-        """Return the part of a type: a method's own, which no field above names."""
-        return next(part for _, part in self if type(part) is kind)
 
 
 if TYPE_CHECKING:
@@ -132,11 +99,13 @@ def reconstruct(
     settings = settings or MethodSettings()
     frames = frames.of_one_deviation()
     given = Given(psi, frames, dictionary, on_step, estimates, film, moving)
-    if not settings.screening:
-        return method.solve(given, settings)
-    started = time.perf_counter()
-    seen = screened(psi, checked_inputs(psi, frames))
-    took = time.perf_counter() - started
-    given = dataclasses.replace(given, frames=seen.frames)
+    started, compiling, notes = running_s(), compiling_s(), ()
+    if settings.screening:
+        seen = screened(psi, checked_inputs(psi, frames))
+        given = dataclasses.replace(given, frames=seen.frames)
+        notes = seen.notes
     result = method.solve(given, settings)
-    return dataclasses.replace(result, seconds=result.seconds + took, screening=seen.notes)
+    return dataclasses.replace(
+        result, seconds=running_s() - started, compiling_seconds=compiling_s() - compiling,
+        screening=notes or result.screening,
+    )  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +20,8 @@ from reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_p
 from reconstruction.method import Given, Method, Sensitivity, cost_words
 from reconstruction.methods.variational import solve_tv_dict
 from reconstruction.result import Reconstruction
+from reconstruction.settings import ShippedSettings
 from reconstruction.sparse import SparseSettings
-
-if TYPE_CHECKING:
-    from reconstruction.methods import MethodSettings
 
 PATCH_RTOL, PATCH_STEPS = 1e-2, 100
 """Of the patches beside surfaces. On 64x80 middles with three shots those of `tv-dict` itself cost
@@ -46,10 +43,12 @@ def may_take_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
     return settings.patches is not None and min(psi.size) >= max(usual_patch(psi.binning))
 
 
-def takes_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
-    """Return whether `adaptive` averages with sparse patches whatever the scene: from so many
-    shots."""
-    return may_take_patches(psi, settings) and settings.patched(psi.shots)
+def _patches(psi: ImagingMatrix, settings: ShippedSettings) -> SparseSettings | None:
+    """Return the patches that `adaptive` averages with whatever the scene: from so many shots."""
+    adaptive = settings.adaptive
+    if not (may_take_patches(psi, adaptive) and adaptive.patched(psi.shots)):
+        return None
+    return sparse_patches(settings.sparse, psi.binning)
 
 
 @lru_cache(maxsize=1)
@@ -61,7 +60,7 @@ def _solve(
     name: str,
     chosen: Callable[[AdaptiveSettings], AdaptiveSettings],
     given: Given,
-    settings: MethodSettings,
+    settings: ShippedSettings,
 ) -> Reconstruction:
     adaptive, psi = chosen(settings.adaptive), given.psi
     present = given.of_first_shot() if given.moving else given
@@ -101,6 +100,9 @@ METHODS = (
         AdaptiveSettings,
         films=True,
         sensitivity=Sensitivity(one_shot=True),
+        factor=3.5,
+        scout="adaptive-fast",
+        patches=_patches,
     ),
     Method(
         "adaptive-fast",
@@ -113,5 +115,7 @@ METHODS = (
         AdaptiveSettings,
         films=True,
         sensitivity=Sensitivity(one_shot=True),
+        factor=1.0,
+        scout="adaptive-fast",
     ),
 )

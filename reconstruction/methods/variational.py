@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emmc_rig.model.compiling import running_s
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import choose_mu
 from reconstruction.inputs import checked_inputs
 from reconstruction.method import Given, Method, Sensitivity, cost_words
 from reconstruction.problem import PatchTerm
 from reconstruction.result import Reconstruction
+from reconstruction.settings import ShippedSettings
 from reconstruction.sparse import SparseSettings, estimate_patches
 from reconstruction.tv import TVSettings, reconstruct_tv
-
-if TYPE_CHECKING:
-    from reconstruction.methods import MethodSettings
 
 Array = NDArray[np.floating]
 PATCHED_MU, PATCHED_RHO = 3.0, 18.0
@@ -44,19 +41,19 @@ def patched_weights(
     return tv.model_copy(update={"mu": mu, "rho": rho})
 
 
-def _solve_tv(given: Given, settings: MethodSettings) -> Reconstruction:
+def _solve_tv(given: Given, settings: ShippedSettings) -> Reconstruction:
     return reconstruct_tv(given.psi, given.frames, settings.tv, given.on_step)
 
 
-def solve_tv_dict(given: Given, settings: MethodSettings) -> Reconstruction:
+def solve_tv_dict(given: Given, settings: ShippedSettings) -> Reconstruction:
     """Return the light field of `tv-dict`; `adaptive` averages with it."""
-    started = time.perf_counter()
+    started = running_s()
     psi, dictionary = given.psi, given.needed_dictionary("tv-dict")
     frames = checked_inputs(psi, given.frames)
     found = given.estimates or estimate_patches(
         psi, frames, dictionary, settings.sparse, given.on_step
     )
-    first_s = time.perf_counter() - started
+    first_s = running_s() - started
     term = PatchTerm(found.light_field, found.weight)
     readings = frames.readings[frames.usable]
     tv = patched_weights(settings.tv, settings.sparse, psi, readings, frames.noise_sigma)
@@ -64,7 +61,7 @@ def solve_tv_dict(given: Given, settings: MethodSettings) -> Reconstruction:
     return dataclasses.replace(
         result,
         method="tv-dict",
-        seconds=time.perf_counter() - started,
+        seconds=running_s() - started,
         parameters={
             **result.parameters,
             "patches": len(found.atoms),
@@ -85,6 +82,7 @@ METHODS = (
         "tv",
         TVSettings,
         sensitivity=Sensitivity(psi=1.0, bad_pixels=2.0),
+        factor=0.4,
     ),
     Method(
         "tv-dict",
@@ -96,5 +94,6 @@ METHODS = (
         "tv",
         TVSettings,
         needs_dictionary=True,
+        patches=lambda psi, settings: settings.sparse,
     ),
 )

@@ -7,9 +7,9 @@ docs/results/verdict-constants.csv: but for DISPLACED_PX none flags more or fewe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -163,6 +163,16 @@ class Verdict:
 
     def __repr__(self) -> str:
         return f"Verdict({self.level!r}, {len(self.reasons)} reasons, {self.evidence.method})"
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Verdict:
+        """Return a verdict from what `as_dict` gave, also through JSON, or by an earlier version.
+
+        Figures that the earlier version did not have are None.
+        """
+        reasons = tuple(Reason(**reason) for reason in data["reasons"])
+        figures = {**dict.fromkeys(Evidence.__dataclass_fields__), **data["features"]}
+        return cls(data["level"], reasons, Evidence.from_dict(figures))
 
     def as_dict(self) -> dict:
         """Return the verdict as plain data."""

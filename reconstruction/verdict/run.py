@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.compiling import compiling_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import shows_parallax
@@ -59,7 +60,7 @@ def reconstruct_judged(
     kept, which costs it next to nothing. Where every pixel sees the same colour, its three colours
     are alike. film: see `reconstruct`.
     """
-    settings = settings or MethodSettings()
+    settings, compiling = settings or MethodSettings(), compiling_s()
     read, notes = _as_fitted(psi, frames.of_one_deviation(), settings.screening)
     typical = read.frames.noise_sigma
     unscreened = settings.model_copy(update={"screening": False})
@@ -122,9 +123,14 @@ def reconstruct_judged(
             f"excluded {found.moved.mean():.1%} of the readings, where one shot saw another scene "
             "than the others",
         )
-    result = dataclasses.replace(result, screening=notes, maps=named_maps(result.maps, psi))
+    result = dataclasses.replace(
+        result, screening=notes, maps=named_maps(result.maps, psi),
+        compiling_seconds=compiling_s() - compiling,
+    )  # fmt: skip
     verdict = verdict_from(gathered(psi, read, result, seen, found))
     psi.even_unseen_colours(result.light_field)
+    # A mean of values in [0, 1] may round to just above 1.
+    np.clip(result.light_field, 0, 1, out=result.light_field)
     return result, verdict
 
 

@@ -142,10 +142,12 @@ def test_a_result_is_saved_as_the_command_saves_it(taken, tmp_path):
     result.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "files.json",
+        "frames.h5",
         "light_field.h5",
         "maps.h5",
         "metrics.json",
-        "pictures",
+        "psi.h5",
+        "report.html",
     }
     saved = load_hdf5(tmp_path / "out" / "light_field.h5")
     np.testing.assert_array_equal(saved, result.light_field)
@@ -209,10 +211,12 @@ def test_a_module_loads_only_what_it_needs(module, unwanted):
         "emmc_rig.processing.filming",
         "emmc_rig.processing.raw_frames",
         "emmc_rig.processing.reconstructing",
+        "emmc_rig.processing.result",
         "emmc_rig.bench.rig_config",
     ],
 )
-def test_the_examples_in_docstrings_give_what_they_show(module):
+def test_the_examples_in_docstrings_give_what_they_show(module, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     tested = doctest.testmod(import_module(module), extraglobs={})
     assert tested.attempted > 0
     assert tested.failed == 0
@@ -338,6 +342,24 @@ MISTAKES = {
         lambda t: api.Psi.from_weights(np.full((1, 1, 1, 4, 6), np.nan)),
         "entries that are not finite",
     ),
+    "weights below 0": (
+        lambda t: api.Psi.from_weights(np.linspace(-0.1, 1, 24).reshape(1, 1, 1, 4, 6)),
+        "weights down to -0.1, and a pixel sees no less than no light",
+    ),
+    "weights that are masked": (
+        lambda t: api.Psi.from_weights(np.ma.masked_equal(np.eye(4)[None, None, None], 1)),
+        "weights: 4 of its values are masked, so not valid",
+    ),
+    "readings that are masked": (
+        lambda t: api.reconstruct(t[1], np.ma.masked_less(t[2].readings, 0.1), "tv"),
+        r"frames: \d+ of its values are masked, so not valid",
+    ),
+    "readings of shots last": (
+        lambda t: api.reconstruct(t[1], np.moveaxis(t[2].readings, 0, -1), "tv"),
+        r"the axis of shots comes first: np.moveaxis\(frames, -1, 0\)",
+    ),
+    "a folder without a result": (lambda t: api.open_result("nowhere"), "nowhere: no such folder"),
+    "a result of a number": (lambda t: api.open_result(3), "folder: got 3; it takes"),
     "a mask that lets nothing through": (
         lambda t: api.Psi.from_weights(np.zeros((1, 1, 1, 4, 6))),
         "weights that are all 0",
@@ -460,7 +482,7 @@ def test_readings_are_the_sum_over_views_of_weight_times_the_light_that_filters_
     cfa, binning
 ):
     rng = np.random.default_rng(0)
-    weights, light = rng.normal(size=(2, 1, 7, 4, 6)), rng.uniform(size=(1, 7, 4, 6, 3))
+    weights, light = rng.uniform(size=(2, 1, 7, 4, 6)), rng.uniform(size=(1, 7, 4, 6, 3))
     psi = emmc.Psi.from_weights(weights, cfa, binning)
     tile = {"mono": ["W"], "rggb": ["RG", "GB"], ("RW", "GB"): ["RW", "GB"]}[cfa]
     passed = {"R": (1, 0, 0), "G": (0, 1, 0), "B": (0, 0, 1), "W": np.full(3, 1 / 3)}

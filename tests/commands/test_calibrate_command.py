@@ -22,6 +22,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.results import save_frames
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.session_drift import run_drift
 from simulators.effects import ORDINARY, TOGETHER, Flaws, flawed
@@ -200,9 +201,7 @@ def frames_of(folder, camera, truth):
     hot, dead = truth.sensor.bad((48, 64))
     usable = ~noise.saturated(frames) & ~(hot | dead)
     folder.mkdir()
-    save_frames(
-        folder / "frames.h5", frames, readings, exposures_s, deviation=deviation, usable=usable
-    )
+    save_frames(folder / "frames.h5", Frames(readings, deviation, usable))
     return folder
 
 

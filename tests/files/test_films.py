@@ -71,7 +71,7 @@ def drop_frames(folder):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (cut_metrics, "metrics.json: not that of a film"),
+        (cut_metrics, "metrics.json: cannot be read"),
         (drop_times, "5 times of 6 frames"),
         (drop_film, "metrics.json: not that of a film"),
         (drop_frames, "a film without a frame"),

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.files.exports import LIGHT_FIELD, save_maps
+from emmc_rig.files.result_files import write_light_field
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import open_scene
-from emmc_rig.model.lightfield import save_hdf5
 
 SIZE = 36, 48
 
@@ -32,9 +31,10 @@ def write_film(
             continue
         inside = folder / "frames" / f"{place:06d}"
         light_field = light_field_at(place)
-        save_hdf5(inside / LIGHT_FIELD, light_field, {})
+        inside.mkdir(parents=True)
         sigma = np.full(light_field.shape[:4], 0.02, np.float32)
-        save_maps(inside, {"disparity": np.full(SIZE, 0.5, np.float32), "sigma": sigma})
+        maps = {"disparity": np.full(SIZE, 0.5, np.float32), "sigma": sigma}
+        write_light_field(inside, light_field, maps)
         reasons = [{"what": "a reason", "remedy": "a remedy"}] if place in given else []
         verdict = {"level": given.get(place, "trust"), "reasons": reasons}
         write_metrics(inside, {"method": "adaptive", "verdict": verdict})

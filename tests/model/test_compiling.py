@@ -285,3 +285,38 @@ def test_the_process_that_compiles_computes_what_later_ones_load(tmp_path, monke
     totals, kept, _ = zip(*(run(ROOT, RECONSTRUCT) for _ in range(2)), strict=True)
     assert totals[0] == totals[1]
     assert kept[0] == 0 < kept[1]
+
+
+def test_the_clock_stands_still_while_a_kernel_is_compiled():
+    @compiling.njit
+    def kernel(x):
+        return x * 2 + 1
+
+    started, running, compiled = time.perf_counter(), compiling.running_s(), compiling.compiling_s()
+    assert kernel(3) == 7
+    took_s = time.perf_counter() - started
+    compiled = compiling.compiling_s() - compiled
+    assert 0 < compiled <= took_s
+    assert compiling.running_s() - running == pytest.approx(took_s - compiled, abs=0.01)
+    before = compiling.compiling_s()
+    assert kernel(4) == 9
+    assert compiling.compiling_s() == before
+
+
+def test_kernels_compiled_by_two_threads_count_once():
+    barrier, meter = threading.Barrier(2), compiling._Meter()
+
+    def work():
+        with meter():
+            barrier.wait()
+            with meter():  # what a kernel compiles within itself
+                time.sleep(0.05)
+            barrier.wait()
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    started = time.perf_counter()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert 0.05 <= meter.read()[1] <= time.perf_counter() - started

@@ -11,10 +11,11 @@ import h5py
 import numpy as np
 import pytest
 from programs import program
+from view_files import save_views
 
 import emmc_rig as emmc
 from emmc_rig.model.errors import ViewOrderWarning
-from emmc_rig.model.lightfield import load_views, save_views
+from emmc_rig.model.lightfield import load_views
 from emmc_rig.model.view_order import ViewOrder, order_of
 
 WRONG = [order for order in ViewOrder if order != ViewOrder.AS_NAMED]

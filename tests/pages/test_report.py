@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from emmc_rig.files.cameras import find_camera
 from emmc_rig.pages.display import HEAT, DisplayCurve, heat, round_up
 from emmc_rig.pages.page import Head
 from emmc_rig.pages.report import ReportContent, render, write_report
@@ -27,14 +28,10 @@ def content() -> ReportContent:
     psi = rng.random((VIEWS, VIEWS, HEIGHT, WIDTH)).astype(np.float32) / 25
     return ReportContent(
         title="First light",
-        scene="near-planar",
-        camera="bayer-rgbw",
-        camera_line="Bayer sensor behind a random RGBW mask",
-        camera_reference="the paper, Section V-C",
+        described=find_camera("rgbw-bayer-1shot"),
         estimate=truth + np.float32(0.1),
         truth=truth,
         frames=rng.random((3, HEIGHT, WIDTH)).astype(np.float32),
-        cfa="rggb",
         whiteboards=[("View v 0, u 0", psi[0, 0]), ("Dark", np.zeros((HEIGHT, WIDTH)))],
         metrics={
             "psnr_db": 20.0,
@@ -46,12 +43,14 @@ def content() -> ReportContent:
             "method": "tv",
             "status": "converged",
             "advice": "",
+            "scene": "near-planar",
+            "camera": "bayer-rgbw",
             "seed": 7,
+            "warnings": ["Diffraction: Fresnel number 1.8"],
+            "command": "emmc-rig demo --seed 7",
             "versions": {"numpy": "2.0.0"},
         },
         stage_s={"whiteboards": 1.5, "reconstruction": 2.5},
-        warnings=["Diffraction: Fresnel number 1.8"],
-        command="emmc-rig demo --seed 7",
     )
 
 
@@ -124,20 +123,25 @@ def test_a_write_that_fails_leaves_nothing_new_behind(content, tmp_path, monkeyp
 
 
 def test_names_from_outside_are_shown_not_run(content):
-    attack = "<script>alert('x')</script>&\"'</script>"
+    attack, mono = "<script>alert('x')</script>&\"'</script>", find_camera("rgbw-mono")
     hostile = replace(
         content,
         title=attack,
-        scene=attack,
-        camera=attack,
-        camera_line=attack,
-        camera_reference=attack,
-        cfa=attack,
-        command=attack,
-        warnings=[attack],
+        described=mono.model_copy(update={"title": attack, "reference": attack}),
         whiteboards=[(attack, content.whiteboards[0][1])],
         stage_s={attack: 1.0},
-        metrics={**content.metrics, attack: attack, "status": attack, "versions": {attack: attack}},
+        metrics={
+            **content.metrics,
+            attack: attack,
+            "status": attack,
+            "versions": {attack: attack},
+            "scene": attack,
+            "camera": attack,
+            "command": attack,
+            "warnings": [attack],
+            "assumed": attack,
+            "source": attack,
+        },
     )
     page = render(hostile)
     assert "<script>alert" not in page
@@ -339,15 +343,7 @@ def test_scales_end_at_readable_values(value, end):
 def test_a_bare_monochrome_run_can_be_shown(content):
     page = render(
         ReportContent(
-            title="t",
-            scene="s",
-            camera="c",
-            camera_line="",
-            camera_reference="",
-            estimate=content.estimate[..., :1],
-            frames=content.frames[:1],
-            cfa="mono",
-            metrics={},
+            title="t", estimate=content.estimate[..., :1], frames=content.frames[:1], metrics={}
         )
     )
     assert picture(page_data(page)["estimate"]).shape[-1] == 3

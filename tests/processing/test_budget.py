@@ -12,7 +12,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.results import METRICS, parse_seconds
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.processing import budget
-from emmc_rig.processing.budget import COST, method_within, timed
+from emmc_rig.processing.budget import FACTORS, method_within, timed
 from reconstruction.methods import reconstruct
 from simulators.scenes import render
 
@@ -41,7 +41,7 @@ def test_a_budget_takes_the_most_accurate_within_it(monkeypatch):
                          ("9", "tv"), ("0.5", "tv")):  # fmt: skip
         taken, why = method_within(NOT_READ, NOT_READ, text)
         assert taken == method
-        assert f"about {10 * COST[method]:.2g} s" in why
+        assert f"about {10 * FACTORS[method]:.2g} s" in why
         assert ("none is done within" in why) == (text == "0.5")
 
 

@@ -27,7 +27,8 @@ from emmc_rig.store.folders import result_folder
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.stability_run import run_stability
 from emmc_rig.study.stability.stability_study import stability_settings
-from reconstruction.methods import BlockSettings, MethodSettings
+from reconstruction.methods import MethodSettings
+from reconstruction.settings import BlockSettings
 from reconstruction.tiles import CaptureSurvey, Grid
 from reconstruction.tv import TVSettings
 

@@ -244,6 +244,19 @@ def test_no_maker_s_raw_values_look_like_codes():
     assert looked
 
 
+def test_what_is_masked_is_not_usable_and_in_no_estimate(exposed):
+    dn, _ = exposed
+    dead = np.zeros(dn.shape, dtype=bool)
+    dead[:, 40:44, 50:60] = True
+    known = emmc.frames(dn, dark=BLACK, white_level=WHITE)
+    for value in (np.nan, 0, 60_000):
+        masked = np.ma.masked_array(np.where(dead, value, dn), dead)
+        frames = emmc.frames(masked, dark=BLACK, white_level=WHITE)
+        np.testing.assert_array_equal(frames.usable, ~dead & known.usable)
+        np.testing.assert_array_equal(frames.readings, np.where(dead, 0, known.readings))
+        assert frames.noise_sigma == pytest.approx(known.noise_sigma, rel=0.05)
+
+
 FLAT = np.full((1, 64, 64), 900.0)
 MISTAKES = {
     "text": (lambda: emmc.frames("shot.tif"), "dn: got 'shot.tif'; it takes raw values"),
@@ -257,6 +270,26 @@ MISTAKES = {
     "small": (
         lambda: emmc.frames(FLAT[:, :20], dark=0, white_level=1023),
         "too few pixels that are not saturated to estimate their noise",
+    ),
+    "shots last, as MATLAB keeps them": (
+        lambda: emmc.frames(np.moveaxis(np.repeat(FLAT, 2, axis=0), 0, -1)),
+        r"dn: shape \(64, 64, 2\) looks like \(y, x, shot\), where shots come first: np.moveaxis",
+    ),
+    "a picture": (
+        lambda: emmc.frames(np.full((40, 64, 3), 9, np.uint8), white_level=255),
+        r"dn: shape \(40, 64, 3\) looks like a picture \(y, x, colour\)",
+    ),
+    "too few columns": (
+        lambda: emmc.frames(FLAT[:, :, :4], dark=0, white_level=1023),
+        "too few pixels that are not saturated to estimate their noise",
+    ),
+    "below 0": (lambda: emmc.frames(FLAT - 1000), "values down to -100 DN.*give dark=0"),
+    "complex numbers": (lambda: emmc.frames(FLAT + 1j), "complex128; it takes raw values"),
+    "objects": (lambda: emmc.frames(FLAT.astype(object)), "object; it takes raw values"),
+    "all masked": (lambda: emmc.frames(np.ma.masked_all((1, 64, 64))), "all values are masked"),
+    "a masked dark": (
+        lambda: emmc.frames(FLAT, dark=np.ma.masked_equal(FLAT, 900), white_level=4095),
+        "dark: 4096 of its values are masked, so not valid",
     ),
     "swapped": (lambda: emmc.frames(FLAT, dark=1000, white_level=4095), "frames and darks swapped"),
     "a dark of another size": (

@@ -14,11 +14,11 @@ import pytest
 from pydantic import ValidationError
 
 from emmc_rig.model.errors import RemovedSettingWarning
-from reconstruction.adaptive.settings import AdaptiveSettings, fast
+from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import usual_patch
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD, METHODS, MethodSettings, find_method
-from reconstruction.methods.surfaces import sparse_patches, takes_patches
+from reconstruction.methods.surfaces import sparse_patches
 from reconstruction.patches import regular_grid
 from reconstruction.sparse import SparseSettings
 
@@ -107,8 +107,19 @@ def test_adaptive_takes_patches_from_two_shots_where_one_fits(
     random_psi, shots, size, binning, takes
 ):
     psi = random_psi(shots, (2, 2), size, binning=binning)
-    assert takes_patches(psi, AdaptiveSettings()) == takes
-    assert not takes_patches(psi, fast(AdaptiveSettings()))
+    settings = MethodSettings()
+    assert (METHODS["adaptive"].patches(psi, settings) is not None) == takes
+    assert METHODS["adaptive-fast"].patches(psi, settings) is None
+
+
+def test_blocks_and_time_budgets_ask_the_method_and_name_none():
+    root = Path(__file__).parents[2]
+    for module in ("reconstruction/tiles.py", "emmc_rig/processing/budget.py"):
+        code = (root / module).read_text()
+        assert not [name for name in METHODS if f'"{name}"' in code], module
+    assert METHODS["adaptive"].factor > METHODS["adaptive-fast"].factor == 1
+    for method in METHODS.values():
+        assert method.scout is None or METHODS[method.scout].settings is method.settings
 
 
 @pytest.mark.parametrize("binning", range(1, 18))

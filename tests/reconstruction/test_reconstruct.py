@@ -35,20 +35,18 @@ def frames(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("method", "dictionary"), [("tv", None), ("dict-omp", "dct")])
-def test_frames_become_a_light_field_with_pictures_and_metrics(
-    frames, tmp_path, method, dictionary
-):
+def test_frames_become_a_light_field_with_a_page_and_metrics(frames, tmp_path, method, dictionary):
     metrics = reconstruct_folder(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
     light_field = load_hdf5(tmp_path / "light_field.h5")
     assert light_field.shape == (5, 5, *SIZE, 3)
     assert metrics["method"] == method
     assert metrics["psnr_db"] > 12
     assert json.loads((tmp_path / "metrics.json").read_text())["noise_sigma"] > 0
-    assert any((tmp_path / "pictures").iterdir())
+    assert "Where it is wrong" in (tmp_path / "report.html").read_text()
 
 
-def test_a_result_is_on_the_disk_before_its_pictures_are_drawn(frames, tmp_path, monkeypatch):
-    def stopped(*_):
+def test_a_result_is_on_the_disk_before_its_page_is_drawn(frames, tmp_path, monkeypatch):
+    def stopped(*_, **named):
         raise KeyboardInterrupt
 
     out = tmp_path / "out"
@@ -62,7 +60,7 @@ def test_a_result_is_on_the_disk_before_its_pictures_are_drawn(frames, tmp_path,
     ((_, metrics),) = reconstruct_captures(places, None, None, None, print, method="tv")
     assert not isinstance(metrics, Exception)
     assert metrics["method"] == "tv"
-    assert any((out / "pictures").iterdir())
+    assert (out / "report.html").is_file()
 
 
 def test_the_noise_level_is_that_of_the_usable_pixels(frames):

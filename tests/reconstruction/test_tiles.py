@@ -12,8 +12,9 @@ from emmc_rig.model.lightfield import psnr_db
 from reconstruction.adaptive.settings import SIDES, AdaptiveSettings
 from reconstruction.dictionary import dct_dictionary
 from reconstruction.errors import ReconstructionError
-from reconstruction.methods import BlockSettings, MethodSettings, reconstruct
+from reconstruction.methods import MethodSettings, reconstruct
 from reconstruction.result import Reconstruction, Status
+from reconstruction.settings import BlockSettings
 from reconstruction.sparse import SparseSettings
 from reconstruction.tiles import (
     CaptureSurvey,

@@ -12,9 +12,10 @@ import yaml
 from programs import program
 
 import emmc_rig as emmc
-from emmc_rig.files.exports import MAPS, open_export
+from emmc_rig.files.exports import open_export
 from emmc_rig.files.formats.registry import FORMATS
 from emmc_rig.files.psi import FRAMES, PSI, StoredPsi, save_shards
+from emmc_rig.files.result_files import MAPS
 from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
 from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
 from emmc_rig.model.frames import even_frames
@@ -211,9 +212,7 @@ def test_a_report_of_bands_speaks_of_no_view():
         "view_axes": list(BANDS), "psnr_db": 20.0, "replicate_psnr_db": 25.0, "size": [24, 32],
         "verdict": {"level": "trust", "reasons": []},
     }  # fmt: skip
-    content = ReportContent(
-        "t", "s", "c", "", "", light, light[0, :1, ..., 0], "mono", metrics, truth=light
-    )
+    content = ReportContent("t", light, metrics, light[0, :1, ..., 0], truth=light)
     page = render(content)
     words = page.split("<script")[0]
     for wrong in ("another side", "parallax", "centre view", "over views"):
@@ -230,8 +229,8 @@ def test_a_result_of_bands_calls_them_so_in_every_file(bands, tmp_path):
         h5py.File(tmp_path / "out" / MAPS) as maps,
     ):
         assert file["light_field"].attrs["view_axes"] == maps.attrs["view_axes"] == "angle,band"
-    names = {path.name for path in (tmp_path / "out/pictures").iterdir()}
-    assert names == {"views", "bands.webp"}
+    page = (tmp_path / "out/report.html").read_text().split("<script")[0]
+    assert "Drag from band to band" in page
     assert "1x6 bands" in repr(bands)
     assert bands.metrics()["view_axes"] == list(BANDS)
     opened = open_export(str(tmp_path / "out"))

@@ -7,10 +7,10 @@ import os
 import numpy as np
 import pytest
 from pages import Page
+from view_files import save_views
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
-from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
 from emmc_rig.study.chart import chart_points, measure
 from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings

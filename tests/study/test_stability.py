@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from pages import Page
 from pools import Posting
+from view_files import save_views
 
 from emmc_rig.files.results import METRICS
-from emmc_rig.model.lightfield import save_views
 from emmc_rig.progress import Silent
 from emmc_rig.study import trial
 from emmc_rig.study.points import StudyStopped

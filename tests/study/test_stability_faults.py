@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from view_files import save_views
 
 from calibration.placement import designed_placement
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.model.lightfield import save_views
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.stability.mask_faults import misplaced_psi
