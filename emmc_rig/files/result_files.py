@@ -63,11 +63,9 @@ def result_in(folder: Path) -> Path:
     if (place / "frames").is_dir() and (place / METRICS).is_file():
         raise AppError(f"{place}: a film; open one of its frames, such as {place}/frames/000000")
     if is_session(folder):
-        raise AppError(f"{folder}: not reconstructed yet; run: emmc-rig reconstruct {folder}")
+        raise AppError(f"{folder}: not reconstructed yet", "reconstruct", folder)
     if holds_frames(folder):
-        raise AppError(
-            f"{folder}: holds frames, no light field; run: emmc-rig reconstruct {folder}"
-        )
+        raise AppError(f"{folder}: holds frames, no light field yet", "reconstruct", folder)
     raise AppError(f"{folder}: holds no light field, neither {LIGHT_FIELD} nor {RESULT_GROUP}")
 
 

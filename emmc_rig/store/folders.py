@@ -114,7 +114,7 @@ def result_folder(
     folder = Path(os.path.realpath(out))
     refuse_inside_session(out, belongs_to)
     if os.path.isfile(folder):
-        raise AppError(f"--out {out}: a file of that name exists; choose another folder")
+        raise AppError(f"{out}: a file of that name exists; choose another folder")
     try:
         with made_folder(folder), _workplace(folder / PARTIAL, resumes):
             _finish(folder)

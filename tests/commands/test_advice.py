@@ -21,6 +21,7 @@ OURS = ("emmc_rig/commands/", "emmc_rig/cli.py")
 TYPED = re.compile(rf"emmc-rig (?:{'|'.join(COMMANDS)})\b|`emmc-rig $|(?<![\w-])--[a-z]")
 SHOWN = {
     "emmc_rig/conformance/named.py": "the option is pytest's",
+    "emmc_rig/files/results.py": "the flags are git's",
     "emmc_rig/pages/calibration_page.py": "a report's next command",
     "emmc_rig/pages/page.py": "a report's next command",
     "emmc_rig/pages/session_sheet.py": "a report's next command",
