@@ -84,7 +84,7 @@ def read_result(folder: Path) -> SavedResult:
         light_field = load_light_field(group)
         with stored_shards(group, AppError, AGAIN) as stored:
             axes = axes_from(stored.attributes.get(ATTRIBUTE), group, AppError)
-            names = [name for name, _ in stored.arrays() if name != "light_field"]
+            names = [name for name in stored.names() if name != "light_field"]
             maps = {name: whole(stored.array(name), group, AppError, AGAIN) for name in names}
     return SavedResult(folder, light_field, maps, metrics, axes)
 

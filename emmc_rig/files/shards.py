@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from math import ceil, prod
 from pathlib import Path
 from typing import Any, Literal
 
@@ -102,6 +103,10 @@ class StoredGroup:
     def __contains__(self, name: str) -> bool:
         return name in self._group
 
+    def names(self) -> list[str]:
+        """Return the names of the arrays of the group itself."""
+        return list(self._group.array_keys())
+
     def dataset(self, name: str) -> Any:
         """Return an array, not read."""
         return self._group[name]
@@ -165,9 +170,12 @@ def read_array(folder: Path, name: str = "") -> NDArray:
 def _all_of(stored: Any, folder: Path) -> NDArray:
     """Return an array; raises ValueError where Zarr would fill in what is missing."""
     check_fits(stored.nbytes, folder)
-    missing = stored.nchunks - stored.nchunks_initialized
+    in_a_file = stored.shards or stored.chunks
+    files = prod(ceil(n / side) for n, side in zip(stored.shape, in_a_file, strict=True))
+    # Zarr counts all chunks of a shard that is there, those beyond the array too.
+    missing = files - stored.nchunks_initialized // (prod(in_a_file) // prod(stored.chunks))
     if missing:
-        raise ValueError(f"{missing} of its {stored.nchunks} chunks are not there")
+        raise ValueError(f"{missing} of its {files} chunks are not there")
     return np.asarray(stored[...])
 
 
