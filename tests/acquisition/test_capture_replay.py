@@ -1,5 +1,6 @@
 """Which file of a recording is which planned frame: by name, time and exposure, never a guess."""
 
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -82,8 +83,8 @@ def test_files_are_in_the_order_of_their_times_where_all_state_one(tmp_path, mon
     assert [file.name for file in camera.files()] == ["1.dng", "2.dng", "10.dng"]
     (tmp_path / "10.dng").unlink()
 
-    def stated(data):
-        return 0.01, times[data[-5:].decode()]
+    def stated(file):
+        return 0.01, datetime.strptime(times[file.read()[-5:].decode()], "%Y:%m:%d %H:%M:%S")
 
     monkeypatch.setattr("drivers.folder.exposure_and_time", stated)
     assert [file.name for file in FolderCamera(tmp_path).files()] == ["2.dng", "1.dng"]

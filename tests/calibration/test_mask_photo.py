@@ -361,8 +361,8 @@ def test_nothing_is_written_over(tmp_path, run):
 @pytest.mark.parametrize(
     ("words", "code", "complaint"),
     [
-        (("no.tif", *MASK), 1, "no.tif: cannot be read"),
-        (("text.png", *MASK), 1, "text.png: not a picture"),
+        (("no.tif", *MASK), 1, "no.tif: no such file"),
+        (("text.png", *MASK), 1, "text.png: of an unknown format"),
         (("photo.tif", "--cells", "40", *MASK[2:]), 2, "write ROWSxCOLUMNS"),
         (("photo.tif", "--cells", "40x60", *MASK[2:]), 1, "about 40x52 cells"),
         (("photo.tif", *MASK, "--corners", "1,2 3,4"), 2, "write four points"),

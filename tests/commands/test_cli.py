@@ -247,7 +247,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(run, monkeypatch, tmp_path):
 def test_an_export_says_what_is_missing_of_what_it_was_given(run, tmp_path):
     assert run("simulate", "--size", "32x32", "--out", "taken")[0] == 0
     for given, reported in {
-        "taken": "holds frames to reconstruct first; run `emmc-rig reconstruct taken`",
+        "taken": "holds frames, no light field yet; run `emmc-rig reconstruct taken`",
         "near-plana": "did you mean 'near-planar'?",
         "nothing": "no folder or file 'nothing', and no built-in scene: known are",
     }.items():

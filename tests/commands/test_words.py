@@ -35,7 +35,6 @@ REPLACED = {
     r"drawn towards": "TV + dictionary",
     r"\bp patches\b": "about 3 s for 64x80 pixels",
     r"\bPsi to \d|\bPsi to \{": "calibration error 0.41 %",
-    r"home it first(?!:)": "home it first, with the command",
     r"stands_um": "fixed positions",
     r"\bkinds? of camera\b": "driver",
     r"--leave-out|leave_out": "--skip",

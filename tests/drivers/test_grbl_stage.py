@@ -191,6 +191,7 @@ def test_homing_that_is_switched_off_is_refused_with_what_to_do():
 
 
 def test_firmware_as_it_is_shipped_homes_all_axes_where_one_is_asked_for_and_says_so(bench, caplog):
+    caplog.set_level("WARNING", logger="drivers")
     stage = bench.stage()
     stage.home(["x"])
     assert "homes all axes together: x, y" in caplog.text

@@ -12,7 +12,7 @@ from drivers.dng import Facts, encode_dng
 from drivers.errors import RawFrameError
 from drivers.folder import FolderCamera
 from drivers.raw import captured_at, decode_raw
-from emmc_rig.acquisition.checks import figures
+from emmc_rig.session.brightness import figures
 from emmc_rig.session.frame_file import decode_frame, dng_of, frame_entry, frame_file
 from emmc_rig.session.journal import Figures
 from simulators.clock import ManualClock

@@ -180,7 +180,7 @@ def test_a_file_that_is_no_description_is_refused(tmp_path, text, complaint):
 def test_a_file_that_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(CameraError, match="no such file"):
         load_camera(tmp_path / "missing.yaml")
-    with pytest.raises(CameraError, match="cannot be read"):
+    with pytest.raises(CameraError, match="a folder, where a file is meant"):
         load_camera(tmp_path)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(CameraError, match="not text in UTF-8"):

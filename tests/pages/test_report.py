@@ -4,13 +4,13 @@ import os
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from emmc_rig.files.cameras import find_camera
+from emmc_rig.model.files import Disk
 from emmc_rig.pages.display import HEAT, DisplayCurve, heat, round_up
 from emmc_rig.pages.page import Head
 from emmc_rig.pages.report import ReportContent, render, write_report
@@ -104,16 +104,15 @@ def test_a_write_that_fails_leaves_nothing_new_behind(content, tmp_path, monkeyp
     path = tmp_path / "report.html"
     path.write_text("older")
 
-    def full_disk(self, data):
-        with open(self, "wb") as half_written:
-            half_written.write(data[:100])
+    def full_disk(self, path, data):
+        path.write_bytes(data[:100])
         raise OSError(28, "No space left on device")
 
     def refused(*_):
         raise OSError(13, "Permission denied")
 
     if failing == "write":
-        monkeypatch.setattr(Path, "write_bytes", full_disk)
+        monkeypatch.setattr(Disk, "write", full_disk)
     else:
         monkeypatch.setattr(os, "replace", refused)
     with pytest.raises(OSError, match=r"No space|Permission"):

@@ -73,8 +73,8 @@ def test_the_window_keeps_pixels_whole(random_psi, monkeypatch, binning, size):
     rows = np.arange(psi.frames_shape[1])[None, :, None] * np.ones(psi.frames_shape)
     seen = []
 
-    def solve(method, part, readings, noise_sigma, usable):
-        seen.append((part, readings))
+    def solve(method, part, frames):
+        seen.append((part, frames.readings))
         raise ZeroDivisionError
 
     monkeypatch.setattr(budget, "reconstruct", solve)

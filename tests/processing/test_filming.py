@@ -25,6 +25,7 @@ from emmc_rig.model.arguments import ArgumentError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.processing import filming
+from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.filming import reconstruct_film_session
 from emmc_rig.processing.reconstructing import sensor_deviation
 from emmc_rig.session.readings import film_places
@@ -69,11 +70,16 @@ def session(tmp_path_factory):
     return folder / "session"
 
 
+def reconstructed(session, *given, **named):
+    """Reconstruct the film of a session; the capture is opened anew."""
+    return reconstruct_film_session(opened_capture(session), *given, **named)
+
+
 @pytest.fixture(scope="module")
 def whole(session):
     """The film's result of one run that nothing interrupted."""
     out = session.parent / "whole"
-    reconstruct_film_session(session, out, METHOD)
+    reconstructed(session, out, METHOD)
     return out
 
 
@@ -145,12 +151,12 @@ def test_a_film_is_exported_as_one_page(whole, run):
 def test_after_a_kill_the_same_command_goes_on_to_the_same_bytes(session, whole, tmp_path, done):
     out, notes = tmp_path / "out", []
     with pytest.raises(KilledError):
-        reconstruct_film_session(session, out, METHOD, on_step=kill_after(done))
+        reconstructed(session, out, METHOD, on_step=kill_after(done))
     assert not (out / "metrics.json").exists()
     kept = out / ".emmc-rig.partial/kept/frames"
     before = {path: path.stat().st_mtime_ns for path in kept.rglob("light_field.h5")}
     assert len(before) == done
-    reconstruct_film_session(session, out, METHOD, on_note=notes.append)
+    reconstructed(session, out, METHOD, on_note=notes.append)
     assert notes == [f"goes on with an earlier run; frames done: {done}"]
     after = {path.stat().st_mtime_ns for path in out.rglob("light_field.h5")}
     assert set(before.values()) < after or done == FRAMES
@@ -177,9 +183,9 @@ def test_a_frame_after_which_nothing_was_noted_is_made_again(
     monkeypatch.setattr(filming.Result, "write", cut)
     monkeypatch.setattr(filming.Latest, "saved", late)
     with pytest.raises(KilledError):
-        reconstruct_film_session(session, out, METHOD)
+        reconstructed(session, out, METHOD)
     monkeypatch.undo()
-    reconstruct_film_session(session, out, METHOD)
+    reconstructed(session, out, METHOD)
     assert content(out) == content(whole)
 
 
@@ -198,11 +204,11 @@ def test_what_an_earlier_run_left_damaged_or_of_another_film_is_not_gone_on_from
     out, notes = tmp_path / "out", []
     other = MethodSettings(screening=damaged is not None)
     with pytest.raises(KilledError):
-        reconstruct_film_session(session, out, METHOD, settings=other, on_step=kill_after(1))
+        reconstructed(session, out, METHOD, settings=other, on_step=kill_after(1))
     if damaged is not None:
         path = out / ".emmc-rig.partial/kept" / damaged
         path.write_bytes(path.read_bytes()[:-1000])
-    reconstruct_film_session(session, out, METHOD, on_note=notes.append)
+    reconstructed(session, out, METHOD, on_note=notes.append)
     assert [one.split(":")[0] for one in notes] == [note]
     assert content(out) == content(whole)
 
@@ -228,14 +234,14 @@ def test_ctrl_c_says_that_frames_are_kept(session, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(StoppedError, match="frames that are done are kept in"):
-        reconstruct_film_session(session, tmp_path / "out", METHOD, on_step=stop)
+        reconstructed(session, tmp_path / "out", METHOD, on_step=stop)
 
 
 def test_a_missing_frame_keeps_its_place_and_the_next_goes_on_from_the_one_before(
     session, tmp_path, monkeypatch
 ):
     changed_frames(monkeypatch, lambda frame: None if frame.place == 2 else frame)
-    reconstruct_film_session(session, tmp_path / "out", METHOD)
+    reconstructed(session, tmp_path / "out", METHOD)
     film = open_film(tmp_path / "out")
     assert film.missing == film_metrics(tmp_path / "out")["missing"] == [2]
     np.testing.assert_allclose(film.times_s, np.arange(FRAMES) / RATE, atol=1e-6)
@@ -248,7 +254,7 @@ def test_a_frame_without_usable_pixels_is_named_and_the_others_are_made(
         return replace(frame, usable=frame.usable & (frame.place != 3))
 
     changed_frames(monkeypatch, dark)
-    reconstruct_film_session(session, tmp_path / "out", METHOD)
+    reconstructed(session, tmp_path / "out", METHOD)
     about = film_metrics(tmp_path / "out")
     assert about["missing"] == [3]
     assert "no usable pixel" in about["failed"]["3"]
@@ -257,7 +263,7 @@ def test_a_frame_without_usable_pixels_is_named_and_the_others_are_made(
 def test_a_film_without_a_usable_frame_is_one_line(session, tmp_path, monkeypatch):
     changed_frames(monkeypatch, lambda frame: replace(frame, usable=frame.usable & False))
     with pytest.raises(AppError, match="no usable pixel"):
-        reconstruct_film_session(session, tmp_path / "out", METHOD)
+        reconstructed(session, tmp_path / "out", METHOD)
 
 
 def test_a_segments_first_frame_is_that_of_a_capture_of_its_own(
@@ -267,7 +273,7 @@ def test_a_segments_first_frame_is_that_of_a_capture_of_its_own(
         return [replace(at, segment=int(at.place >= 3)) for at in film_places(session)]
 
     monkeypatch.setattr(filming, "film_places", broken)
-    reconstruct_film_session(session, tmp_path / "out", METHOD)
+    reconstructed(session, tmp_path / "out", METHOD)
     assert 3 not in film_metrics(tmp_path / "out")["begun_anew"]
     code, _, err = run("reconstruct", session, "--frame", 3, "--method", METHOD, "--out", "alone")
     assert code == 0, err
@@ -310,14 +316,14 @@ TWO = MethodSettings.model_validate({"film": {"segment": 4}})
 def in_two(session):
     """The film's result in segments of four frames and two, computed one after the other."""
     out = session.parent / "in-two"
-    reconstruct_film_session(session, out, METHOD, settings=TWO)
+    reconstructed(session, out, METHOD, settings=TWO)
     return out
 
 
 def shared(session, out, pool, monkeypatch, **more):
     """Reconstruct the film in two segments by the workers of a pool."""
     monkeypatch.setattr(filming, "opened_pool", lambda *_: nullcontext(pool))
-    reconstruct_film_session(session, out, METHOD, settings=TWO, workers=2, **more)
+    reconstructed(session, out, METHOD, settings=TWO, workers=2, **more)
 
 
 def test_a_segment_begins_as_a_first_frame_does(session, whole, in_two, tmp_path, run):
@@ -389,7 +395,7 @@ def test_a_cluster_does_segments_to_the_bytes_of_this_machine(session, in_two, t
         n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None,
         protocol="tcp", host="127.0.0.1",
     ) as cluster:  # fmt: skip
-        reconstruct_film_session(
+        reconstructed(
             session, tmp_path / "out", METHOD, settings=TWO, cluster=cluster.scheduler_address
         )
     assert content(tmp_path / "out") == content(in_two)
@@ -397,7 +403,7 @@ def test_a_cluster_does_segments_to_the_bytes_of_this_machine(session, in_two, t
 
 def test_workers_that_one_segment_leaves_idle_are_named_with_what_to_set(session, whole, tmp_path):
     notes = []
-    reconstruct_film_session(session, tmp_path / "out", METHOD, workers=2, on_note=notes.append)
+    reconstructed(session, tmp_path / "out", METHOD, workers=2, on_note=notes.append)
     assert ["film: {segment: 50}" in note for note in notes] == [True]
     assert content(tmp_path / "out") == content(whole)
 
@@ -412,7 +418,7 @@ def test_one_frame_is_of_a_film_only(session, run):
 def test_a_film_of_more_than_a_block_is_refused_with_what_to_do(session, tmp_path):
     small = MethodSettings.model_validate({"blocks": {"whole": 1000}})
     with pytest.raises(AppError, match=r"40x48 are more than one block.*raise blocks"):
-        reconstruct_film_session(session, tmp_path / "out", METHOD, settings=small)
+        reconstructed(session, tmp_path / "out", METHOD, settings=small)
 
 
 @pytest.fixture(scope="module")

@@ -116,6 +116,8 @@ def test_blocks_and_time_budgets_ask_the_method_and_name_none():
     root = Path(__file__).parents[2]
     for module in ("reconstruction/tiles.py", "emmc_rig/processing/budget.py"):
         code = (root / module).read_text()
+        # Keys of settings are not names of methods.
+        code = re.sub(r"model_copy\(update=\{.*?\}\)", "", code)
         assert not [name for name in METHODS if f'"{name}"' in code], module
     assert METHODS["adaptive"].factor > METHODS["adaptive-fast"].factor == 1
     for method in METHODS.values():

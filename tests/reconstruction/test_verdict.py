@@ -551,9 +551,9 @@ CAUSES = (
     ("gamma", -0.1, "to the power of 0.90", "without gamma"),
     ("blur", 0.81, "blurred by 0.9 pixels more", "calibrate"),
     ("blur", -0.81, "sharper by 0.9 pixels", "calibrate"),
-    ("distance", 0.1, "10% further from", "--drift"),
+    ("distance", 0.1, "10% further from", "drift"),
     ("vignetting", 0.2, "lose 20% more", "aperture"),
-    ("contrast", 0.03, "masks' contrast is 95% of that in Psi", "--drift"),
+    ("contrast", 0.03, "masks' contrast is 95% of that in Psi", "drift"),
 )
 
 

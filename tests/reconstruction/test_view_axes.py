@@ -269,7 +269,7 @@ def test_bands_are_exported_unless_a_format_shows_parallax(bands, tmp_path, name
     )
     if FORMATS[name].parallax:
         assert code == 1
-        assert f"--format {name} shows parallax, and out has bands for views" in error
+        assert f"format {name} shows parallax, and out has bands for views" in error
         assert not (tmp_path / "exported").exists()
     else:
         assert code == 0
