@@ -41,6 +41,8 @@ whiteboards: null
 darks: {{repeats: 2}}
 """
 TIMES = {
+    "compiling_seconds",
+    "threads",
     "seconds",
     "search_seconds",
     "seconds_per_frame",
@@ -109,7 +111,8 @@ def changed_frames(monkeypatch, change):
     real = filming.film_frames
 
     def frames(*given):
-        return (one for frame in real(*given) if (one := change(frame)) is not None)
+        changed = ((at, change(at.place, frames)) for at, frames in real(*given))
+        return ((at, frames) for at, frames in changed if frames is not None)
 
     monkeypatch.setattr(filming, "film_frames", frames)
 
@@ -240,7 +243,7 @@ def test_ctrl_c_says_that_frames_are_kept(session, tmp_path):
 def test_a_missing_frame_keeps_its_place_and_the_next_goes_on_from_the_one_before(
     session, tmp_path, monkeypatch
 ):
-    changed_frames(monkeypatch, lambda frame: None if frame.place == 2 else frame)
+    changed_frames(monkeypatch, lambda place, frames: None if place == 2 else frames)
     reconstructed(session, tmp_path / "out", METHOD)
     film = open_film(tmp_path / "out")
     assert film.missing == film_metrics(tmp_path / "out")["missing"] == [2]
@@ -250,8 +253,8 @@ def test_a_missing_frame_keeps_its_place_and_the_next_goes_on_from_the_one_befor
 def test_a_frame_without_usable_pixels_is_named_and_the_others_are_made(
     session, tmp_path, monkeypatch
 ):
-    def dark(frame):
-        return replace(frame, usable=frame.usable & (frame.place != 3))
+    def dark(place, frames):
+        return replace(frames, usable=frames.usable & (place != 3))
 
     changed_frames(monkeypatch, dark)
     reconstructed(session, tmp_path / "out", METHOD)
@@ -261,7 +264,7 @@ def test_a_frame_without_usable_pixels_is_named_and_the_others_are_made(
 
 
 def test_a_film_without_a_usable_frame_is_one_line(session, tmp_path, monkeypatch):
-    changed_frames(monkeypatch, lambda frame: replace(frame, usable=frame.usable & False))
+    changed_frames(monkeypatch, lambda place, frames: replace(frames, usable=frames.usable & False))
     with pytest.raises(AppError, match="no usable pixel"):
         reconstructed(session, tmp_path / "out", METHOD)
 
@@ -417,7 +420,7 @@ def test_one_frame_is_of_a_film_only(session, run):
 
 def test_a_film_of_more_than_a_block_is_refused_with_what_to_do(session, tmp_path):
     small = MethodSettings.model_validate({"blocks": {"whole": 1000}})
-    with pytest.raises(AppError, match=r"40x48 are more than one block.*raise blocks"):
+    with pytest.raises(AppError, match=r"40x48 are more than one block.*raise the setting blocks"):
         reconstructed(session, tmp_path / "out", METHOD, settings=small)
 
 
