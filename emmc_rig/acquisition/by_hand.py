@@ -124,6 +124,7 @@ class HandPlaces:
         if self._stands_um is not None or not self.shows(planned):
             return
         board = self._board(planned, frame)
+        assert self._mask is not None
         with suppress(CalibrationError):
             if self._first_um is None:
                 found = locate(board, self._mask, self._placement)

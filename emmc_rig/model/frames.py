@@ -62,8 +62,8 @@ class Frames:
     @cached_property
     def sha256(self) -> str:
         """SHA-256 of the readings and of which are usable."""
-        digest = hashlib.sha256(np.ascontiguousarray(self.readings))
-        digest.update(np.ascontiguousarray(self.usable))
+        digest = hashlib.sha256(np.ascontiguousarray(self.readings).data)
+        digest.update(np.ascontiguousarray(self.usable).data)
         return digest.hexdigest()
 
     @property
@@ -82,8 +82,8 @@ class Frames:
 
     def cut(self, part: tuple[slice, ...]) -> Frames:
         """Return some shots, rows and columns."""
-        arrays = (array[part] for array in (self.readings, self.deviation, self.usable))
-        return Frames(*arrays, exposures=self.exposures[part[0]])
+        readings, deviation, usable = self.readings[part], self.deviation[part], self.usable[part]
+        return Frames(readings, deviation, usable, exposures=self.exposures[part[0]])
 
     def mean(self, *given: Any, **named: Any) -> Any:
         """Return NumPy's mean of the readings."""

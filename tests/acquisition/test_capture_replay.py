@@ -20,7 +20,7 @@ def frames(**exposures_s):
 
 
 def files(**exposures_s):
-    return [Recorded(f"{name}.dng", seconds, "") for name, seconds in exposures_s.items()]
+    return [Recorded(f"{name}.dng", seconds, None) for name, seconds in exposures_s.items()]
 
 
 def names(planned, there):
@@ -51,7 +51,7 @@ def test_metered_frames_are_matched_in_order_or_by_name_only():
     planned = frames(meter=None, shot=None)
     assert names(planned, files(a=0.3, b=0.1)) == {"meter": "a.dng", "shot": "b.dng"}
     assert names(planned, files(a=0.3)) == {}
-    assert names(planned, [Recorded("00007-shot.dng", 0.1, "")]) == {"shot": "00007-shot.dng"}
+    assert names(planned, [Recorded("00007-shot.dng", 0.1, None)]) == {"shot": "00007-shot.dng"}
 
 
 def test_a_frame_is_taken_once_it_and_what_meters_it_have_files():
@@ -59,7 +59,7 @@ def test_a_frame_is_taken_once_it_and_what_meters_it_have_files():
     plain, metered, meter = "dark-0-r0", "shot-1-e0-r0", "meter-shot-1"
 
     def chosen(*names):
-        found = dict.fromkeys(names, Recorded("x.dng", None, ""))
+        found = dict.fromkeys(names, Recorded("x.dng", None, None))
         return [frame.id for frame in there(session, found)(lambda: 0.0)]
 
     assert chosen(plain, metered) == [plain]

@@ -24,14 +24,9 @@ def content() -> ReportContent:
     psi = rng.random((VIEWS, VIEWS, HEIGHT, WIDTH)).astype(np.float32) / 25
     return ReportContent(
         title="Browser test",
-        scene="plane",
-        camera="bayer",
-        camera_line="a plane of known disparity",
-        camera_reference="",
         estimate=np.clip(truth + rng.normal(0, 0.03, truth.shape), 0, 1).astype(np.float32),
         truth=truth,
         frames=rng.random((2, HEIGHT, WIDTH)).astype(np.float32),
-        cfa="rggb",
         whiteboards=[("View v 0, u 0", psi[0, 0])],
         metrics={"psnr_db": 30.0},
         stage_s={"reconstruction": 1.0},

@@ -249,6 +249,7 @@ def test_a_calibration_of_other_frames_is_measured_again_by_its_method(own_sessi
     (own_session / "calibration" / "product.json").unlink()
     listing = own_session / "calibration" / "files.json"
     listed = Listing.read(own_session / "calibration")
+    assert listed is not None
     files = {name: sha for name, sha in listed.files.items() if name != "product.json"}
     listing.write_text(Listing(listed.command, files).text())
     code, out, err = program("reconstruct", own_session, "--method", "tv")

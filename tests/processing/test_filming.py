@@ -25,10 +25,11 @@ from emmc_rig.model.arguments import ArgumentError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.processing import filming
-from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.filming import reconstruct_film_session
 from emmc_rig.processing.reconstructing import sensor_deviation
+from emmc_rig.processing.session_capture import SessionCapture
 from emmc_rig.session.readings import film_places
+from emmc_rig.session.session import Session
 from reconstruction.adaptive.film import Film, FilmSettings
 from reconstruction.methods import MethodSettings
 
@@ -74,7 +75,7 @@ def session(tmp_path_factory):
 
 def reconstructed(session, *given, **named):
     """Reconstruct the film of a session; the capture is opened anew."""
-    return reconstruct_film_session(opened_capture(session), *given, **named)
+    return reconstruct_film_session(SessionCapture(Session(session)), *given, **named)
 
 
 @pytest.fixture(scope="module")

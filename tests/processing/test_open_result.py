@@ -147,6 +147,7 @@ def test_a_result_of_an_earlier_version_opens_without_its_frames():
     assert opened.verdict.level == written["verdict"]["level"]
     assert opened.stated_db is written["stated_db"] is None
     assert opened.seconds == written["seconds"]
+    assert opened.disparity is not None
     assert opened.disparity.shape == opened.misfit.shape == opened.light_field.shape[2:4]
     assert "viewer-data" in opened.viewer()
     asked = (

@@ -14,6 +14,7 @@ from drivers.dng import encode_dng
 from drivers.raw import decode_raw
 from emmc_rig.live.light_field import LiveLightField, live_scale
 from emmc_rig.model.camera import pixel_light
+from emmc_rig.model.frames import Frames
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.session import Session
 
@@ -25,7 +26,7 @@ class Ended:
     """In place of a solver: it notes what the live page gives it."""
 
     def __init__(self):
-        self.frames = None
+        self.frames: Frames | None = None
 
     def __call__(self, method, psi, frames, *rest):
         self.frames = frames
@@ -41,6 +42,7 @@ def shown_live(scale, raw):
     live.update(raw)
     while live.update(raw)["why"] != "enough":
         pass
+    assert solver.frames is not None
     return solver.frames
 
 
