@@ -25,9 +25,7 @@ from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.lightfield import (
-    psnr_db,
-)
+from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.result import Result
 from emmc_rig.progress import Silent, Watcher

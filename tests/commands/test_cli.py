@@ -217,7 +217,7 @@ def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
 def test_ctrl_c_in_any_stage_leaves_nothing(run, monkeypatch, tmp_path):
     from emmc_rig import demo
 
-    for stage in ("simulated_session", "measure_psi", "ssim"):
+    for stage in ("simulated_session", "measure_psi", "write_metrics"):
 
         def interrupted(*arguments, **settings):
             raise KeyboardInterrupt
@@ -237,7 +237,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(run, monkeypatch, tmp_path):
     def full(*arguments, **settings):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(demo, "write_report", full)
+    monkeypatch.setattr(demo, "write_metrics", full)
     code, _, err = run("demo", *SMALL, "--shots", 1, "--out", "r")
     assert code == 1
     assert "No space left" in one_line(err)

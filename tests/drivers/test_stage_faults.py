@@ -234,7 +234,8 @@ def test_a_device_that_never_answers_well_is_an_error_within_its_time_limit(simu
         stage.position_um(axis)
     assert simulated.clock.now_s() - start_s < 20 * simulated.timeout_on_clock_s
     assert caught.value.command
-    assert ": check" in str(caught.value)
+    # The cable is named only where bytes show noise on the line.
+    assert any(words in str(caught.value) for words in (": check", "is it the device"))
     with pytest.raises(DriverError):
         stage.move_to_um({axis: middle_um(stage, axis)})
 

@@ -37,7 +37,7 @@ def test_as_many_workers_run_as_fit_beside_the_program():
 @pytest.mark.slow
 def test_a_task_needs_more_for_larger_blocks_halos_and_shots_and_never_less_than_the_survey():
     def need(shots, side, halo):
-        psi: Any = SimpleNamespace(shape=(shots, 5, 5, 4000, 1, 3000), size=(4000, 3000))
+        psi: Any = SimpleNamespace(weights_shape=(shots, 5, 5, 4000, 1, 3000), size=(4000, 3000))
         return task_bytes(psi, Grid(psi.size, 2, halo, BlockSettings(side=side)))
 
     assert need(1, 300, 20) < need(1, 300, 40) < need(1, 384, 40) < need(3, 384, 40)
