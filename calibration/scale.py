@@ -45,12 +45,12 @@ class RawValues(Protocol):
 
     @property
     def exposure_s(self) -> float | None:
-        """Exposure in seconds; None where it is not known."""
+        """Exposure in seconds; None if unknown."""
         ...
 
     @property
     def gain(self) -> float | None:
-        """Gain, 1 at the base sensitivity; None where it is not known, taken as 1."""
+        """Gain, 1 at the base sensitivity; None if unknown, taken as 1."""
         ...
 
 

@@ -83,7 +83,7 @@ DARK = "the picture is dark: no light field to see"
 
 
 class _ChangedError(Exception):
-    """The scene is another one than that being reconstructed."""
+    """The scene changed during its reconstruction."""
 
 
 class LiveLightField:
@@ -184,7 +184,7 @@ class LiveLightField:
         return self._clock() - self._since_s >= STILL_S
 
     def _take(self, run: _Refinement, number: int) -> None:
-        """Show what a reconstruction that ended gave, and let the next one go on from it."""
+        """Show the result of a reconstruction, from which the next one goes on."""
         self._run, self._done = None, run.of
         self._refined, self._fault = run.result, run.fault
         if run.result is None:

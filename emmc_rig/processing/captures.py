@@ -50,7 +50,7 @@ class Capture(Protocol):
     ) -> tuple[Frames, Path]:
         """Return readings, and the file of their Psi, which is written into `out` if need be.
 
-        psi: of another Psi than its own. place: of the one frame of a film, from 0. on_note: told
+        psi: the file of another Psi. place: of the one frame of a film, from 0. on_note: told
         which Psi it is. Raises AppError, SensingError or CalibrationError.
         """
         ...

@@ -187,8 +187,8 @@ def calibrated_scale(
 ) -> Scale:
     """Return the scale that is stored in a session; measured and stored first where there is none.
 
-    on_note: told in a sentence which calibration it is. A calibration of other frames or another
-    version is replaced by one of the same method. Raises AppError or CalibrationError.
+    on_note: told in a sentence which calibration it is. A stored calibration whose frames or
+    program version differ is measured again, by its own method. Raises AppError or CalibrationError.
     """
     known, words = stored_scale(session)
     if known is not None:
