@@ -170,7 +170,7 @@ def calibrate_into(
     """Calibrate and write the result into an existing folder.
 
     The method free writes Psi and its deviations view by view, and does not hold them in memory:
-    they are no longer there in what is returned. Raises AppError or CalibrationError.
+    the returned calibration has closed arrays. Raises AppError or CalibrationError.
     """
     whole = taken_shots(session) == tuple(range(len(camera_of(session).shots)))
     with arrays_in(folder) as on_disk:
@@ -188,7 +188,9 @@ def calibrated_scale(
     """Return the scale that is stored in a session; measured and stored first where there is none.
 
     on_note: told in a sentence which calibration it is. A stored calibration whose frames or
-    program version differ is measured again, by its own method. Raises AppError or CalibrationError.
+    program version differ is measured again, by its own method.
+
+    Raises AppError or CalibrationError.
     """
     known, words = stored_scale(session)
     if known is not None:
