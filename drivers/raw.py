@@ -410,11 +410,12 @@ def _number(tags: Any, exif: Mapping[str, Any], code: int, name: str) -> float |
         numbers = value if isinstance(value, tuple) else (value,)
         if code == ISO_TAG:  # some write several, the first that of the picture
             numbers = numbers[:1]
-        if len(numbers) not in (1, 2) or not all(isinstance(one, int | float) for one in numbers):
+        plain = [number for number in numbers if isinstance(number, int | float)]
+        if len(plain) != len(numbers) or len(plain) not in (1, 2):
             continue
-        number = float(numbers[0])
-        if len(numbers) == 2:
-            number = number / numbers[1] if numbers[1] else math.nan
+        number = float(plain[0])
+        if len(plain) == 2:
+            number = number / plain[1] if plain[1] else math.nan
         if math.isfinite(number) and number > 0:
             return number
     return None

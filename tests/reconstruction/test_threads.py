@@ -24,7 +24,8 @@ def without_times(stated):
     if not isinstance(stated, dict):
         return stated
     kept = {name: without_times(value) for name, value in stated.items()}
-    return {name: value for name, value in kept.items() if "seconds" not in name}
+    differing = ("seconds", "threads")
+    return {name: value for name, value in kept.items() if not any(d in name for d in differing)}
 
 def for_each_number_of_threads(call):
     found = {}
