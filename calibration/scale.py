@@ -84,21 +84,28 @@ class Scale:
         psi, white = self.psi.of_shots(places, camera), self.white_dn_per_s[places]
         return replace(self, psi=psi, white_dn_per_s=white, shots=chosen)
 
-    def frames(self, bracket_of: Callable[[int], Sequence[RawValues]]) -> Frames:
-        """Return the readings of all shots.
+    def frames(
+        self,
+        bracket_of: Callable[[int], Sequence[RawValues]],
+        shots: Sequence[int] | None = None,
+    ) -> Frames:
+        """Return the readings of shots.
 
         bracket_of: called with the camera's number of each shot in turn; returns its raw frames.
+        shots: by the camera's numbers (default: all of the scale); Psi is not copied for them.
         Raises CalibrationError for frames of another size, without an exposure, or of several gains
         in one shot.
         """
-        shape = self.psi.frames_shape
+        shots = self.shots if shots is None else shots
+        shape = (len(shots), *self.psi.frames_shape[1:])
         readings, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
         usable, exposures = np.empty(shape, bool), []
-        for place, shot in enumerate(self.shots):
+        for place, shot in enumerate(shots):
             bracket = bracket_of(shot)
             rate, spread, seen = self._linear(bracket)
-            lit = self.white_dn_per_s[place] > 0
-            white = np.where(lit, self.white_dn_per_s[place], 1.0)
+            full = self.white_dn_per_s[self.shots.index(shot)]
+            lit = full > 0
+            white = np.where(lit, full, 1.0)
             # What a pixel that is not to be used reads says nothing, not even how much at least.
             readings[place] = rate / white * (lit & self.good)
             variance[place] = spread / white**2

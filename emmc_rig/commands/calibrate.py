@@ -132,8 +132,7 @@ def _tell_findings(metrics: dict) -> None:
 
 
 def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) -> None:
-    from emmc_rig.files.results import METRICS
-    from emmc_rig.model.json_text import parse_json
+    from emmc_rig.files.result_files import read_metrics
     from emmc_rig.processing.session_calibration import SENSOR, calibrate_into
     from emmc_rig.session.measured_psi import stored_calibration
     from emmc_rig.session.session import CALIBRATION, Session
@@ -145,7 +144,7 @@ def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) 
     known = product is not None and product.inputs["method"] == method
     if known and (not sensor or (place / SENSOR).is_file()):
         say("note", f"nothing new to measure: {words}")
-        metrics = parse_json((place / METRICS).read_bytes(), str(place / METRICS), AppError)
+        metrics = read_metrics(place)
     else:
         with result_folder(out, "calibrate", belongs_to=place) as folder, shown_progress() as bars:
             calibration = calibrate_into(folder, captured, method, sensor, bars)

@@ -97,7 +97,9 @@ def read_metrics(folder: Path) -> dict[str, Any]:
         if not isinstance(known, dict):
             raise ValueError("no object of JSON")
     except (OSError, ValueError) as fault:
-        raise AppError(f"{path}: cannot be read ({one_line(fault)}); {AGAIN}") from fault
+        raise AppError(
+            f"{path}: cannot be read ({one_line(fault)}); copy the folder again, or make it again"
+        ) from fault
     return known
 
 

@@ -151,6 +151,8 @@ class LiveLightField:
             )
         if shot is None:
             return self._report("the mask is at the place of no shot of this Psi")
+        if not frame.exposure_s:
+            return self._report("the camera does not state how long its frames were exposed")
         quick, self._seen_s = self._clock() - self._seen_s < CUT_S, self._clock()
         known, dark = shot in self._held, is_dark(frame)
         if not known or self._changed(shot, frame):

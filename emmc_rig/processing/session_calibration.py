@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,14 @@ from calibration.sensor import SensorSheet, characterise
 from calibration.whiteboard import Calibration, NewArray, in_memory
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import PSI
-from emmc_rig.files.results import METRICS, command_line, metrics_text, versions, write_metrics
+from emmc_rig.files.result_files import read_metrics
+from emmc_rig.files.results import command_line, metrics_text, versions, write_metrics
 from emmc_rig.files.scales import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.model.arguments import numbers_of, path_of
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import camera_of as camera_of_psi
 from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Silent, Watcher
 from emmc_rig.session.board_sets import sensor_pairs
@@ -213,14 +213,11 @@ def calibrated_scale(
 
 def _method_of(session: Session) -> str:
     """Return the method of the calibration in a session; auto where there is none."""
-    try:
-        metrics = parse_json(
-            (session.folder / CALIBRATION / METRICS).read_bytes(), METRICS, ValueError
-        )
-        method = metrics["route"]
-    except (OSError, ValueError, LookupError, TypeError):
-        return "auto"
-    return method if method in METHODS else "auto"
+    with suppress(AppError):
+        method = read_metrics(session.folder / CALIBRATION).get("route")
+        if method in METHODS:
+            return method
+    return "auto"
 
 
 @one_blas_thread()

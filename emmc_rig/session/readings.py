@@ -115,7 +115,7 @@ def film_frames(
             raise AppError(f"{session.folder}: {at.entry.id} shows the same as the frame before it")
         before = raw.mosaic
         if at.place in only:
-            frames = scale.of_shots([at.shot]).frames(lambda shot, raw=raw: [raw])
+            frames = scale.frames(lambda shot, raw=raw: [raw], [at.shot])
             exposures = (replace(frames.exposures[0], time_s=at.time_s),)
             yield at, replace(frames, exposures=exposures)
 

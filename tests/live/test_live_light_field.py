@@ -258,6 +258,17 @@ def test_frames_that_do_not_fit_and_dark_ones_are_refused_in_words(one_shot):
     assert dark["pictures"] is None
 
 
+def test_a_frame_without_an_exposure_is_one_line_however_often_it_comes(one_shot):
+    camera, psi, scene = one_shot
+    live = LiveLightField(designed_scale(psi), "tv")
+    good = live_frames(camera, psi, scene)[0]
+    unknown = replace(good, exposure_s=None)
+    for frame in (unknown, unknown, good, unknown):
+        why = live.update(frame)["why"]
+        assert ("does not state how long" in why) == (frame is unknown)
+    live.close()
+
+
 def test_a_psi_is_opened_with_what_lies_beside_it(tmp_path, one_shot):
     _, psi, _ = one_shot
     psi.save(tmp_path / "psi.h5")
