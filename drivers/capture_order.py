@@ -87,7 +87,7 @@ def _by_name(names: Sequence[str]) -> tuple[list[int], str]:
     if len(differing) != 1 or None in differing[0]:
         return places, ""
     numbers = [part[0] for part in differing[0]]
-    highest = next((one for one in HIGHEST_NUMBERS if one >= numbers[-1]), math.inf)
+    highest = next((most for most in HIGHEST_NUMBERS if most >= numbers[-1]), math.inf)
     if numbers[0] > DELETED or numbers[-1] < highest - DELETED:
         return places, ""
     gaps = [later - earlier for earlier, later in pairwise(numbers)]

@@ -83,10 +83,10 @@ def encode_dng(
 ) -> bytes:
     """Return a DNG with the uint16 `(y, x)` mosaic in it, uncompressed.
 
-    `cfa` is a Bayer phase, "mono", or the name of any other tile: that one is marked rggb for
-    LibRaw's sake and carries its name beside it. `black_level_dn` is a number, or a tile of them as
+    `cfa` is a Bayer phase, "mono", or the name of another tile, which is stored in a tag of ours
+    while the file claims rggb, for LibRaw. `black_level_dn` is a number, or a tile of them as
     in `RawFrame`. `exposure_s`: None where it is not known.
-    `private`: other bytes to be kept in it, which `private_data` returns. `facts`: go into its EXIF
+    `private`: bytes to store in the file; `private_data` returns them. `facts`: go into its EXIF
     directory, with exposure and the camera's serial number. Raises `ValueError`.
     """
     black = np.atleast_2d(np.asarray(black_level_dn, np.float64))

@@ -433,11 +433,13 @@ def _dng_levels(pages: Sequence[Any]) -> _DngLevels | None:
     codes = BLACK_TAG, BLACK_REPEAT_TAG, BLACK_ROWS_TAG, BLACK_COLUMNS_TAG, ACTIVE_AREA_TAG
     stated = [_numbers(page.tags.get(code)) for code in codes]
     level, repeat, rows, columns, area = stated
-    odd = any(one is None and code in page.tags for code, one in zip(codes, stated, strict=True))
+    odd = any(
+        value is None and code in page.tags for code, value in zip(codes, stated, strict=True)
+    )
     if odd or (level is None and rows is None and columns is None):
         return None
     none = np.zeros(1)
-    tile, rows, columns = (none if one is None else one for one in (level, rows, columns))
+    tile, rows, columns = (none if value is None else value for value in (level, rows, columns))
     size = (1, 1) if repeat is None else tuple(repeat.astype(int).tolist())
     top, left, bottom, right = (0, 0, page.imagelength, page.imagewidth)
     if area is not None and area.size == 4:

@@ -11,9 +11,9 @@
 
 Functions: `camera`, `scene`, `frames`, `reconstruct`, `reconstruct_film`, `rig`, `capture`,
 `calibrate`, `open_frames`, `open_result`.
-What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. Faults that the user can
-mend are of the classes in `ERRORS`, each one line that says what to do. A hook that a plan calls
-between frames raises `StopCapture` to end the capture.
+What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. `ERRORS` holds the
+classes of errors that a user can mend; each message is a line with its remedy. A hook that a plan
+calls between frames raises `StopCapture` to end the capture.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ LETTERS = "XYZABC"
 SMALL_AXIS = AxisSpec(microstep_um=0.3125, max_speed_um_s=8_000.0, backlash_um=3.0)
 BENCH_AXES = {"X": SMALL_AXIS, "Y": SMALL_AXIS, "Z": SMALL_AXIS}
 AS_SHIPPED, WITH_SINGLE_AXIS_HOMING = "V", "VH"
-"""Options in `$I`: those that Grbl's config.h has, and one that must be compiled in."""
+"""Options that `$I` states: of Grbl's default config.h, and with option H compiled in."""
 VERSION = "1.1h"
 BUILD = "20190825"
 PLANNER_BLOCKS = 15

@@ -146,7 +146,7 @@ def _items(
     """
     seen: dict[object, str] = {}
     first: tuple[str, tuple[int, ...], np.dtype] | None = None
-    apart = {one.path.resolve() for one in listed}
+    apart = {row.path.resolve() for row in listed}
     for one in listed:
         name = shown_path(one.path)
         own = read_own(one.path, one.array, apart)
@@ -198,7 +198,7 @@ def _items(
 
 
 def _in_capture_order(items: Sequence[_Item]) -> tuple[list[_Item], list[str]]:
-    """Return the frames, those of files that one glob named as captured, and what to note."""
+    """Return the frames, the files of each glob in the order of capture, and notes on the order."""
     ordered, notes = [], []
     for pattern, group in groupby(items, key=lambda item: item.listed.pattern):
         files = [list(file) for _, file in groupby(group, key=lambda item: item.listed.where)]

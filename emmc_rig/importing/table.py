@@ -143,7 +143,7 @@ def _separator(text: str) -> tuple[int, str]:
     head = text.partition("\n")[0].strip("\r")
     if stated := SEPARATOR_LINE.fullmatch(head):
         return 1, stated[1]
-    return 0, next((one for one in "\t;" if one in head and "," not in head), ",")
+    return 0, next((mark for mark in "\t;" if mark in head and "," not in head), ",")
 
 
 def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
@@ -162,7 +162,7 @@ def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
             if not names:
                 raise AppError(f"{pattern}: no file is called so ({kind})")
             listed = (_listed(Row(file=name, kind=kind), name, Path()) for name in names)
-            found += [replace(one, pattern=pattern) for one in listed]
+            found += [replace(row, pattern=pattern) for row in listed]
     return found
 
 

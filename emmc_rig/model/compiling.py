@@ -4,10 +4,10 @@ Numba keeps machine code until the kernel's own file changes. But helpers and co
 files are part of that code, so it is kept here per state of all files that the kernel's file
 imports from its own package and from this project, directly or through others.
 
-What one kernel calls of another must be compiled into it (`forceinline=True`, and no cache of its
-own). Where a call is left, the caller's machine code brings a copy of what it calls, optimised once
-more, and a process calls whichever copy it met first: one that compiles that of the helper itself,
-one that loads from the disk that of the first caller. The two may round differently.
+A helper that a kernel calls must be compiled into the kernel (`forceinline=True`, and no cache of
+its own). If a call remains, the kernel's machine code brings its own copy of the helper, optimised
+again, and a process calls the copy that it met first: after compiling, the helper's own copy; after
+loading from the disk, the copy of the first kernel. The two copies may round differently.
 
 Of several processes that need a kernel, one compiles it: the others wait, and load what it wrote.
 The clock `running_s` stands still meanwhile: the seconds of a method are those of its work.

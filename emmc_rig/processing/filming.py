@@ -115,12 +115,12 @@ class Latest:
         on_step: OnStep | None = None,
     ) -> tuple[Result, Latest]:
         """Return the result of the next frame, taken as a shot of Psi, and what follows from it."""
-        one = psi_of_shot(psi, shot)
+        of_shot = psi_of_shot(psi, shot)
         solved, verdict = reconstruct_judged(
-            method, one, frames, None, settings, on_step, self.film
+            method, of_shot, frames, None, settings, on_step, self.film
         )
         shots = (*self.shots, shot)[-len(solved.film.known.earlier) :]
-        result = Result(replace(solved, film=None), verdict, one, frames, settings=settings)
+        result = Result(replace(solved, film=None), verdict, of_shot, frames, settings=settings)
         return result, replace(self, film=solved.film, shots=shots)
 
     def saved(self, path: Path, psi: ImagingMatrix) -> Latest:

@@ -98,10 +98,10 @@ def frames(
         read_noise: standard deviation in the dark, in electrons.
         white: a white board through the open aperture without masks, (y, x) or (repeat, y, x), or
             one number; it reads 1. Default: the white level does. DN.
-        gamma: of codes that are light ** (1 / gamma), such as those of pictures: about 2.2. None:
-            1, and `estimates` says where the values look like such codes.
-        exposure_s: of every shot, seconds, where they differ: readings are those at the shortest
-            one, of which `white` is to be. Default: all alike.
+        gamma: exponent of codes light ** (1 / gamma), about 2.2 for pictures. None: 1, and
+            `estimates` warns if the values look like such codes.
+        exposure_s: exposure of every shot in seconds, if they differ; readings are scaled to the
+            shortest exposure, at which `white` must be taken. Default: all alike.
 
     Raises:
         AppError: axes in another order; values that are not finite, of another size, below 0

@@ -117,8 +117,8 @@ def reconstruct_next(
 ) -> Reconstruction | Film:
     """Return the light field of the next frame of a film, from what the frames before showed.
 
-    frames: of one shot. film: after the frame before. Where earlier frames do not predict this one,
-    or mislead its fit, a film is returned that begins with it.
+    frames: of one shot. film: after the frame before. If earlier frames do not predict this frame,
+    or mislead its fit, returns a film that begins with this frame.
     """
     started = running_s()
     whole = checked(psi, frames)

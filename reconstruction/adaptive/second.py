@@ -35,8 +35,8 @@ WIDE_SHARE = 0.1
 BESIDE, MISSED = 0.15, 0.35
 """Sparse patches are worth their time where the rays of one pixel spread over BESIDE of the
 picture's shorter side, and the residual of surfaces at held-out readings is MISSED of that of total
-variation. One shot of dice, 64x80: at a share of 0.4 to 0.5 patches gain 0.8 dB with one camera; at
-0.25 to 0.3 they gain nothing with another camera."""
+variation. One shot of dice, 64x80: patches gain 0.8 dB where that share is 0.4 to 0.5, and nothing
+where it is 0.25 to 0.3 (two cameras)."""
 
 Array = NDArray[np.floating]
 

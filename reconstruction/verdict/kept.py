@@ -20,7 +20,7 @@ SHARE = 0.003
 """Of the usable readings that are kept from every fit; more of few, so that WANTED are."""
 WANTED, MOST_SHARE = 150, 0.04
 SEED = 1
-"""Another seed than that of `adaptive`, which keeps readings for its standard deviation."""
+"""Differs from the seed by which `adaptive` keeps readings for its standard deviation."""
 
 FLAT_STEPS = 60
 """Of total variation for one picture that all views are: `tv` ends after about 50 for buttercup and
