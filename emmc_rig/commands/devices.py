@@ -116,19 +116,30 @@ def probe(
     from emmc_rig.bench.hardware import probe_port, probe_simulated
 
     # Silence in all protocols but one is what a probe expects.
-    logging.getLogger("drivers").setLevel(logging.ERROR)
-    if rig is not None:
-        protocol = simulated_protocol(rig)
-        tell(f"simulated:{protocol}: {probe_simulated(protocol)}")
-        return
-    chosen = ports or [port.device for port in list_serial_ports() if guess_of(port)]
-    if not chosen:
-        raise AppError("no port with a known adapter: name the ports to ask")
-    with shown_progress() as progress:
-        progress.begin("ask", len(chosen))
-        for port in chosen:
-            tell(f"{port}: {probe_port(port) or 'no answer in Zaber ASCII, Grbl or APT'}")
-            progress.step(port)
+    with _errors_only(logging.getLogger("drivers")):
+        if rig is not None:
+            protocol = simulated_protocol(rig)
+            tell(f"simulated:{protocol}: {probe_simulated(protocol)}")
+            return
+        chosen = ports or [port.device for port in list_serial_ports() if guess_of(port)]
+        if not chosen:
+            raise AppError("no port with a known adapter: name the ports to ask")
+        with shown_progress() as progress:
+            progress.begin("ask", len(chosen))
+            for port in chosen:
+                tell(f"{port}: {probe_port(port) or 'no answer in Zaber ASCII, Grbl or APT'}")
+                progress.step(port)
+
+
+@contextmanager
+def _errors_only(logger: logging.Logger) -> Iterator[None]:
+    """Keep warnings of a logger silent for a while; its level before comes back."""
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 @app.command()
