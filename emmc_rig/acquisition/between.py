@@ -84,7 +84,7 @@ def load_hook(name: str, *folders: Path) -> Between:
     try:
         if colon:
             files = [folder / f"{module.replace('.', '/')}.py" for folder in folders]
-            file = next((one for one in files if one.is_file()), None)
+            file = next((file for file in files if file.is_file()), None)
             hook = _load(name) if file is None else _of_file(file, function)
         else:
             hook = next(iter(entry_points(group=HOOKS, name=name))).load()

@@ -84,11 +84,11 @@ def exposure_setting(planned: PlannedFrame) -> str:
     return "whiteboards.exposure_s" if planned.metered_by is None else "whiteboards.level"
 
 
-def is_same(one: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:
+def is_same(frame: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:
     """Return whether two mosaics are equal, and not just equally empty."""
-    if one.shape != other.shape or not np.array_equal(one[::256], other[::256]):
+    if frame.shape != other.shape or not np.array_equal(frame[::256], other[::256]):
         return False
-    return bool(one.min() != one.max()) and np.array_equal(one, other)
+    return bool(frame.min() != frame.max()) and np.array_equal(frame, other)
 
 
 def refuse_impossible(rig: Rig, frames: Iterable[PlannedFrame]) -> None:

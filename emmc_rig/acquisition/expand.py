@@ -110,9 +110,9 @@ def _board_darks(
         return
     bench = Bench("whiteboard", "off", 0, 0, masks_in=True)
     exposures = dict.fromkeys(
-        (one.exposure_s, one.metered_by, one.light)
-        for one in boards
-        if one.kind != "metering" and one.bench.lamp == OPEN_LAMP and one.light >= 1
+        (board.exposure_s, board.metered_by, board.light)
+        for board in boards
+        if board.kind != "metering" and board.bench.lamp == OPEN_LAMP and board.light >= 1
     )
     for place, (exposure_s, metered_by, light) in enumerate(exposures):
         yield from _repeated(

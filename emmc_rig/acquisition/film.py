@@ -125,9 +125,9 @@ class Ring:
         return SLOW_DISK if place in self._overflowed else NONE_CAME
 
     def _read(self) -> None:
-        for place, sent in groupby(self._sent(), lambda one: one.place):
+        for place, sent in groupby(self._sent(), lambda frame: frame.place):
             due_s = (place - self._places.start) / self._rate_hz
-            nearest = min(sent, key=lambda one: abs(one.film_s - due_s))
+            nearest = min(sent, key=lambda frame: abs(frame.film_s - due_s))
             try:
                 self._frames.put_nowait(nearest)
             except Full:

@@ -352,22 +352,22 @@ def _camera_shot(camera: Camera, place: int, shot: PlannedShot) -> Shot:
     return own.model_copy(update={"offset_um": offsets})
 
 
-def differences(one: Plan, other: Plan) -> list[str]:
+def differences(plan: Plan, other: Plan) -> list[str]:
     """Return what differs between two plans, in words; nothing for equal ones."""
-    return list(_differences(one.model_dump(), other.model_dump(), ""))
+    return list(_differences(plan.model_dump(), other.model_dump(), ""))
 
 
-def _differences(one: Any, other: Any, where: str) -> Iterator[str]:
-    if isinstance(one, dict) and isinstance(other, dict):
-        for key in one:
-            yield from _differences(one[key], other.get(key), f"{where}.{key}")
-    elif isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
-        if len(one) != len(other):
-            yield f"{where.lstrip('.')} has {len(one)} entries, not {len(other)}"
-        for place, (a, b) in enumerate(zip(one, other, strict=False)):
+def _differences(value: Any, other: Any, where: str) -> Iterator[str]:
+    if isinstance(value, dict) and isinstance(other, dict):
+        for key in value:
+            yield from _differences(value[key], other.get(key), f"{where}.{key}")
+    elif isinstance(value, (list, tuple)) and isinstance(other, (list, tuple)):
+        if len(value) != len(other):
+            yield f"{where.lstrip('.')} has {len(value)} entries, not {len(other)}"
+        for place, (a, b) in enumerate(zip(value, other, strict=False)):
             yield from _differences(a, b, f"{where}.{place}")
-    elif one != other:
-        yield f"{where.lstrip('.')} is {_shown(one)}, not {_shown(other)}"
+    elif value != other:
+        yield f"{where.lstrip('.')} is {_shown(value)}, not {_shown(other)}"
 
 
 def _shown(value: Any) -> str:

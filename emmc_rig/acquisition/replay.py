@@ -96,7 +96,8 @@ def missing_words(
     if not missing:
         return ""
     shown = ", ".join(
-        f"{one.id} ({one.exposure_s:g} s)" if one.exposure_s else one.id for one in missing[:5]
+        f"{frame.id} ({frame.exposure_s:g} s)" if frame.exposure_s else frame.id
+        for frame in missing[:5]
     )
     more = ", ..." if len(missing) > 5 else ""
     return (

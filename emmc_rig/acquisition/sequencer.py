@@ -180,7 +180,9 @@ class Sequencer:
                 versions=versions(),
                 command=command_line(),
                 resumed=bool(session.stored),
-                environment={one.config.name: one.config.unit for one in self._rig.sources},
+                environment={
+                    source.config.name: source.config.unit for source in self._rig.sources
+                },
                 between={} if self._between is None else self._between.facts(),
                 **self._devices.facts(),
             )

@@ -52,11 +52,11 @@ def chart(
     place = out or Path("emmc-chart")
     with shown_progress() as bars:
         outcome = run_chart(settings, place, bars)
-    for one in outcome.shown():
+    for panel in outcome.shown():
         rows = [
-            (m.configuration.label, f"{m.seconds:.3g}", f"{m.psnr_db:.2f}") for m in one.front()
+            (m.configuration.label, f"{m.seconds:.3g}", f"{m.psnr_db:.2f}") for m in panel.front()
         ]
-        show_table(("method", "s", "dB"), rows, one.title)
+        show_table(("method", "s", "dB"), rows, panel.title)
     for line in outcome.left_out:
         say("excluded", line)
     tell(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")

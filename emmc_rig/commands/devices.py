@@ -82,10 +82,10 @@ def _list_cameras(backend: Any = None) -> None:
 
     try:
         found = [
-            (kind, one)
+            (kind, device)
             for kind, protocol in CAMERAS.items()
             if protocol.interface
-            for one in list_usb(protocol.interface, backend)
+            for device in list_usb(protocol.interface, backend)
         ]
     except DriverError as fault:
         tell(f"USB cameras cannot be listed: {fault}")
@@ -97,8 +97,13 @@ def _list_cameras(backend: Any = None) -> None:
     show_table(
         ("camera", "maker", "model", "may be opened"),
         [
-            (f"{kind}:{one.serial}", one.maker, one.model, "yes" if one.accessible else refused)
-            for kind, one in found
+            (
+                f"{kind}:{device.serial}",
+                device.maker,
+                device.model,
+                "yes" if device.accessible else refused,
+            )
+            for kind, device in found
         ],
     )
 
@@ -184,18 +189,20 @@ def check(
             found.append(ability(name, find_camera(name), axes, hands))
             progress.step(name)
     if camera:
-        one = found[0]
-        tell(f"{camera}: {one.shots} of {one.of_shots} shots, {one.by_hand} mask moves by hand")
+        first = found[0]
+        tell(
+            f"{camera}: {first.shots} of {first.of_shots} shots, {first.by_hand} mask moves by hand"
+        )
         show_table(
             ("calibration", "axes", "by hand", "calibration error"),
             [
                 (
                     way.name,
                     ", ".join(way.axes) or "none",
-                    f"{one.hands(way)} moves" if way.name in one.possible else "not possible",
+                    f"{first.hands(way)} moves" if way.name in first.possible else "not possible",
                     shown_error(way.error),
                 )
-                for way in one.calibrations
+                for way in first.calibrations
             ],
         )
     else:
@@ -210,27 +217,27 @@ def check(
             ),
             [
                 (
-                    one.camera,
-                    f"{one.shots} of {one.of_shots}",
-                    one.best.name,
-                    f"{one.hands(one.best) + one.by_hand} moves",
-                    shown_error(one.best.error),
-                    one.more(axes),
+                    fit.camera,
+                    f"{fit.shots} of {fit.of_shots}",
+                    fit.best.name,
+                    f"{fit.hands(fit.best) + fit.by_hand} moves",
+                    shown_error(fit.best.error),
+                    fit.more(axes),
                 )
-                for one in found
+                for fit in found
             ],
         )
     give_result(
         rig=rig,
         axes=list(axes),
         cameras={
-            one.camera: {
-                "shots": one.shots,
-                "calibration": one.best.name,
-                "relative_error": one.best.error,
-                "moves_by_hand": one.hands(one.best) + one.by_hand,
+            fit.camera: {
+                "shots": fit.shots,
+                "calibration": fit.best.name,
+                "relative_error": fit.best.error,
+                "moves_by_hand": fit.hands(fit.best) + fit.by_hand,
             }
-            for one in found
+            for fit in found
         },
     )
 

@@ -61,10 +61,10 @@ def export(
         return
     known = {VIEWER.name: VIEWER, **FORMATS}
     if list_formats:
-        for one in known.values():
-            uses = ["; --scene reads it"] * bool(one.read) + ["; films"] * bool(one.write_film)
-            tell(f"{one.name:<10} {one.title}: {one.keeps}{''.join(uses)}")
-        give_result(formats={one.name: one.keeps for one in known.values()})
+        for kind in known.values():
+            uses = ["; --scene reads it"] * bool(kind.read) + ["; films"] * bool(kind.write_film)
+            tell(f"{kind.name:<10} {kind.title}: {kind.keeps}{''.join(uses)}")
+        give_result(formats={kind.name: kind.keeps for kind in known.values()})
         return
     named = form or VIEWER.name
     form = ALIASES.get(named, named)

@@ -47,14 +47,14 @@ def figure(
 
     settings = FigureSettings(
         None if view is None else _pair("--view", view),
-        [_pair("--at", one) for one in at or ()],
+        [_pair("--at", text) for text in at or ()],
         side,
         width,
     )
     with result_folder(out, "figure") as folder, shown_progress("read") as bars:
         truths = (truth, *[None] * (len(results) - 1))
         asked = parse_size(size)
-        opened = [open_export(*one, asked) for one in zip(results, truths, strict=True)]
+        opened = [open_export(*pair, asked) for pair in zip(results, truths, strict=True)]
         bars.begin("draw")
         drawn = draw_results(opened, settings)
         drawn.save(folder)

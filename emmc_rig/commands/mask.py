@@ -65,8 +65,8 @@ def mask(
         f"{cells} cells, {height:g} x {width:g} mm: transmittance within "
         f"{sigma:.3f} rms, {found.clear:.0%} clear, blur {found.blur_cells:.2f} cells"
     )
-    for one in found.defects[:SHOWN_DEFECTS]:
-        say("defect", f"row {one.row}, column {one.column}: {one.what}")
+    for defect in found.defects[:SHOWN_DEFECTS]:
+        say("defect", f"row {defect.row}, column {defect.column}: {defect.what}")
     if len(found.defects) > SHOWN_DEFECTS:
         say("defect", f"and {len(found.defects) - SHOWN_DEFECTS} more, see {listed}")
     tell(f"in a camera's file: pattern: {{kind: picture, path: {out.name}}}, cell_um: {cell_um:g}")
@@ -77,11 +77,11 @@ def mask(
 def _corners(text: str) -> list[tuple[float, float]]:
     """Return four points from "X,Y X,Y X,Y X,Y"; raises BadParameter."""
     try:
-        points = [tuple(map(float, one.split(","))) for one in text.split()]
+        points = [tuple(map(float, pair.split(","))) for pair in text.split()]
     except ValueError:
         points = []
-    if len(points) != 4 or any(len(one) != 2 for one in points):
+    if len(points) != 4 or any(len(point) != 2 for point in points):
         raise typer.BadParameter(
             f"--corners {text}: write four points in quotes, such as '12,9 620,14 611,630 8,622'"
         )
-    return [(one[0], one[1]) for one in points]
+    return [(point[0], point[1]) for point in points]

@@ -52,7 +52,7 @@ class ModalCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line; options of earlier versions are taken under their new names."""
         renamed = RENAMED.get(self.name or "", {})
-        words = [_under_new_name(one, renamed) for one in args]
+        words = [_under_new_name(word, renamed) for word in args]
         if self.name in NUMBERS:  # a number with a space before it looks like no option
             words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
         return super().parse_args(ctx, words)
@@ -122,5 +122,5 @@ def refuse(context: typer.Context, names: Iterable[str], where: str) -> None:
 
 def option_of(context: typer.Context, name: str) -> str:
     """Return a parameter as it is typed."""
-    (parameter,) = (one for one in context.command.params if one.name == name)
+    (parameter,) = (known for known in context.command.params if known.name == name)
     return max(parameter.opts, key=len) if name not in parameter.opts else name.upper()

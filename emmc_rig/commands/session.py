@@ -35,26 +35,26 @@ def list_sessions(
 
     with shown_progress("read sessions") as progress:
         found = []
-        for one in sessions_in(folder):
-            progress.step(one.name)
-            found.append(one)
+        for session in sessions_in(folder):
+            progress.step(session.name)
+            found.append(session)
     if not found:
         raise AppError(f"{folder}: holds no session; `emmc-rig capture PLAN` makes one")
     rows = []
-    for one in found:
+    for session in found:
         # Its path from here distinguishes sessions of one name in several folders.
-        inside = os.path.relpath(one.folder, folder)
-        name = one.name if inside == "." else inside
-        about = ", ".join(dict.fromkeys(part for part in (one.title, one.camera) if part))
-        stated = "" if one.stated_db is None else f"{one.stated_db:.1f}"
-        frames, size = f"{one.stored}/{one.planned}", shown_bytes(one.bytes)
+        inside = os.path.relpath(session.folder, folder)
+        name = session.name if inside == "." else inside
+        about = ", ".join(dict.fromkeys(part for part in (session.title, session.camera) if part))
+        stated = "" if session.stated_db is None else f"{session.stated_db:.1f}"
+        frames, size = f"{session.stored}/{session.planned}", shown_bytes(session.bytes)
         rows.append(
-            (f"{escape(name)}\n[dim]{escape(about)}[/]", one.state, frames, size,
-             one.created[:10], one.verdict, stated)
+            (f"{escape(name)}\n[dim]{escape(about)}[/]", session.state, frames, size,
+             session.created[:10], session.verdict, stated)
         )  # fmt: skip
     heads = (Column(head, no_wrap=True) for head in ("state", "frames", "size", "begun", "verdict"))
     show_table((Column("session", overflow="fold"), *heads, "accuracy, dB"), rows)
-    give_result(sessions=[{**asdict(one), "folder": str(one.folder)} for one in found])
+    give_result(sessions=[{**asdict(session), "folder": str(session.folder)} for session in found])
 
 
 @app.command()

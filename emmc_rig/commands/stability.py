@@ -94,8 +94,8 @@ def _list_faults() -> None:
     show_table(
         (Column("fault", no_wrap=True), "unit", "strengths", "what happens"),
         [
-            (one.name, one.unit, " ".join(f"{s:g}" for s in one.strengths), one.explained)
-            for one in FAULTS.values()
+            (fault.name, fault.unit, " ".join(f"{s:g}" for s in fault.strengths), fault.explained)
+            for fault in FAULTS.values()
         ],
     )
     give_result(faults=list(FAULTS))
