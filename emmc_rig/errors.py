@@ -1,4 +1,4 @@
-"""Errors that a user can mend: one line each, what is wrong and what to do."""
+"""Errors that a user can mend: each message is a line with the fault and its remedy."""
 
 from __future__ import annotations
 

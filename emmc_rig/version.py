@@ -1,5 +1,5 @@
-"""The version of the program and that of its figures, in one place."""
+"""The version of the program, and the revision of its numerical results."""
 
 __version__ = "0.4.0"
 NUMERICS = 1
-"""Raised when the same inputs give other results: what was stored before is computed again."""
+"""Raised when equal inputs give other results: products stored before are computed again."""

@@ -1,10 +1,10 @@
-"""What an edited plan changes in a session that has begun: frames taken stay, the others follow it.
+"""An edited plan in a session that has begun: frames taken stay, the other frames follow the edit.
 
 An edit may change everything about frames that are not taken yet, and at any time order, checks,
-retries, settling and metering level. A frame that is taken keeps the exposure that it had, and
-stays when the edited plan has no such frame any more. Refused is an edit that gives a frame taken
-another bench, gain, camera or rig; or a shot of which frames are taken other masks, another filter
-or mask place, or leaves it out.
+retries, settling and metering level. A frame that is taken keeps its exposure, and stays when the
+edited plan lacks it. An edit is refused if it gives a taken frame another bench, gain, camera or
+rig, or if it removes a shot with taken frames or gives the shot other masks, another filter or
+another mask place.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ REMEDY = "take that edit back, or begin another session"
 
 @dataclass(frozen=True)
 class Amendment:
-    """Another plan for a session; frames: all of them, those taken as they were planned.
+    """Another plan for a session; frames: all frames, with taken frames as first planned.
 
     changes: to the plan, for people. kept: how many frames taken it would expose otherwise.
     """
@@ -54,8 +54,8 @@ def amendment(
 ) -> Amendment | None:
     """Return what an edited plan makes of a session; None where nothing was edited.
 
-    rig: another one only where no frame is taken. planned: what follows from the edited plan
-    alone, in order. Raises AppError for an edit that frames already taken contradict.
+    rig: may differ only while no frame is taken. planned: the frames of the edited plan, in order.
+    Raises AppError for an edit that frames already taken contradict.
     """
     folder = session.folder.name
     place = str(session.folder)
@@ -121,7 +121,7 @@ def _refuse_other_camera(session: Session, plan: Plan, camera: Camera, earlier: 
 
 
 def _seen(camera: Mapping[str, Any], shot: int) -> dict[str, Any]:
-    """Return what a shot is, but for how long it is exposed."""
+    """Return a shot of the camera without its exposure."""
     return {**camera["shots"][shot], "exposure_s": None}
 
 

@@ -4,13 +4,13 @@
 
     def hook(rig, frame, note): ...
 
-It is called before every frame, once what somebody does at the bench for that frame is done (lamp,
-board, masks), and before any axis moves for it; and once after the last frame, with `frame` None.
-Whatever was taken before is on the disk by then. rig: a `Rig`, its devices open. frame: the
-`PlannedFrame` that comes next. `note(power_w=0.1)` puts facts into the journal: numbers, texts,
-lists, mappings. It ends the capture by raising `StopCapture`; whatever else it raises stops the
-capture with one line, and the same command goes on. It pauses the capture by not returning yet;
-Ctrl-C ends it then. Where axes stand is read again afterwards, and everything else is set again.
+It is called before every frame, after work by hand at the bench (lamp, board, masks) and before any
+axis moves; and once after the last frame, with `frame` None. All earlier frames are on the disk by
+then. rig: a `Rig`, its devices open. frame: the next `PlannedFrame`. `note(power_w=0.1)` puts facts
+into the journal: numbers, texts, lists, mappings. Raising `StopCapture` ends the capture; any other
+error stops the capture with a line, and the same command goes on. A hook that does not return yet
+pauses the capture; Ctrl-C ends it then. Afterwards the positions of axes are read again, and
+everything else is set again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class HookError(GaveUpError):
 
 @dataclass(frozen=True)
 class Between:
-    """A hook by its name in the plan, and the file that it is written in, "" where unknown."""
+    """A hook by its name in the plan; file: of its source, "" if unknown."""
 
     name: str
     call: Hook
@@ -75,10 +75,10 @@ class Between:
 
 
 def load_hook(name: str, *folders: Path) -> Between:
-    """Return the hook of a plan; folders: where its module may lie, the first that has it counts.
+    """Return the hook of a plan; folders: searched in order for the hook's module.
 
-    Raises AppError with one line where there is none of that name, it cannot be loaded, or does
-    not take (rig, frame, note).
+    Raises AppError if no hook has the name, if it cannot be loaded, or if it does not take
+    (rig, frame, note).
     """
     module, colon, function = name.partition(":")
     try:

@@ -23,10 +23,10 @@ ENDING = ("SIGTERM", "SIGHUP")
 
 
 class Control:
-    """What somebody wants of a capture; any thread or signal handler may ask for it.
+    """Requests to a capture, from any thread or signal handler.
 
-    The sequencer looks between frames. Plain flags: a lock could be held by the very code that a
-    signal interrupts.
+    The sequencer reads them between frames. They are plain flags: a signal handler must not wait
+    for a lock, which the interrupted code may hold.
 
     stays: at the end the capture waits until it is stopped, so that frames may be taken again.
     between_frames: a hook is running, so that nothing is lost by stopping at once.
@@ -68,9 +68,9 @@ class Control:
         self.stopping = True
 
     def until_answered(self, pressed: Callable[[], str] = lambda: "") -> None:
-        """Wait until what somebody was asked for is done; Enter says so too, among keys pressed.
+        """Wait for the answer to a request at the bench; Enter among the keys pressed answers, too.
 
-        Raises StoppedError where the capture is to stop: then nobody does it any more.
+        Raises StoppedError if the capture is to stop.
         """
         while not self.answered and pressed() not in ("\n", "\r"):
             if self.stopping:

@@ -1,6 +1,7 @@
 """A frame on the devices of a rig: the bench set up for it, exposed, and read back.
 
-What was sent last is remembered, so that nothing is sent twice; after a fault nothing is known.
+The last settings of each device are remembered, and equal settings are not sent again. A fault
+clears this memory.
 """
 
 from __future__ import annotations
@@ -107,9 +108,9 @@ class Devices:
             self.home()
 
     def look_again(self) -> None:
-        """Take nothing for known, after somebody else had the devices, but axes that still stand.
+        """Clear the remembered settings after other use of the devices; read the axes' positions.
 
-        Where they do not, or cannot be read, they are moved again, homed if need be.
+        An axis that has moved, or that cannot be read, is moved again, and homed if needed.
         """
         before_um, self.sent = self.sent.offsets_um, Sent()
         with suppress(DriverError):
@@ -182,10 +183,10 @@ class Devices:
         return read_um
 
     def beside(self, streaming: bool = False) -> dict[str, Any]:
-        """Return what is read beside a frame: see `FrameEntry`; what cannot be read is left out.
+        """Return readings beside a frame, see `FrameEntry`; unreadable values are left out.
 
-        Devices are asked for temperatures every few seconds only; a camera that is streaming, whose
-        wire another thread reads, is not.
+        Temperatures are read every few seconds only, and not from a streaming camera: another
+        thread reads its wire.
         """
         stage, stands_um = self._rig.stage, {}
         for axis in stage.axes:
@@ -275,7 +276,7 @@ class Devices:
         return {axis: um for axis, um in planned.bench.offsets_um.items() if axis in axes}
 
     def _expose(self, planned: PlannedFrame, exposure_s: float) -> tuple[RawFrame, Figures]:
-        """Expose one frame, or of a metering frame as many as it takes to find its exposure."""
+        """Expose a frame; a metering frame again and again until its exposure is found."""
         if planned.kind != "metering" or planned.id in self._rig.recorded_s:
             return self.snap(planned, exposure_s)
         low_s, high_s = self.camera.exposure_limits_s

@@ -1,7 +1,7 @@
-"""How long a capture takes and how much it writes: before it begins, and while it runs.
+"""How long a capture takes and how much it writes, before and during it.
 
-Exposures that are metered are known once their metering frame is taken; until then they are a
-guess, and it is said how many.
+A metered exposure is known once its metering frame is taken. Until then it is a guess, and the
+number of guessed exposures is stated.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ EXCHANGES_S = 0.15
 MOVE_S = 0.2
 """A move's acceleration, polling and settling."""
 LEARNT_FROM = 9
-"""The last frames whose median cost counts: one that had to wait for something is no rule."""
+"""The number of latest frames whose median cost counts: a single frame may have waited long."""
 ANY_LIMITS = (0.0, float("inf"))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Seconds by what they are spent on, and bytes on the disk.
+    """Seconds by kind of work, and bytes on the disk.
 
     by_hand: how often a person is asked to change something at the bench, which takes time of its
     own. guessed: frames whose exposure is not metered yet. exposing_s: of a film's frames, their
@@ -51,12 +51,12 @@ class Estimate:
 
     @property
     def seconds(self) -> float:
-        """Total, without what is done by hand."""
+        """Total seconds, without the work of hands."""
         return self.moving_s + self.exposing_s + self.downloading_s
 
 
 class Pace:
-    """What frames cost in time, learnt from those that were taken.
+    """The time that a frame costs, learnt from frames already taken.
 
     waits: whether moves and exposures take their time; those of most simulated rigs do not. hands:
     axes that a hand moves. asks: whether a person is that hand. period_s: of a film's frames.

@@ -312,9 +312,9 @@ def _scene_meterings(plan: Plan, camera: Camera, window_um: float) -> dict[int, 
 def _shot_darks(
     plan: Plan, camera: Camera, meterings: Mapping[int, PlannedFrame]
 ) -> Iterator[PlannedFrame]:
-    """Yield darks at the longest exposure of the shots: of those planned, and of each metered one.
+    """Yield darks at the longest planned exposure, and at the exposure of each metered shot.
 
-    Shots that are metered alike have one. At shorter exposures the dark current lies on a line.
+    Shots of one metering share a dark. At shorter exposures the dark current lies on a line.
     """
     if plan.darks is None or not plan.darks.of_shots:
         return

@@ -1,8 +1,8 @@
-"""Films: what refuses one before it begins, and the frames of a camera's stream at their places.
+"""Films: checks before a film begins, and the frames of a camera's stream at their places in time.
 
 A place in time is a whole number of periods of the film's rate after a segment's first frame. A
-frame that does not come at its place, or that finds no room in memory, is dropped: it cannot be
-taken again. The camera is never made to wait.
+frame that comes late, or for which memory has no room, is dropped: it cannot be taken again. The
+camera never waits.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class Ring:
         self._thread.shutdown()
 
     def stop(self) -> None:
-        """Let the camera send no further frame; those that wait can still be had."""
+        """Stop the camera's stream; frames that wait in the queue can still be iterated."""
         self._stopped.set()
 
     def __iter__(self) -> Iterator[Arrived | None]:

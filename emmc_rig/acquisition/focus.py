@@ -40,7 +40,7 @@ class Sharpness:
 
 
 def sharpness(now: RawFrame, before: RawFrame) -> Sharpness | None:
-    """Return how sharp two frames of the same scene are; None where they do not show it."""
+    """Return the sharpness of two frames of a scene; None if frames differ or are dark."""
     alike = (now.mosaic.shape, now.cfa, now.exposure_s)
     if alike != (before.mosaic.shape, before.cfa, before.exposure_s):
         return None
@@ -86,7 +86,7 @@ class FocusMeter:
     def forget(self) -> None:
         """Compare with nothing seen so far: something else is before the camera.
 
-        May be called by another thread while `add` works: what that looks at is left as it is.
+        Another thread may call this method while `add` works: `add` keeps its frame.
         """
         self._before = None
         self._seen = deque()

@@ -1,10 +1,9 @@
 """The order of the frames: least work by hand first, then least travel.
 
-Frames that need nothing done at the bench between them stay together, in the order in which the
-plan names them first. Among these the stage visits each place once, always the nearest next (2-opt
-saves another 0 to 12 % of the way with the shipped cameras). All axes move at once, so the way
-between two places is the longest of their axes', and an axis that goes down overshoots to come up
-again.
+Frames that need no work by hand between them stay together, in the order of the plan. Among these
+the stage visits each place once, always the nearest next (2-opt saves another 0 to 12 % of the way
+with the shipped cameras). All axes move at once: the distance of two places is that of the axis
+with the longest way. An axis that moves down overshoots, and comes up again.
 """
 
 from __future__ import annotations

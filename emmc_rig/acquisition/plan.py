@@ -73,9 +73,10 @@ class PlannedShot(Settings):
 
 
 class OpenBoard(Settings):
-    """A whiteboard through the masks with the aperture open: what a fit of the mask needs.
+    """A whiteboard through the masks with the aperture open, for fits of the mask.
 
-    mask_um: x, y beyond the first shot's own place. validation: no fit uses it, it judges them.
+    mask_um: x, y beyond the first shot's mask position. validation: kept out of all fits, to judge
+    them.
     """
 
     renamed: ClassVar = {"held_out": "validation"}
@@ -299,7 +300,7 @@ def load_plan(path: Path) -> Plan:
 
 
 def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
-    """Return the camera that the plan makes: one of its shots for each of the plan's.
+    """Return the camera of a plan, with the shots of the plan.
 
     beside: the folder that a camera file is looked for in first. Raises AppError or CameraError.
     """

@@ -1,8 +1,8 @@
-"""Replaying a recording: which of its RAW files is which planned frame, by what files state.
+"""Replaying a recording: each planned frame is matched with a RAW file, by name, time and exposure.
 
-A file named as a frame (`shot-0-e0-r0.dng`, or as sessions name theirs) is that frame. The others
-are taken by time, then name, where there are as many as frames and all exposures agree. Nothing is
-guessed beyond that: what is missing is named, and the rest of the session is taken.
+A file named as a frame (`shot-0-e0-r0.dng`, or as sessions name their files) is that frame. The
+other files are matched by time, then name, if they are as many as the frames left and all exposures
+agree. Nothing else is guessed: missing frames are named, and the rest of the session is taken.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from emmc_rig.session.session import Session
 
 
 def matched(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[str, Recorded]:
-    """Return by frame's id the file that is it; files: in the order in which they were taken."""
+    """Return the file of each frame, by the frame's id; files: in the order of capture."""
     found = _by_name(frames, files)
     taken = {file.name for file in found.values()}
     left = [file for file in files if file.name not in taken]
@@ -79,7 +79,7 @@ def replaying(rig: Rig, frames: Sequence[PlannedFrame]) -> tuple[Rig, Mapping[st
 def there(
     session: Session, found: Mapping[str, Recorded]
 ) -> Callable[[Callable[[], float]], tuple[PlannedFrame, ...]]:
-    """Return what chooses, for a `Sequencer`, those missing frames of which there is a file."""
+    """Return a `Sequencer`'s selection of frames: missing frames that have a file."""
 
     def choose(now_s: Callable[[], float]) -> tuple[PlannedFrame, ...]:
         known = {*found, *session.stored, None}
@@ -91,7 +91,7 @@ def there(
 def missing_words(
     folder: Path, frames: Sequence[PlannedFrame], found: Mapping[str, Recorded]
 ) -> str:
-    """Return which frames have no file, "" where all have one; frames: still to be taken."""
+    """Return a sentence that names frames without a file, or ""; frames: still to be taken."""
     missing = [frame for frame in frames if frame.id not in found and not frame.is_optional]
     if not missing:
         return ""

@@ -1,4 +1,4 @@
-"""Which faults are worth another try, what must be mended before it, and when enough is enough."""
+"""Faults that are worth another try, repairs before it, and the limit of tries."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ HOPELESS = (
     UsbPermissionError,
     UsbUnavailableError,
 )
-"""Somebody has to do something first; an emergency stop above all is never argued with."""
+"""Faults that a person has to mend before another try, the emergency stop above all."""
 
 CAMERA_GONE = (CameraClosedError, UsbGoneError, UsbNotFoundError)
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0

@@ -1,4 +1,4 @@
-"""One thread that does jobs in order, so that a frame is written while the stage moves on.
+"""A thread that does jobs in order, so that a frame is written while the stage moves on.
 
 The first job that fails ends the writing: later ones are dropped, and the fault is raised to
 whoever hands over the next job, or closes. At most `room` jobs wait: memory stays flat.
@@ -45,7 +45,7 @@ class Writer:
         self._jobs.put(job)
 
     def flush(self) -> None:
-        """Return when every job handed over so far is done; raises what one of them raised."""
+        """Return when every job handed over so far is done; raises the first fault of a job."""
         done = threading.Event()
         self._jobs.put(done)
         done.wait()

@@ -72,7 +72,7 @@ def conform(
 
 
 def _suites(device: str) -> list[str]:
-    """Return which suites a name asks for; raises AppError for one that names nothing."""
+    """Return the test suites of a device's name; raises AppError for an unknown name."""
     from emmc_rig.bench.camera_config import DRIVER_KEYS
     from emmc_rig.bench.hardware import camera_drivers
     from emmc_rig.bench.stage_config import stage_protocols

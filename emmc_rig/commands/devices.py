@@ -1,4 +1,4 @@
-"""`emmc-rig devices`: what is connected, and single steps with it by hand.
+"""`emmc-rig devices`: lists connected devices, and moves or exposes by hand.
 
 Every command works alike on a real stage (`--stage`) and on a simulated one (`--rig simulated`).
 Ctrl-C, SIGTERM, a closed terminal or an error during a move stops the stage and leaves it stopped.

@@ -1,10 +1,10 @@
-"""The first run on a machine compiles kernels: it says so, and other processes help.
+"""The first run on a machine compiles kernels, in several processes, with a message.
 
-Numba keeps what it compiled on the disk, and who needs a kernel that another process is compiling
-waits for it (`emmc_rig.model.compiling`). So this process goes its way, from the simulated capture
-to the first kernels of the reconstruction, while others compile those that it needs later. They
-begin with what takes longest, and all cores are busy until all is compiled. The others end with
-this process.
+Numba keeps compiled kernels on the disk. A process that needs a kernel which another process is
+compiling waits for it (`emmc_rig.model.compiling`). So this process runs the simulated capture and
+the first kernels of the reconstruction, while other processes compile the later kernels, the
+slowest first. All cores are busy until every kernel is compiled. The other processes end with this
+process.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ PARTS = {
     "adaptive": ("variation", "fit", "search"),
     "adaptive-fast": ("variation", "fit", "search"),
 }
-"""What the other processes do for a method: first what takes longest, last what this process comes
-to first; for one that is not here, the whole of it."""
+"""By method, the groups of kernels that other processes compile: the slowest group first, last the
+group that this process needs first. For a method without an entry they compile all its kernels."""
 
 NOT_KEPT = "no folder to keep them can be written to (set NUMBA_CACHE_DIR to one that can)"
 
@@ -152,7 +152,7 @@ def _fit(
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it ends, and with it this process's input."""
+    """End this process when its parent ends: standard input closes then."""
     os.read(sys.stdin.fileno(), 1)
     os._exit(1)
 

@@ -1,4 +1,4 @@
-"""Modes of commands: options that make a command do something else, and those that it takes then.
+"""Modes of commands: an option that changes what a command does, and the options of each mode.
 
 An option that would be ignored is refused: wrong usage, in one line.
 """
@@ -34,9 +34,9 @@ NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
     "cameras": {"out": "name"},
     "export": {"truth": "result"},
 }
-"""By command, an option and the one, or those, without which it does nothing."""
+"""By command and option: the option, or options, that it depends on."""
 RENAMED = {"calibrate": {"--route": "--method", "--leave-out": "--skip"}}
-"""By command, options of earlier versions that scripts use, and what they are called now."""
+"""By command: options of earlier versions, which scripts use, and their new names."""
 NUMBERS = {"jog"}
 """Commands with numbers for arguments: -5 is a number there, not an option."""
 _NEGATIVE = re.compile(r"-\.?\d")
@@ -114,7 +114,7 @@ def given_names(context: typer.Context) -> set[str]:
 
 
 def refuse(context: typer.Context, names: Iterable[str], where: str) -> None:
-    """Raise BadParameter where there are such parameters; where: in what case they do nothing."""
+    """Raise BadParameter if any parameters are named; where: the mode that ignores them."""
     options = sorted(option_of(context, name) for name in names)
     if options:
         raise typer.BadParameter(f"{', '.join(options)}: no effect {where}; leave it out")

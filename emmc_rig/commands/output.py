@@ -1,16 +1,16 @@
-"""What a command shows: progress on a terminal, results in words; with --json all as JSON lines.
+"""Output of commands: progress on a terminal, results in words; with --json all as JSON lines.
 
 Progress goes to standard error, and only to a terminal. With `--json` standard output has one JSON
 object a line, and nothing else:
 
 | event | facts |
 |---|---|
-| `stage` | `stage`, `steps`: it begins; null where their number is not known |
+| `stage` | `stage`, `steps`: a stage begins; null for an unknown number of steps |
 | `step` | `stage`, `done`, `steps`, `detail` |
 | `message` | `text`: a result in words |
 | `note` | `label`, `text`: a warning, or what is missing |
 | `table` | `title`, `heads`, `rows` |
-| `result` | the command's result: `out`, `metrics` as metrics.json has them, or facts of its own |
+| `result` | result of the command: `out`, `metrics` as in metrics.json, or other facts |
 | `error` | `text`: the command failed |
 """
 
@@ -111,7 +111,7 @@ class Quiet:
         """Begin a stage; the one before is done. steps: None where not known."""
 
     def step(self, detail: str = "") -> None:
-        """Show that one step more is done; from any thread."""
+        """Show another step as done; from any thread."""
 
     def at(self, done: float, steps: float | None, detail: str = "") -> None:
         """Show how many steps are done."""

@@ -232,10 +232,10 @@ def _refuse_holding(folder: Path, out: Path) -> None:
 
 @contextmanager
 def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
-    """Make a hidden folder that is this program's alone, and remove it with its files at the end.
+    """Make a hidden folder for this program alone, and remove it with its files at the end.
 
-    Files that a killed program left in it are removed too, except a result that takes its place,
-    and kept files where `resumes`. Raises AppError where another program works in it, and OSError.
+    Files of a killed program are removed too, except a result on its way to its place, and kept
+    files if `resumes`. Raises AppError if another program works in the folder, and OSError.
     """
     release = None
     while release is None:
@@ -262,9 +262,9 @@ def _workplace(place: Path, resumes: bool = False) -> Iterator[None]:
 
 
 def _clear(place: Path, spared: str | None = None) -> None:
-    """Empty a hidden folder, unless a result in it takes its place; links are not followed.
+    """Empty a hidden folder, unless it holds a result on its way; links are not followed.
 
-    spared: the name of a folder in it that stays, unless it is empty.
+    spared: the name of a subfolder that stays, unless it is empty.
     """
     if (place / FILES).exists() or (place / MOVES).exists():
         return
