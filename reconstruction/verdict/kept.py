@@ -29,10 +29,20 @@ WINDOW_PX = 9
 """Side of the square that a place is judged by: 81 readings a shot distinguish 1 from 1.25."""
 
 
-def kept_readings(usable: NDArray[np.bool_], seed: int = SEED) -> NDArray[np.bool_]:
-    """Return which usable readings (shot, pixel_y, pixel_x) to keep from the fit, at random."""
+def kept_readings(
+    psi: ImagingMatrix, usable: NDArray[np.bool_], seed: int = SEED
+) -> NDArray[np.bool_]:
+    """Return a random selection of usable readings (shot, pixel_y, pixel_x) to keep from the fit.
+
+    A reading is selected by its pixel and by the weights of its shot: the order of the shots in Psi
+    changes nothing.
+    """
+    v, u = (views // 2 for views in psi.views)
+    order = sorted(range(psi.shots), key=lambda shot: psi.weights[shot, v, u].tobytes())
     share = min(max(SHARE, WANTED / max(int(usable.sum()), 1)), MOST_SHARE)
-    return usable & (np.random.default_rng(seed).random(usable.shape) < share)
+    kept = usable.copy()
+    kept[order] &= np.random.default_rng(seed).random(usable.shape) < share
+    return kept
 
 
 def compare_held_out(

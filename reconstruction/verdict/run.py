@@ -169,10 +169,10 @@ def _as_fitted(
     """Return the frames as a method gets them, and what was done to them before, in words."""
     checked, excluded = checked_inputs(psi, frames), np.where(frames.usable, 0, frames.readings)
     if not screening:
-        return FittedFrames(checked, kept_readings(checked.usable), excluded), ()
+        return FittedFrames(checked, kept_readings(psi, checked.usable), excluded), ()
     seen = screened(psi, checked)
     left_out = tuple(sorted((*seen.dark, *seen.double)))
-    kept, bad = kept_readings(seen.frames.usable), float(seen.bad.mean())
+    kept, bad = kept_readings(psi, seen.frames.usable), float(seen.bad.mean())
     excluded = (excluded / seen.gains[:, None, None]).astype(excluded.dtype)
     gains = tuple(seen.gains.tolist())
     return FittedFrames(seen.frames, kept, excluded, left_out, bad, gains=gains), seen.notes

@@ -323,11 +323,11 @@ def test_places_without_usable_readings_count_as_explained():
 def test_few_readings_are_kept_and_the_same_each_time(three):
     usable = everywhere(three)
     usable[0, :20] = False
-    kept = kept_readings(usable)
+    kept = kept_readings(three, usable)
     # 150 of 7,936: a larger share of a small capture.
     assert 0.012 < kept.sum() / usable.sum() < 0.025
     assert not kept[~usable].any()
-    np.testing.assert_array_equal(kept, kept_readings(usable))
+    np.testing.assert_array_equal(kept, kept_readings(three, usable))
 
 
 def judged_trial(
@@ -393,7 +393,7 @@ def test_a_light_field_that_foretells_less_than_anybody_would_is_doubted(three):
     rng = np.random.default_rng(0)
     frames = three.forward(scene)
     frames += 0.003 * rng.standard_normal(frames.shape, np.float32)
-    kept, usable = kept_readings(everywhere(three)), everywhere(three)
+    kept, usable = kept_readings(three, everywhere(three)), everywhere(three)
     rough = 0.1 * rng.standard_normal(frames.shape)
     for residual, worse in ((rough, True), (0.003 * rng.standard_normal(frames.shape), False)):
         over = over_baselines(three, frames, residual, 0.003, usable, kept)
@@ -436,7 +436,7 @@ def clean_evidence(three):
     empty = Reconstruction("tv", even, Status.CONVERGED, "", 1, (), 0.0, {})
     usable = everywhere(three)
     frames = even_frames(grey(three), 1e-3, usable)
-    read = FittedFrames(frames, kept_readings(usable), np.zeros(three.frames_shape))
+    read = FittedFrames(frames, kept_readings(three, usable), np.zeros(three.frames_shape))
     # Of a scene with depth, but for that.
     return dataclasses.replace(gathered(three, read, empty), parallax=0.05)
 
@@ -483,7 +483,7 @@ def test_a_coded_aperture_leaves_nothing_in_one_frame_that_would_show_a_wrong_ps
     frames = grey(psi)
     usable = everywhere(psi)
     seen = even_frames(frames, 1e-3, usable)
-    read = FittedFrames(seen, kept_readings(usable), np.zeros(psi.frames_shape))
+    read = FittedFrames(seen, kept_readings(psi, usable), np.zeros(psi.frames_shape))
     light_field = np.full(psi.light_field_shape, 0.5, np.float32)
     result = Reconstruction("tv", light_field, Status.CONVERGED, "", 1, (), 0.0, {})
     verdict = verdict_from(gathered(psi, read, result))
