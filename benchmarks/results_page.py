@@ -657,7 +657,7 @@ def others() -> Section:
     for capture in captures:
         table.append((capture, level[capture, "adaptive-fast"], level[capture, "tv"]))
     return Section(
-        "Does it work on captures of other authors?",
+        "Does emmc-rig work on captures of other authors?",
         f"{len(captures)} captures of {cameras} cameras: {len(worse)} of {len(by)} results predict "
         f"validation readings worse than interpolation; {trusted or 'none'} of them trusted. "
         f"Masks shifted by some rows or mirrored: {refused} refused.",
