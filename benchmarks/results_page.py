@@ -173,7 +173,7 @@ def whole_speed() -> Section:
         "How long does a whole frame take?",
         f"`adaptive` reaches {best[1]:.1f} dB in {best[0]:.0f} s of processor time, "
         f"`adaptive-fast` {fast[1]:.1f} dB in {fast[0]:.0f} s: means of {len(scenes)} whole light "
-        "fields. Colours that the filters do not sample limit the accuracy; disparity hardly does.",
+        "fields. The colours that the filters do not sample limit the PSNR, hardly the disparity.",
         "Up is better, left is faster. Points of one colour are settings of one method. More "
         "patches, `best`, cost time without gain in whole frames. The table lists the PSNR with "
         "parts of the true light field given to the method.",
