@@ -1,4 +1,4 @@
-"""docs/results.md, its charts and the README's table are docs/results/*.csv, by one command.
+"""Write docs/results.md, its charts and the README's table from docs/results/*.csv.
 
     python benchmarks/results_page.py
 
@@ -28,10 +28,10 @@ Row = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Section:
-    """One question: how it is answered, in a sentence, by charts and a table, from which files.
+    """A question with its answer in a sentence, charts and a table, from CSV files.
 
-    charts: SVG by name. how: how to read them. table: its head first. line: a row of the README's
-    table, what was measured and what it reached.
+    charts: SVG by name. how: advice for reading the charts. table: head first. line: quantity and
+    value of a row in the README's table.
     """
 
     heading: str
@@ -129,7 +129,7 @@ def speed() -> Section:
     fast = named["one shot"]["adaptive-fast"]
     answer = f"adaptive is {best[1] - second[0]:.1f} dB above the next best method"
     table: list[tuple[str, ...]] = [("method", "one shot", "three shots")]
-    for method in sorted(named["one shot"], key=lambda one: -named["one shot"][one][1]):
+    for method in sorted(named["one shot"], key=lambda method: -named["one shot"][method][1]):
         cells = (named[shots][method] for shots in CAMERAS)
         table.append((f"`{method}`", *(f"{db:.2f} dB, {cpu_s:.1f} s" for cpu_s, db in cells)))
     return Section(
@@ -201,7 +201,9 @@ def films() -> Section:
     gain = {(row["scene"], row["motion"]): number(row, "gain_db") for row in rows}
     dots = {text: [gain[scene, motion] for scene in scenes] for motion, text in words.items()}
     of = {motion: [row for row in rows if row["motion"] == motion] for motion in words}
-    pans, rests = (mean(number(row, "gain_db") for row in of[one]) for one in ("pans", "rests"))
+    pans, rests = (
+        mean(number(row, "gain_db") for row in of[motion]) for motion in ("pans", "rests")
+    )
     cost = mean(number(row, "cost") for row in rows)
     flicker = mean(number(row, "flicker") for row in of["rests"])
     table = [("motion", "mean gain", "least gain", "processor time", "flicker", "inside")]
@@ -277,7 +279,7 @@ def three_shots() -> Section:
     """Three shots of a moved mask."""
     rows = rows_of("three-shots")
     by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in rows}
-    scenes = sorted({row["scene"] for row in rows}, key=lambda one: -by[one, "adaptive"])
+    scenes = sorted({row["scene"] for row in rows}, key=lambda scene: -by[scene, "adaptive"])
     dots = {method: [by[scene, method] for scene in scenes] for method in ("tv-dict", "adaptive")}
     leads = [a - b for a, b in zip(dots["adaptive"], dots["tv-dict"], strict=True)]
     answer = f"Three shots: adaptive is {mean(leads):.1f} dB above tv-dict"
@@ -532,7 +534,7 @@ def calibration() -> Section:
         row["what"].split(":")[0] for row in rows if row["what"].endswith(": true error of Psi")
     ]
     labels = [
-        {"few": "ten whiteboards", "session": "a whole session"}.get(one, one) for one in names
+        {"few": "ten whiteboards", "session": "a whole session"}.get(name, name) for name in names
     ]
     dots = {
         words: [100 * by[f"{name}: {key} error of Psi"] for name in names]
@@ -605,7 +607,7 @@ def learning() -> Section:
     rows = [*rows_of("group-b-chart"), *rows_of("group-b-unrolled")]
     kept = [row for row in rows if row["camera"] == "scenario-ii-cfa" and row["level"] == "default"]
     by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in kept}
-    scenes = sorted({row["scene"] for row in kept}, key=lambda one: -by[one, "adaptive"])
+    scenes = sorted({row["scene"] for row in kept}, key=lambda scene: -by[scene, "adaptive"])
     dots = {
         words: [by[scene, method] for scene in scenes]
         for words, method in (
@@ -613,8 +615,8 @@ def learning() -> Section:
         )
     }  # fmt: skip
     over, under = (
-        mean(a - b for a, b in zip(dots[one], dots[other], strict=True))
-        for one, other in (("unrolled, a network", "tv"), ("adaptive", "unrolled, a network"))
+        mean(a - b for a, b in zip(dots[better], dots[worse], strict=True))
+        for better, worse in (("unrolled, a network", "tv"), ("adaptive", "unrolled, a network"))
     )
     return Section(
         "What does training gain?",
@@ -725,7 +727,7 @@ def table_text(rows: Sequence[Sequence[str]]) -> str:
 
 
 def run_text(file: str, runs: Mapping[str, Row]) -> str:
-    """Return what a CSV is, when it was measured and by which command."""
+    """Return a link to a CSV, with date, version and command of its measurement."""
     run = runs[f"{file}.csv"]
     return (
         f"[{file}.csv](results/{file}.csv): {run['date']}, version {run['version']}, "
