@@ -1,4 +1,4 @@
-"""docs/results.md, its charts and the README's table are docs/results/*.csv, by one command.
+"""Write docs/results.md, its charts and the README's table from docs/results/*.csv.
 
     python benchmarks/results_page.py
 
@@ -28,10 +28,10 @@ Row = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Section:
-    """One question: how it is answered, in a sentence, by charts and a table, from which files.
+    """A question with its answer in a sentence, charts and a table, from CSV files.
 
-    charts: SVG by name. how: how to read them. table: its head first. line: a row of the README's
-    table, what was measured and what it reached.
+    charts: SVG by name. how: advice for reading the charts. table: head first. line: quantity and
+    value of a row in the README's table.
     """
 
     heading: str
@@ -92,10 +92,9 @@ def whole_frames() -> Section:
     return Section(
         "How good is one shot?",
         f"From one frame of the paper's Bayer camera `adaptive` reaches {reached}, {lead:.1f} dB "
-        "above `tv-dict` on average; noise on, nothing trained.",
-        "To the right is better; 6 dB are half the error. The grey bar of a light field spans from "
-        "the baseline, which has no parallax at all, to the best method. Seconds are those of "
-        "`adaptive`.",
+        "above `tv-dict` on average, with noise and without training data.",
+        "Right is better; 6 dB halve the error. The grey bar of a light field spans from the "
+        "baseline, without parallax, to the best method. Seconds are those of `adaptive`.",
         files,
         {"whole-frames": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
         table,
@@ -130,22 +129,23 @@ def speed() -> Section:
     fast = named["one shot"]["adaptive-fast"]
     answer = f"adaptive is {best[1] - second[0]:.1f} dB above the next best method"
     table: list[tuple[str, ...]] = [("method", "one shot", "three shots")]
-    for method in sorted(named["one shot"], key=lambda one: -named["one shot"][one][1]):
+    for method in sorted(named["one shot"], key=lambda method: -named["one shot"][method][1]):
         cells = (named[shots][method] for shots in CAMERAS)
         table.append((f"`{method}`", *(f"{db:.2f} dB, {cpu_s:.1f} s" for cpu_s, db in cells)))
     return Section(
         "Which method, for how much time?",
         f"`adaptive` leads `{second[1]}` by {best[1] - second[0]:.1f} dB with one shot; "
-        f"`adaptive-fast` is {best[1] - fast[1]:.1f} dB below it in {fast[0] / best[0]:.0%} of its "
-        "time.".replace("%", " %"),
+        f"`adaptive-fast` is {best[1] - fast[1]:.1f} dB below `adaptive`, in "
+        f"{fast[0] / best[0]:.0%} of the time.".replace("%", " %"),
         f"Up is better, left is faster. Each point is the mean of {len(scenes)} light fields of "
-        "group B, which no setting was tuned on, cut to 64x80; time is of one core.",
+        "group B, cropped to 64x80; time is on one core.",
         ("chart-group-b-64x80", "chart-group-a-64x80"),
         {"speed": svg_charts.points(answer, ("processor seconds", "PSNR, dB"), named)},
         table,
         (
-            f"The same of {len(scenes)} that nothing was tuned on, cut to 64x80",
-            f"{best[1]:.1f} dB in {best[0]:.1f} s, next best `{second[1]}` {second[0]:.1f} dB",
+            f"Mean PSNR of {len(scenes)} light fields not used for tuning, cropped to 64x80",
+            f"{best[1]:.1f} dB in {best[0]:.1f} s; next best method, `{second[1]}`: "
+            f"{second[0]:.1f} dB",
         ),
     )
 
@@ -167,16 +167,16 @@ def whole_speed() -> Section:
     known: dict[str, list[float]] = {}
     for row in rows_of("bounds"):
         known.setdefault(row["known"], []).append(number(row, "psnr_db"))
-    table = [("what `adaptive` is told, 128x128", "PSNR")]
+    table = [("truth given to `adaptive`, 128x128", "PSNR")]
     table += [(words or "nothing", f"{mean(of):.2f} dB") for words, of in known.items()]
     return Section(
         "How long does a whole frame take?",
         f"`adaptive` reaches {best[1]:.1f} dB in {best[0]:.0f} s of processor time, "
         f"`adaptive-fast` {fast[1]:.1f} dB in {fast[0]:.0f} s: means of {len(scenes)} whole light "
-        "fields. What bounds it are the colours that the sensor does not see, not the depth.",
+        "fields. The colours that the filters do not sample limit the PSNR, hardly the disparity.",
         "Up is better, left is faster. Points of one colour are settings of one method. More "
-        "patches, `best`, cost time for nothing in whole frames. The table is what the truth about "
-        "one thing would gain.",
+        "patches, `best`, cost time without gain in whole frames. The table lists the PSNR with "
+        "parts of the true light field given to the method.",
         ("chart-full-frames", "bounds"),
         {
             "whole-speed": svg_charts.points(
@@ -201,10 +201,12 @@ def films() -> Section:
     gain = {(row["scene"], row["motion"]): number(row, "gain_db") for row in rows}
     dots = {text: [gain[scene, motion] for scene in scenes] for motion, text in words.items()}
     of = {motion: [row for row in rows if row["motion"] == motion] for motion in words}
-    pans, rests = (mean(number(row, "gain_db") for row in of[one]) for one in ("pans", "rests"))
+    pans, rests = (
+        mean(number(row, "gain_db") for row in of[motion]) for motion in ("pans", "rests")
+    )
     cost = mean(number(row, "cost") for row in rows)
     flicker = mean(number(row, "flicker") for row in of["rests"])
-    table = [("motion", "over frames alone", "least", "processor time", "flicker", "inside")]
+    table = [("motion", "mean gain", "least gain", "processor time", "flicker", "inside")]
     for motion, text in words.items():
         columns = {
             key: [number(row, key) for row in of[motion]]
@@ -218,15 +220,16 @@ def films() -> Section:
         )  # fmt: skip
     return Section(
         "What does a film gain over its frames?",
-        f"{pans:+.1f} dB where the camera pans, {rests:+.1f} dB where all rests, in "
-        f"{100 * cost:.0f} % of the time; what rests flickers {100 * flicker:.0f} % as much.",
-        "To the right of 0 is better: the mean over frames 3 to 8 less that of each frame "
-        "reconstructed alone. The table has time and flicker over those of frames alone, and in "
-        "how many frames the true PSNR lies in the interval stated.",
+        f"{pans:+.1f} dB if the camera pans and {rests:+.1f} dB at rest. A film takes "
+        f"{100 * cost:.0f} % of the time, and a scene at rest flickers {100 * flicker:.0f} % as "
+        "much.",
+        "Right of 0 is better. The gain is the mean PSNR of frames 3 to 8 minus that of the same "
+        "frames reconstructed singly. The table lists time and flicker relative to single frames; "
+        "inside: share of frames whose true PSNR lies in the stated interval.",
         ("films",),
-        {"films": svg_charts.dots("Time is a code", "gain, dB", scenes, dots, 0)},
+        {"films": svg_charts.dots("A film against its single frames", "gain, dB", scenes, dots, 0)},
         table,
-        ("A film over its frames alone, where the camera pans", f"{pans:+.1f} dB"),
+        ("Gain of a film over its frames reconstructed singly, camera panning", f"{pans:+.1f} dB"),
     )
 
 
@@ -241,7 +244,7 @@ def moving_shots() -> Section:
     }
     dots = {f"{step:g} px": [over[scene, step] for scene in scenes] for step in steps}
     loss = mean(over.values())
-    table = [("motion a shot", "over rest", "least", "over one shot alone", "trusted", "inside")]
+    table = [("motion per shot", "against rest", "worst", "against one shot", "trusted", "inside")]
     for step in steps:
         of = [row for row in rows if number(row, "step_px") == step]
         own = [over[row["scene"], step] for row in of]
@@ -257,15 +260,15 @@ def moving_shots() -> Section:
     film = {row["scene"]: number(row, "film_db") - number(row, "together_db") for row in rows}
     return Section(
         "Does a capture survive motion between its shots?",
-        f"Three shots of a scene that moves by {min(steps):g} to {max(steps):g} pixels a shot "
-        f"have {loss:+.1f} dB over the same at rest.",
-        f"To the right is better. {len(scenes)} light fields slide before the camera, 96x128. At "
-        f"rest, the last of three frames of a film has {mean(film.values()):+.1f} dB over all "
-        "shots of one capture, without patches.",
+        f"Three shots of a scene that moves by {min(steps):g} to {max(steps):g} pixels per shot "
+        f"differ by {loss:+.1f} dB from the scene at rest.",
+        f"Right is better. {len(scenes)} light fields slide before the camera, 96x128. At rest, "
+        f"the last of three film frames differs by {mean(film.values()):+.1f} dB from three shots "
+        "reconstructed together, without patches. Inside: true PSNR within the stated interval.",
         ("moving-shots",),
         {
             "moving-shots": svg_charts.dots(
-                "Shots that survive motion", "over rest, dB", scenes, dots, 0
+                "Shots that survive motion", "against rest, dB", scenes, dots, 0
             )
         },
         table,
@@ -276,7 +279,7 @@ def three_shots() -> Section:
     """Three shots of a moved mask."""
     rows = rows_of("three-shots")
     by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in rows}
-    scenes = sorted({row["scene"] for row in rows}, key=lambda one: -by[one, "adaptive"])
+    scenes = sorted({row["scene"] for row in rows}, key=lambda scene: -by[scene, "adaptive"])
     dots = {method: [by[scene, method] for scene in scenes] for method in ("tv-dict", "adaptive")}
     leads = [a - b for a, b in zip(dots["adaptive"], dots["tv-dict"], strict=True)]
     answer = f"Three shots: adaptive is {mean(leads):.1f} dB above tv-dict"
@@ -284,8 +287,8 @@ def three_shots() -> Section:
         "What do three shots give?",
         f"With the mask moved between three shots `adaptive` leads `tv-dict` by "
         f"{min(leads):.1f} to {max(leads):.1f} dB.",
-        f"To the right is better. {len(scenes)} light fields, cut to 256x256; the last ones have "
-        "disparities wider than the search.",
+        f"Right is better. {len(scenes)} light fields, cropped to 256x256; the last ones have "
+        "disparities beyond the search range.",
         ("three-shots",),
         {"three-shots": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
     )
@@ -323,8 +326,8 @@ def noise_and_shots() -> Section:
     }  # fmt: skip
     return Section(
         "Do less noise and more shots help?",
-        f"Less noise gains up to {gained:.1f} dB on average, sixteen shots {more:.1f} dB. One "
-        f"scene of wide disparities falls by {falls:.1f} dB between two numbers of shots.",
+        f"Less noise gains up to {gained:.1f} dB on average, sixteen shots gain {more:.1f} dB. One "
+        f"scene with wide disparities loses {falls:.1f} dB from one number of shots to the next.",
         "A line should never fall towards less noise (left) or more shots (right). Thin lines are "
         "single light fields, 64x64.",
         ("noise-and-shots",),
@@ -352,16 +355,16 @@ def stated() -> Section:
     held = f"{number(other, 'in_interval'):.0%}".replace("%", " %")
     return Section(
         "Can the estimated accuracy be believed?",
-        f"The interval of a result's estimated accuracy holds the true PSNR in {held} of the "
-        "captures that it was not fitted to; it is wide: "
+        f"The interval of the estimated accuracy contains the true PSNR in {held} of the captures "
+        "excluded from its fit; its median width is "
         f"{number(other, 'median_width_db'):.1f} dB.",
-        "90 % should lie within. The estimate itself is off by the rms, so that it tells a good "
-        "result from a poor one, not 30 from 31 dB.",
+        "The nominal rate is 90 %. With this rms error, the estimate separates good from poor "
+        "results, but not 30 dB from 31 dB.",
         ("stated-groups",),
         {},
         table,
         (
-            "The interval of the estimated accuracy holds the true PSNR",
+            "Captures with true PSNR inside the interval of the estimated accuracy (nominal: 90 %)",
             f"{held} of {other['captures']}",
         ),
     )
@@ -374,7 +377,7 @@ def verdicts() -> Section:
     """Whether results that a fault broke are flagged."""
     rows = [row for row in rows_of("verdicts-real") if row["kind"] in ("broken", "good", "between")]
     groups = {
-        "group A, limits were set on it": [row for row in rows if row["scene"] in GROUP_A],
+        "group A (sets the limits)": [row for row in rows if row["scene"] in GROUP_A],
         "group B": [row for row in rows if row["scene"] not in GROUP_A],
     }
 
@@ -402,11 +405,11 @@ def verdicts() -> Section:
         table.append((words, *counts[kind]))
     return Section(
         "Is a broken result flagged?",
-        f"Of results that a fault broke {counts['broken'][1]} are flagged in light fields that the "
-        f"limits were not set on, of good ones {counts['good'][1]}.",
-        f"{faults} faults in steps, one shot, `adaptive-fast`. The line should be at 0 % to the "
-        "left, where a fault costs nothing, and at 100 % from 3 dB on. Flagged is any verdict but "
-        "*trust*.",
+        f"In group B, {counts['broken'][1]} results that lost 3 dB or more to a fault are flagged; "
+        f"among good results, {counts['good'][1]} are false alarms.",
+        f"{faults} faults in steps, one shot, `adaptive-fast`. The line should be at 0 % on the "
+        "left, where a fault costs nothing, and at 100 % from 3 dB on. Any verdict but *trust* "
+        "counts as flagged.",
         ("verdicts-real",),
         {
             "verdicts": svg_charts.lines(
@@ -418,7 +421,7 @@ def verdicts() -> Section:
         },
         table,
         (
-            "Results that a fault broke are flagged; good ones, by mistake",
+            "Flagged results among those that lost 3 dB or more to a fault; false alarms",
             "; ".join(of[1] for of in counts.values()),
         ),
     )
@@ -431,19 +434,19 @@ def wrong_psi() -> Section:
     rows = [row for row in rows if row["method"] != "adaptive-dict"]
     rows.sort(key=lambda row: -number(row, "oracle"))
     dots = {
-        "Psi of before": [number(row, "mismatched") for row in rows],
+        "Psi before the shift": [number(row, "mismatched") for row in rows],
         "Psi fitted to the frames": [number(row, "blind") for row in rows],
         "the true Psi": [number(row, "oracle") for row in rows],
     }
     lost = [number(row, "oracle") - number(row, "mismatched") for row in rows]
     won = min(number(row, "recovered_of_oracle") for row in rows)
-    answer = "A mask half a pixel off costs every method; the frames alone mend Psi"
+    answer = "A mask shifted by half a pixel costs every method; the frames correct Psi"
     return Section(
         "What if the mask has moved?",
-        f"Half a pixel costs {min(lost):.1f} to {max(lost):.1f} dB; a Psi fitted to the frames, "
-        f"blindly, wins back {won:.0%} or more of what the true one does.".replace("%", " %"),
-        "The grey bar is what is lost by a wrong Psi. One scene, 32x40: the order counts, not the "
-        "levels.",
+        f"A shift by half a pixel costs {min(lost):.1f} to {max(lost):.1f} dB; fitting Psi to the "
+        f"frames alone recovers {won:.0%} or more of this loss.".replace("%", " %"),
+        "The grey bar is the loss by the wrong Psi. One scene, 32x40: the order counts, not the "
+        "absolute values.",
         ("mismatch",),
         {"wrong-psi": svg_charts.dots(answer, "PSNR, dB", [row["method"] for row in rows], dots)},
     )
@@ -497,16 +500,15 @@ def breaking() -> Section:
     shared = sorted(set.intersection(*({x for x, _ in line} for line in every)))
     middle = [(x, mean(dict(line)[x] for line in every)) for x in shared]
     return Section(
-        "How much does a method bear?",
-        "It follows the scene: a mask that is off costs 3 dB from "
-        f"{shifts[strict]:.2g} pixels on in {strict}, and from {shifts[mild]:.2g} in {mild}.",
-        f"The table says from which strength on a fault costs 3 dB, over {len(every)} light "
-        "fields, 48x64, three shots. Frames are cleaned up before. The thin lines are single light "
-        "fields.",
+        "Which strength of a fault costs 3 dB?",
+        "The strength depends on the scene: a mask shift costs 3 dB from "
+        f"{shifts[strict]:.2g} pixels in {strict}, and from {shifts[mild]:.2g} pixels in {mild}.",
+        f"The table lists the strengths that cost 3 dB, over {len(every)} light fields, 48x64, "
+        "three shots, after frame clean-up. Thin lines are single light fields.",
         ("stability-real-breaking", "stability-real"),
         {
             "mask-shift": svg_charts.lines(
-                "A mask that is off is paid for at once",
+                "Small shifts of the mask already cost accuracy",
                 ("shift of the mask, px", "PSNR, dB"),
                 {f"mean of {len(every)} light fields": middle}, every,
             )
@@ -532,7 +534,7 @@ def calibration() -> Section:
         row["what"].split(":")[0] for row in rows if row["what"].endswith(": true error of Psi")
     ]
     labels = [
-        {"few": "ten whiteboards", "session": "a whole session"}.get(one, one) for one in names
+        {"few": "ten whiteboards", "session": "a whole session"}.get(name, name) for name in names
     ]
     dots = {
         words: [100 * by[f"{name}: {key} error of Psi"] for name in names]
@@ -540,8 +542,8 @@ def calibration() -> Section:
     }
     table = [("calibration method", "true error of Psi")]
     for words, what in (
-        ("parametric: the mask's place, fitted", "Psi, parametric (dust not modelled)"),
-        ("with its defects", "Psi, mixed"),
+        ("parametric: the mask's position, fitted", "Psi, parametric (dust not modelled)"),
+        ("parametric, with the mask's defects", "Psi, mixed"),
         ("free: every coefficient measured", "Psi, free"),
         ("both combined", "Psi, combined"),
     ):
@@ -550,22 +552,23 @@ def calibration() -> Section:
     largest = max(sizes, key=lambda row: number(row, "columns"))
     return Section(
         "How well is Psi measured?",
-        f"To {100 * by['Psi, combined']:.1f} %, from {by['frames']:.0f} frames of a bench with "
-        "offset, turn, dust, vignetting and bad pixels, and the deviation stated is true. At "
-        f"{largest['rows']}x{largest['columns']} pixels it takes {largest['cpu_s']} s and "
+        f"The error of Psi is {100 * by['Psi, combined']:.1f} %, from {by['frames']:.0f} frames of "
+        "a simulated bench with offset, rotation, dust, vignetting and bad pixels, and agrees with "
+        "the stated deviation. "
+        f"{largest['rows']}x{largest['columns']} pixels take {largest['cpu_s']} s and "
         f"{largest['peak_gib']} GiB.",
-        "The two dots of a row should lie on each other: what is stated is what is true. A row is "
-        "one more thing wrong with the bench; the truth is integrated ray by ray.",
+        "Each row is a bench with another fault. The stated and the true error of a row should "
+        "coincide; the true Psi is integrated ray by ray.",
         ("calibration_checks", "calibration-sizes"),
         {
             "calibration": svg_charts.dots(
-                "The stated error of Psi is the true one", "error of Psi, %", labels, dots, 0
+                "The stated error of Psi matches the true error", "error of Psi, %", labels, dots, 0
             )
         },
         table,
         (
-            "Psi, measured on a bench with ordinary faults",
-            f"{100 * by['Psi, combined']:.2f} % error",
+            "Error of Psi, measured on a simulated bench with ordinary faults",
+            f"{100 * by['Psi, combined']:.2f} %",
         ),
     )  # fmt: skip
 
@@ -584,10 +587,11 @@ def mask_design() -> Section:
         table.append((name, row["design"], f"`{row['best_shipped']}`", f"{gain:+.2f} dB"))
     return Section(
         "Which mask to order?",
-        f"Before a monochrome sensor with three shots the designed mask gains {max(gains):.1f} dB "
-        "(shipped since as `rgbw-mono-3shots`); behind Bayer filters the mask hardly counts.",
-        "To the right is better. Mean of the light fields of group B, 96x96, diffraction included, "
-        "equal exposure.",
+        "With a monochrome sensor and three shots, the designed mask gains "
+        f"{max(gains):.1f} dB (shipped since as `rgbw-mono-3shots`); with a Bayer sensor, the mask "
+        "hardly matters.",
+        "Right is better. Mean of the light fields of group B, 96x96, diffraction included, equal "
+        "exposure.",
         ("design",),
         {
             "design": svg_charts.dots(
@@ -603,7 +607,7 @@ def learning() -> Section:
     rows = [*rows_of("group-b-chart"), *rows_of("group-b-unrolled")]
     kept = [row for row in rows if row["camera"] == "scenario-ii-cfa" and row["level"] == "default"]
     by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in kept}
-    scenes = sorted({row["scene"] for row in kept}, key=lambda one: -by[one, "adaptive"])
+    scenes = sorted({row["scene"] for row in kept}, key=lambda scene: -by[scene, "adaptive"])
     dots = {
         words: [by[scene, method] for scene in scenes]
         for words, method in (
@@ -611,14 +615,14 @@ def learning() -> Section:
         )
     }  # fmt: skip
     over, under = (
-        mean(a - b for a, b in zip(dots[one], dots[other], strict=True))
-        for one, other in (("unrolled, a network", "tv"), ("adaptive", "unrolled, a network"))
+        mean(a - b for a, b in zip(dots[better], dots[worse], strict=True))
+        for better, worse in (("unrolled, a network", "tv"), ("adaptive", "unrolled, a network"))
     )
     return Section(
-        "What does training buy?",
+        "What does training gain?",
         f"A small network, trained on random worlds, gains {over:.1f} dB over total "
-        f"variation and stays {under:.1f} dB below `adaptive`, which is trained on nothing.",
-        "To the right is better. Group B, 128x160, one shot. The network is the plug-in "
+        f"variation and stays {under:.1f} dB below `adaptive`, which needs no training data.",
+        "Right is better. Group B, 128x160, one shot. The network is the plug-in "
         "`benchmarks/unrolled_plugin`.",
         ("group-b-chart", "group-b-unrolled"),
         {
@@ -655,13 +659,13 @@ def others() -> Section:
     for capture in captures:
         table.append((capture, level[capture, "adaptive-fast"], level[capture, "tv"]))
     return Section(
-        "Does it work on cameras that others built?",
+        "Does emmc-rig work on captures of other authors?",
         f"{len(captures)} captures of {cameras} cameras: {len(worse)} of {len(by)} results predict "
-        f"readings worse than interpolation, trusted of these: {trusted or 'none'}. A mask some "
-        f"rows off or mirrored is refused in {refused}.",
-        "Readings kept from the fit (validation), 1 is what interpolation without any camera model "
-        "misses them by; to the left is better. Of tsa the published mask is sharper than its "
-        "shadow, and the verdict says so: [cameras that others built](real-captures.md).",
+        f"validation readings worse than interpolation; {trusted or 'none'} of them trusted. "
+        f"Masks shifted by some rows or mirrored: {refused} refused.",
+        "Left is better: the error of validation readings, divided by that of interpolation, which "
+        "uses no camera model. The published mask of tsa is sharper than its shadow, as its "
+        "verdict says: [captures of other authors](real-captures.md).",
         ("real_captures",),
         {
             "others": svg_charts.dots(
@@ -676,7 +680,7 @@ def others() -> Section:
 def large() -> Section:
     """Whole sensors."""
     rows = rows_of("large")
-    table = [("megapixels", "method", "processor time", "for a sample", "memory of a worker")]
+    table = [("megapixels", "method", "processor time", "per sample", "memory per worker")]
     for row in rows:
         samples = number(row, "rows") * number(row, "columns")
         cpu_s = number(row, "cpu_s") + number(row, "survey_cpu_s")
@@ -688,11 +692,11 @@ def large() -> Section:
         )  # fmt: skip
     most = max(rows, key=lambda row: number(row, "megapixels"))
     return Section(
-        "How large may it be?",
-        f"{most['megapixels']} megapixels were reconstructed in {most['blocks']} blocks, each of "
-        f"which needs {most['worker_gib']} GiB.",
+        "How large can a light field be?",
+        f"{most['megapixels']} megapixels were reconstructed in {most['blocks']} blocks of "
+        f"{most['worker_gib']} GiB each.",
         "Time and memory grow with the pixels and the range of disparities; "
-        "[large captures](scale.md) says how to share them out.",
+        "[large captures](scale.md) explains how to distribute them.",
         ("large",),
         {},
         table,
@@ -711,7 +715,8 @@ HEAD = """\
 
 Real light fields come in two groups: settings were tuned on **A**, and results are reported on
 **B**. Accuracy is the {term}`PSNR` of all views, pixels and colours against the true light field.
-Every chart is drawn from the rows below it, by one command; what its run was is at its foot.
+One command draws the charts from the listed files; each section ends with the commands that
+measured them.
 """
 
 
@@ -722,7 +727,7 @@ def table_text(rows: Sequence[Sequence[str]]) -> str:
 
 
 def run_text(file: str, runs: Mapping[str, Row]) -> str:
-    """Return what a CSV is, when it was measured and by which command."""
+    """Return a link to a CSV, with date, version and command of its measurement."""
     run = runs[f"{file}.csv"]
     return (
         f"[{file}.csv](results/{file}.csv): {run['date']}, version {run['version']}, "
