@@ -11,9 +11,9 @@
 
 Functions: `camera`, `scene`, `frames`, `reconstruct`, `reconstruct_film`, `rig`, `capture`,
 `calibrate`, `open_frames`, `open_result`.
-What they return: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. `ERRORS` holds the
-classes of errors that a user can mend; each message is a line with its remedy. A hook that a plan
-calls between frames raises `StopCapture` to end the capture.
+Their results: `Camera`, `Scene`, `Psi`, `Frames`, `Result`, `Session`. `ERRORS` holds the base
+classes of errors with a remedy; each message is a line that states it. A hook, which a plan calls
+between frames, raises `StopCapture` to end the capture.
 """
 
 from __future__ import annotations

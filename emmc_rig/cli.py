@@ -73,7 +73,7 @@ def root(
 
 
 def main() -> None:
-    """Run the program; never shows a traceback for a fault that the user can mend."""
+    """Run the program; an error of `ERRORS` becomes a line without a traceback."""
     try:
         with _warnings_as_notes():
             code = app(standalone_mode=False) or 0

@@ -1,4 +1,4 @@
-"""Errors that a user can mend: each message is a line with the fault and its remedy."""
+"""Errors for the user: each message is a line with the fault and its remedy."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ class StoppedError(AppError):
 
 
 class StopCapture(Exception):  # noqa: N818
-    """Raised by a hook of a plan to end the capture, with the reason; what was taken is kept."""
+    """Raised by a hook of a plan to end the capture, with the reason; frames taken are kept."""
 
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)
-"""The roots of each package's errors: `except emmc_rig.ERRORS` catches what the user can mend."""
+"""The base class of each package's errors: `except emmc_rig.ERRORS` catches every error that is not
+a bug of the program."""

@@ -2,8 +2,8 @@
 From plan to light field
 ========================
 
-The whole bench without a bench: a plan is captured on the simulated rig, whose devices speak the
-real ones' bytes, Psi is measured from its whiteboards, and the light field is reconstructed.
+A whole bench session without hardware: the simulated rig captures a plan over the protocols of real
+devices, Psi is measured from the whiteboards, and the light field is reconstructed.
 """
 
 from pathlib import Path

@@ -2,8 +2,8 @@
 Several scenes on a turntable
 =============================
 
-A plan may have a function called between frames: `between: module:function`. Here it turns a table
-with an axis of its own, so that every shot shows the object from another side.
+A plan can call a function between frames: `between: module:function`. Here the function turns a
+table with an axis of its own, so that every shot shows the object from another side.
 """
 
 from pathlib import Path

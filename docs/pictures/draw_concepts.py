@@ -28,7 +28,7 @@ LENS_X, SENSOR_X, AXIS_Y, CELL = 190, 390, 120, 30
 NEAR, FAR = "#d98200", "#1f6fb5"
 LENS_MM, CELL_MM, SAMPLE_UM = 50.0, 4.0, 24.0
 SHADOW_MM = 0.3
-"""Distance of a mask at which its shadow moves by one sample from a view to the next."""
+"""Distance of a mask whose shadow moves by one sample between neighbouring views."""
 
 Array = NDArray[np.floating]
 
@@ -58,7 +58,7 @@ def raster(x: float, y: float, wide: float, high: float, values: Array) -> Parts
 
 
 def parts_of_lens(x: float, open_at: int | None = None) -> Parts:
-    """Yield the lens with its five parts; of a plate that opens one, the others are shut."""
+    """Yield the lens with its five parts; open_at: the only part that a plate leaves open."""
     yield lens(x, AXIS_Y, 13, 84)
     for part in range(5):
         fill = INK if open_at not in (None, part) else "#fff"
@@ -267,7 +267,7 @@ PICTURES: dict[str, tuple[Callable[[], Parts], int]] = {
     "psi": (psi, 272),
     "whiteboard": (whiteboard, 282),
 }
-"""What draws each picture, and how high it is."""
+"""By picture: the function that draws it, and its height."""
 
 
 def drawn(name: str) -> str:

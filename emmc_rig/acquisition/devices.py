@@ -95,7 +95,7 @@ class Devices:
         self.sent = Sent()
 
     def mend(self, what: Mending) -> None:
-        """Wait, and repair what a fault broke."""
+        """Wait, and repair the devices after a fault."""
         self._rig.clock.sleep(what.wait_s)
         self.sent = Sent()
         if what.reopen_camera and self._rig.reopen_camera is not None:

@@ -77,7 +77,7 @@ def _plane(frame: RawFrame) -> NDArray[np.float32]:
 
 
 class FocusMeter:
-    """The sharpness of frames as they come, against the sharpest of the last minute."""
+    """Measures the sharpness of each frame, relative to the sharpest frame of the last minute."""
 
     def __init__(self) -> None:
         self._before: RawFrame | None = None

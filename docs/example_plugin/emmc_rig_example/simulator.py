@@ -21,7 +21,7 @@ def open_simulated(address: str, settings: StageSettings, clock: Clock) -> HostS
 
 
 class ExampleController(SimulatedController):
-    """One axis that is lost at power-up, until it was homed."""
+    """An axis whose position is unknown after power-up, until it is homed."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__(clock)

@@ -44,15 +44,15 @@ def open_camera(
     black_level_dn: int = 0,
     exposure_s: float = 0.0,
 ) -> "GenTlCamera":
-    """Open a camera of the producer in the file `address`: the first, or that of a serial number.
+    """Open the first camera of the GenTL producer in the file `address`, or the camera `serial`.
 
-    exposure_s: of a camera that has no feature for it. Raises a `DriverError`.
+    exposure_s: of a camera without an exposure feature. Raises a `DriverError`.
     """
     harvester = Harvester()
     try:
         harvester.add_file(address)
         harvester.update()
-        found = [str(one.serial_number) for one in harvester.device_info_list]
+        found = [str(device.serial_number) for device in harvester.device_info_list]
         if not found or (serial and serial not in found):
             there = ", ".join(found) or "none"
             raise DriverError(f"no camera {serial} of {address}", f"those there are: {there}")
@@ -182,7 +182,7 @@ class GenTlCamera:
                 if not buffer.is_complete():
                     raise CaptureError("it did not come whole")
                 component = buffer.payload.components[0]
-                # The buffer goes back to the producer: what is in it must be copied.
+                # The buffer goes back to the producer: its contents must be copied.
                 mosaic = np.array(component.data, dtype=np.uint16)
                 shape = (int(component.height), int(component.width))
         except TimeoutException as error:
