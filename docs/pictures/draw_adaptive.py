@@ -39,7 +39,7 @@ def _map(figure: Figure, axes: Axes, values: Array, unit: str, **how: object) ->
 
 
 def _patches(volume: Volume) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return row and column of the most and of the least decisive patch."""
+    """Return row and column of a patch of median decisiveness, and of the least decisive."""
     finite = np.where(np.isfinite(volume.evidence), volume.evidence, np.nan)
     sure = np.nanmax(finite, axis=-1) - np.nanmean(finite, axis=-1)
     order = np.argsort(sure, axis=None)
