@@ -66,8 +66,8 @@ class Stage(Protocol):
         ...
 
     def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
-        """As `move_to_um`, relative to where the axes read to be."""
-        ...
+        """As `move_to_um`, relative to where the axes read to be; they must be homed too."""
+        return self.move_to_um({a: self.position_um(a) + step for a, step in steps_um.items()})
 
     def position_um(self, axis: str) -> float:
         """Return where the axis reads to be; raises `NotHomedError` while it does not know."""
@@ -100,9 +100,11 @@ class Stage(Protocol):
     def close(self) -> None:
         """Close the ports; nothing is moved or stopped."""
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *exception: object) -> None: ...
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ class Link(Protocol):
         """Close it; closing twice is allowed."""
 
 
-class HostStage(ABC):
+class HostStage(Stage, ABC):
     """The host's side of a stage, over the primitives of one protocol.
 
     No move is ever sent twice: when the answer to one is lost, the position decides whether it
@@ -284,12 +286,6 @@ class HostStage(ABC):
     def axes(self) -> tuple[str, ...]:
         """Names of the axes."""
         return self._axes
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the ports; nothing is moved or stopped."""
@@ -410,11 +406,6 @@ class HostStage(ABC):
             arrived_um = self._travel(reached_um, targets_um)
             self._clock.sleep(self._settings.settle_s)
         return arrived_um
-
-    def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
-        """As `move_to_um`, relative to where the axes read to be; they must be homed too."""
-        start_um = {axis: self.position_um(axis) for axis in self._choose(steps_um)}
-        return self.move_to_um({axis: start_um[axis] + step for axis, step in steps_um.items()})
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """Stop the given axes (all by default) at once, and return when they stand.
