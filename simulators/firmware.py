@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from drivers.clock import Clock
 from simulators.faults import Faults
+from simulators.motion import Motor
 from simulators.wire import MemoryTransport
 
 WIRE_FAULTS = (
@@ -56,6 +57,13 @@ class SimulatedController(ABC):
         self._sent = 0
         self._garbled = 0
         self.fed = 0
+
+    def _stalls(self, motor: Motor) -> bool:
+        """Arm on the motor the faults that strike its next move; return whether it stalls."""
+        if self.faults.strikes("drift", self._command):
+            motor.drift_um = self.drift_um
+        motor.busy_forever |= self.faults.strikes("busy_forever", self._command)
+        return self.faults.strikes("stall", self._command)
 
     def _start_s(self) -> float:
         """Return when a move that was commanded now begins."""
@@ -130,9 +138,7 @@ class SimulatedController(ABC):
     def next_due_s(self) -> float | None:
         """Return when something may next fall due, if anything will."""
         with self._lock:
-            waiting_s = self._outbox[0][0] if self._outbox else None
-            times_s = [one for one in (waiting_s, self._next_event_s()) if one is not None]
-            return min(times_s, default=None)
+            return earliest_s([self._next_event_s(), *(entry[0] for entry in self._outbox[:1])])
 
     def _due(self) -> bytes:
         now_s = self._clock.now_s()
@@ -164,6 +170,11 @@ class SimulatedController(ABC):
         """Take note of the command under way; return whether a fault loses it."""
         self._command = command
         return self.faults.strikes("drop_command", Occasion(command))
+
+
+def earliest_s(times_s: Iterable[float | None]) -> float | None:
+    """Return the earliest of the times that are known, None where none is."""
+    return min((time_s for time_s in times_s if time_s is not None), default=None)
 
 
 def _without_middle(data: bytes) -> bytes:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 from drivers import grbl_codec as codec
 from drivers.clock import Clock
-from simulators.firmware import SimulatedController
+from simulators.firmware import SimulatedController, earliest_s
 from simulators.motion import AxisSpec, End, Motor
 
 LETTERS = "XYZABC"
@@ -228,8 +228,7 @@ class GrblController(SimulatedController):
         self._report_if_asked()
 
     def _next_event_s(self) -> float | None:
-        ends_s = [motor.ends_s for motor in self._motors.values()]
-        return min((one for one in ends_s if one is not None), default=None)
+        return earliest_s(motor.ends_s for motor in self._motors.values())
 
     def _end_block(self, ended_s: float | None) -> None:
         block, self._block = self._block, None

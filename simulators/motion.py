@@ -1,4 +1,4 @@
-"""A motor on a lead screw: where it really is, how it gets there, and what it believes."""
+"""A motor on a lead screw: its true position, its motion, and the position that it counts."""
 
 import math
 from dataclasses import dataclass
@@ -132,14 +132,16 @@ class End(Enum):
 
 
 class Motor:
-    """One motor: its true position, that of its nut, and the position that it counts.
+    """A motor with its true position, the position of its nut, and the counted position.
 
-    `busy_forever`: it says that it moves although it stands.
+    busy_forever: the motor reports motion although it stands. drift_um: a shift that is not
+    counted, at the end of the next move.
     """
 
     def __init__(self, spec: AxisSpec, clock: Clock) -> None:
         self.spec = spec
         self.busy_forever = False
+        self.drift_um = 0.0
         self._clock = clock
         self._motor_um = spec.start_um
         self._nut_um = spec.start_um
@@ -242,4 +244,6 @@ class Motor:
         if now_s < self._course.start_s + self._course.duration_s:
             return None
         self._course = None
+        self.drift(self.drift_um)
+        self.drift_um = 0.0
         return self._end

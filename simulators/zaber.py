@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from drivers.clock import Clock
 from drivers.zaber_codec import DEFAULT_RESOLUTION, FLAG_MEANINGS, SPEED_SCALE, lrc
-from simulators.firmware import SimulatedController
+from simulators.firmware import SimulatedController, earliest_s
 from simulators.motion import AxisSpec, End, Motion, Motor
 
 __all__ = ["BENCH_AXES", "AxisSpec", "Motion", "ZaberChain"]
@@ -54,7 +54,6 @@ class _Axis:
         self.peripheral_id = peripheral_id
         self.flags = {"WR", "WH"}
         self.driver_enabled = True
-        self.drift_um = 0.0
         self.settings = {
             "maxspeed": round(spec.max_speed_um_s / spec.microstep_um * SPEED_SCALE),
             "limit.approach.maxspeed": round(
@@ -79,8 +78,6 @@ class _Axis:
         elif end is End.ARRIVED and self._homing:
             self.motor.count_from_here()
             self.flags -= {"WR", "WH"}
-        self.motor.drift(self.drift_um)
-        self.drift_um = 0.0
         return True
 
     @property
@@ -237,16 +234,16 @@ class ZaberChain(SimulatedController):
     def position_um(self, device: int, axis: int) -> float:
         """Return where the axis really is, whatever its counter says: um from the home switch."""
         with self._lock:
-            one = self._devices[device].axes[axis - 1]
-            one.advance()
-            return one.motor.nut_um
+            found = self._devices[device].axes[axis - 1]
+            found.advance()
+            return found.motor.nut_um
 
     def displace(self, device: int, axis: int, distance_um: float) -> None:
         """Push an axis that stands; its encoder notices."""
         with self._lock:
-            one = self._devices[device].axes[axis - 1]
-            one.motor.drift(distance_um)
-            one.flags.add("WM")
+            found = self._devices[device].axes[axis - 1]
+            found.motor.drift(distance_um)
+            found.flags.add("WM")
 
     def power_cycle(self) -> None:
         """Switch the chain off and on: the axes stay where they are and forget where that is."""
@@ -269,8 +266,8 @@ class ZaberChain(SimulatedController):
                     self._send(_encode("!", text, device))
 
     def _next_event_s(self) -> float | None:
-        ends_s = [axis.motor.ends_s for device in self._devices.values() for axis in device.axes]
-        return min((one for one in ends_s if one is not None), default=None)
+        devices = self._devices.values()
+        return earliest_s(axis.motor.ends_s for device in devices for axis in device.axes)
 
     def _answer(self, line: bytes) -> None:
         self._advance()
@@ -325,7 +322,7 @@ class ZaberChain(SimulatedController):
 
     def _home(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         for axis in axes:
-            axis.home(self._stalls(axis))
+            axis.home(self._stalls(axis.motor))
         return "0"
 
     def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
@@ -350,15 +347,8 @@ class ZaberChain(SimulatedController):
                 axis.stop()
             else:
                 speed = speeds[0] if speeds else None
-                axis.move_abs(target, self._stalls(axis), self._start_s(), speed)
+                axis.move_abs(target, self._stalls(axis.motor), self._start_s(), speed)
         return "0"
-
-    def _stalls(self, axis: _Axis) -> bool:
-        """Arm on the axis the faults that its next move meets; return whether it stalls."""
-        if self.faults.strikes("drift", self._command):
-            axis.drift_um = self.drift_um
-        axis.motor.busy_forever |= self.faults.strikes("busy_forever", self._command)
-        return self.faults.strikes("stall", self._command)
 
     def _stop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         for axis in axes:
@@ -407,7 +397,7 @@ class ZaberChain(SimulatedController):
             ids = [axis.peripheral_id for axis in axes if axis.peripheral_id is not None]
             if not ids:
                 raise _RefusedError("BADCOMMAND")
-            return " ".join(str(one) if setting == "peripheral.id" else "0" for one in ids)
+            return " ".join(str(i) if setting == "peripheral.id" else "0" for i in ids)
         if setting in axes[0].settings:
             return " ".join(str(axis.settings[setting]) for axis in axes)
         whole = device.settings | device.constants
