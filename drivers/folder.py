@@ -11,7 +11,7 @@ from drivers.camera import EXPOSURE_AGREEMENT, CameraIdentity, Limits, check_fra
 from drivers.capture_order import capture_order
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import CameraSettingError, FolderCameraError, RawFrameError
-from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw, exposure_and_time
+from drivers.raw import RawFrame, decode_raw, exposure_and_time, has_raw_suffix
 
 _log = logging.getLogger(__name__)
 
@@ -50,11 +50,7 @@ class FolderCamera:
         self._asked_s: float | None = None
         self._chosen = False
         try:
-            paths = [
-                path
-                for path in self.folder.iterdir()
-                if path.suffix.lower() in RAW_SUFFIXES and path.is_file()
-            ]
+            paths = [p for p in self.folder.iterdir() if has_raw_suffix(p.name) and p.is_file()]
         except OSError as fault:
             raise FolderCameraError(str(folder), f"it cannot be read ({fault.strerror})") from fault
         found = [_recorded(path) for path in paths]

@@ -13,13 +13,13 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import CameraClosedError, CameraSettingError, CaptureError, GphotoError
-from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+from drivers.raw import RawFrame, decode_raw, has_raw_suffix
 
 PTP_IP = "PTP/IP Camera"
 PAIR_LIMIT_S = 2.0
@@ -157,22 +157,22 @@ class GphotoCamera(ShapeFromFrames):
         """
         check_setting("exposure in seconds", exposure_s, self.exposure_limits_s)
         if self._shutters:
-            nearest = min(self._shutters, key=lambda one: abs(one / exposure_s - 1))
-            self._set(SHUTTER, self._shutters[nearest])
+            self._set_nearest(SHUTTER, self._shutters, exposure_s)
 
     def set_gain(self, gain: float) -> None:
         """Choose the gain of the frames that follow: the nearest ISO; raises as the exposure."""
         check_setting("gain", gain, self.gain_limits)
         if self._isos:
-            wanted = gain * min(self._isos)
-            self._set(ISO, self._isos[min(self._isos, key=lambda one: abs(one / wanted - 1))])
+            self._set_nearest(ISO, self._isos, gain * min(self._isos))
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises `GphotoError`, `CaptureError`, `RawFrameError`."""
         with self._lock:
             exposure_s, gain = self.exposure_s, self.gain
             with self._asking("take a picture"):
-                self._forget_events()
+                # Events of an earlier exposure: no file of it may pass for the next.
+                while self._camera.wait_for_event(1)[0] != self._gp.GP_EVENT_TIMEOUT:
+                    pass
                 first = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
                 name, data = self._raw_file(first)
             arrived_s = self._clock.now_s()
@@ -214,10 +214,10 @@ class GphotoCamera(ShapeFromFrames):
         gp, camera = self._gp, self._camera
         paths = [first]
         deadline_s = self._clock.now_s() + PAIR_LIMIT_S
-        while not (raw := [one for one in paths if _is_raw(one.name)]):
+        while not (raw := [path for path in paths if has_raw_suffix(path.name)]):
             left_s = deadline_s - self._clock.now_s()
             if left_s <= 0:
-                names = ", ".join(one.name for one in paths)
+                names = ", ".join(path.name for path in paths)
                 raise CaptureError(
                     f"the camera gave {names}", "set its image quality to RAW, or RAW with JPEG"
                 )
@@ -231,11 +231,6 @@ class GphotoCamera(ShapeFromFrames):
         if self._delete:
             camera.file_delete(path.folder, path.name)
         return path.name, data
-
-    def _forget_events(self) -> None:
-        """Read away what an earlier exposure left, so that no file of it passes for the next."""
-        while self._camera.wait_for_event(1)[0] != self._gp.GP_EVENT_TIMEOUT:
-            pass
 
     def _numbers(self, name: str, number: Any) -> dict[float, str]:
         """Return the choices of a setting that are numbers above 0, {} where it has none."""
@@ -259,6 +254,10 @@ class GphotoCamera(ShapeFromFrames):
                 return self._value(self._camera.get_single_config(name)) or ""
             except self._gp.GPhoto2Error:
                 return ""
+
+    def _set_nearest(self, name: str, words: Mapping[float, str], wanted: float) -> None:
+        nearest = min(words, key=lambda value: abs(value / wanted - 1))
+        self._set(name, words[nearest])
 
     def _set(self, name: str, word: str) -> None:
         """Set a setting; raises `CameraSettingError`."""
@@ -317,7 +316,3 @@ def _loaded(package: Path) -> ctypes.CDLL:
     """Return the libgphoto2 that python-gphoto2 uses: in its wheel, or else the system's."""
     inside = sorted((package / "libgphoto2").glob("libgphoto2.*"))
     return ctypes.CDLL(str(inside[0]) if inside else ctypes.util.find_library("gphoto2"))
-
-
-def _is_raw(name: str) -> bool:
-    return PurePosixPath(name.lower()).suffix in RAW_SUFFIXES

@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 from drivers import grbl_codec as codec
 from drivers.clock import SYSTEM_CLOCK, Clock
@@ -118,12 +119,13 @@ class GrblStage(HostStage):
         super().stop(axes)
 
     def _configure(self) -> None:
-        self._controller = _Controller(self._transport, self._clock, self._mark_all_unknown)
+        mark_all_unknown = partial(self._mark_unknown, self._axes)
+        self._controller = _Controller(self._transport, self._clock, mark_all_unknown)
         self._controller.wait_for_boot()
         self._build = self._controller.command("$I")
         self._options = self._build.get("OPT", "").split(",")[0]
         self._controller.command("$$")
-        self._mark_all_unknown("it was not homed since it was connected")
+        mark_all_unknown("it was not homed since it was connected")
         self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}
         for axis in self._axes:
             self._check_scale(axis)
@@ -238,9 +240,6 @@ class GrblStage(HostStage):
             raise _no_such_axis(axis, "$$", f"${number}={value:g}")
         return value
 
-    def _mark_all_unknown(self, why: str) -> None:
-        self._mark_unknown(self._axes, why)
-
 
 class _Controller:
     """Lines and real-time commands to one Grbl, and what it says by itself.
@@ -286,7 +285,13 @@ class _Controller:
             with self._transport.lock:
                 self._take_waiting()
                 self._transport.write(codec.STATUS_QUERY)
-                status = self._read_status()
+                for _ in turns(self._clock, LINES_TOLERATED):
+                    status = self._read_message()
+                    if isinstance(status, codec.Status):
+                        break
+                    self._note(status)
+                else:
+                    raise GarbledReplyError(b"", "no report among what came")
         except (TransportTimeoutError, GarbledReplyError) as error:
             self._drain()
             self.raise_alarm()
@@ -302,9 +307,9 @@ class _Controller:
         for _ in range(REPORTS_UNTIL_OFFSET):
             status = self.status()
             if status.offset is not None:
-                self._offset_mm = tuple(one * unit for one in status.offset)
+                self._offset_mm = tuple(offset * unit for offset in status.offset)
             if status.machine is not None:
-                return status, tuple(one * unit for one in status.machine)
+                return status, tuple(position * unit for position in status.machine)
             if status.work is not None and self._offset_mm is not None:
                 pairs = zip(status.work, self._offset_mm, strict=False)
                 return status, tuple(work * unit + offset for work, offset in pairs)
@@ -439,14 +444,6 @@ class _Controller:
             self._transport.write(codec.SOFT_RESET)
             self._drain()
         self._alarm, self._restarted = None, False
-
-    def _read_status(self) -> codec.Status:
-        for _ in turns(self._clock, LINES_TOLERATED):
-            message = self._read_message()
-            if isinstance(message, codec.Status):
-                return message
-            self._note(message)
-        raise GarbledReplyError(b"", "no report among what came")
 
     def _drain(self) -> None:
         """Take everything off the wire until nothing comes any more."""

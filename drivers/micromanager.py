@@ -465,10 +465,12 @@ class MicroManagerStage(HostStage):
 
     def identity(self, axis: str) -> StageIdentity:
         """As `HostStage.identity`: adapter and device, and a property that is a serial number."""
-        (label, _), core = self._place(axis), self._loaded.core
+        (label, _), core, serial = self._place(axis), self._loaded.core, ""
         with calling("describe the stage"):
-            names = [n for n in core.getDevicePropertyNames(label) if "serialnumber" in _plain(n)]
-            serial = core.getProperty(label, names[0]) if names else ""
+            for name in core.getDevicePropertyNames(label):
+                if "serialnumber" in "".join(filter(str.isalnum, name)).lower():
+                    serial = core.getProperty(label, name)
+                    break
             return StageIdentity(core.getDeviceLibrary(label), core.getDeviceName(label), serial)
 
     def speed_um_s(self, axis: str) -> float:
@@ -577,11 +579,6 @@ class MicroManagerStage(HostStage):
             if place.endswith(ending):
                 return place.removesuffix(ending), coordinate
         return place, None
-
-
-def _plain(name: str) -> str:
-    """Return a property's name without case, spaces and marks."""
-    return "".join(filter(str.isalnum, name)).lower()
 
 
 def stage_axes(loaded: LoadedCore) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, timezone
+from pathlib import PurePath
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -43,6 +44,12 @@ RAW_SUFFIXES = frozenset(
     )
 )
 """What makers call the RAW files that LibRaw knows."""
+
+
+def has_raw_suffix(name: str) -> bool:
+    """Return whether a file's name is that of a RAW file."""
+    return PurePath(name.lower()).suffix in RAW_SUFFIXES
+
 
 TEXT_TAGS = {"maker": (271, "Make"), "model": (272, "Model"), "serial": (42033, "BodySerialNumber")}
 NUMBER_TAGS = {"iso": (ISO_TAG, "ISOSpeedRatings"), "aperture": (33437, "FNumber")}
@@ -358,9 +365,11 @@ def _read_tiff(file: BinaryIO, magic: bytes) -> _TiffTags:
             exif = tags.valueof(EXIF_TAG)
             exif = exif if isinstance(exif, dict) else {}
             levels = _dng_levels(pages) if DNG_VERSION_TAG in tags else None
+            description = tags.valueof(IMAGE_DESCRIPTION_TAG)
+            names_tile = isinstance(description, str) and description.startswith(CFA_TILE_PREFIX)
             found = _TiffTags(
                 _number(tags, exif, EXPOSURE_TIME_TAG, "ExposureTime"),
-                _tile_name(tags.valueof(IMAGE_DESCRIPTION_TAG)),
+                description.removeprefix(CFA_TILE_PREFIX) if names_tile else None,
                 _metadata(tags, exif),
                 levels,
             )
@@ -369,12 +378,6 @@ def _read_tiff(file: BinaryIO, magic: bytes) -> _TiffTags:
     if missing > 0:
         raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")
     return found
-
-
-def _tile_name(description: object) -> str | None:
-    if isinstance(description, str) and description.startswith(CFA_TILE_PREFIX):
-        return description.removeprefix(CFA_TILE_PREFIX)
-    return None
 
 
 def _metadata(tags: Any, exif: Mapping[str, Any]) -> dict[str, str]:

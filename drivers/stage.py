@@ -502,7 +502,7 @@ class HostStage(Stage, ABC):
             _log.warning("%s: %s", axis, fault)
             return False
 
-    def _send_once(self, axes: Iterable[str], send: Callable[[], None]) -> None:
+    def _send_once(self, axes: Iterable[str], send: Callable[[], object]) -> None:
         """Send a command that must not be repeated; the position shows later if it arrived."""
         try:
             send()

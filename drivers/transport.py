@@ -63,12 +63,13 @@ def repeated(
     what: str,
     recover: Callable[[], None] = lambda: None,
     faults: tuple[type[DriverError], ...] = (TransportTimeoutError, GarbledReplyError),
+    attempts: int = QUERY_ATTEMPTS,
 ) -> _Answer:
     """Return the answer to what may be asked again without harm, after a few attempts if need be.
 
     recover: called between them. Raises the fault of the last.
     """
-    for attempt in range(1, QUERY_ATTEMPTS):
+    for attempt in range(1, attempts):
         try:
             return ask()
         except faults as fault:

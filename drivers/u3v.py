@@ -37,6 +37,7 @@ from drivers.errors import (
 from drivers.genapi import Features
 from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, PixelFormat, image_bytes, unpack
 from drivers.raw import RawFrame, hashed
+from drivers.transport import repeated
 from drivers.u3v_control import U3vControl
 from drivers.u3v_stream import U3vStream
 from drivers.usb import BULK, UsbDevice, open_device
@@ -73,7 +74,8 @@ RAW_SETTINGS = (
 RATE = "AcquisitionFrameRate"
 SHORTEST_S, LONGEST_S = 1e-7, 3600.0
 FRAME_GRACE_S = 2.0
-LOST_IN_A_ROW = 3
+LOST = (CaptureError,)
+"""Of a stream: such frames are passed over, unless three are lost in a row."""
 IN_FLIGHT = 3
 """Frames that a camera may have begun before a new setting counts."""
 
@@ -178,7 +180,8 @@ class U3vCamera:
         last_block: int | None = None
         with self._acquisition("Continuous"):
             while True:
-                frame = self._decode(self._receive_whole())
+                raw = repeated(self._receive, f"{self._device.name} to stream", faults=LOST)
+                frame = self._decode(raw)
                 block = int(frame.metadata["block_id"])
                 lost = 0 if last_block is None else max(0, block - last_block - 1)
                 last_block = block
@@ -270,16 +273,6 @@ class U3vCamera:
 
     def _receive(self) -> bytes:
         return self._stream.receive(max(self.exposure_s, self._period_s) + FRAME_GRACE_S)
-
-    def _receive_whole(self) -> bytes:
-        for attempt in range(1, LOST_IN_A_ROW + 1):
-            try:
-                return self._receive()
-            except CaptureError as error:
-                if attempt == LOST_IN_A_ROW:
-                    raise
-                _log.warning("%s: %s", self._device.name, error)
-        raise AssertionError("unreachable")
 
     def _decode(self, original: bytes) -> RawFrame:
         host_time_s = self._clock.now_s()
@@ -434,7 +427,7 @@ def read_description(control: U3vControl) -> bytes:
     ]
     if not usable:
         raise CameraDescriptionError("its manifest table names no XML")
-    entry = max(usable, key=lambda one: one.version)
+    entry = max(usable, key=lambda entry: entry.version)
     if not 0 < entry.size <= XML_LIMIT:
         raise CameraDescriptionError(f"its XML is {entry.size} bytes long")
     data = control.read(entry.address, entry.size)

@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle
 from typing import Any
 
@@ -166,11 +167,8 @@ class ZaberStage(HostStage):
     def _start_moves(self, targets_um: Mapping[str, float], start_um: Mapping[str, float]) -> None:
         for axis, target_um in targets_um.items():
             target = round(target_um / self._microstep_um[axis])
-            self._send_once((axis,), lambda axis=axis, target=target: self._move(axis, target))
-
-    def _move(self, axis: str, target: int) -> None:
-        device, number = self._addresses[axis]
-        self._chain.ask(device, number, f"move abs {target}", axis)
+            command = (*self._addresses[axis], f"move abs {target}", axis)
+            self._send_once((axis,), partial(self._chain.ask, *command))
 
     def _stop_axis(self, axis: str) -> None:
         self._query(axis, "stop")

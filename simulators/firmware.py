@@ -40,7 +40,8 @@ class SimulatedController(ABC):
     sends it twice, `unplug` pulls the cable at the next byte from the host. `stall` blocks the
     next move half way, `drift` shifts the axis by `drift_um` unnoticed at the end of the next
     move, after `busy_forever` an axis says for ever that it moves, `slow_start` lets the next move
-    begin `slow_by_s` after its command. `fed` counts how often the host wrote.
+    begin `slow_by_s` after its command. `fed` counts the writes of the host, `plugs` how often the
+    cable was plugged in: a port opened before the last time is dead.
     """
 
     def __init__(self, clock: Clock, faults: Iterable[str] = ()) -> None:
@@ -50,8 +51,8 @@ class SimulatedController(ABC):
         self.slow_by_s = 0.2
         self._clock = clock
         self._lock = threading.RLock()
-        self._plugged = True
-        self._plugs = 1
+        self.unplugged = False
+        self.plugs = 1
         self._command = b""
         self._outbox: list[tuple[float, int, bytes]] = []
         self._sent = 0
@@ -80,7 +81,7 @@ class SimulatedController(ABC):
 
     @abstractmethod
     def _advance(self) -> None:
-        """Advance to the time of the clock; what it says by itself it says with `_send`."""
+        """Advance to the time of the clock; messages that nobody asked for go out by `_send`."""
 
     @abstractmethod
     def _next_event_s(self) -> float | None:
@@ -90,26 +91,16 @@ class SimulatedController(ABC):
         """Return a wire in memory that ends in this firmware."""
         return MemoryTransport(self, self._clock, timeout_s)
 
-    @property
-    def unplugged(self) -> bool:
-        """Whether the cable has been pulled."""
-        return not self._plugged
-
-    @property
-    def plugs(self) -> int:
-        """How often the cable has been plugged in; a port opened before the last is dead."""
-        return self._plugs
-
     def unplug(self) -> None:
         """Pull the cable of the port; the power stays on."""
         with self._lock:
-            self._plugged = False
+            self.unplugged = True
 
     def replug(self, power_lost: bool = False) -> None:
         """Plug the cable in again, after a loss of power too if `power_lost`."""
         with self._lock:
-            self._plugged = True
-            self._plugs += 1
+            self.unplugged = False
+            self.plugs += 1
             self._outbox.clear()
             if power_lost:
                 self.power_cycle()
@@ -117,8 +108,8 @@ class SimulatedController(ABC):
     def feed(self, data: bytes) -> bytes:
         """Take bytes from the host; return those that fell due for the host by now."""
         with self._lock:
-            if not self._plugged or self.faults.strikes("unplug", Occasion(data)):
-                self._plugged = False
+            if self.unplugged or self.faults.strikes("unplug", Occasion(data)):
+                self.unplugged = True
                 return b""
             if self.faults.strikes("lose_command_byte", Occasion(data)):
                 data = _without_middle(data)
@@ -130,7 +121,7 @@ class SimulatedController(ABC):
     def due(self) -> bytes:
         """Return the bytes that fell due for the host by now."""
         with self._lock:
-            if not self._plugged:
+            if self.unplugged:
                 return b""
             self._advance()
             return self._due()

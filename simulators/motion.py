@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import cached_property
-from typing import Protocol
 
 from drivers.clock import Clock
 
@@ -23,28 +22,6 @@ class AxisSpec:
     acceleration_um_s2: float = 200_000.0
     start_um: float = 3_210.0
     backlash_um: float = 3.0
-
-
-class Course(Protocol):
-    """A motion along one axis from a time on."""
-
-    @property
-    def start_s(self) -> float:
-        """When it begins."""
-        ...
-
-    @property
-    def duration_s(self) -> float:
-        """Time until it stands."""
-        ...
-
-    def position_um(self, now_s: float) -> float:
-        """Return where the motor is."""
-        ...
-
-    def velocity_um_s(self, now_s: float) -> float:
-        """Return how fast it goes, negative downwards."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -122,6 +99,9 @@ class Braking:
         return math.copysign(speed_um_s, self.initial_um_s)
 
 
+Course = Motion | Braking
+
+
 class End(Enum):
     """How a motion ended."""
 
@@ -134,6 +114,7 @@ class End(Enum):
 class Motor:
     """A motor with its true position, the position of its nut, and the counted position.
 
+    true_um, nut_um: of the motor, and of the nut with its load, at the last `advance`.
     busy_forever: the motor reports motion although it stands. drift_um: a shift that is not
     counted, at the end of the next move.
     """
@@ -143,8 +124,8 @@ class Motor:
         self.busy_forever = False
         self.drift_um = 0.0
         self._clock = clock
-        self._motor_um = spec.start_um
-        self._nut_um = spec.start_um
+        self.true_um = spec.start_um
+        self.nut_um = spec.start_um
         self._counted_from_um = spec.start_um
         self._course: Course | None = None
         self._end = End.ARRIVED
@@ -156,19 +137,9 @@ class Motor:
         return begun or self.busy_forever
 
     @property
-    def nut_um(self) -> float:
-        """Where the nut, and what it carries, really is."""
-        return self._nut_um
-
-    @property
-    def true_um(self) -> float:
-        """Where the motor really is, as of the last `advance`."""
-        return self._motor_um
-
-    @property
     def counted_um(self) -> float:
         """Where the motor believes to be, as of the last `advance`."""
-        return self._motor_um - self._counted_from_um
+        return self.true_um - self._counted_from_um
 
     @property
     def ends_s(self) -> float | None:
@@ -192,10 +163,10 @@ class Motor:
         end_um = min(max(wanted_um, 0.0), self.spec.travel_um)
         self._end = End.ARRIVED if abs(end_um - wanted_um) < 1e-6 else End.AT_END_OF_TRAVEL
         if stalls:
-            end_um = (self._motor_um + end_um) / 2
+            end_um = (self.true_um + end_um) / 2
             self._end = End.STALLED
         start_s = self._clock.now_s() if start_s is None else start_s
-        self._course = Motion(self._motor_um, end_um, start_s, speed_um_s, acceleration_um_s2)
+        self._course = Motion(self.true_um, end_um, start_s, speed_um_s, acceleration_um_s2)
 
     def seek(
         self,
@@ -215,7 +186,7 @@ class Motor:
             return
         now_s = self._clock.now_s()
         self._course = Braking(
-            self._motor_um, self._course.velocity_um_s(now_s), now_s, acceleration_um_s2
+            self.true_um, self._course.velocity_um_s(now_s), now_s, acceleration_um_s2
         )
         self._end = End.BRAKED
 
@@ -225,12 +196,12 @@ class Motor:
 
     def count_from_here(self, counted_um: float = 0.0) -> None:
         """Believe from now on to be at this position."""
-        self._counted_from_um = self._motor_um - counted_um
+        self._counted_from_um = self.true_um - counted_um
 
     def drift(self, distance_um: float) -> None:
         """Move without counting it."""
-        self._motor_um += distance_um
-        self._nut_um += distance_um
+        self.true_um += distance_um
+        self.nut_um += distance_um
         self._counted_from_um += distance_um
 
     def advance(self) -> End | None:
@@ -238,9 +209,9 @@ class Motor:
         if self._course is None:
             return None
         now_s = self._clock.now_s()
-        self._motor_um = self._course.position_um(now_s)
-        highest_um = self._motor_um + self.spec.backlash_um
-        self._nut_um = min(max(self._nut_um, self._motor_um), highest_um)
+        self.true_um = self._course.position_um(now_s)
+        highest_um = self.true_um + self.spec.backlash_um
+        self.nut_um = min(max(self.nut_um, self.true_um), highest_um)
         if now_s < self._course.start_s + self._course.duration_s:
             return None
         self._course = None

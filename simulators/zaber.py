@@ -301,35 +301,31 @@ class ZaberChain(SimulatedController):
             if axis_number:
                 axes = [device.axes[axis_number - 1]]
             name = words[0] if words else ""
-            if name not in self._commands:
-                raise self._not_modelled(words)
-            data = self._commands[name](self, device, axes, axis_number, words[1:])
+            if act := self._simple.get(name):
+                for axis in axes:
+                    act(axis)
+                data = None
+            elif name in self._commands:
+                data = self._commands[name](self, device, axes, axis_number, words[1:])
+            else:
+                raise _not_modelled(words)
             outcome = "OK"
         except _RefusedError as refusal:
             outcome, data = "RJ", str(refusal)
         status = "BUSY" if any(axis.busy for axis in axes) else "IDLE"
         label = "" if message_id is None else f"{message_id:02d} "
-        text = f"{address:02d} {axis_number} {label}{outcome} {status} {_flag(axes)} {data}"
+        text = f"{address:02d} {axis_number} {label}{outcome} {status} {_flag(axes)} {data or '0'}"
         return _encode("@", text, device)
 
-    def _not_modelled(self, words: list[str]) -> _RefusedError:
-        """Return the refusal of a command, having logged that it may exist on a real device."""
-        _log.warning("not modelled, refused: %s", " ".join(words))
-        return _RefusedError("BADCOMMAND")
-
-    def _poll(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        return "0"
-
-    def _home(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _home(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         for axis in axes:
             axis.home(self._stalls(axis.motor))
-        return "0"
 
-    def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         """`move abs|rel DISTANCE [SPEED]`, `move vel SPEED`, `move min|max [SPEED]`."""
         kind, *numbers = words or [""]
         if kind not in MOVE_NUMBERS:
-            raise self._not_modelled(["move", *words])
+            raise _not_modelled(["move", *words])
         fewest, most = MOVE_NUMBERS[kind]
         if not fewest <= len(numbers) <= most:
             raise _RefusedError("BADCOMMAND")
@@ -348,35 +344,22 @@ class ZaberChain(SimulatedController):
             else:
                 speed = speeds[0] if speeds else None
                 axis.move_abs(target, self._stalls(axis.motor), self._start_s(), speed)
-        return "0"
 
-    def _stop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        for axis in axes:
-            axis.stop()
-        return "0"
-
-    def _estop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        for axis in axes:
-            axis.halt()
-        return "0"
-
-    def _system(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _system(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         if words != ["reset"]:
-            raise self._not_modelled(["system", *words])
+            raise _not_modelled(["system", *words])
         if number:
             raise _RefusedError("DEVICEONLY")
         for axis in device.axes:
             axis.advance()
             axis.motor.halt()
         device.axes = [axis.restarted() for axis in device.axes]
-        return "0"
 
-    def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         if words != ["enable"]:
             raise _RefusedError("BADCOMMAND")
         for axis in axes:
             axis.enable()
-        return "0"
 
     def _warnings(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         flags = _flags(axes)
@@ -384,7 +367,7 @@ class ZaberChain(SimulatedController):
             for axis in axes:
                 axis.clear_warnings()
         elif words:
-            raise self._not_modelled(["warnings", *words])
+            raise _not_modelled(["warnings", *words])
         return " ".join([f"{len(flags):02d}", *flags])
 
     def _get(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
@@ -402,12 +385,12 @@ class ZaberChain(SimulatedController):
             return " ".join(str(axis.settings[setting]) for axis in axes)
         whole = device.settings | device.constants
         if setting not in whole:
-            raise self._not_modelled(["get", setting])
+            raise _not_modelled(["get", setting])
         if number:
             raise _RefusedError("DEVICEONLY")
         return str(whole[setting])
 
-    def _set(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _set(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         if len(words) != 2:
             raise _RefusedError("BADCOMMAND")
         setting, value = words[0], _integer(words[1])
@@ -422,27 +405,35 @@ class ZaberChain(SimulatedController):
                     raise _RefusedError("BADDATA")
                 axis.settings[setting] = value
         elif setting not in device.settings:
-            raise self._not_modelled(["set", *words])
+            raise _not_modelled(["set", *words])
         elif number:
             raise _RefusedError("DEVICEONLY")
         elif value not in (0, 1):
             raise _RefusedError("BADDATA")
         else:
             device.settings[setting] = value
-        return "0"
 
-    _commands: Mapping[str, Callable[..., str]] = {
-        "": _poll,
+    _simple: Mapping[str, Callable[[_Axis], None]] = {
+        "": lambda axis: None,
+        "stop": _Axis.stop,
+        "estop": _Axis.halt,
+    }
+    """Commands that ask the same of every axis, whatever follows them."""
+    _commands: Mapping[str, Callable[..., str | None]] = {
         "home": _home,
         "move": _move,
-        "stop": _stop,
-        "estop": _estop,
         "system": _system,
         "driver": _driver,
         "warnings": _warnings,
         "get": _get,
         "set": _set,
     }
+
+
+def _not_modelled(words: list[str]) -> _RefusedError:
+    """Return the refusal of a command, having logged that it may exist on a real device."""
+    _log.warning("not modelled, refused: %s", " ".join(words))
+    return _RefusedError("BADCOMMAND")
 
 
 def _parse(body: str) -> tuple[int, int, int | None, list[str]]:
