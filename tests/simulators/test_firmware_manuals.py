@@ -184,7 +184,8 @@ def test_a_zaber_homes_at_its_approach_speed(zaber):
     ("kind", "place"),
     [
         ("abs 5000", 5000), ("rel 700", 1700), ("rel -300", 700), ("min", 0), ("max", 200_000),
-        ("vel -50000", 0), ("abs 5000 40000", 5000),
+        ("vel -50000", 0), ("vel 200000", 200_000), ("abs 5000 40000", 5000),
+        ("max 100000", 200_000),
     ],
 )  # fmt: skip
 def test_each_kind_of_zaber_move_ends_where_the_manual_says(homed_zaber, kind, place):
@@ -209,6 +210,9 @@ def test_zaber_flags_are_listed_by_severity_and_raised_by_what_the_manual_says(h
     assert homed_zaber.data("1 1 11 warnings") == "03 FS WM WR"
     homed_zaber.device.power_cycle()
     assert homed_zaber.data("1 1 12 warnings") == "02 WR WH"
+    homed_zaber.ask("1 0 13 home", after_s=60.0)
+    assert homed_zaber.data("1 0 14 system reset") == "0"
+    assert homed_zaber.data("1 1 15 warnings") == "02 WR WH"
 
 
 def test_a_zaber_without_its_driver_moves_only_once_that_is_enabled(homed_zaber):
@@ -230,12 +234,23 @@ def test_a_finer_zaber_resolution_scales_places_and_settings(homed_zaber):
     # `maxspeed` ends at 16384 times the resolution.
     assert homed_zaber.data("1 1 7 set maxspeed 2097152") == "0"
     assert homed_zaber.data("1 1 8 set maxspeed 2097153") == "BADDATA"
+    for move in ("move vel", "move abs 10"):
+        assert homed_zaber.data(f"1 1 9 {move} 2097153") == "BADDATA"
+        assert homed_zaber.data(f"1 1 10 {move} 2097152") == "0"
 
 
 def test_a_zaber_that_may_sends_an_alert_when_a_move_ends(homed_zaber):
     homed_zaber.ask("1 0 1 set comm.alert 1")
     said = homed_zaber(b"/" + checked(b"1 1 2 move rel 400") + b"\n", after_s=10.0)
     assert said.splitlines()[-1] == b"!" + checked(b"01 1 IDLE --")
+
+
+def test_what_is_not_modelled_is_refused_and_logged(zaber, apt, caplog):
+    for command in ("servo 1 get", "get knob.mode"):
+        assert zaber.data(f"1 1 1 {command}") == "BADCOMMAND"
+        assert f"not modelled, refused: {command}" in caplog.text
+    assert apt(short(0x0500)) == b""
+    assert "not modelled, passed over: message 0x0500" in caplog.text
 
 
 def test_a_zaber_without_checksums_leaves_them_out(zaber):
@@ -400,6 +415,12 @@ def test_apt_updates_come_ten_times_a_second_and_end_without_acknowledgement(apt
     apt(short(0x0492))
     assert apt(b"", after_s=20.0).count(bytes.fromhex("91 04 0e 00")) == 50
     assert apt(b"", after_s=5.0) == b""
+
+
+def test_apt_keeps_the_limit_switches_that_it_is_sent(apt):
+    limits = struct.pack("<HHHIIH", 1, 3, 1, 10, 20, 2)
+    apt(long(0x0423, limits))
+    assert apt(short(0x0424, 1)) == long(0x0425, limits, HOST, UNIT)
 
 
 @pytest.mark.parametrize(
@@ -601,8 +622,39 @@ def test_a_grbl_axis_homes_downwards_where_its_bit_says(grbl):
     ]  # fmt: skip
 
 
+@pytest.fixture
+def free_grbl():
+    return Grbl(settings={20: 0, 21: 0, 22: 0})
+
+
+def test_grbl_loses_the_bytes_that_its_receive_buffer_cannot_hold(free_grbl):
+    lines = [b"G1 F60 X-%d\n" % number for number in range(1, 40)]
+    answered = free_grbl(b"".join(lines)).count(b"ok")
+    unanswered = sum(len(line) for line in lines[answered:])
+    # RX_BUFFER_SIZE of Grbl 1.1's serial.h: ends of lines are held as well.
+    assert unanswered - free_grbl.device.lost_bytes == 128
+    assert answered < len(lines)
+
+
+def test_grbl_counted_by_answers_loses_nothing(free_grbl):
+    for number in range(1, 20):
+        assert free_grbl.say(f"G1 F6000 X-{number}", after_s=1.0) == ["ok"]
+    assert free_grbl.device.lost_bytes == 0
+
+
+def test_check_mode_parses_and_moves_nothing_and_sleep_wants_a_reset(free_grbl):
+    assert free_grbl.say("$C") == ["[MSG:Enabled]", "ok"]
+    assert free_grbl.say("G1 F600 X-5", after_s=2.0) == ["ok"]
+    assert free_grbl.say("G2 X1 Y1 I1") == ["error:20"]
+    assert len(set(free_grbl.place())) == 1
+    assert "Grbl 1.1h" in str(free_grbl.say("$C"))
+    assert "[MSG:Sleeping]" in free_grbl.say("$SLP")
+    assert free_grbl.say("G1 F600 X-5") == ["error:9"]
+    assert b"Grbl 1.1h" in free_grbl(b"\x18")
+
+
 def test_a_hold_of_grbl_ends_in_hold_0_and_is_taken_up_by_a_tilde(grbl):
-    grbl.say("G91 G1 F300 X-50", after_s=1.0)
+    grbl.say("G91 G1 F300 X-40\nG1 X-10", after_s=1.0)
     assert re.match(r"<Run\|.*\|FS:300,0", grbl.report())
     assert grbl(b"!?").decode().startswith("<Hold:1|")
     grbl.clock.sleep(5.0)
