@@ -308,12 +308,7 @@ class Bench:
         if callable(scene):
             scene = scene(0.0)
         finer = (scene.shape[0] // views[0], scene.shape[2] // size[0])
-        expected = (
-            views[0] * finer[0],
-            views[1] * finer[0],
-            size[0] * finer[1],
-            size[1] * finer[1],
-        )
+        expected = (*(count * finer[0] for count in views), *(count * finer[1] for count in size))
         if scene.shape != (*expected, 3):
             raise ValueError(f"a scene of shape {scene.shape} is no finer grid of {views} x {size}")
         self.lamp = "off"
@@ -540,9 +535,5 @@ class Bench:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
         cell_um = self.camera.lens.aperture_cell_um
         window_half_um = window_side_um(self.camera.views, cell_um) / 2
-        return np.array(
-            [
-                (x_um, y_um, cell_um / 2),
-                (x_um - self.window_um, y_um, window_half_um),
-            ]
-        )
+        window_um = (x_um - self.window_um, y_um, window_half_um)
+        return np.array([(x_um, y_um, cell_um / 2), window_um])

@@ -141,7 +141,7 @@ class EosCameraSimulator(PtpCameraSimulator):
         elif code == EosOperation.RELEASE_ON:
             pressed, self._button = self._button, self._button | arguments[0]
             if pressed == 1 and self._button == 3:
-                return Answer(self._capture(arguments, b"", transaction).code)
+                return Answer(self._initiate_capture(arguments, b"", transaction).code)
         elif code == EosOperation.RELEASE_OFF:
             self._button &= ~arguments[0]
         return Answer()
