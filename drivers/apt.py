@@ -60,12 +60,12 @@ ACTUATORS = {
     "z825b": Actuator(34.55496, 25_000.0, 2_600.0),
 }
 """By stage: counts per millimetre from "Scaling parameters" of the protocol document, travel and
-maximum velocity from the data sheets. No controller reports which one is plugged in."""
+maximum velocity from the data sheets. No controller reports the model of its stage."""
 
 
 @dataclass(frozen=True)
 class AptAxis:
-    """One channel: the port it is on, its address there, and what it drives.
+    """A motor channel: serial port, address on the port, and actuator.
 
     `destination` is 0x50 for a unit on USB, 0x21 upwards for the bays of a rack.
     """
@@ -227,7 +227,7 @@ class AptStage(HostStage):
 
 
 class _Link:
-    """Messages on one port; unexpected ones are kept until they are requested."""
+    """Messages on one port; unexpected messages are kept until they are requested."""
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self.transport = transport

@@ -1,4 +1,4 @@
-"""Several stages as one: each axis is that of the stage which has it."""
+"""Several stages combined: a command to an axis goes to the stage with that axis."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack

@@ -35,9 +35,9 @@ ADVICE = {
     -1: "look at the camera's display; without a memory card, set capturetarget: Internal RAM",
     -7: "check cable and power; switch the camera off and on",
     -10: "check cable and power; switch the camera off and on",
-    -52: "plug it in and switch it on",
+    -52: "plug it in, then switch the camera on",
     -53: "another program has the camera, often the desktop's file manager: eject it there",
-    -105: "plug it in and switch it on; or name its model as gphoto2 --list-cameras does",
+    -105: "plug it in, then switch the camera on; or name its model as gphoto2 --list-cameras does",
     -110: "wait until it is ready",
 }
 
@@ -196,7 +196,7 @@ class GphotoCamera(ShapeFromFrames):
                     self._camera.exit()
 
     def _choose(self, address: str, model: str) -> None:
-        """Tell libgphoto2 which camera it is; one with no address is looked for by itself."""
+        """Pass model and port to libgphoto2, which searches for a camera without an address."""
         gp = self._gp
         if address.startswith("ptpip:"):
             model = model or PTP_IP
@@ -238,7 +238,7 @@ class GphotoCamera(ShapeFromFrames):
         return {value: word for value, word in found.items() if value}
 
     def _choices(self, name: str) -> list[str]:
-        """Return the words that a setting may be set to, [] where it has none."""
+        """Return the choices of a setting as words, [] for a setting without choices."""
         with self._lock, suppress(self._gp.GPhoto2Error):
             widget = self._camera.get_single_config(name)
             if widget is not None and not widget.get_readonly():
@@ -283,7 +283,7 @@ class GphotoCamera(ShapeFromFrames):
                     yield child.get_name(), value
 
     def _value(self, widget: Any) -> str | None:
-        """Return a setting's value; None for no setting, or one that was given no value.
+        """Return a setting's value; None for a missing setting, or a setting without a value.
 
         A camera whose value is none of its own choices leaves the setting without, and
         python-gphoto2 2.6 ends the process when it is asked for a word that is not there.

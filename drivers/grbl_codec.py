@@ -69,7 +69,7 @@ _OLD_STATUS = re.compile(r"<[A-Z][a-z]+,[MW]Pos:.*>")
 
 @dataclass(frozen=True)
 class Ok:
-    """The line was accepted; what it started may go on."""
+    """The line was accepted; a motion that it started may go on."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def jog(targets_mm: Mapping[str, float], feed_mm_min: float) -> str:
 def decode_line(line: bytes) -> Message | None:
     """Return the message in one line, its line end included.
 
-    None for an empty line, and for one that Grbl ran by itself when it started. Raises
+    None for an empty line, and for a startup line that Grbl ran at boot. Raises
     `GarbledReplyError`, and `FirmwareError` for a report of Grbl 0.9 or older.
     """
     if not line.endswith(b"\n") or b"\n" in line[:-1]:

@@ -177,4 +177,4 @@ KERNELS: dict[tuple[int, int, str], tuple[int, int, Kernel]] = {
     (10, 10, "p"): (5, 4, low_first(10)),
     (12, 10, "Packed"): (3, 2, high_and_low(10)),
 }
-"""By bits stored, bits of light and packing: bytes and pixels of one group, and what unpacks it."""
+"""By bits stored, bits of light and packing: bytes and pixels of a group, and its kernel."""

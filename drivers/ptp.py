@@ -91,7 +91,7 @@ class PtpSettings:
 
 
 class PtpSession:
-    """An open session with a camera; `info` is what it said of itself.
+    """An open session with a camera, whose DeviceInfo is `info`.
 
     An exchange that breaks off, Ctrl-C included, is cleared away before the next one. Any thread
     may call; `lock` is held for one exchange, and by a camera for a whole capture.
@@ -193,7 +193,7 @@ class PtpSession:
         self.request(Operation.DELETE_OBJECT, handle, 0)
 
     def describe(self, code: int) -> codec.PropertyDescription | None:
-        """Return what a property is and may become, None where the camera has none such."""
+        """Return a property's type, value and choices, None where the camera lacks it."""
         if code not in self.info.properties:
             return None
         return codec.decode_description(self.fetch(Operation.GET_PROPERTY_DESCRIPTION, code))
@@ -215,7 +215,7 @@ class PtpSession:
         """Release the shutter and return the first new object that is accepted.
 
         Folders are passed over. An event that never comes is made up for by looking at the card.
-        `all_of_it`: wait until the camera says that it is done, for the other files of the same
+        `all_of_it`: wait for the camera's CaptureComplete, and so for the other files of the same
         exposure. Raises `CaptureError`, `CardFullError`, or as `request` does.
         """
         with self.lock:

@@ -160,7 +160,7 @@ class PtpUsb:
         raise CameraBusyError("for its status", STATUS_POLLS * STATUS_POLL_S)
 
     def _unhalt(self, pipe: UsbPipe) -> None:
-        """Clear the endpoint's halt if it has one: clearing one that has none upsets cameras."""
+        """Clear a halted endpoint; a needless CLEAR_FEATURE upsets cameras."""
         try:
             status = self._device.control(
                 ENDPOINT_STATUS_IN, GET_STATUS, index=pipe.address, data=2

@@ -57,7 +57,7 @@ TIME_TAGS = (
     ((36867, "DateTimeOriginal"), (37521, "SubsecTimeOriginal"), (36881, "OffsetTimeOriginal")),
     ((306, "DateTime"), (37520, "SubsecTime"), (36880, "OffsetTime")),
 )
-"""Code and tifffile's name of what a frame's metadata take from the file, where it has it."""
+"""Code and tifffile's name of the tags that a frame's metadata copy from the file."""
 EXIF_TIME = "%Y:%m:%d %H:%M:%S"
 
 DNG_VERSION_TAG, ACTIVE_AREA_TAG = 50706, 50829
@@ -155,13 +155,13 @@ class RawFrame:
 
 
 def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
-    """Return the frame in the bytes of a RAW file: DNG, or any other that LibRaw knows.
+    """Return the frame in the bytes of a RAW file: DNG, or another format of LibRaw's.
 
-    Raises `RawFrameError` for bytes that are no RAW file, that are torn, or too few for their
-    picture, or a mosaic whose `(y, x)` is not `expected_shape`. LibRaw reports most damage, but
-    fills what is missing of a plain DNG, of an empty tile or of a Panasonic's RW2 with zeros: the
-    table of contents of a TIFF-based file (DNG, NEF, CR2, RW2, ORF, ...) is checked first. A
-    flipped bit that still decodes cannot be distinguished from light: keep `sha256`.
+    Raises `RawFrameError` for bytes that are no RAW file, for torn files and files too short for
+    their picture, and for a mosaic `(y, x)` of another shape than `expected_shape`. LibRaw reports
+    most damage, but fills missing pixels of a plain DNG, of an empty tile or of a Panasonic's RW2
+    with zeros: the table of contents of a TIFF-based file (DNG, NEF, CR2, RW2, ORF, ...) is checked
+    first. A flipped bit that still decodes cannot be distinguished from light: keep `sha256`.
     """
     if not data:
         raise RawFrameError("it is empty")
@@ -454,7 +454,7 @@ def _dng_levels(pages: Sequence[Any]) -> _DngLevels | None:
 
 
 def _numbers(tag: Any) -> Array | None:
-    """Return the numbers in a tag, float64; None without a tag, or where they are not finite."""
+    """Return the numbers in a tag, float64; None for a missing tag or numbers not finite."""
     if tag is None or isinstance(tag.value, str | bytes):
         return None
     found = np.atleast_1d(np.asarray(tag.value, np.float64))

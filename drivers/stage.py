@@ -150,7 +150,7 @@ DEFAULT_SETTINGS = StageSettings()
 
 
 class Reading(NamedTuple):
-    """What an axis says of itself: where it is, whether it knows that from homing, and moves."""
+    """An axis's report: its position, whether homing gave the reference, and whether it moves."""
 
     position_um: float
     homed: bool
@@ -312,7 +312,7 @@ class HostStage(Stage, ABC):
         return StageIdentity()
 
     def temperatures_c(self) -> dict[str, float]:
-        """Return the temperatures that the controllers tell, by what they are of."""
+        """Return the controllers' temperatures, by the name of the sensor's place."""
         return {}
 
     def is_homed(self, axis: str) -> bool:

@@ -1,4 +1,4 @@
-"""USB3 Vision cameras: one that names exposure, gain and pixels as GenICam does, and its frames.
+"""USB3 Vision cameras with GenICam's names for exposure, gain and pixels, and their frames.
 
 A recorded frame (`RawFrame.original`) is the camera's leader, payload and trailer in a row, as they
 came; `decode_frame` reads it again. Source: USB3 Vision 1.0; EMVA Standard Features Naming
@@ -91,8 +91,8 @@ def open_camera(address: str, clock: Clock, backend: Any = None) -> U3vCamera:
 class U3vCamera:
     """A `drivers.camera.StreamingCamera` over an open USB device, which it closes.
 
-    Pixels come in the deepest format that it offers and we can read. The black level is what its
-    `BlackLevel` says, taken as DN, or as per cent of white where that is its unit.
+    Pixels come in the deepest format that it offers and we can read. The black level is the feature
+    `BlackLevel` in DN, or in per cent of white if its unit is %.
     The constructor switches automatic and processed modes off and stops an acquisition that was
     left running. Raises a `DriverError`, the device closed.
     """
@@ -174,7 +174,7 @@ class U3vCamera:
 
         `metadata["frames_lost"]` counts the frames missing right before this one, by the camera's
         numbers. Frames that come torn are passed over; three in a row raise `CaptureError`.
-        Exposure and gain are None for frames that may have begun before a change of them.
+        Exposure and gain are None for frames that may have begun before a change of a setting.
         """
         self._in_flight = 0
         last_block: int | None = None
@@ -373,8 +373,8 @@ def decode_frame(
 ) -> RawFrame:
     """Return the frame in a leader, payload and trailer, as `RawFrame.original` holds them.
 
-    What the bytes do not say is None, or as given here. Raises `CameraFormatError` for bytes that
-    are no frame, `RawFrameError` for one that cannot be unpacked.
+    Values that the bytes do not state are None, or as given here. Raises `CameraFormatError` for
+    bytes that are no frame, `RawFrameError` for a frame with pixels that cannot be unpacked.
     """
     leader, payload, trailer = codec.split_frame(original)
     form = BY_CODE.get(leader.pixel_format)
@@ -432,7 +432,7 @@ def read_description(control: U3vControl) -> bytes:
         raise CameraDescriptionError(f"its XML is {entry.size} bytes long")
     data = control.read(entry.address, entry.size)
     if any(entry.sha1) and hashlib.sha1(data, usedforsecurity=False).digest() != entry.sha1:
-        raise CameraDescriptionError("its XML does not match its checksum")
+        raise CameraDescriptionError("the XML and its checksum differ")
     return _unzipped(data) if entry.file_format == codec.XML_ZIPPED else data.rstrip(b"\0")
 
 

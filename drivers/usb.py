@@ -112,9 +112,9 @@ def open_device(
 
 
 class UsbDevice:
-    """An open device; its interfaces are claimed one by one.
+    """An open device, whose interfaces are claimed separately.
 
-    Use it in a `with` block or `close` it: only then may another program claim it.
+    Closing the device, as the end of a `with` block does, frees it for other programs.
     """
 
     def __init__(self, device: Any, listing: UsbListing, proc: Path = PROC) -> None:
@@ -132,7 +132,7 @@ class UsbDevice:
         self.close()
 
     def claim(self, kind: Kind) -> UsbInterface:
-        """Claim the interface of that kind, taking it from the kernel's driver if there is one.
+        """Claim the interface of that kind, taking it from a driver of the kernel if need be.
 
         Raises `UsbNotFoundError` where the device has none, `UsbClaimedError`,
         `UsbPermissionError` or `UsbGoneError`.
@@ -372,7 +372,7 @@ def _find(kind: Kind | None, backend: Any) -> list[Any]:
     def matches(device: Any) -> bool:
         if kind is None:
             return True
-        # A device that hides its descriptors cannot be what is looked for.
+        # A device with hidden descriptors matches no kind.
         with suppress(usb.core.USBError, NotImplementedError):
             return any(_kind(i) == kind for configuration in device for i in configuration)
         return False

@@ -99,7 +99,7 @@ class AptController(SimulatedController):
             return self._bays[address].motor.nut_um - HOME_OFFSET_UM
 
     def power_cycle(self) -> None:
-        """Switch off and on: the axes stay where they are and forget where that is."""
+        """Switch off and on: the axes stay in place and lose their reference."""
         with self._lock:
             for address, bay in self._bays.items():
                 bay.motor.advance()

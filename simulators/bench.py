@@ -277,9 +277,9 @@ def window_side_um(views: tuple[int, int], cell_um: float) -> float:
 class Bench:
     """Scene or whiteboard, lamp, masks, pinhole plate and sensor of a camera, as they really are.
 
-    scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1. Or, of one
-        that moves, what returns that as it is at a time in seconds: a frame shows it as it was when
-        the exposure began, without motion blur.
+    scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1. For a
+        moving scene, a function that returns this array at a time in seconds: a frame shows the
+        scene at the begin of the exposure, without motion blur.
     positions_um: asks where the stages really are; keys mask_x, mask_y (0: masks centred on the
         axis), aperture_x, aperture_y (0: the pinhole on the axis), and focus (0: as the scene is),
         where there is such an axis.
@@ -358,7 +358,7 @@ class Bench:
             self._scene = self._scene_at(self._began_s)
             state = (*state, self._began_s)
         if state not in self._seen:
-            if sum(one.nbytes for one in self._seen.values()) > KEPT_BYTES:
+            if sum(readings.nbytes for readings in self._seen.values()) > KEPT_BYTES:
                 self._seen.clear()
             self._seen[state] = self._pixels(self._trace(at_um, lamp))
         return self._seen[state]
@@ -392,8 +392,8 @@ class Bench:
         """Return every coefficient of Psi of one shot, (v, u, y, colour, x), by integration.
 
         Each is the mean over the rays between its pixel and its aperture cell of what masks, lens
-        and sensor pass of one colour, over what the open camera without masks passes of all: no
-        frame, no lamp and no whiteboard is in it. Masks stand where the stages are.
+        and sensor pass of one colour, over what the open camera without masks passes of all.
+        Frames, lamp and whiteboard do not enter. Masks stand where the stages are.
         """
         camera, size = self.camera, self._size
         k = camera.sensor.binning

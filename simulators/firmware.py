@@ -73,7 +73,7 @@ class SimulatedController(ABC):
 
     @abstractmethod
     def power_cycle(self) -> None:
-        """Switch off and on: the axes stay where they are and forget where that is."""
+        """Switch off and on: the axes stay in place and lose their reference."""
 
     @abstractmethod
     def _receive(self, data: bytes) -> None:

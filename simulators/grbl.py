@@ -113,7 +113,7 @@ class GrblController(SimulatedController):
             return self._motors[letter].nut_um
 
     def power_cycle(self) -> None:
-        """Switch off and on: the axes stay where they are and forget where that is."""
+        """Switch off and on: the axes stay in place and lose their reference."""
         with self._lock:
             for motor in self._motors.values():
                 motor.advance()

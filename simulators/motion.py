@@ -1,4 +1,4 @@
-"""A motor on a lead screw: its true position, its motion, and the position that it counts."""
+"""A motor on a lead screw: true position, motion, and counted position."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from drivers.clock import Clock
 
 @dataclass(frozen=True)
 class AxisSpec:
-    """A lead-screw axis: 0 and `travel_um` are its ends, `start_um` where it stands at power-up.
+    """A lead-screw axis from 0 to `travel_um`, which stands at `start_um` at power-up.
 
     `backlash_um` is the play of the nut: moving up it sits on the screw's own position, moving
     down it lags that much above.
@@ -132,7 +132,7 @@ class Motor:
 
     @property
     def moving(self) -> bool:
-        """Whether it says that it moves."""
+        """Whether the motor reports motion."""
         begun = self._course is not None and self._course.start_s <= self._clock.now_s()
         return begun or self.busy_forever
 

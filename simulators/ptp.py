@@ -110,15 +110,15 @@ class PtpCameraSimulator:
     `render(exposure_s)` returns the uint16 `(y, x)` mosaic in DN that the sensor reads at the
     lowest ISO, called when the exposure is over. `exposures`: the choices in units of 0.1 ms, or
     (lowest, highest, step) in `span`. `quality`: "raw", "raw+jpeg" or "jpeg". `lacks`: operations
-    that it does not know. Faults are armed with
-    `faults.inject`; those of the wire strike there.
+    of the standard that the camera refuses. Faults are armed with `faults.inject`; those of the
+    wire strike there.
     """
 
     maker, model = "EMMC", "EMMC simulated camera"
     vendor_extension = 0
     vendor_operations: tuple[int, ...] = ()
     hidden: tuple[int, ...] = ()
-    """Properties of the standard that it does not have."""
+    """Properties of the standard that the camera lacks."""
     with_data: tuple[int, ...] = (Operation.SET_PROPERTY,)
     """Operations that the host sends data with."""
 
@@ -469,7 +469,7 @@ class PtpUsbFunction(UsbFunction):
         self.camera.power_up()
 
     def bulk_out(self, endpoint: int, data: bytes) -> int:
-        """Gather containers: a command, then its data where it has some."""
+        """Gather containers: a command, then its data, if any."""
         self._received += data
         while len(self._received) >= HEADER_SIZE:
             try:

@@ -1,6 +1,6 @@
-"""A stage without physics, which is where it is sent.
+"""A stage without physics, at the target as soon as a move ends.
 
-For what is measured or tested around devices: its own time is none, or exactly as asked for.
+For measurements and tests around devices: a move takes no time, or exactly the stated time.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,8 +1,8 @@
 """A USB bus in memory: a pyusb backend that hosts simulated devices, down to their packets.
 
 Pass it wherever pyusb takes a backend: `open_device(kind, backend=bus)`. A device is any object
-with the hooks of `UsbFunction`; what it returns is cut into packets here, so that a read ends
-where a real one would. Waiting costs time on the injected clock only. Source: USB 2.0
+with the hooks of `UsbFunction`; its messages are cut into packets here, so that a read ends as on
+a real bus. Waiting costs time on the injected clock only. Source: USB 2.0
 specification, 5.8 and 9.4; return codes as `usb.backend.libusb1` gives them.
 """
 
@@ -315,7 +315,7 @@ class SimulatedUsb(usb.backend.IBackend):
         _plug(dev_handle).kernel_driver = True
 
     def clear_halt(self, dev_handle: Handle, ep: int) -> None:
-        """Make an endpoint usable again; what was on its way is lost."""
+        """Make an endpoint usable again; pending bytes are lost."""
         plug = _plug(dev_handle)
         plug.halted.discard(ep)
         plug.pending.pop(ep, None)

@@ -21,7 +21,7 @@ TICK_S = 0.002
 class Firmware(Protocol):
     """A simulated device on the end of a wire.
 
-    unplugged: whether the wire has been pulled. plugs: how often it has been plugged in.
+    unplugged: whether the wire has been pulled. plugs: count of how often the wire was plugged in.
     """
 
     unplugged: bool
@@ -157,7 +157,7 @@ class PtyServer:
                 self._close()
 
     def _send(self, channel: Any, send: Callable[[bytes], int], data: bytes) -> None:
-        """Send bytes as the host takes them; one that takes none does not delay unplug or end."""
+        """Send bytes as the host takes them; a host that takes none delays no unplug and no end."""
         while data and not self._firmware.unplugged:
             ready, free, _ = select.select([self._wake_read], [channel], [], TICK_S)
             if ready:

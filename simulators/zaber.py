@@ -47,7 +47,7 @@ class _RefusedError(Exception):
 
 
 class _Axis:
-    """One motor with its settings and its flags."""
+    """A motor with its settings and warning flags."""
 
     def __init__(self, spec: AxisSpec, clock: Clock, peripheral_id: int | None) -> None:
         self.spec = spec
@@ -246,7 +246,7 @@ class ZaberChain(SimulatedController):
             found.flags.add("WM")
 
     def power_cycle(self) -> None:
-        """Switch the chain off and on: the axes stay where they are and forget where that is."""
+        """Switch the chain off and on: the axes stay in place and lose their reference."""
         with self._lock:
             for device in self._devices.values():
                 device.axes = [axis.restarted() for axis in device.axes]
