@@ -44,7 +44,7 @@ class Bench:
         return stage
 
     def say(self, line):
-        """Send a line as another program would; return what is said to it."""
+        """Send a line as another program would; return the controller's answer."""
         return self.device.feed(line).decode("ascii")
 
 

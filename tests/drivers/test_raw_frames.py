@@ -1,6 +1,5 @@
 """RAW files: what the sensor read comes back exactly, and what is damaged is not believed."""
 
-
 import numpy as np
 import pytest
 from simulated_raw_camera import SimulatedRawCamera

@@ -1,4 +1,4 @@
-"""Every stage over simulated firmware whose truth is known: its accuracy, and every fault of it."""
+"""Every stage over simulated firmware with known true positions: accuracy, and every fault."""
 
 import math
 import threading

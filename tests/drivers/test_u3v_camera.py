@@ -571,7 +571,7 @@ def test_a_description_that_unpacks_without_end_is_refused(bench):
 
 
 def described_as(bench, old, new):
-    """Change what the camera says of itself, as another maker would have it."""
+    """Return the camera, opened with another maker's wording in its description."""
     assert old in bench.simulator.description
     bench.simulator._file = simulation._zip(bench.simulator.description.replace(old, new))
     bench.simulator.plugged()
@@ -642,7 +642,7 @@ def test_a_camera_without_an_exposure_is_refused(bench):
 
 
 SEEDS = st.integers(0, 1 << 62)
-"""Of the damage done: what hypothesis would draw bit by bit takes longer than what it tests."""
+"""Of the random damage: hypothesis draws single bits more slowly than the test runs."""
 KINDS = ("keep", "keep", "keep", "drop", "cut", "grow", "change", "change", "noise")
 
 

@@ -315,7 +315,7 @@ def test_firmware_without_checksums_is_read_twice(bench):
 
 def test_devices_are_found_with_their_axes(bench):
     found = find_devices(bench.transport, bench.clock)
-    assert [(one.address, one.axis_count) for one in found] == [(1, 2), (2, 2)]
+    assert [(device.address, device.axis_count) for device in found] == [(1, 2), (2, 2)]
     assert found[0].serial_number != found[1].serial_number
     assert found[0].firmware == "7.38"
 

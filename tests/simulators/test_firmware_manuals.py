@@ -19,7 +19,7 @@ from simulators.zaber import ZaberChain
 
 
 class Wire:
-    """One controller on one clock: what it says to bytes, and later by itself."""
+    """A controller and its clock; a call sends bytes and returns all answers until a time."""
 
     def __init__(self, make, *arguments, **settings):
         self.clock = ManualClock()
@@ -29,7 +29,7 @@ class Wire:
     def __call__(self, data, after_s=0.0):
         said = self.device.feed(data)
         end_s = self.clock.now_s() + after_s
-        # From event to event: what a firmware does next, it does at the time of the last one.
+        # From event to event: firmware acts at the time of an event, not at the end of a sleep.
         while (next_s := self.device.next_due_s()) is not None and next_s < end_s:
             self.clock.sleep(max(0.0, next_s - self.clock.now_s()) + 1e-9)
             said += self.device.due()
@@ -109,7 +109,7 @@ def test_a_zaber_checksum_is_that_of_the_manuals_example():
 def test_zaber_replies_are_formatted_as_the_manual_says(zaber, command, reply):
     replies = zaber.ask(command)
     if "BUSY" in reply:
-        replies = [re.sub(r"BUSY \S\S", "BUSY --", one) for one in replies]
+        replies = [re.sub(r"BUSY \S\S", "BUSY --", line) for line in replies]
     assert replies == [reply]
 
 
@@ -502,11 +502,11 @@ def test_a_grbl_report_has_its_fields_in_the_documents_order(grbl):
 
 def test_grbl_repeats_the_offset_every_tenth_report_at_rest_and_every_thirtieth_in_motion(grbl):
     reports = [grbl.report() for _ in range(41)]
-    offset = [at for at, one in enumerate(reports) if "WCO" in one]
+    offset = [at for at, report in enumerate(reports) if "WCO" in report]
     assert [b - a for a, b in pairwise(offset)] == [10] * (len(offset) - 1)
     grbl.say("$J=G91 X-150 F60")
     moving = [grbl.report() for _ in range(90)]
-    offset = [at for at, one in enumerate(moving) if "WCO" in one]
+    offset = [at for at, report in enumerate(moving) if "WCO" in report]
     assert offset[-1] - offset[-2] == 30
 
 
@@ -598,10 +598,10 @@ def test_grbl_alarms_have_the_documents_numbers(grbl):
 )
 def test_grbl_reports_its_accessories_by_the_documents_letters(word, letters):
     device = Grbl(options="VHM", settings={22: 0, 20: 0})
-    for one in word.split():
-        assert device.say(one) == ["ok"]
+    for part in word.split():
+        assert device.say(part) == ["ok"]
     reports = [device.report() for _ in range(12)]
-    shown = re.search(r"\|A:(\w+)", next(one for one in reports if "Ov:" in one))
+    shown = re.search(r"\|A:(\w+)", next(report for report in reports if "Ov:" in report))
     assert (shown[1] if shown else "") == letters
 
 
