@@ -60,12 +60,12 @@ ACTUATORS = {
     "z825b": Actuator(34.55496, 25_000.0, 2_600.0),
 }
 """By stage: counts per millimetre from "Scaling parameters" of the protocol document, travel and
-maximum velocity from the data sheets. No controller reports which one is plugged in."""
+maximum velocity from the data sheets. No controller reports the model of its stage."""
 
 
 @dataclass(frozen=True)
 class AptAxis:
-    """One channel: the port it is on, its address there, and what it drives.
+    """A motor channel: serial port, address on the port, and actuator.
 
     `destination` is 0x50 for a unit on USB, 0x21 upwards for the bays of a rack.
     """
@@ -92,12 +92,12 @@ class AptStage(HostStage):
         clock: Clock = SYSTEM_CLOCK,
         settings: StageSettings = DEFAULT_SETTINGS,
     ) -> None:
-        super().__init__(axes, (one.transport for one in axes.values()), clock, settings)
-        for axis, one in axes.items():
-            check_tolerance(axis, settings.tolerance_um, 1 / one.actuator.counts_per_um)
-        transports = dict.fromkeys(one.transport for one in axes.values())
+        super().__init__(axes, (wiring.transport for wiring in axes.values()), clock, settings)
+        transports = dict.fromkeys(wiring.transport for wiring in axes.values())
         links = {transport: _Link(transport, clock) for transport in transports}
-        self._channels = {axis: _Channel(axis, one, links) for axis, one in axes.items()}
+        self._channels = {axis: _Channel(axis, wiring, links) for axis, wiring in axes.items()}
+        for axis, channel in self._channels.items():
+            check_tolerance(axis, settings.tolerance_um, 1 / channel.actuator.counts_per_um)
         self._homing_since_s: dict[str, float] = {}
         self._start_up()
 
@@ -167,7 +167,8 @@ class AptStage(HostStage):
         status = self._status_without_fault(axis)
         complaint = self._channels[axis].link.take_complaint()
         if complaint is not None:
-            command = _name(complaint.message_id)
+            number = complaint.message_id
+            command = next((i.name for i in Id if i == number), f"message {number:#06x}")
             reply = f"{complaint.code} ({complaint.notes})"
             advice = "see the controller's display and the limits"
             raise CommandRefusedError(command, reply, axis, advice)
@@ -226,7 +227,7 @@ class AptStage(HostStage):
 
 
 class _Link:
-    """Messages on one port; unexpected ones are kept until they are requested."""
+    """Messages on one port; unexpected messages are kept until they are requested."""
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self.transport = transport
@@ -365,10 +366,3 @@ def _fault(axis: str, status: codec.MotorStatus) -> AxisFaultError | None:
     if not status.bits & StatusBit.ENABLED:
         return AxisFaultError(axis, "the channel is switched off", "home it").about(reply=reply)
     return None
-
-
-def _name(message_id: int) -> str:
-    try:
-        return Id(message_id).name
-    except ValueError:
-        return f"message {message_id:#06x}"

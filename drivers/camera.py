@@ -1,4 +1,4 @@
-"""A camera that gives RAW frames: what every camera offers, and what all of them check."""
+"""A camera that gives RAW frames: the common interface of cameras, and their common checks."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class CameraIdentity:
 class Camera(Protocol):
     """A camera on manual exposure.
 
-    A setting that is asked for and the one that is taken differ where the camera has steps:
-    `exposure_s` and `gain` are what the camera does, read back from it.
+    Requested and actual setting differ where the camera has steps: `exposure_s` and `gain` are the
+    actual settings, read back from the camera.
     """
 
     @property
@@ -170,7 +170,7 @@ class ShapeFromFrames(ABC):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame; exposes one if there was none yet."""
+        """Rows and columns of a frame; takes a frame if no frame was taken before."""
         if self._shape is None:
             self.snap()
         assert self._shape is not None
@@ -178,7 +178,7 @@ class ShapeFromFrames(ABC):
 
     @property
     def cfa(self) -> str:
-        """Colour phase or tile name of a frame; exposes one if there was none yet."""
+        """Colour phase or tile name of a frame; takes a frame if no frame was taken before."""
         if self._cfa is None:
             self.snap()
         assert self._cfa is not None

@@ -1,4 +1,4 @@
-"""The camera protocols, a row each: a new one is its row here and its module."""
+"""The camera protocols, a row each: a new protocol is a module and a row here."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class CameraProtocol:
-    """One driver's cameras, and its module, imported when it is used.
+    """A protocol of cameras, and its driver's module, imported at first use.
 
     module: has `open_camera(address, clock, backend)`, whose backend is pyusb's; where it also has
     a dataclass OPTIONS, that is a fourth argument, and its fields are settings of a camera's YAML
     file. address: what follows the driver and a colon. interface: class, subclass and protocol on
-    USB, by which such cameras are listed. frame_prefix: first bytes of its frames where
-    `drivers.raw` does not know them; `decode_frame(data, black_level_dn, white_level_dn)` of the
-    module reads these.
+    USB, by which such cameras are listed. frame_prefix: first bytes of frames in a format
+    unknown to `drivers.raw`; `decode_frame(data, black_level_dn, white_level_dn)` of the module
+    decodes these frames.
     """
 
     module: str
@@ -36,5 +36,5 @@ CAMERAS = {
     "mm": CameraProtocol("drivers.micromanager", "CONFIG.cfg"),
     "folder": CameraProtocol("drivers.folder", "DIR"),
 }
-CAMERA_HELP = ", ".join(f"{name}:{one.address}" for name, one in CAMERAS.items())
+CAMERA_HELP = ", ".join(f"{name}:{camera.address}" for name, camera in CAMERAS.items())
 """What `--camera` takes, for help texts and refusals."""

@@ -18,13 +18,8 @@ class Clock(Protocol):
 class SystemClock:
     """The computer's own monotonic clock."""
 
-    def now_s(self) -> float:
-        """Return the time in seconds."""
-        return time.monotonic()
-
-    def sleep(self, duration_s: float) -> None:
-        """Return `duration_s` seconds later."""
-        time.sleep(duration_s)
+    now_s = staticmethod(time.monotonic)
+    sleep = staticmethod(time.sleep)
 
 
 SYSTEM_CLOCK = SystemClock()

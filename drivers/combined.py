@@ -1,15 +1,14 @@
-"""Several stages as one: each axis is that of the stage which has it."""
+"""Several stages combined: a command to an axis goes to the stage with that axis."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from typing import Self
 
 from drivers.errors import UnknownAxisError
 from drivers.stage import Stage, StageIdentity, check_within_limits
 
 
-class CombinedStage:
-    """A `drivers.stage.Stage` of several, or of none; their axes have different names.
+class CombinedStage(Stage):
+    """A stage of several, or of none; their axes have different names.
 
     Stages move one after the other. Whatever one raises stops them all.
     """
@@ -66,10 +65,6 @@ class CombinedStage:
             raise
         return reached_um
 
-    def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
-        """As `move_to_um`, relative to where the axes read to be."""
-        return self.move_to_um({a: self.position_um(a) + step for a, step in steps_um.items()})
-
     def position_um(self, axis: str) -> float:
         """Return where the axis reads to be; raises `NotHomedError` while it does not know."""
         return self._stage(axis).position_um(axis)
@@ -111,12 +106,6 @@ class CombinedStage:
         with ExitStack() as closing:
             for stage in self._stages:
                 closing.callback(stage.close)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _stage(self, axis: str) -> Stage:
         if axis not in self._of:

@@ -37,7 +37,7 @@ BAYER_PATTERNS = {
 SMALLEST_SIDE_PX = 22
 """LibRaw takes anything smaller for a thumbnail."""
 PRIVATE_DATA_TAG, PRIVATE_DATA_OWNER = 50740, b"emmc-rig: camera's bytes\0"
-"""DNGPrivateData, which begins with the name of the program that can read it: this one."""
+"""DNGPrivateData, and this program's name, with which our private data begin."""
 MONO = "mono"
 STAND_IN_PHASE = "rggb"
 """Written for a colour tile that is not Bayer; the tile's name goes into ImageDescription."""
@@ -58,10 +58,10 @@ SIMULATED = CameraIdentity("EMMC", "EMMC simulated camera")
 
 @dataclass(frozen=True)
 class Facts:
-    """What a DNG says of its frame besides; None or "" where that is not known.
+    """Further facts on a frame for its DNG; None or "" for unknown facts.
 
-    captured: with its time zone, where that is known. document: a name; unique_id: 32 hexadecimal
-    digits that no other picture has.
+    captured: with the time zone, if known. document: a name. unique_id: 32 hexadecimal digits,
+    different for every picture.
     """
 
     iso: int | None = None
@@ -85,7 +85,7 @@ def encode_dng(
 
     `cfa` is a Bayer phase, "mono", or the name of another tile, which is stored in a tag of ours
     while the file claims rggb, for LibRaw. `black_level_dn` is a number, or a tile of them as
-    in `RawFrame`. `exposure_s`: None where it is not known.
+    in `RawFrame`. `exposure_s`: None if unknown.
     `private`: bytes to store in the file; `private_data` returns them. `facts`: go into its EXIF
     directory, with exposure and the camera's serial number. Raises `ValueError`.
     """

@@ -1,4 +1,4 @@
-"""Errors of the drivers: each carries its data and says in one line what happened, what to do."""
+"""Errors of the drivers: their data, and a message of one line with the cause and advice."""
 
 from typing import Self
 
@@ -58,7 +58,7 @@ class PortError(DriverError):
 
 
 class PortNotFoundError(PortError):
-    """No such serial port, or more than one."""
+    """The name matches no serial port, or several."""
 
     def __init__(self, port: str, what: str = "does not exist") -> None:
         super().__init__(port, what, "check the cable, power and port name")
@@ -121,7 +121,7 @@ class GarbledReplyError(DriverError):
             )
         advice = "check the cable and the baud rate"
         if not on_the_line:
-            advice = "is it the device that was named, with firmware that is supported?"
+            advice = "check the device's model and protocol, and the version of its firmware"
         what = f"garbled reply {_shown(raw)}" if raw else "no valid reply"
         super().__init__(f"{what} ({reason})", advice)
         self.raw = raw
@@ -129,7 +129,7 @@ class GarbledReplyError(DriverError):
 
 
 class FirmwareError(DriverError):
-    """The controller runs firmware that is not supported, or does not say what must be known."""
+    """The controller's firmware is unsupported, or does not state a setting that is needed."""
 
 
 class CommandRefusedError(DriverError):
@@ -250,7 +250,7 @@ class MoveTimeoutError(DriverError):
     def __init__(self, axis: str, time_limit_s: float) -> None:
         super().__init__(
             f"{axis} still moves after {time_limit_s:.3g} s",
-            "check its speed and that nothing drags",
+            "check the axis's speed, and its load",
             axis=axis,
         )
         self.time_limit_s = time_limit_s
@@ -322,11 +322,13 @@ class UsbGoneError(DriverError):
     """The device was unplugged, or lost its power, while it was open."""
 
     def __init__(self, device: str) -> None:
-        super().__init__(f"{device} went away: plug it in, switch it on and open it again")
+        super().__init__(
+            f"{device} went away: plug it in, switch it on, then open the device again"
+        )
 
 
 class UsbStalledError(DriverError):
-    """The device halted an endpoint: it did not accept what it was sent."""
+    """The device halted an endpoint: it did not accept the host's data or request."""
 
     def __init__(self, device: str, endpoint: int) -> None:
         super().__init__(
@@ -341,7 +343,7 @@ class UsbTimeoutError(DriverError):
     def __init__(self, device: str, timeout_s: float, done: int = 0) -> None:
         got = f"stopped after {done} bytes" if done else "was silent"
         super().__init__(
-            f"{device} {got} for {timeout_s:g} s: see that it is switched on and awake"
+            f"{device} {got} for {timeout_s:g} s: check power and the device's sleep mode"
         )
         self.done = done
 
@@ -363,7 +365,7 @@ class CameraSettingError(DriverError):
 
 
 class CameraFormatError(DriverError):
-    """Bytes from a camera that are no message of its protocol, or not the one that must come."""
+    """Bytes from a camera that are no message of its protocol, or an unexpected message."""
 
     def __init__(self, raw: bytes, reason: str) -> None:
         shown = raw[:24].hex(" ") + (" ..." if len(raw) > 24 else "")
@@ -386,13 +388,13 @@ class CameraBusyError(DriverError):
 
     def __init__(self, operation: str, waited_s: float) -> None:
         super().__init__(
-            f"the camera was busy for {waited_s:.3g} s when asked {operation}: wait until it has "
-            "stored its pictures, check its battery, close its menus, or switch it off and on"
+            f"the camera was busy for {waited_s:.3g} s when asked {operation}: wait until its "
+            "pictures are stored, check battery and menus, or switch the camera off and on"
         )
 
 
 class CardFullError(DriverError):
-    """There is no room for another picture."""
+    """The memory card has no room for another picture."""
 
     def __init__(self, camera: str) -> None:
         super().__init__(f"the card of {camera} is full or missing: empty or insert it")

@@ -1,4 +1,4 @@
-"""A camera that replays the RAW files of a folder in order, as if it were taking them."""
+"""A camera that replays the RAW files of a folder in order, as if taken now."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.camera import EXPOSURE_AGREEMENT, CameraIdentity, Limits, check_fra
 from drivers.capture_order import capture_order
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import CameraSettingError, FolderCameraError, RawFrameError
-from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw, exposure_and_time
+from drivers.raw import RawFrame, decode_raw, exposure_and_time, has_raw_suffix
 
 _log = logging.getLogger(__name__)
 
@@ -35,9 +35,9 @@ def open_camera(address: str, clock: Clock, backend: object = None) -> FolderCam
 class FolderCamera:
     """The RAW files of a folder, in the order in which they were captured.
 
-    All must have the first one's shape and colours. The exposure of a recording cannot be chosen:
-    asking for the one that the next frame has is accepted, so that a sequence can be run again; of
-    a file that states none, any. `choose` names the file that is next.
+    All must have the shape and colours of the first file. The exposure of a recording cannot be
+    chosen: the exposure of the next frame is accepted, so that a sequence can be run again; any
+    exposure where the file states none. `choose` names the file that is next.
     Raises `FolderCameraError` when there is no file, and after the last one.
     """
 
@@ -50,11 +50,7 @@ class FolderCamera:
         self._asked_s: float | None = None
         self._chosen = False
         try:
-            paths = [
-                path
-                for path in self.folder.iterdir()
-                if path.suffix.lower() in RAW_SUFFIXES and path.is_file()
-            ]
+            paths = [p for p in self.folder.iterdir() if has_raw_suffix(p.name) and p.is_file()]
         except OSError as fault:
             raise FolderCameraError(str(folder), f"it cannot be read ({fault.strerror})") from fault
         found = [_recorded(path) for path in paths]
@@ -86,7 +82,7 @@ class FolderCamera:
 
     @property
     def exposure_limits_s(self) -> Limits:
-        """The next frame's exposure, twice; any where it is not stated, or files are chosen."""
+        """The next frame's exposure, twice; any if the file states none, or files are chosen."""
         exposure_s = None if self._chosen else self._peek().exposure_s
         return ANY_EXPOSURE_S if exposure_s is None else (exposure_s, exposure_s)
 

@@ -60,7 +60,7 @@ class _Item:
 
 @dataclass(frozen=True)
 class _Node:
-    """One element with a name: its kind is its tag, its items are what it contains."""
+    """A named element of the XML. kind: the tag. items: the child elements."""
 
     kind: str
     name: str
@@ -175,7 +175,7 @@ class Features:
             for entry in self._entries(node):
                 if _integer(entry.text("Value")) == code:
                     return entry.name
-            raise CameraDescriptionError(f"{node.name} is {code}, which is none of its choices")
+            raise CameraDescriptionError(f"{node.name} is {code}, no value of the choices")
         if node.kind == "Boolean":
             return self._number(node) == _integer(node.text("OnValue") or "1")
         if node.kind in ("StringReg", "String"):
@@ -393,11 +393,11 @@ class Features:
         return tuple(entry.name for entry in self._entries(node) if READ in self._access(entry))
 
     def _access(self, node: _Node) -> Access:
-        """Return what may be done with a node now, and whether the camera has it at all.
+        """Return whether a node is present now, and whether it may be read and written.
 
-        It is there while its own conditions hold, what its formula, its address or its limits
-        are worked out from can be read, and something of an enumeration or a category is there.
-        It can do no more than the node that holds its value.
+        A node is present while its own conditions hold, the inputs of its formula, address and
+        limits can be read, and an enumeration or category has a present member. Its access is
+        limited by the access of the node that holds its value.
         """
         known = self._accesses.get(id(node))
         if known is None:
@@ -412,19 +412,19 @@ class Features:
             access = self._own_access(node)
             if not self._holds(node.text("pIsAvailable")):
                 access &= UNAVAILABLE
-            for one in self._inputs(node):
-                access &= EVERYTHING_OF[self._access(one) & READABLE]
+            for source in self._inputs(node):
+                access &= EVERYTHING_OF[self._access(source) & READABLE]
             if node.kind == "Enumeration":
                 entries = (self._access(entry) for entry in self._entries(node))
                 access &= EVERYTHING_OF[frozenset().union(*entries) & READABLE]
             elif node.kind == "Category":
-                features = [self._access(self._node(one.text)) for one in node.all("pFeature")]
+                features = [self._access(self._node(item.text)) for item in node.all("pFeature")]
                 return READABLE if any(features) else ABSENT
             target = self._target(node) if node.kind in _HOLDING else None
             return access if target is None else access & self._access(target)
 
     def _holds(self, condition: str | None) -> bool:
-        """Return whether a condition holds; one that cannot be read does not."""
+        """Return whether a condition holds; an unreadable condition counts as false."""
         if condition is None:
             return True
         node = self._node(condition)

@@ -13,13 +13,13 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
 from drivers.clock import SYSTEM_CLOCK, Clock
 from drivers.errors import CameraClosedError, CameraSettingError, CaptureError, GphotoError
-from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+from drivers.raw import RawFrame, decode_raw, has_raw_suffix
 
 PTP_IP = "PTP/IP Camera"
 PAIR_LIMIT_S = 2.0
@@ -35,9 +35,9 @@ ADVICE = {
     -1: "look at the camera's display; without a memory card, set capturetarget: Internal RAM",
     -7: "check cable and power; switch the camera off and on",
     -10: "check cable and power; switch the camera off and on",
-    -52: "plug it in and switch it on",
+    -52: "plug it in, then switch the camera on",
     -53: "another program has the camera, often the desktop's file manager: eject it there",
-    -105: "plug it in and switch it on; or name its model as gphoto2 --list-cameras does",
+    -105: "plug it in, then switch the camera on; or name its model as gphoto2 --list-cameras does",
     -110: "wait until it is ready",
 }
 
@@ -157,22 +157,22 @@ class GphotoCamera(ShapeFromFrames):
         """
         check_setting("exposure in seconds", exposure_s, self.exposure_limits_s)
         if self._shutters:
-            nearest = min(self._shutters, key=lambda one: abs(one / exposure_s - 1))
-            self._set(SHUTTER, self._shutters[nearest])
+            self._set_nearest(SHUTTER, self._shutters, exposure_s)
 
     def set_gain(self, gain: float) -> None:
         """Choose the gain of the frames that follow: the nearest ISO; raises as the exposure."""
         check_setting("gain", gain, self.gain_limits)
         if self._isos:
-            wanted = gain * min(self._isos)
-            self._set(ISO, self._isos[min(self._isos, key=lambda one: abs(one / wanted - 1))])
+            self._set_nearest(ISO, self._isos, gain * min(self._isos))
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises `GphotoError`, `CaptureError`, `RawFrameError`."""
         with self._lock:
             exposure_s, gain = self.exposure_s, self.gain
             with self._asking("take a picture"):
-                self._forget_events()
+                # Events of an earlier exposure: no file of it may pass for the next.
+                while self._camera.wait_for_event(1)[0] != self._gp.GP_EVENT_TIMEOUT:
+                    pass
                 first = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
                 name, data = self._raw_file(first)
             arrived_s = self._clock.now_s()
@@ -196,7 +196,7 @@ class GphotoCamera(ShapeFromFrames):
                     self._camera.exit()
 
     def _choose(self, address: str, model: str) -> None:
-        """Tell libgphoto2 which camera it is; one with no address is looked for by itself."""
+        """Pass model and port to libgphoto2, which searches for a camera without an address."""
         gp = self._gp
         if address.startswith("ptpip:"):
             model = model or PTP_IP
@@ -214,10 +214,10 @@ class GphotoCamera(ShapeFromFrames):
         gp, camera = self._gp, self._camera
         paths = [first]
         deadline_s = self._clock.now_s() + PAIR_LIMIT_S
-        while not (raw := [one for one in paths if _is_raw(one.name)]):
+        while not (raw := [path for path in paths if has_raw_suffix(path.name)]):
             left_s = deadline_s - self._clock.now_s()
             if left_s <= 0:
-                names = ", ".join(one.name for one in paths)
+                names = ", ".join(path.name for path in paths)
                 raise CaptureError(
                     f"the camera gave {names}", "set its image quality to RAW, or RAW with JPEG"
                 )
@@ -232,18 +232,13 @@ class GphotoCamera(ShapeFromFrames):
             camera.file_delete(path.folder, path.name)
         return path.name, data
 
-    def _forget_events(self) -> None:
-        """Read away what an earlier exposure left, so that no file of it passes for the next."""
-        while self._camera.wait_for_event(1)[0] != self._gp.GP_EVENT_TIMEOUT:
-            pass
-
     def _numbers(self, name: str, number: Any) -> dict[float, str]:
         """Return the choices of a setting that are numbers above 0, {} where it has none."""
         found = {number(word): word for word in self._choices(name)}
         return {value: word for value, word in found.items() if value}
 
     def _choices(self, name: str) -> list[str]:
-        """Return the words that a setting may be set to, [] where it has none."""
+        """Return the choices of a setting as words, [] for a setting without choices."""
         with self._lock, suppress(self._gp.GPhoto2Error):
             widget = self._camera.get_single_config(name)
             if widget is not None and not widget.get_readonly():
@@ -259,6 +254,10 @@ class GphotoCamera(ShapeFromFrames):
                 return self._value(self._camera.get_single_config(name)) or ""
             except self._gp.GPhoto2Error:
                 return ""
+
+    def _set_nearest(self, name: str, words: Mapping[float, str], wanted: float) -> None:
+        nearest = min(words, key=lambda value: abs(value / wanted - 1))
+        self._set(name, words[nearest])
 
     def _set(self, name: str, word: str) -> None:
         """Set a setting; raises `CameraSettingError`."""
@@ -284,7 +283,7 @@ class GphotoCamera(ShapeFromFrames):
                     yield child.get_name(), value
 
     def _value(self, widget: Any) -> str | None:
-        """Return a setting's value; None for no setting, or one that was given no value.
+        """Return a setting's value; None for a missing setting, or a setting without a value.
 
         A camera whose value is none of its own choices leaves the setting without, and
         python-gphoto2 2.6 ends the process when it is asked for a word that is not there.
@@ -317,7 +316,3 @@ def _loaded(package: Path) -> ctypes.CDLL:
     """Return the libgphoto2 that python-gphoto2 uses: in its wheel, or else the system's."""
     inside = sorted((package / "libgphoto2").glob("libgphoto2.*"))
     return ctypes.CDLL(str(inside[0]) if inside else ctypes.util.find_library("gphoto2"))
-
-
-def _is_raw(name: str) -> bool:
-    return PurePosixPath(name.lower()).suffix in RAW_SUFFIXES

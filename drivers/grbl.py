@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 from drivers import grbl_codec as codec
 from drivers.clock import SYSTEM_CLOCK, Clock
@@ -48,7 +49,7 @@ SINGLE_AXIS_HOMING = "H"
 """Among the options of `$I`; a compile-time option, off by default (Grbl's config.h)."""
 REFUSAL_ADVICE = {
     5: "switch homing on ($22=1) and wire its limit switches",
-    8: "it is busy, wait until it stands",
+    8: "the controller is busy, wait until the axes stand",
     9: "home it",
     13: "close the safety door",
     15: "check the travel ($130 to $132) and the limits",
@@ -70,11 +71,10 @@ class GrblStage(HostStage):
 
     The travel lies below zero, as Grbl has it, and ends short of the homing switches. Grbl does
     not report whether it was homed, and is idle as well after `$X`, so every axis must be homed
-    after connecting. Firmware without option H in `$I`, as it is shipped, homes all axes together:
-    homing one of them homes all. The scale is the
-    controller's `$100` and following; `steps_per_mm`, by name of an axis, states what they must
-    be, without which the firmware's default counts as never set. Construction waits up to
-    BOOT_S for the controller to start; it moves nothing. Raises `ScaleError`, or
+    after connecting. Firmware without option H in `$I`, as it is shipped, homes all axes together.
+    The scale is the controller's `$100` and following; `steps_per_mm`, by name of an axis, states
+    the expected scale, without which the firmware's default counts as never set. Construction
+    waits up to BOOT_S for the controller to start; it moves nothing. Raises `ScaleError`, or
     `TransportTimeoutError` when the controller does not answer.
     Source: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Configuration".
     """
@@ -118,12 +118,13 @@ class GrblStage(HostStage):
         super().stop(axes)
 
     def _configure(self) -> None:
-        self._controller = _Controller(self._transport, self._clock, self._mark_all_unknown)
+        mark_all_unknown = partial(self._mark_unknown, self._axes)
+        self._controller = _Controller(self._transport, self._clock, mark_all_unknown)
         self._controller.wait_for_boot()
         self._build = self._controller.command("$I")
         self._options = self._build.get("OPT", "").split(",")[0]
         self._controller.command("$$")
-        self._mark_all_unknown("it was not homed since it was connected")
+        mark_all_unknown("no homing since the connection was opened")
         self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}
         for axis in self._axes:
             self._check_scale(axis)
@@ -238,12 +239,9 @@ class GrblStage(HostStage):
             raise _no_such_axis(axis, "$$", f"${number}={value:g}")
         return value
 
-    def _mark_all_unknown(self, why: str) -> None:
-        self._mark_unknown(self._axes, why)
-
 
 class _Controller:
-    """Lines and real-time commands to one Grbl, and what it says by itself.
+    """Lines and real-time commands to a Grbl, and its answers and unasked messages.
 
     `on_lost` is called with the reason whenever the position became unknown.
     """
@@ -286,7 +284,13 @@ class _Controller:
             with self._transport.lock:
                 self._take_waiting()
                 self._transport.write(codec.STATUS_QUERY)
-                status = self._read_status()
+                for _ in turns(self._clock, LINES_TOLERATED):
+                    status = self._read_message()
+                    if isinstance(status, codec.Status):
+                        break
+                    self._note(status)
+                else:
+                    raise GarbledReplyError(b"", "no report among what came")
         except (TransportTimeoutError, GarbledReplyError) as error:
             self._drain()
             self.raise_alarm()
@@ -302,9 +306,9 @@ class _Controller:
         for _ in range(REPORTS_UNTIL_OFFSET):
             status = self.status()
             if status.offset is not None:
-                self._offset_mm = tuple(one * unit for one in status.offset)
+                self._offset_mm = tuple(offset * unit for offset in status.offset)
             if status.machine is not None:
-                return status, tuple(one * unit for one in status.machine)
+                return status, tuple(position * unit for position in status.machine)
             if status.work is not None and self._offset_mm is not None:
                 pairs = zip(status.work, self._offset_mm, strict=False)
                 return status, tuple(work * unit + offset for work, offset in pairs)
@@ -334,7 +338,7 @@ class _Controller:
             raise
 
     def start_homing(self, lines: list[str]) -> None:
-        """Send the homing commands; each is answered when it is done."""
+        """Send the homing commands; the controller answers each command at its end."""
         with self._transport.lock:
             self._take_waiting()
             self._rests = False
@@ -345,8 +349,8 @@ class _Controller:
     def is_homing(self) -> bool:
         """Wait for the next line, and return whether homing goes on.
 
-        It ends with an `ok` for every line sent. Grbl reports no state while it homes: a report
-        of rest that no `ok` follows means that homing never began, or that its end is unknown.
+        Homing ends with an `ok` for every line sent. Grbl reports no state while it homes: a report
+        of rest without a following `ok` means that homing never began, or that its end is unknown.
         """
         if not self._homing_lines:
             return False
@@ -374,7 +378,7 @@ class _Controller:
         return bool(self._homing_lines)
 
     def abandon_homing(self) -> None:
-        """Reset a controller that homes, which stops it wherever it is."""
+        """Reset a controller during homing, which stops the axes at once."""
         self._homing_lines.clear()
         self._on_lost("its homing was stopped")
         self._transport.write(codec.SOFT_RESET)
@@ -439,14 +443,6 @@ class _Controller:
             self._transport.write(codec.SOFT_RESET)
             self._drain()
         self._alarm, self._restarted = None, False
-
-    def _read_status(self) -> codec.Status:
-        for _ in turns(self._clock, LINES_TOLERATED):
-            message = self._read_message()
-            if isinstance(message, codec.Status):
-                return message
-            self._note(message)
-        raise GarbledReplyError(b"", "no report among what came")
 
     def _drain(self) -> None:
         """Take everything off the wire until nothing comes any more."""

@@ -69,7 +69,7 @@ _OLD_STATUS = re.compile(r"<[A-Z][a-z]+,[MW]Pos:.*>")
 
 @dataclass(frozen=True)
 class Ok:
-    """The line was accepted; what it started may go on."""
+    """The line was accepted; a motion that it started may go on."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def jog(targets_mm: Mapping[str, float], feed_mm_min: float) -> str:
 def decode_line(line: bytes) -> Message | None:
     """Return the message in one line, its line end included.
 
-    None for an empty line, and for one that Grbl ran by itself when it started. Raises
+    None for an empty line, and for a startup line that Grbl ran at boot. Raises
     `GarbledReplyError`, and `FirmwareError` for a report of Grbl 0.9 or older.
     """
     if not line.endswith(b"\n") or b"\n" in line[:-1]:
@@ -205,15 +205,12 @@ def _decode_status(line: bytes, text: str) -> Status:
     match = _STATUS.fullmatch(text)
     if match is None or match[1] not in STATES:
         raise GarbledReplyError(line, "not a status report")
-    names, values = [], {}
-    for part in match[3].split("|")[1:]:
-        name, _, value = part.partition(":")
-        names.append(name)
-        values[name] = value
-    if len(values) < len(names):
+    fields = match[3].split("|")[1:]
+    values = dict(field.split(":", 1) for field in fields)
+    if len(values) < len(fields):
         raise GarbledReplyError(line, "a field appears twice")
     machine, work, offset = (
-        _position(line, values[name]) if name in values else None
+        tuple(_number(line, word) for word in values[name].split(",")) if name in values else None
         for name in ("MPos", "WPos", "WCO")
     )
     if machine is None and work is None:
@@ -227,10 +224,6 @@ def _decode_status(line: bytes, text: str) -> Status:
         work=work,
         offset=offset,
     )
-
-
-def _position(line: bytes, text: str) -> tuple[float, ...]:
-    return tuple(_number(line, word) for word in text.split(","))
 
 
 def _number(line: bytes, word: str) -> float:

@@ -149,7 +149,7 @@ def _one_line(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class CameraSetup:
-    """What a Micro-Manager camera cannot say of its frames, and how it is to be set.
+    """Facts on frames that Micro-Manager does not state, and the settings of the camera.
 
     label: of the camera; "" takes the configuration's. cfa: a Bayer phase of the whole sensor, or
     "mono". black_level_dn: a whole number. bit_depth, binning: None leaves them. roi: left, top,
@@ -351,7 +351,7 @@ class MicroManagerCamera:
 
     @contextmanager
     def _alone(self) -> Iterator[CMMCorePlus]:
-        """Yield the core, made to use this camera; others wait until it is released."""
+        """Yield the core with this camera chosen; other threads wait for its release."""
         if self._closed:
             raise CameraClosedError(self.label)
         with self._loaded.lock:
@@ -405,8 +405,8 @@ class StageSetup:
 
     axes: our names, and where they are: `XY.x`, `XY.y`, or the label of a one-axis stage; None
     takes all, by those names. travel_um: lowest and highest place, by our names. homes: True homes
-    by the adapter; False is for an encoder that always knows where it is, or a stage that was
-    homed in Micro-Manager: homing it, after an unplug, moves nothing. speed_property,
+    by the adapter; False is for absolute encoders and for stages homed in Micro-Manager: homing
+    such a stage, after an unplug, moves nothing. speed_property,
     speed_unit_um_s: the property that holds the speed, and its unit. speed_um_s: what the axes
     move at where there is none, for time limits.
     """
@@ -465,10 +465,12 @@ class MicroManagerStage(HostStage):
 
     def identity(self, axis: str) -> StageIdentity:
         """As `HostStage.identity`: adapter and device, and a property that is a serial number."""
-        (label, _), core = self._place(axis), self._loaded.core
+        (label, _), core, serial = self._place(axis), self._loaded.core, ""
         with calling("describe the stage"):
-            names = [n for n in core.getDevicePropertyNames(label) if "serialnumber" in _plain(n)]
-            serial = core.getProperty(label, names[0]) if names else ""
+            for name in core.getDevicePropertyNames(label):
+                if "serialnumber" in "".join(filter(str.isalnum, name)).lower():
+                    serial = core.getProperty(label, name)
+                    break
             return StageIdentity(core.getDeviceLibrary(label), core.getDeviceName(label), serial)
 
     def speed_um_s(self, axis: str) -> float:
@@ -534,7 +536,7 @@ class MicroManagerStage(HostStage):
                 f"home {' and '.join(sorted(together))} together",
             )
         for label in sorted(labels):
-            with calling(f"home {label}: set homes: false if it always knows where it is"):
+            with calling(f"home {label}: set homes: false for an absolute encoder"):
                 self._loaded.core.home(label)
         self._homed.update(axes)
 
@@ -577,11 +579,6 @@ class MicroManagerStage(HostStage):
             if place.endswith(ending):
                 return place.removesuffix(ending), coordinate
         return place, None
-
-
-def _plain(name: str) -> str:
-    """Return a property's name without case, spaces and marks."""
-    return "".join(filter(str.isalnum, name)).lower()
 
 
 def stage_axes(loaded: LoadedCore) -> tuple[str, ...]:

@@ -60,17 +60,12 @@ class PixelFormat:
         return (width * self.stored_bits + 7) // 8
 
 
-def _formats() -> tuple[PixelFormat, ...]:
-    found = []
-    for place, depth in enumerate(DEPTHS):
-        bits = int("".join(letter for letter in depth if letter.isdigit()))
-        packing = depth.removeprefix(str(bits))
-        for colours, codes in CODES.items():
-            found.append(PixelFormat(colours + depth, codes[place], CFA[colours], bits, packing))
-    return tuple(found)
-
-
-FORMATS = _formats()
+FORMATS = tuple(
+    PixelFormat(colours + depth, codes[place], CFA[colours], int(bits), depth.removeprefix(bits))
+    for place, depth in enumerate(DEPTHS)
+    for bits in (depth.rstrip("Packedp"),)
+    for colours, codes in CODES.items()
+)
 """Every format that can be unpacked; the deepest come first."""
 BY_NAME = {form.name: form for form in FORMATS}
 BY_CODE = {form.code: form for form in FORMATS}
@@ -182,4 +177,4 @@ KERNELS: dict[tuple[int, int, str], tuple[int, int, Kernel]] = {
     (10, 10, "p"): (5, 4, low_first(10)),
     (12, 10, "Packed"): (3, 2, high_and_low(10)),
 }
-"""By bits stored, bits of light and packing: bytes and pixels of one group, and what unpacks it."""
+"""By bits stored, bits of light and packing: bytes and pixels of a group, and its kernel."""

@@ -1,4 +1,4 @@
-"""Serial ports: which there are, which one is meant, who holds it, and how to be allowed to use it.
+"""Serial ports of this computer: list, choice by name, holder of a port, and permissions.
 
 A port is named in one of four ways: by its device (`/dev/ttyUSB0`), by a pattern
 (`/dev/serial/by-id/*FTDI*`), by the serial number of its USB adapter (`usb:AB0JQ4XY`), or by a URL

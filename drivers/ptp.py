@@ -9,11 +9,11 @@ from __future__ import annotations
 import io
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import PurePosixPath
+from enum import IntEnum
 from typing import Any
 
 from drivers import ptp_codec as codec
@@ -35,7 +35,8 @@ from drivers.errors import (
 )
 from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
 from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+from drivers.raw import RawFrame, decode_raw, has_raw_suffix
+from drivers.transport import repeated
 from drivers.usb import open_device
 
 _log = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
 ISO_SPECIALS = frozenset((0xFFFF,))
 """Automatic."""
 
-REFUSALS = {
+REFUSALS: Mapping[int, str] = {
     Code.SESSION_NOT_OPEN: "open the camera again",
     Code.OPERATION_NOT_SUPPORTED: "this camera cannot do it by the standard of PTP; look in its "
     "menus for a mode like PTP, PC remote or tethering, or open it as gphoto2:",
@@ -90,7 +91,7 @@ class PtpSettings:
 
 
 class PtpSession:
-    """An open session with a camera; `info` is what it said of itself.
+    """An open session with a camera, whose DeviceInfo is `info`.
 
     An exchange that breaks off, Ctrl-C included, is cleared away before the next one. Any thread
     may call; `lock` is held for one exchange, and by a camera for a whole capture.
@@ -192,7 +193,7 @@ class PtpSession:
         self.request(Operation.DELETE_OBJECT, handle, 0)
 
     def describe(self, code: int) -> codec.PropertyDescription | None:
-        """Return what a property is and may become, None where the camera has none such."""
+        """Return a property's type, value and choices, None where the camera lacks it."""
         if code not in self.info.properties:
             return None
         return codec.decode_description(self.fetch(Operation.GET_PROPERTY_DESCRIPTION, code))
@@ -214,7 +215,7 @@ class PtpSession:
         """Release the shutter and return the first new object that is accepted.
 
         Folders are passed over. An event that never comes is made up for by looking at the card.
-        `all_of_it`: wait until the camera says that it is done, for the other files of the same
+        `all_of_it`: wait for the camera's CaptureComplete, and so for the other files of the same
         exposure. Raises `CaptureError`, `CardFullError`, or as `request` does.
         """
         with self.lock:
@@ -243,25 +244,24 @@ class PtpSession:
         """
         known = info.size != codec.EVERYTHING
         most = info.size if known else codec.EVERYTHING
-        for attempt in range(1, self.settings.attempts + 1):
-            received = io.BytesIO()
 
-            def take(piece: memoryview, received: io.BytesIO = received) -> None:
+        def fetch() -> bytes:
+            received, reason = io.BytesIO(), "the camera sent no more"
+
+            def take(piece: memoryview) -> None:
                 received.write(piece)
                 on_progress(received.tell(), info.size if known else received.tell())
 
             try:
                 self.request(Operation.GET_OBJECT, handle, sink=take, most=most)
-            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
-                reason = str(error)
-                _log.info("%s: fetching %s again: %s", self.name, info.name, error)
-            else:
                 if not known or received.tell() == info.size:
                     return received.getvalue()
-                reason = "the camera sent no more"
-            if attempt == self.settings.attempts:
-                raise DownloadError(info.name, received.tell(), info.size, reason)
-        raise AssertionError("unreachable")
+            except (CameraFormatError, UsbTimeoutError, UsbStalledError) as error:
+                reason = str(error)
+            raise DownloadError(info.name, received.tell(), info.size, reason)
+
+        what = f"{self.name} to fetch {info.name}"
+        return repeated(fetch, what, faults=(DownloadError,), attempts=self.settings.attempts)
 
     def _open(self) -> None:
         """Open the session, whatever state an earlier program left the camera in."""
@@ -282,15 +282,12 @@ class PtpSession:
                 self.clock.sleep(self.settings.busy_poll_s)
             elif response.code == Code.SESSION_ALREADY_OPEN and not last:
                 _log.info("%s: closing a session that was left open", self.name)
-                self._end_foreign_session()
+                try:
+                    self.request(Operation.CLOSE_SESSION)
+                except CameraRefusedError:
+                    self._transport.reset()
             else:
                 raise _refused(Operation.OPEN_SESSION, response.code)
-
-    def _end_foreign_session(self) -> None:
-        try:
-            self.request(Operation.CLOSE_SESSION)
-        except CameraRefusedError:
-            self._transport.reset()
 
     def _exchange(
         self,
@@ -404,8 +401,7 @@ class Taken:
 
 def is_raw(info: ObjectInfo) -> bool:
     """Whether an object is a RAW file: by its format for DNG, else by its name."""
-    suffix = PurePosixPath(info.name.lower()).suffix
-    return info.format == Format.DNG or suffix in RAW_SUFFIXES
+    return info.format == Format.DNG or has_raw_suffix(info.name)
 
 
 class Dial:
@@ -613,17 +609,16 @@ def _camera_time_s(text: str) -> float | None:
     return moment.replace(tzinfo=UTC).timestamp()
 
 
+def _words(codes: type[IntEnum], value: int, unknown: str = "") -> str:
+    """Return a code's name in words, else its number after `unknown`."""
+    names = (code.name.lower().replace("_", " ") for code in codes if code == value)
+    return next(names, f"{unknown}{value:#06x}")
+
+
 def _shown(operation: int) -> str:
-    try:
-        return Operation(operation).name.lower().replace("_", " ")
-    except ValueError:
-        return f"operation {operation:#06x}"
+    return _words(Operation, operation, "operation ")
 
 
 def _refused(operation: int, code: int) -> CameraRefusedError:
-    try:
-        known = Code(code)
-    except ValueError:
-        return CameraRefusedError(_shown(operation), f"{code:#06x}", SEE_MANUAL)
-    answer = known.name.lower().replace("_", " ")
-    return CameraRefusedError(_shown(operation), answer, REFUSALS.get(known, SEE_MANUAL))
+    advice = REFUSALS.get(code, SEE_MANUAL)
+    return CameraRefusedError(_shown(operation), _words(Code, code), advice)

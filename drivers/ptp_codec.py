@@ -164,7 +164,7 @@ def decode_message(data: bytes) -> Message:
     header = decode_header(data)
     count, rest = divmod(header.payload_length, 4)
     if header.length != len(data) or rest or count > MOST_PARAMETERS or header.kind == Kind.DATA:
-        raise CameraFormatError(data, "its length does not fit its parameters")
+        raise CameraFormatError(data, "length and parameters do not match")
     parameters = struct.unpack_from(f"<{count}I", data, HEADER_SIZE)
     return Message(header.kind, header.code, header.transaction, parameters)
 
@@ -206,7 +206,7 @@ class _Reader:
         return self.take(f"{count}{layout}")
 
     def text(self) -> str:
-        """Return a string; some cameras end it by a null and some do not, or leave it out."""
+        """Return a string; some cameras omit the closing null, or the whole string at the end."""
         if self._at == len(self._data):
             return ""
         size = 2 * self.number("B")
@@ -237,7 +237,7 @@ def _encode_array(layout: str, values: tuple[int, ...]) -> bytes:
 
 
 def encode_value(data_type: int, value: Value) -> bytes:
-    """Return a property's value; raises `ValueError` for one that does not fit its type."""
+    """Return a property's value; raises `ValueError` where value and type do not match."""
     if data_type == TEXT:
         return encode_text(str(value))
     layout = NUMBERS.get(data_type & ~ARRAY)
@@ -305,7 +305,7 @@ class _Dataset:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceInfo(_Dataset):
-    """Who the camera is and what it can do (clause 5.5.2)."""
+    """Identity and capabilities of a camera (clause 5.5.2)."""
 
     standard_version: U16 = 100
     vendor_extension: U32 = 0
@@ -442,7 +442,7 @@ def nearest(described: PropertyDescription, target: float, special: frozenset[in
 
 
 def limits(described: PropertyDescription, special: frozenset[int]) -> tuple[int, int]:
-    """Return the lowest and highest value above 0; what it is now where nothing else is said."""
+    """Return the lowest and highest value above 0; the present value where no form states them."""
     choices = numeric_choices(described, special)
     if not choices and described.span is not None:
         return max(1, described.span[0]), max(1, described.span[1])

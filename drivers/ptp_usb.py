@@ -14,12 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import (
-    CameraBusyError,
-    CameraFormatError,
-    UsbStalledError,
-    UsbTimeoutError,
-)
+from drivers.errors import CameraBusyError, CameraFormatError, UsbStalledError, UsbTimeoutError
 from drivers.ptp_codec import (
     HEADER_SIZE,
     Code,
@@ -94,7 +89,7 @@ class PtpUsb:
             header, start = self._read_start()
             ours = header.transaction == command.transaction
             if header.kind == Kind.DATA:
-                self._read_payload(header, start, sink if ours else _forget, most)
+                self._read_payload(header, start, sink if ours else lambda piece: None, most)
             elif header.kind == Kind.RESPONSE:
                 response = self._read_message(header, start)
                 if ours:
@@ -165,7 +160,7 @@ class PtpUsb:
         raise CameraBusyError("for its status", STATUS_POLLS * STATUS_POLL_S)
 
     def _unhalt(self, pipe: UsbPipe) -> None:
-        """Clear the endpoint's halt if it has one: clearing one that has none upsets cameras."""
+        """Clear a halted endpoint; a needless CLEAR_FEATURE upsets cameras."""
         try:
             status = self._device.control(
                 ENDPOINT_STATUS_IN, GET_STATUS, index=pipe.address, data=2
@@ -241,7 +236,3 @@ class PtpUsb:
             data = data[length:]
             if message.kind == Kind.EVENT:
                 self._unread_events.append(message)
-
-
-def _forget(piece: memoryview) -> None:
-    """Discard data that no request expects."""

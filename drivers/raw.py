@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, timezone
+from pathlib import PurePath
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -44,13 +45,19 @@ RAW_SUFFIXES = frozenset(
 )
 """What makers call the RAW files that LibRaw knows."""
 
+
+def has_raw_suffix(name: str) -> bool:
+    """Return whether a file's name is that of a RAW file."""
+    return PurePath(name.lower()).suffix in RAW_SUFFIXES
+
+
 TEXT_TAGS = {"maker": (271, "Make"), "model": (272, "Model"), "serial": (42033, "BodySerialNumber")}
 NUMBER_TAGS = {"iso": (ISO_TAG, "ISOSpeedRatings"), "aperture": (33437, "FNumber")}
 TIME_TAGS = (
     ((36867, "DateTimeOriginal"), (37521, "SubsecTimeOriginal"), (36881, "OffsetTimeOriginal")),
     ((306, "DateTime"), (37520, "SubsecTime"), (36880, "OffsetTime")),
 )
-"""Code and tifffile's name of what a frame's metadata take from the file, where it has it."""
+"""Code and tifffile's name of the tags that a frame's metadata copy from the file."""
 EXIF_TIME = "%Y:%m:%d %H:%M:%S"
 
 DNG_VERSION_TAG, ACTIVE_AREA_TAG = 50706, 50829
@@ -148,13 +155,13 @@ class RawFrame:
 
 
 def decode_raw(data: bytes, expected_shape: tuple[int, int] | None = None) -> RawFrame:
-    """Return the frame in the bytes of a RAW file: DNG, or any other that LibRaw knows.
+    """Return the frame in the bytes of a RAW file: DNG, or another format of LibRaw's.
 
-    Raises `RawFrameError` for bytes that are no RAW file, that are torn, or too few for their
-    picture, or a mosaic whose `(y, x)` is not `expected_shape`. LibRaw reports most damage, but
-    fills what is missing of a plain DNG, of an empty tile or of a Panasonic's RW2 with zeros: the
-    table of contents of a TIFF-based file (DNG, NEF, CR2, RW2, ORF, ...) is checked first. A
-    flipped bit that still decodes cannot be distinguished from light: keep `sha256`.
+    Raises `RawFrameError` for bytes that are no RAW file, for torn files and files too short for
+    their picture, and for a mosaic `(y, x)` of another shape than `expected_shape`. LibRaw reports
+    most damage, but fills missing pixels of a plain DNG, of an empty tile or of a Panasonic's RW2
+    with zeros: the table of contents of a TIFF-based file (DNG, NEF, CR2, RW2, ORF, ...) is checked
+    first. A flipped bit that still decodes cannot be distinguished from light: keep `sha256`.
     """
     if not data:
         raise RawFrameError("it is empty")
@@ -358,9 +365,11 @@ def _read_tiff(file: BinaryIO, magic: bytes) -> _TiffTags:
             exif = tags.valueof(EXIF_TAG)
             exif = exif if isinstance(exif, dict) else {}
             levels = _dng_levels(pages) if DNG_VERSION_TAG in tags else None
+            description = tags.valueof(IMAGE_DESCRIPTION_TAG)
+            names_tile = isinstance(description, str) and description.startswith(CFA_TILE_PREFIX)
             found = _TiffTags(
                 _number(tags, exif, EXPOSURE_TIME_TAG, "ExposureTime"),
-                _tile_name(tags.valueof(IMAGE_DESCRIPTION_TAG)),
+                description.removeprefix(CFA_TILE_PREFIX) if names_tile else None,
                 _metadata(tags, exif),
                 levels,
             )
@@ -369,12 +378,6 @@ def _read_tiff(file: BinaryIO, magic: bytes) -> _TiffTags:
     if missing > 0:
         raise RawFrameError(f"it is torn, at least {missing} bytes of pixels are missing")
     return found
-
-
-def _tile_name(description: object) -> str | None:
-    if isinstance(description, str) and description.startswith(CFA_TILE_PREFIX):
-        return description.removeprefix(CFA_TILE_PREFIX)
-    return None
 
 
 def _metadata(tags: Any, exif: Mapping[str, Any]) -> dict[str, str]:
@@ -451,7 +454,7 @@ def _dng_levels(pages: Sequence[Any]) -> _DngLevels | None:
 
 
 def _numbers(tag: Any) -> Array | None:
-    """Return the numbers in a tag, float64; None without a tag, or where they are not finite."""
+    """Return the numbers in a tag, float64; None for a missing tag or numbers not finite."""
     if tag is None or isinstance(tag.value, str | bytes):
         return None
     found = np.atleast_1d(np.asarray(tag.value, np.float64))

@@ -66,8 +66,8 @@ class Stage(Protocol):
         ...
 
     def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
-        """As `move_to_um`, relative to where the axes read to be."""
-        ...
+        """As `move_to_um`, relative to where the axes read to be; they must be homed too."""
+        return self.move_to_um({a: self.position_um(a) + step for a, step in steps_um.items()})
 
     def position_um(self, axis: str) -> float:
         """Return where the axis reads to be; raises `NotHomedError` while it does not know."""
@@ -100,9 +100,11 @@ class Stage(Protocol):
     def close(self) -> None:
         """Close the ports; nothing is moved or stopped."""
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *exception: object) -> None: ...
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ DEFAULT_SETTINGS = StageSettings()
 
 
 class Reading(NamedTuple):
-    """What an axis says of itself: where it is, whether it knows that from homing, and moves."""
+    """An axis's report: its position, whether homing gave the reference, and whether it moves."""
 
     position_um: float
     homed: bool
@@ -191,7 +193,7 @@ class Link(Protocol):
         """Close it; closing twice is allowed."""
 
 
-class HostStage(ABC):
+class HostStage(Stage, ABC):
     """The host's side of a stage, over the primitives of one protocol.
 
     No move is ever sent twice: when the answer to one is lost, the position decides whether it
@@ -285,12 +287,6 @@ class HostStage(ABC):
         """Names of the axes."""
         return self._axes
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """Close the ports; nothing is moved or stopped."""
         for transport in self._transports:
@@ -316,7 +312,7 @@ class HostStage(ABC):
         return StageIdentity()
 
     def temperatures_c(self) -> dict[str, float]:
-        """Return the temperatures that the controllers tell, by what they are of."""
+        """Return the controllers' temperatures, by the name of the sensor's place."""
         return {}
 
     def is_homed(self, axis: str) -> bool:
@@ -410,11 +406,6 @@ class HostStage(ABC):
             arrived_um = self._travel(reached_um, targets_um)
             self._clock.sleep(self._settings.settle_s)
         return arrived_um
-
-    def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
-        """As `move_to_um`, relative to where the axes read to be; they must be homed too."""
-        start_um = {axis: self.position_um(axis) for axis in self._choose(steps_um)}
-        return self.move_to_um({axis: start_um[axis] + step for axis, step in steps_um.items()})
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """Stop the given axes (all by default) at once, and return when they stand.
@@ -511,7 +502,7 @@ class HostStage(ABC):
             _log.warning("%s: %s", axis, fault)
             return False
 
-    def _send_once(self, axes: Iterable[str], send: Callable[[], None]) -> None:
+    def _send_once(self, axes: Iterable[str], send: Callable[[], object]) -> None:
         """Send a command that must not be repeated; the position shows later if it arrived."""
         try:
             send()

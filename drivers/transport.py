@@ -1,4 +1,4 @@
-"""Byte streams to serial devices: one object owns one port, and the lock on its exchanges."""
+"""Byte streams to serial devices: an object per port, with the lock on its exchanges."""
 
 import errno
 import logging
@@ -39,7 +39,7 @@ QUIET_LIMIT = 20
 """Reads of `discard_until_quiet` before a device counts as one that never falls silent."""
 RTS_PAUSE_S = 0.05
 BAUD = 115200
-"""Of all controllers that are driven here."""
+"""Of every controller with a driver here."""
 QUERY_ATTEMPTS = 3
 FOREIGN_MESSAGES_TOLERATED = 64
 EXCHANGE_LIMIT_S = 2.0
@@ -63,12 +63,13 @@ def repeated(
     what: str,
     recover: Callable[[], None] = lambda: None,
     faults: tuple[type[DriverError], ...] = (TransportTimeoutError, GarbledReplyError),
+    attempts: int = QUERY_ATTEMPTS,
 ) -> _Answer:
     """Return the answer to what may be asked again without harm, after a few attempts if need be.
 
     recover: called between them. Raises the fault of the last.
     """
-    for attempt in range(1, QUERY_ATTEMPTS):
+    for attempt in range(1, attempts):
         try:
             return ask()
         except faults as fault:
@@ -214,8 +215,8 @@ class SerialTransport(Transport):
     def reopen(self) -> None:
         """Open the port again, wherever it is now; raises as the constructor does.
 
-        A port opened by its name is looked for by the serial number of its USB adapter, if that
-        has one: after an unplug it may have another name.
+        A port opened by its name is searched by the serial number of its USB adapter, if known:
+        after an unplug the port may have another name.
         """
         with self.lock:
             self.close()

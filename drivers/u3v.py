@@ -1,4 +1,4 @@
-"""USB3 Vision cameras: one that names exposure, gain and pixels as GenICam does, and its frames.
+"""USB3 Vision cameras with GenICam's names for exposure, gain and pixels, and their frames.
 
 A recorded frame (`RawFrame.original`) is the camera's leader, payload and trailer in a row, as they
 came; `decode_frame` reads it again. Source: USB3 Vision 1.0; EMVA Standard Features Naming
@@ -37,6 +37,7 @@ from drivers.errors import (
 from drivers.genapi import Features
 from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, PixelFormat, image_bytes, unpack
 from drivers.raw import RawFrame, hashed
+from drivers.transport import repeated
 from drivers.u3v_control import U3vControl
 from drivers.u3v_stream import U3vStream
 from drivers.usb import BULK, UsbDevice, open_device
@@ -73,7 +74,8 @@ RAW_SETTINGS = (
 RATE = "AcquisitionFrameRate"
 SHORTEST_S, LONGEST_S = 1e-7, 3600.0
 FRAME_GRACE_S = 2.0
-LOST_IN_A_ROW = 3
+LOST = (CaptureError,)
+"""Of a stream: such frames are passed over, unless three are lost in a row."""
 IN_FLIGHT = 3
 """Frames that a camera may have begun before a new setting counts."""
 
@@ -89,8 +91,8 @@ def open_camera(address: str, clock: Clock, backend: Any = None) -> U3vCamera:
 class U3vCamera:
     """A `drivers.camera.StreamingCamera` over an open USB device, which it closes.
 
-    Pixels come in the deepest format that it offers and we can read. The black level is what its
-    `BlackLevel` says, taken as DN, or as per cent of white where that is its unit.
+    Pixels come in the deepest format that it offers and we can read. The black level is the feature
+    `BlackLevel` in DN, or in per cent of white if its unit is %.
     The constructor switches automatic and processed modes off and stops an acquisition that was
     left running. Raises a `DriverError`, the device closed.
     """
@@ -172,13 +174,14 @@ class U3vCamera:
 
         `metadata["frames_lost"]` counts the frames missing right before this one, by the camera's
         numbers. Frames that come torn are passed over; three in a row raise `CaptureError`.
-        Exposure and gain are None for frames that may have begun before a change of them.
+        Exposure and gain are None for frames that may have begun before a change of a setting.
         """
         self._in_flight = 0
         last_block: int | None = None
         with self._acquisition("Continuous"):
             while True:
-                frame = self._decode(self._receive_whole())
+                raw = repeated(self._receive, f"{self._device.name} to stream", faults=LOST)
+                frame = self._decode(raw)
                 block = int(frame.metadata["block_id"])
                 lost = 0 if last_block is None else max(0, block - last_block - 1)
                 last_block = block
@@ -270,16 +273,6 @@ class U3vCamera:
 
     def _receive(self) -> bytes:
         return self._stream.receive(max(self.exposure_s, self._period_s) + FRAME_GRACE_S)
-
-    def _receive_whole(self) -> bytes:
-        for attempt in range(1, LOST_IN_A_ROW + 1):
-            try:
-                return self._receive()
-            except CaptureError as error:
-                if attempt == LOST_IN_A_ROW:
-                    raise
-                _log.warning("%s: %s", self._device.name, error)
-        raise AssertionError("unreachable")
 
     def _decode(self, original: bytes) -> RawFrame:
         host_time_s = self._clock.now_s()
@@ -380,8 +373,8 @@ def decode_frame(
 ) -> RawFrame:
     """Return the frame in a leader, payload and trailer, as `RawFrame.original` holds them.
 
-    What the bytes do not say is None, or as given here. Raises `CameraFormatError` for bytes that
-    are no frame, `RawFrameError` for one that cannot be unpacked.
+    Values that the bytes do not state are None, or as given here. Raises `CameraFormatError` for
+    bytes that are no frame, `RawFrameError` for a frame with pixels that cannot be unpacked.
     """
     leader, payload, trailer = codec.split_frame(original)
     form = BY_CODE.get(leader.pixel_format)
@@ -434,12 +427,12 @@ def read_description(control: U3vControl) -> bytes:
     ]
     if not usable:
         raise CameraDescriptionError("its manifest table names no XML")
-    entry = max(usable, key=lambda one: one.version)
+    entry = max(usable, key=lambda entry: entry.version)
     if not 0 < entry.size <= XML_LIMIT:
         raise CameraDescriptionError(f"its XML is {entry.size} bytes long")
     data = control.read(entry.address, entry.size)
     if any(entry.sha1) and hashlib.sha1(data, usedforsecurity=False).digest() != entry.sha1:
-        raise CameraDescriptionError("its XML does not match its checksum")
+        raise CameraDescriptionError("the XML and its checksum differ")
     return _unzipped(data) if entry.file_format == codec.XML_ZIPPED else data.rstrip(b"\0")
 
 

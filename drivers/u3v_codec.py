@@ -136,7 +136,7 @@ class Trailer:
 
 @dataclass(frozen=True)
 class ManifestEntry:
-    """Where a description of the camera lies; `sha1` is all zero where it is not given."""
+    """Place and format of a camera description; `sha1` is all zero if the camera states none."""
 
     version: tuple[int, int, int]
     file_type: int
@@ -203,7 +203,7 @@ def decode_trailer(raw: bytes | memoryview) -> Trailer:
 def split_frame(original: bytes) -> tuple[Leader, memoryview, Trailer]:
     """Return leader, payload and trailer of a recorded frame, which is these three in a row.
 
-    Raises `CameraFormatError` for bytes that are no such frame, or a torn one.
+    Raises `CameraFormatError` for bytes that are no recorded frame, or a torn frame.
     """
     leader = decode_leader(original)
     begin = packet_size(original)

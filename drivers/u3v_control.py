@@ -74,7 +74,7 @@ class U3vControl:
         return b"".join(parts)
 
     def write(self, address: int, data: bytes) -> None:
-        """Store `data`; raises a `DriverError`, after which it may be stored or not."""
+        """Store `data`; raises a `DriverError`, after which the memory may have changed or not."""
         for at in range(0, len(data), self._write_size):
             self._write(address + at, data[at : at + self._write_size])
 

@@ -222,7 +222,10 @@ class U3vStream:
 
     def _transfer(self, size: int, deadline_s: float, complaint: str) -> memoryview:
         """Return what one transfer of at most `size` bytes, rounded up, brings."""
-        buffer = self._buffer(self._pipe.whole_packets(size))
+        room = self._pipe.whole_packets(size)
+        if room not in self._buffers:
+            self._buffers[room] = array.array("B", bytes(room))
+        buffer = self._buffers[room]
         while True:
             left_s = deadline_s - self._clock.now_s()
             if left_s <= 0:
@@ -237,11 +240,6 @@ class U3vStream:
                 self._pipe.clear_halt()
                 raise CaptureError("the camera halted its stream") from error
             return memoryview(buffer)[:count]
-
-    def _buffer(self, size: int) -> array.array[int]:
-        if size not in self._buffers:
-            self._buffers[size] = array.array("B", bytes(size))
-        return self._buffers[size]
 
 
 def _is_packet(raw: memoryview) -> bool:

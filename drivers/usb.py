@@ -11,7 +11,7 @@ import array
 import errno
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +75,8 @@ class UsbListing:
     @property
     def name(self) -> str:
         """How messages call it."""
-        return _name(self.model, self.vendor, self.product, self.bus, self.address)
+        ids = f"{self.vendor:04x}:{self.product:04x}"
+        return f"{self.model or 'device'} {ids} (bus {self.bus}, address {self.address})"
 
 
 def list_devices(kind: Kind | None = None, backend: Any = None) -> list[UsbListing]:
@@ -111,9 +112,9 @@ def open_device(
 
 
 class UsbDevice:
-    """An open device; its interfaces are claimed one by one.
+    """An open device, whose interfaces are claimed separately.
 
-    Use it in a `with` block or `close` it: only then may another program claim it.
+    Closing the device, as the end of a `with` block does, frees it for other programs.
     """
 
     def __init__(self, device: Any, listing: UsbListing, proc: Path = PROC) -> None:
@@ -131,7 +132,7 @@ class UsbDevice:
         self.close()
 
     def claim(self, kind: Kind) -> UsbInterface:
-        """Claim the interface of that kind, taking it from the kernel's driver if there is one.
+        """Claim the interface of that kind, taking it from a driver of the kernel if need be.
 
         Raises `UsbNotFoundError` where the device has none, `UsbClaimedError`,
         `UsbPermissionError` or `UsbGoneError`.
@@ -142,7 +143,8 @@ class UsbDevice:
                 (i for i in self._device.get_active_configuration() if _kind(i) == kind), None
             )
         if found is None:
-            raise UsbNotFoundError(f"interface of class {_shown(kind)} on {self.name}")
+            shown = "/".join(f"{part:02x}" for part in kind)
+            raise UsbNotFoundError(f"interface of class {shown} on {self.name}")
         number = found.bInterfaceNumber
         with self._faults():
             # Not every system can query or detach; the claim below then decides.
@@ -370,7 +372,7 @@ def _find(kind: Kind | None, backend: Any) -> list[Any]:
     def matches(device: Any) -> bool:
         if kind is None:
             return True
-        # A device that hides its descriptors cannot be what is looked for.
+        # A device with hidden descriptors matches no kind.
         with suppress(usb.core.USBError, NotImplementedError):
             return any(_kind(i) == kind for configuration in device for i in configuration)
         return False
@@ -386,30 +388,16 @@ def _listing(device: Any) -> UsbListing:
     accessible = True
     try:
         _configure(device)
-    except usb.core.USBError as fault:
-        accessible = fault.errno not in (errno.EACCES, errno.EPERM)
-    except NotImplementedError:
-        accessible = True
-    texts = (
-        [_text(lambda name=name: getattr(device, name)) for name in _TEXTS]
-        if accessible
-        else ["", "", ""]
+    except (usb.core.USBError, NotImplementedError) as fault:
+        accessible = getattr(fault, "errno", None) not in (errno.EACCES, errno.EPERM)
+    maker, model, serial = (
+        _text(device, name) if accessible else ""
+        for name in ("manufacturer", "product", "serial_number")
     )
     with suppress(usb.core.USBError, NotImplementedError):
         usb.util.dispose_resources(device)
-    return UsbListing(
-        device.idVendor,
-        device.idProduct,
-        device.bus or 0,
-        device.address or 0,
-        texts[0],
-        texts[1],
-        texts[2],
-        accessible,
-    )
-
-
-_TEXTS = ("manufacturer", "product", "serial_number")
+    place = device.bus or 0, device.address or 0
+    return UsbListing(device.idVendor, device.idProduct, *place, maker, model, serial, accessible)
 
 
 def _configure(device: Any) -> None:
@@ -426,28 +414,16 @@ def _configure(device: Any) -> None:
         device.set_configuration()
 
 
-def _text(read: Callable[[], str | None]) -> str:
-    """Return a string descriptor, or nothing where the device has none that can be read."""
+def _text(device: Any, name: str) -> str:
+    """Return a string descriptor, "" where the device has no readable text of that name."""
     try:
-        return (read() or "").strip("\x00 ")
+        return (getattr(device, name) or "").strip("\x00 ")
     except (usb.core.USBError, NotImplementedError, ValueError, IndexError):
         return ""
 
 
-def _name(model: str, vendor: int, product: int, bus: int, address: int) -> str:
-    return f"{model or 'device'} {vendor:04x}:{product:04x} (bus {bus}, address {address})"
-
-
 def _kind(interface: Any) -> Kind:
-    return (
-        interface.bInterfaceClass,
-        interface.bInterfaceSubClass,
-        interface.bInterfaceProtocol,
-    )
-
-
-def _shown(kind: Kind) -> str:
-    return "/".join(f"{part:02x}" for part in kind)
+    return interface.bInterfaceClass, interface.bInterfaceSubClass, interface.bInterfaceProtocol
 
 
 def _milliseconds(timeout_s: float) -> int:

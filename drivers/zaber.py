@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle
 from typing import Any
 
@@ -51,7 +52,7 @@ REFUSAL_ADVICE = {
     "BADDATA": "the value is out of range, check units and limits",
     "BADCOMMAND": "this device does not know the command, check its model and firmware",
     "BADAXIS": "the device has no such axis, check the axis numbers",
-    "STATUSBUSY": "it is moving, stop it or wait",
+    "STATUSBUSY": "the axis is moving, stop the axis or wait",
     "PARKED": "it is parked, unpark it",
     "DRIVERDISABLED": "its motor driver is off, release the emergency stop and home it",
     "INACTIVE": "nothing is connected to this axis, check its cable",
@@ -80,10 +81,10 @@ class ZaberStage(HostStage):
     """Axes of one chain, `axes` mapping names to (device address, axis number).
 
     `microstep_um` is the length of a microstep, one for all axes or by name; what it does not
-    state is looked up by the ids of device and peripheral. `resolution` is the device's setting
-    of that name for which it was stated. Construction asks every axis for its scale, limits
-    and speed; it moves nothing. Raises `ScaleError` for an axis whose scale is unknown or
-    contradicts what was stated, `TransportTimeoutError` for a device that does not answer.
+    state is looked up by the ids of device and peripheral. `resolution`: the device's setting
+    `resolution` at which `microstep_um` holds. Construction asks every axis for its scale, limits
+    and speed; it moves nothing. Raises `ScaleError` for an axis of unknown or contradicted scale,
+    `TransportTimeoutError` for a silent device.
     Source: Zaber ASCII Protocol Manual (commands `home`, `move abs`, `stop`, `warnings`,
     `driver enable`; settings `pos`, `limit.min`, `limit.max`, `maxspeed`, `comm.checksum`,
     `limit.approach.maxspeed`, `resolution`, `deviceid`, `peripheralid`, `device.hw.modified`,
@@ -166,11 +167,8 @@ class ZaberStage(HostStage):
     def _start_moves(self, targets_um: Mapping[str, float], start_um: Mapping[str, float]) -> None:
         for axis, target_um in targets_um.items():
             target = round(target_um / self._microstep_um[axis])
-            self._send_once((axis,), lambda axis=axis, target=target: self._move(axis, target))
-
-    def _move(self, axis: str, target: int) -> None:
-        device, number = self._addresses[axis]
-        self._chain.ask(device, number, f"move abs {target}", axis)
+            command = (*self._addresses[axis], f"move abs {target}", axis)
+            self._send_once((axis,), partial(self._chain.ask, *command))
 
     def _stop_axis(self, axis: str) -> None:
         self._query(axis, "stop")
@@ -276,7 +274,7 @@ class ZaberStage(HostStage):
         return speed_um_s
 
     def _approach_speed_um_s(self, axis: str) -> float:
-        """Return the speed of homing; firmware that has no setting for it homes as it moves."""
+        """Return the speed of homing; firmware without a setting for it homes at move speed."""
         try:
             approach_um_s = self._speed_setting_um_s(axis, "limit.approach.maxspeed")
         except CommandRefusedError:
@@ -310,7 +308,7 @@ def _by_axis(value: Any, axes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class _Chain:
-    """Commands to the devices on one port, and the replies that belong to them."""
+    """Commands to the devices on one port, with their replies."""
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self.checksummed: frozenset[int] = frozenset()

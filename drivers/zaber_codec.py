@@ -3,8 +3,8 @@
 Source: Zaber ASCII Protocol Manual, "Message Format" (commands `/`, replies `@`, alerts `!`,
 information `#`), "Message Checksums" and "Warning Flags".
 
-Only models with a public source are known: one that is not has its microstep in Zaber Launcher or
-on its data sheet, or it can be measured. A rotary stage is listed to be named in the refusal.
+Only models with a public source are known. Zaber Launcher and the data sheets state the microsteps
+of other models. A rotary stage is listed to be named in the refusal.
 """
 
 import re
@@ -131,7 +131,7 @@ FULL_STEPS_PER_S = 10_000.0
 
 @dataclass(frozen=True)
 class Model:
-    """A linear axis: `microstep_um` at `DEFAULT_RESOLUTION`, None for one that turns."""
+    """A model of axis: `microstep_um` at `DEFAULT_RESOLUTION`, None for a rotary axis."""
 
     name: str
     microstep_um: float | None

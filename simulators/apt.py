@@ -12,12 +12,13 @@ import logging
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Self
 
 from drivers import apt_codec as codec
 from drivers.apt_codec import Id, Message, StatusBit
 from drivers.clock import Clock
 from drivers.errors import GarbledReplyError
-from simulators.firmware import SimulatedController
+from simulators.firmware import SimulatedController, earliest_s
 from simulators.motion import AxisSpec, End, Motor
 
 COUNTS_PER_UM = 34.304
@@ -43,6 +44,9 @@ UPWARDS = 2
 """Direction of a jog and of a move at a velocity, which KDC101 count the other way round."""
 LIMIT_SWITCHES = struct.Struct("<HHHIIH")
 MAKES_ON_CONTACT = 2
+PID = (435, 195, 993, 195, 15)
+"""Gains, limit of the integral, and which of them are used."""
+LIGHTS = 11
 OUT_OF_RANGE = 8
 """Code of a complaint about a target; the document leaves the numbers to the server's help."""
 
@@ -63,7 +67,6 @@ class _Bay:
     homed: bool = False
     homing: str = ""
     motion_error: bool = False
-    drift_um: float = 0.0
     jog: tuple[int, ...] = ()
     limit_switches: tuple[int, ...] = (MAKES_ON_CONTACT, MAKES_ON_CONTACT, 0, 0, 1)
 
@@ -96,7 +99,7 @@ class AptController(SimulatedController):
             return self._bays[address].motor.nut_um - HOME_OFFSET_UM
 
     def power_cycle(self) -> None:
-        """Switch off and on: the axes stay where they are and forget where that is."""
+        """Switch off and on: the axes stay in place and lose their reference."""
         with self._lock:
             for address, bay in self._bays.items():
                 bay.motor.advance()
@@ -139,12 +142,14 @@ class AptController(SimulatedController):
             return
         self._motor_unplugged |= self.faults.strikes("motor_unplugged", raw)
         message = codec.decode(raw)
-        handle = self._handlers.get(message.id)
-        if handle is None:
-            _log.warning("not modelled, passed over: message %#06x", message.id)
-            return
         for address in self._meant(message.destination):
-            handle(self, address, self._bays[address], message)
+            bay = self._bays[address]
+            if answer := self._answers.get(message.id):
+                self._say(address, Id(message.id + 1), data=answer(self, bay))
+            elif handle := self._handlers.get(message.id):
+                handle(self, address, bay, message)
+            else:
+                _log.warning("not modelled, passed over: message %#06x", message.id)
 
     def _meant(self, destination: int) -> list[int]:
         """Return the bays that a message is for; one unit alone answers to every address."""
@@ -160,12 +165,9 @@ class AptController(SimulatedController):
 
     def _next_event_s(self) -> float | None:
         ends_s = [bay.motor.ends_s for bay in self._bays.values()]
-        times_s = [one for one in (*ends_s, self._updates_s) if one is not None]
-        return min(times_s, default=None)
+        return earliest_s([*ends_s, self._updates_s])
 
     def _end_move(self, address: int, bay: _Bay, end: End) -> None:
-        bay.motor.drift(bay.drift_um)
-        bay.drift_um = 0.0
         if end is End.STALLED:
             bay.motion_error, bay.enabled, bay.homing = True, False, ""
         elif bay.homing == "seeking" and end is End.ARRIVED:
@@ -212,8 +214,11 @@ class AptController(SimulatedController):
             (bay.enabled, StatusBit.ENABLED),
         ):
             bits |= bit if condition else StatusBit(0)
-        position = round(bay.motor.counted_um * COUNTS_PER_UM)
-        return codec.MotorStatus(1, position, round(velocity_um_s / 1e3 * 2.048), int(bits))
+        velocity = round(velocity_um_s / 1e3 * 2.048)
+        return codec.MotorStatus(1, self._counts(bay), velocity, int(bits))
+
+    def _counts(self, bay: _Bay) -> int:
+        return round(bay.motor.counted_um * COUNTS_PER_UM)
 
     def _speed_um_s(self, bay: _Bay) -> float:
         return bay.maximum / codec.velocity_units(1.0, COUNTS_PER_UM)
@@ -243,22 +248,13 @@ class AptController(SimulatedController):
             self._complain(address, message_id, "channel disabled or motor not connected")
             return
         bay.homing = ""
-        if self.faults.strikes("drift", self._command):
-            bay.drift_um = self.drift_um
-        bay.motor.busy_forever |= self.faults.strikes("busy_forever", self._command)
         bay.motor.go(
             target / COUNTS_PER_UM,
             self._speed_um_s(bay),
             self._acceleration_um_s2(bay),
-            self.faults.strikes("stall", self._command),
+            self._stalls(bay.motor),
             self._start_s(),
         )
-
-    def _info(self, address: int, bay: _Bay, message: Message) -> None:
-        data = struct.pack(
-            "<I8sH4B60sHHH", SERIAL_NUMBER, MODEL, 16, *FIRMWARE, b"\0" * 60, 1, 0, len(self._bays)
-        )
-        self._say(address, Id.HW_GET_INFO, data=data)
 
     def _start_updates(self, address: int, bay: _Bay, message: Message) -> None:
         self._updates_s = self._clock.now_s() + UPDATE_EVERY_S
@@ -279,18 +275,10 @@ class AptController(SimulatedController):
         state = codec.ENABLE if bay.enabled else codec.DISABLE
         self._say(address, Id.MOD_GET_CHANENABLESTATE, message.param1, state)
 
-    def _position(self, address: int, bay: _Bay, message: Message) -> None:
-        position = round(bay.motor.counted_um * COUNTS_PER_UM)
-        self._say(address, Id.MOT_GET_POSCOUNTER, data=codec.encode_position(1, position))
-
     def _set_velocity(self, address: int, bay: _Bay, message: Message) -> None:
         parameters = codec.decode_velocity(message)
         bay.maximum = max(1, parameters.maximum)
         bay.acceleration = max(1, parameters.acceleration)
-
-    def _get_velocity(self, address: int, bay: _Bay, message: Message) -> None:
-        parameters = codec.VelocityParameters(1, 0, bay.acceleration, bay.maximum)
-        self._say(address, Id.MOT_GET_VELPARAMS, data=codec.encode_velocity(parameters))
 
     def _jog_parameters(self, bay: _Bay) -> tuple[int, ...]:
         """Return mode, step, least speed, acceleration, speed and way to stop."""
@@ -303,15 +291,11 @@ class AptController(SimulatedController):
         if message.data is not None and len(message.data) == JOG.size:
             bay.jog = JOG.unpack(message.data)[1:]
 
-    def _get_jog(self, address: int, bay: _Bay, message: Message) -> None:
-        data = JOG.pack(1, *self._jog_parameters(bay))
-        self._say(address, Id.MOT_GET_JOGPARAMS, data=data)
-
     def _jog(self, address: int, bay: _Bay, message: Message) -> None:
         mode, step, _, acceleration, speed, _ = self._jog_parameters(bay)
         if mode == CONTINUOUS:
             step = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
-        here = round(bay.motor.counted_um * COUNTS_PER_UM)
+        here = self._counts(bay)
         usual = bay.maximum, bay.acceleration
         bay.maximum, bay.acceleration = max(1, speed), max(1, acceleration)
         target = here + step if message.param2 == UPWARDS else here - step
@@ -322,27 +306,15 @@ class AptController(SimulatedController):
         if message.data is not None and len(message.data) == LIMIT_SWITCHES.size:
             bay.limit_switches = LIMIT_SWITCHES.unpack(message.data)[1:]
 
-    def _get_limit_switches(self, address: int, bay: _Bay, message: Message) -> None:
-        data = LIMIT_SWITCHES.pack(1, *bay.limit_switches)
-        self._say(address, Id.MOT_GET_LIMSWITCHPARAMS, data=data)
-
     def _pass_over(self, address: int, bay: _Bay, message: Message) -> None:
         """Take a message that changes nothing here: a lamp, flash memory, the end of the link."""
 
     def _set_backlash(self, address: int, bay: _Bay, message: Message) -> None:
         (_, bay.backlash) = struct.unpack("<Hi", message.data or b"\0" * 6)
 
-    def _get_backlash(self, address: int, bay: _Bay, message: Message) -> None:
-        data = codec.encode_position(1, bay.backlash)
-        self._say(address, Id.MOT_GET_GENMOVEPARAMS, data=data)
-
     def _set_home(self, address: int, bay: _Bay, message: Message) -> None:
         velocity, bay.home_offset = codec.decode_home(message)
         bay.home_velocity = max(1, velocity)
-
-    def _get_home(self, address: int, bay: _Bay, message: Message) -> None:
-        data = struct.pack("<HHHii", 1, 2, 1, bay.home_velocity, bay.home_offset)
-        self._say(address, Id.MOT_GET_HOMEPARAMS, data=data)
 
     def _home(self, address: int, bay: _Bay, message: Message) -> None:
         if not bay.enabled or self._motor_unplugged:
@@ -361,8 +333,8 @@ class AptController(SimulatedController):
 
     def _move_relative(self, address: int, bay: _Bay, message: Message) -> None:
         if message.data is not None and len(message.data) == 6:
-            here = round(bay.motor.counted_um * COUNTS_PER_UM)
-            self._go(address, bay, here + struct.unpack("<Hi", message.data)[1], message.id)
+            step = struct.unpack("<Hi", message.data)[1]
+            self._go(address, bay, self._counts(bay) + step, message.id)
 
     def _move_for_ever(self, address: int, bay: _Bay, message: Message) -> None:
         far = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
@@ -378,55 +350,48 @@ class AptController(SimulatedController):
             bay.homing = ""
             self._say_status(address, bay, Id.MOT_MOVE_STOPPED)
 
-    def _give_status(self, address: int, bay: _Bay, message: Message) -> None:
-        self._say_status(address, bay, Id.MOT_GET_DCSTATUSUPDATE)
-
-    def _give_stepper_status(self, address: int, bay: _Bay, message: Message) -> None:
-        status = self._status(bay)
-        data = struct.pack("<HiiI", 1, status.position, status.position, status.bits)
-        self._say(address, Id.MOT_GET_STATUSUPDATE, data=data)
-
-    def _give_status_bits(self, address: int, bay: _Bay, message: Message) -> None:
-        data = struct.pack("<HI", 1, self._status(bay).bits)
-        self._say(address, Id.MOT_GET_STATUSBITS, data=data)
-
-    def _get_pid(self, address: int, bay: _Bay, message: Message) -> None:
-        data = struct.pack("<HIIIIH", 1, 435, 195, 993, 195, 15)
-        self._say(address, Id.MOT_GET_DCPIDPARAMS, data=data)
-
-    def _get_lights(self, address: int, bay: _Bay, message: Message) -> None:
-        self._say(address, Id.MOT_GET_AVMODES, data=struct.pack("<HH", 1, 11))
+    _answers: Mapping[int, Callable[[Self, _Bay], bytes]] = {
+        Id.HW_REQ_INFO: lambda self, bay: struct.pack(
+            "<I8sH4B60sHHH", SERIAL_NUMBER, MODEL, 16, *FIRMWARE, b"", 1, 0, len(self._bays)
+        ),
+        Id.MOT_REQ_POSCOUNTER: lambda self, bay: codec.encode_position(1, self._counts(bay)),
+        Id.MOT_REQ_VELPARAMS: lambda self, bay: codec.encode_velocity(
+            codec.VelocityParameters(1, 0, bay.acceleration, bay.maximum)
+        ),
+        Id.MOT_REQ_JOGPARAMS: lambda self, bay: JOG.pack(1, *self._jog_parameters(bay)),
+        Id.MOT_REQ_LIMSWITCHPARAMS: lambda self, bay: LIMIT_SWITCHES.pack(1, *bay.limit_switches),
+        Id.MOT_REQ_GENMOVEPARAMS: lambda self, bay: codec.encode_position(1, bay.backlash),
+        Id.MOT_REQ_HOMEPARAMS: lambda self, bay: struct.pack(
+            "<HHHii", 1, 2, 1, bay.home_velocity, bay.home_offset
+        ),
+        Id.MOT_REQ_STATUSUPDATE: lambda self, bay: struct.pack(
+            "<HiiI", 1, self._counts(bay), self._counts(bay), self._status(bay).bits
+        ),
+        Id.MOT_REQ_DCSTATUSUPDATE: lambda self, bay: codec.encode_status(self._status(bay)),
+        Id.MOT_REQ_STATUSBITS: lambda self, bay: struct.pack("<HI", 1, self._status(bay).bits),
+        Id.MOT_REQ_DCPIDPARAMS: lambda self, bay: struct.pack("<HIIIIH", 1, *PID),
+        Id.MOT_REQ_AVMODES: lambda self, bay: struct.pack("<HH", 1, LIGHTS),
+    }
+    """Data of the answer to a request; the answer's id is the next number after the request's."""
 
     _handlers: Mapping[int, Callable[..., None]] = {
-        Id.HW_REQ_INFO: _info,
         Id.HW_START_UPDATEMSGS: _start_updates,
         Id.HW_STOP_UPDATEMSGS: _stop_updates,
         Id.MOT_ACK_DCSTATUSUPDATE: _acknowledge,
         Id.MOD_SET_CHANENABLESTATE: _enable,
         Id.MOD_REQ_CHANENABLESTATE: _is_enabled,
-        Id.MOT_REQ_POSCOUNTER: _position,
         Id.MOT_SET_VELPARAMS: _set_velocity,
-        Id.MOT_REQ_VELPARAMS: _get_velocity,
         Id.MOT_SET_JOGPARAMS: _set_jog,
-        Id.MOT_REQ_JOGPARAMS: _get_jog,
         Id.MOT_MOVE_JOG: _jog,
         Id.MOT_SET_LIMSWITCHPARAMS: _set_limit_switches,
-        Id.MOT_REQ_LIMSWITCHPARAMS: _get_limit_switches,
         Id.HW_DISCONNECT: _pass_over,
         Id.HW_NO_FLASH_PROGRAMMING: _pass_over,
         Id.MOD_IDENTIFY: _pass_over,
         Id.MOT_SET_GENMOVEPARAMS: _set_backlash,
-        Id.MOT_REQ_GENMOVEPARAMS: _get_backlash,
         Id.MOT_SET_HOMEPARAMS: _set_home,
-        Id.MOT_REQ_HOMEPARAMS: _get_home,
         Id.MOT_MOVE_HOME: _home,
         Id.MOT_MOVE_ABSOLUTE: _move_absolute,
         Id.MOT_MOVE_RELATIVE: _move_relative,
         Id.MOT_MOVE_VELOCITY: _move_for_ever,
         Id.MOT_MOVE_STOP: _stop,
-        Id.MOT_REQ_STATUSUPDATE: _give_stepper_status,
-        Id.MOT_REQ_DCSTATUSUPDATE: _give_status,
-        Id.MOT_REQ_STATUSBITS: _give_status_bits,
-        Id.MOT_REQ_DCPIDPARAMS: _get_pid,
-        Id.MOT_REQ_AVMODES: _get_lights,
     }

@@ -277,9 +277,9 @@ def window_side_um(views: tuple[int, int], cell_um: float) -> float:
 class Bench:
     """Scene or whiteboard, lamp, masks, pinhole plate and sensor of a camera, as they really are.
 
-    scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1. Or, of one
-        that moves, what returns that as it is at a time in seconds: a frame shows it as it was when
-        the exposure began, without motion blur.
+    scene: (v f, u f, y g, x g, 3) for a light field of (v, u, y, x) samples; f may be 1. For a
+        moving scene, a function that returns this array at a time in seconds: a frame shows the
+        scene at the begin of the exposure, without motion blur.
     positions_um: asks where the stages really are; keys mask_x, mask_y (0: masks centred on the
         axis), aperture_x, aperture_y (0: the pinhole on the axis), and focus (0: as the scene is),
         where there is such an axis.
@@ -308,12 +308,7 @@ class Bench:
         if callable(scene):
             scene = scene(0.0)
         finer = (scene.shape[0] // views[0], scene.shape[2] // size[0])
-        expected = (
-            views[0] * finer[0],
-            views[1] * finer[0],
-            size[0] * finer[1],
-            size[1] * finer[1],
-        )
+        expected = (*(count * finer[0] for count in views), *(count * finer[1] for count in size))
         if scene.shape != (*expected, 3):
             raise ValueError(f"a scene of shape {scene.shape} is no finer grid of {views} x {size}")
         self.lamp = "off"
@@ -363,7 +358,7 @@ class Bench:
             self._scene = self._scene_at(self._began_s)
             state = (*state, self._began_s)
         if state not in self._seen:
-            if sum(one.nbytes for one in self._seen.values()) > KEPT_BYTES:
+            if sum(readings.nbytes for readings in self._seen.values()) > KEPT_BYTES:
                 self._seen.clear()
             self._seen[state] = self._pixels(self._trace(at_um, lamp))
         return self._seen[state]
@@ -397,8 +392,8 @@ class Bench:
         """Return every coefficient of Psi of one shot, (v, u, y, colour, x), by integration.
 
         Each is the mean over the rays between its pixel and its aperture cell of what masks, lens
-        and sensor pass of one colour, over what the open camera without masks passes of all: no
-        frame, no lamp and no whiteboard is in it. Masks stand where the stages are.
+        and sensor pass of one colour, over what the open camera without masks passes of all.
+        Frames, lamp and whiteboard do not enter. Masks stand where the stages are.
         """
         camera, size = self.camera, self._size
         k = camera.sensor.binning
@@ -540,9 +535,5 @@ class Bench:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
         cell_um = self.camera.lens.aperture_cell_um
         window_half_um = window_side_um(self.camera.views, cell_um) / 2
-        return np.array(
-            [
-                (x_um, y_um, cell_um / 2),
-                (x_um - self.window_um, y_um, window_half_um),
-            ]
-        )
+        window_um = (x_um - self.window_um, y_um, window_half_um)
+        return np.array([(x_um, y_um, cell_um / 2), window_um])

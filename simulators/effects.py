@@ -92,7 +92,7 @@ def flawed(base: Bench, names: Iterable[str]) -> Bench:
     names: of EFFECTS, or TOGETHER: all of them. Keeps the class of `base`.
     """
     for name in names:
-        for one in EFFECTS if name == TOGETHER else (name,):
-            for part, changes in EFFECTS[one].items():
+        for effect in EFFECTS if name == TOGETHER else (name,):
+            for part, changes in EFFECTS[effect].items():
                 base = replace(base, **{part: replace(getattr(base, part), **changes)})
     return base

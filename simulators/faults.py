@@ -11,7 +11,7 @@ Condition = Callable[[Any], bool]
 
 @dataclass
 class _Armed:
-    """One fault that waits for its moment."""
+    """A fault that waits for its occasion."""
 
     times: float
     skip: int
@@ -20,7 +20,7 @@ class _Armed:
 
 
 class Faults:
-    """The faults one device knows, and those that are still to strike.
+    """The known faults of a device, and the armed faults.
 
     `clock` is needed for faults that wait for a time.
     """

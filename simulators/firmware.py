@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from drivers.clock import Clock
 from simulators.faults import Faults
+from simulators.motion import Motor
 from simulators.wire import MemoryTransport
 
 WIRE_FAULTS = (
@@ -39,7 +40,8 @@ class SimulatedController(ABC):
     sends it twice, `unplug` pulls the cable at the next byte from the host. `stall` blocks the
     next move half way, `drift` shifts the axis by `drift_um` unnoticed at the end of the next
     move, after `busy_forever` an axis says for ever that it moves, `slow_start` lets the next move
-    begin `slow_by_s` after its command. `fed` counts how often the host wrote.
+    begin `slow_by_s` after its command. `fed` counts the writes of the host, `plugs` how often the
+    cable was plugged in: a port opened before the last time is dead.
     """
 
     def __init__(self, clock: Clock, faults: Iterable[str] = ()) -> None:
@@ -49,13 +51,20 @@ class SimulatedController(ABC):
         self.slow_by_s = 0.2
         self._clock = clock
         self._lock = threading.RLock()
-        self._plugged = True
-        self._plugs = 1
+        self.unplugged = False
+        self.plugs = 1
         self._command = b""
         self._outbox: list[tuple[float, int, bytes]] = []
         self._sent = 0
         self._garbled = 0
         self.fed = 0
+
+    def _stalls(self, motor: Motor) -> bool:
+        """Arm on the motor the faults that strike its next move; return whether it stalls."""
+        if self.faults.strikes("drift", self._command):
+            motor.drift_um = self.drift_um
+        motor.busy_forever |= self.faults.strikes("busy_forever", self._command)
+        return self.faults.strikes("stall", self._command)
 
     def _start_s(self) -> float:
         """Return when a move that was commanded now begins."""
@@ -64,7 +73,7 @@ class SimulatedController(ABC):
 
     @abstractmethod
     def power_cycle(self) -> None:
-        """Switch off and on: the axes stay where they are and forget where that is."""
+        """Switch off and on: the axes stay in place and lose their reference."""
 
     @abstractmethod
     def _receive(self, data: bytes) -> None:
@@ -72,7 +81,7 @@ class SimulatedController(ABC):
 
     @abstractmethod
     def _advance(self) -> None:
-        """Advance to the time of the clock; what it says by itself it says with `_send`."""
+        """Advance to the time of the clock; messages that nobody asked for go out by `_send`."""
 
     @abstractmethod
     def _next_event_s(self) -> float | None:
@@ -82,26 +91,16 @@ class SimulatedController(ABC):
         """Return a wire in memory that ends in this firmware."""
         return MemoryTransport(self, self._clock, timeout_s)
 
-    @property
-    def unplugged(self) -> bool:
-        """Whether the cable has been pulled."""
-        return not self._plugged
-
-    @property
-    def plugs(self) -> int:
-        """How often the cable has been plugged in; a port opened before the last is dead."""
-        return self._plugs
-
     def unplug(self) -> None:
         """Pull the cable of the port; the power stays on."""
         with self._lock:
-            self._plugged = False
+            self.unplugged = True
 
     def replug(self, power_lost: bool = False) -> None:
         """Plug the cable in again, after a loss of power too if `power_lost`."""
         with self._lock:
-            self._plugged = True
-            self._plugs += 1
+            self.unplugged = False
+            self.plugs += 1
             self._outbox.clear()
             if power_lost:
                 self.power_cycle()
@@ -109,8 +108,8 @@ class SimulatedController(ABC):
     def feed(self, data: bytes) -> bytes:
         """Take bytes from the host; return those that fell due for the host by now."""
         with self._lock:
-            if not self._plugged or self.faults.strikes("unplug", Occasion(data)):
-                self._plugged = False
+            if self.unplugged or self.faults.strikes("unplug", Occasion(data)):
+                self.unplugged = True
                 return b""
             if self.faults.strikes("lose_command_byte", Occasion(data)):
                 data = _without_middle(data)
@@ -122,7 +121,7 @@ class SimulatedController(ABC):
     def due(self) -> bytes:
         """Return the bytes that fell due for the host by now."""
         with self._lock:
-            if not self._plugged:
+            if self.unplugged:
                 return b""
             self._advance()
             return self._due()
@@ -130,9 +129,7 @@ class SimulatedController(ABC):
     def next_due_s(self) -> float | None:
         """Return when something may next fall due, if anything will."""
         with self._lock:
-            waiting_s = self._outbox[0][0] if self._outbox else None
-            times_s = [one for one in (waiting_s, self._next_event_s()) if one is not None]
-            return min(times_s, default=None)
+            return earliest_s([self._next_event_s(), *(entry[0] for entry in self._outbox[:1])])
 
     def _due(self) -> bytes:
         now_s = self._clock.now_s()
@@ -164,6 +161,11 @@ class SimulatedController(ABC):
         """Take note of the command under way; return whether a fault loses it."""
         self._command = command
         return self.faults.strikes("drop_command", Occasion(command))
+
+
+def earliest_s(times_s: Iterable[float | None]) -> float | None:
+    """Return the earliest of the times that are known, None where none is."""
+    return min((time_s for time_s in times_s if time_s is not None), default=None)
 
 
 def _without_middle(data: bytes) -> bytes:

@@ -149,8 +149,8 @@ class BoardFlaws:
     """Of the white board: how its radiance differs from the mean, peak to peak.
 
     angle_spread: over the directions into the aperture. place_spread: over the board's width;
-    parallax_px: by how much the outermost view sees the board shifted (0: it is in focus, and what
-    it does over place cancels). Both turn with the board.
+    parallax_px: by how much the outermost view sees the board shifted (0: the board is in focus,
+    and the spread over place cancels). Both turn with the board.
     """
 
     angle_spread: float = 0.0
@@ -185,7 +185,7 @@ class BoardFlaws:
 
 @dataclass(frozen=True)
 class LampFlaws:
-    """Of the lamp: what its level and colour drift by while it warms up, relative.
+    """Of the lamp: relative drift of level and colour during warm-up.
 
     colour_drift: red rises by so much, and blue falls.
     """

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 from drivers import grbl_codec as codec
 from drivers.clock import Clock
-from simulators.firmware import SimulatedController
+from simulators.firmware import SimulatedController, earliest_s
 from simulators.motion import AxisSpec, End, Motor
 
 LETTERS = "XYZABC"
@@ -113,7 +113,7 @@ class GrblController(SimulatedController):
             return self._motors[letter].nut_um
 
     def power_cycle(self) -> None:
-        """Switch off and on: the axes stay where they are and forget where that is."""
+        """Switch off and on: the axes stay in place and lose their reference."""
         with self._lock:
             for motor in self._motors.values():
                 motor.advance()
@@ -164,9 +164,7 @@ class GrblController(SimulatedController):
             elif byte == codec.CYCLE_START:
                 self._cycle_start()
             elif byte == codec.JOG_CANCEL:
-                if self._state == "Jog":
-                    self._blocks.clear()
-                    self._brake()
+                self._cancel_jog()
             elif value >= 0x80:
                 continue
             elif self._stuck() and self._buffered() >= RX_BUFFER:
@@ -228,8 +226,7 @@ class GrblController(SimulatedController):
         self._report_if_asked()
 
     def _next_event_s(self) -> float | None:
-        ends_s = [motor.ends_s for motor in self._motors.values()]
-        return min((one for one in ends_s if one is not None), default=None)
+        return earliest_s(motor.ends_s for motor in self._motors.values())
 
     def _end_block(self, ended_s: float | None) -> None:
         block, self._block = self._block, None
@@ -289,11 +286,14 @@ class GrblController(SimulatedController):
         for letter, motor in self._motors.items():
             motor.brake(self._setting(codec.ACCELERATION, letter) * 1e3)
 
-    def _feed_hold(self) -> None:
+    def _cancel_jog(self) -> None:
         if self._state == "Jog":
             self._blocks.clear()
             self._brake()
-        elif self._state == "Run":
+
+    def _feed_hold(self) -> None:
+        self._cancel_jog()
+        if self._state == "Run":
             self._held = True
             self._brake()
         elif self._state == "Idle":
@@ -444,20 +444,17 @@ class GrblController(SimulatedController):
         seek = self.settings[codec.HOMING_SEEK] / 60 * 1e3
         locate = self.settings[codec.HOMING_FEED] / 60 * 1e3
         pull_off_um = self.settings[codec.HOMING_PULL_OFF] * 1e3
-        at_switch, off_switch = {}, {}
-        for one in letters:
-            travel_um = self.axes[one].travel_um
-            downwards = int(self.settings[codec.HOMING_DIRECTIONS]) >> LETTERS.index(one) & 1
-            at_switch[one] = 0.0 if downwards else travel_um
-            off_switch[one] = pull_off_um if downwards else travel_um - pull_off_um
+        directions = int(self.settings[codec.HOMING_DIRECTIONS])
+        at_and_off_um: dict[str, tuple[float, float]] = {}
+        for axis in letters:
+            travel_um = self.axes[axis].travel_um
+            at_and_off_um[axis] = travel_um, travel_um - pull_off_um
+            if directions >> LETTERS.index(axis) & 1:
+                at_and_off_um[axis] = 0.0, pull_off_um
         self._homing = deque(
-            {one: (place[one], speed) for one in letters}
-            for place, speed in (
-                (at_switch, seek),
-                (off_switch, seek),
-                (at_switch, locate),
-                (off_switch, locate),
-            )
+            {axis: (at_and_off_um[axis][off], speed) for axis in letters}
+            for speed in (seek, locate)
+            for off in (0, 1)
         )
         self._homing_letters = letters
         self._state = "Home"
@@ -658,7 +655,7 @@ class GrblController(SimulatedController):
         if int(self.settings[codec.REPORT_MASK]) & codec.REPORTS_MACHINE_POSITION:
             fields = [state, f"MPos:{self._coordinates(machine_mm, unit)}"]
         else:
-            work_mm = {one: mm - self._offset_mm(one) for one, mm in machine_mm.items()}
+            work_mm = {axis: mm - self._offset_mm(axis) for axis, mm in machine_mm.items()}
             fields = [state, f"WPos:{self._coordinates(work_mm, unit)}"]
         velocities = [motor.velocity_um_s() for motor in self._motors.values()]
         decimals = 0 if unit == 1 else 1

@@ -1,17 +1,16 @@
-"""A motor on a lead screw: where it really is, how it gets there, and what it believes."""
+"""A motor on a lead screw: true position, motion, and counted position."""
 
 import math
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import cached_property
-from typing import Protocol
 
 from drivers.clock import Clock
 
 
 @dataclass(frozen=True)
 class AxisSpec:
-    """A lead-screw axis: 0 and `travel_um` are its ends, `start_um` where it stands at power-up.
+    """A lead-screw axis from 0 to `travel_um`, which stands at `start_um` at power-up.
 
     `backlash_um` is the play of the nut: moving up it sits on the screw's own position, moving
     down it lags that much above.
@@ -23,28 +22,6 @@ class AxisSpec:
     acceleration_um_s2: float = 200_000.0
     start_um: float = 3_210.0
     backlash_um: float = 3.0
-
-
-class Course(Protocol):
-    """A motion along one axis from a time on."""
-
-    @property
-    def start_s(self) -> float:
-        """When it begins."""
-        ...
-
-    @property
-    def duration_s(self) -> float:
-        """Time until it stands."""
-        ...
-
-    def position_um(self, now_s: float) -> float:
-        """Return where the motor is."""
-        ...
-
-    def velocity_um_s(self, now_s: float) -> float:
-        """Return how fast it goes, negative downwards."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -122,6 +99,9 @@ class Braking:
         return math.copysign(speed_um_s, self.initial_um_s)
 
 
+Course = Motion | Braking
+
+
 class End(Enum):
     """How a motion ended."""
 
@@ -132,41 +112,34 @@ class End(Enum):
 
 
 class Motor:
-    """One motor: its true position, that of its nut, and the position that it counts.
+    """A motor with its true position, the position of its nut, and the counted position.
 
-    `busy_forever`: it says that it moves although it stands.
+    true_um, nut_um: of the motor, and of the nut with its load, at the last `advance`.
+    busy_forever: the motor reports motion although it stands. drift_um: a shift that is not
+    counted, at the end of the next move.
     """
 
     def __init__(self, spec: AxisSpec, clock: Clock) -> None:
         self.spec = spec
         self.busy_forever = False
+        self.drift_um = 0.0
         self._clock = clock
-        self._motor_um = spec.start_um
-        self._nut_um = spec.start_um
+        self.true_um = spec.start_um
+        self.nut_um = spec.start_um
         self._counted_from_um = spec.start_um
         self._course: Course | None = None
         self._end = End.ARRIVED
 
     @property
     def moving(self) -> bool:
-        """Whether it says that it moves."""
+        """Whether the motor reports motion."""
         begun = self._course is not None and self._course.start_s <= self._clock.now_s()
         return begun or self.busy_forever
 
     @property
-    def nut_um(self) -> float:
-        """Where the nut, and what it carries, really is."""
-        return self._nut_um
-
-    @property
-    def true_um(self) -> float:
-        """Where the motor really is, as of the last `advance`."""
-        return self._motor_um
-
-    @property
     def counted_um(self) -> float:
         """Where the motor believes to be, as of the last `advance`."""
-        return self._motor_um - self._counted_from_um
+        return self.true_um - self._counted_from_um
 
     @property
     def ends_s(self) -> float | None:
@@ -190,10 +163,10 @@ class Motor:
         end_um = min(max(wanted_um, 0.0), self.spec.travel_um)
         self._end = End.ARRIVED if abs(end_um - wanted_um) < 1e-6 else End.AT_END_OF_TRAVEL
         if stalls:
-            end_um = (self._motor_um + end_um) / 2
+            end_um = (self.true_um + end_um) / 2
             self._end = End.STALLED
         start_s = self._clock.now_s() if start_s is None else start_s
-        self._course = Motion(self._motor_um, end_um, start_s, speed_um_s, acceleration_um_s2)
+        self._course = Motion(self.true_um, end_um, start_s, speed_um_s, acceleration_um_s2)
 
     def seek(
         self,
@@ -213,7 +186,7 @@ class Motor:
             return
         now_s = self._clock.now_s()
         self._course = Braking(
-            self._motor_um, self._course.velocity_um_s(now_s), now_s, acceleration_um_s2
+            self.true_um, self._course.velocity_um_s(now_s), now_s, acceleration_um_s2
         )
         self._end = End.BRAKED
 
@@ -223,12 +196,12 @@ class Motor:
 
     def count_from_here(self, counted_um: float = 0.0) -> None:
         """Believe from now on to be at this position."""
-        self._counted_from_um = self._motor_um - counted_um
+        self._counted_from_um = self.true_um - counted_um
 
     def drift(self, distance_um: float) -> None:
         """Move without counting it."""
-        self._motor_um += distance_um
-        self._nut_um += distance_um
+        self.true_um += distance_um
+        self.nut_um += distance_um
         self._counted_from_um += distance_um
 
     def advance(self) -> End | None:
@@ -236,10 +209,12 @@ class Motor:
         if self._course is None:
             return None
         now_s = self._clock.now_s()
-        self._motor_um = self._course.position_um(now_s)
-        highest_um = self._motor_um + self.spec.backlash_um
-        self._nut_um = min(max(self._nut_um, self._motor_um), highest_um)
+        self.true_um = self._course.position_um(now_s)
+        highest_um = self.true_um + self.spec.backlash_um
+        self.nut_um = min(max(self.nut_um, self.true_um), highest_um)
         if now_s < self._course.start_s + self._course.duration_s:
             return None
         self._course = None
+        self.drift(self.drift_um)
+        self.drift_um = 0.0
         return self._end

@@ -32,8 +32,8 @@ def world_at(world: World, time_s: float) -> World:
     """Return the world as it is at a time, in seconds."""
     return replace(
         world,
-        cards=tuple(moved_card(one, _map_of(one, world, time_s)) for one in world.cards),
-        balls=tuple(_moved_ball(one, _map_of(one, world, time_s), time_s) for one in world.balls),
+        cards=tuple(moved_card(card, _map_of(card, world, time_s)) for card in world.cards),
+        balls=tuple(_moved_ball(b, _map_of(b, world, time_s), time_s) for b in world.balls),
     )
 
 
@@ -78,7 +78,7 @@ def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:
     seen[:2, 3] = -swung * np.array(camera.pan)
     seen[0, 2] = swung * camera.slide * QUOTED
     if isinstance(thing, Ball):
-        # Seen from aside a ball is still a ball: it moves as its centre does.
+        # Seen from aside a ball is still a ball, and moves like its centre.
         seen[0, 3] += seen[0, 2] * (own @ centre)[2]
         seen[0, 2] = 0.0
     return seen @ own

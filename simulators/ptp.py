@@ -110,15 +110,15 @@ class PtpCameraSimulator:
     `render(exposure_s)` returns the uint16 `(y, x)` mosaic in DN that the sensor reads at the
     lowest ISO, called when the exposure is over. `exposures`: the choices in units of 0.1 ms, or
     (lowest, highest, step) in `span`. `quality`: "raw", "raw+jpeg" or "jpeg". `lacks`: operations
-    that it does not know. Faults are armed with
-    `faults.inject`; those of the wire strike there.
+    of the standard that the camera refuses. Faults are armed with `faults.inject`; those of the
+    wire strike there.
     """
 
     maker, model = "EMMC", "EMMC simulated camera"
     vendor_extension = 0
     vendor_operations: tuple[int, ...] = ()
     hidden: tuple[int, ...] = ()
-    """Properties of the standard that it does not have."""
+    """Properties of the standard that the camera lacks."""
     with_data: tuple[int, ...] = (Operation.SET_PROPERTY,)
     """Operations that the host sends data with."""
 
@@ -218,9 +218,11 @@ class PtpCameraSimulator:
     def _standard_answer(
         self, code: int, arguments: tuple[int, ...], data: bytes, transaction: int
     ) -> Answer:
-        if code not in _ANSWERS or code in self._lacks:
+        """Carry out an operation of the standard, by the method of its name."""
+        if code not in tuple(Operation) or code in self._lacks:
             return Answer(Code.OPERATION_NOT_SUPPORTED)
-        return getattr(self, _ANSWERS[code])(arguments, data, transaction)
+        answer = getattr(self, f"_{Operation(code).name.lower()}")
+        return answer(arguments, data, transaction)
 
     def _vendor_answer(
         self, code: int, arguments: tuple[int, ...], data: bytes, transaction: int
@@ -228,7 +230,7 @@ class PtpCameraSimulator:
         """Carry out one of `vendor_operations`."""
         return Answer(Code.OPERATION_NOT_SUPPORTED)
 
-    def _device_info(self, *request: object) -> Answer:
+    def _get_device_info(self, *request: object) -> Answer:
         info = DeviceInfo(
             operations=(
                 *(o for o in Operation if o not in self._lacks),
@@ -236,7 +238,7 @@ class PtpCameraSimulator:
             ),
             vendor_extension=self.vendor_extension,
             events=tuple(EventCode),
-            properties=tuple(one for one in self._values if one not in self.hidden),
+            properties=tuple(code for code in self._values if code not in self.hidden),
             capture_formats=(Format.DNG,),
             image_formats=(Format.DNG, Format.JPEG),
             maker=self.maker,
@@ -258,10 +260,10 @@ class PtpCameraSimulator:
         self.end_session()
         return Answer()
 
-    def _storage_ids(self, *request: object) -> Answer:
+    def _get_storage_ids(self, *request: object) -> Answer:
         return Answer(data=encode_handles((STORAGE,)))
 
-    def _storage_info(self, arguments: tuple[int, ...], *request: object) -> Answer:
+    def _get_storage_info(self, arguments: tuple[int, ...], *request: object) -> Answer:
         if arguments[0] != STORAGE:
             return Answer(Code.INVALID_STORAGE)
         free = max(0, self._capacity_bytes - self._used_bytes)
@@ -274,7 +276,7 @@ class PtpCameraSimulator:
         )
         return Answer(data=info.encode())
 
-    def _object_handles(self, arguments: tuple[int, ...], *request: object) -> Answer:
+    def _get_object_handles(self, arguments: tuple[int, ...], *request: object) -> Answer:
         storage, wanted, parent = arguments[:3]
         if storage not in (STORAGE, EVERYTHING):
             return Answer(Code.INVALID_STORAGE)
@@ -286,43 +288,43 @@ class PtpCameraSimulator:
         ]
         return Answer(data=encode_handles(tuple(found)))
 
-    def _count_objects(self, arguments: tuple[int, ...], *request: object) -> Answer:
-        found = self._object_handles(arguments)
+    def _get_num_objects(self, arguments: tuple[int, ...], *request: object) -> Answer:
+        found = self._get_object_handles(arguments)
         count = len(found.data or b"") // 4 - 1
         return Answer(found.code, (count,)) if found.code == Code.OK else found
 
-    def _object_info(self, arguments: tuple[int, ...], *request: object) -> Answer:
+    def _get_object_info(self, arguments: tuple[int, ...], *request: object) -> Answer:
         if arguments[0] not in self.objects:
             return Answer(Code.INVALID_HANDLE)
         return Answer(data=self.objects[arguments[0]][0].encode())
 
-    def _object(self, arguments: tuple[int, ...], *request: object) -> Answer:
+    def _get_object(self, arguments: tuple[int, ...], *request: object) -> Answer:
         if arguments[0] not in self.objects:
             return Answer(Code.INVALID_HANDLE)
         return Answer(data=memoryview(self.objects[arguments[0]][1]))
 
-    def _thumb(self, *request: object) -> Answer:
+    def _get_thumb(self, *request: object) -> Answer:
         return Answer(Code.NO_THUMBNAIL)
 
-    def _delete(self, arguments: tuple[int, ...], *request: object) -> Answer:
+    def _delete_object(self, arguments: tuple[int, ...], *request: object) -> Answer:
         if self.objects.pop(arguments[0], None) is None:
             return Answer(Code.INVALID_HANDLE)
         return Answer()
 
-    def _describe(self, arguments: tuple[int, ...], *request: object) -> Answer:
+    def _get_property_description(self, arguments: tuple[int, ...], *request: object) -> Answer:
         code = arguments[0]
         if code not in self._values or code in self.hidden:
             return Answer(Code.PROPERTY_NOT_SUPPORTED)
         return Answer(data=encode_description(self._description(code)))
 
-    def _read(self, arguments: tuple[int, ...], *request: object) -> Answer:
+    def _get_property(self, arguments: tuple[int, ...], *request: object) -> Answer:
         code = arguments[0]
         if code not in self._values or code in self.hidden:
             return Answer(Code.PROPERTY_NOT_SUPPORTED)
         described = self._description(code)
         return Answer(data=encode_value(described.data_type, described.current))
 
-    def _write(self, arguments: tuple[int, ...], data: bytes, *request: object) -> Answer:
+    def _set_property(self, arguments: tuple[int, ...], data: bytes, *request: object) -> Answer:
         code = arguments[0]
         if code not in self._values or code in self.hidden:
             return Answer(Code.PROPERTY_NOT_SUPPORTED)
@@ -341,7 +343,9 @@ class PtpCameraSimulator:
             self._values[Property(code)] = value
         return Answer()
 
-    def _capture(self, arguments: tuple[int, ...], data: bytes, transaction: int) -> Answer:
+    def _initiate_capture(
+        self, arguments: tuple[int, ...], data: bytes, transaction: int
+    ) -> Answer:
         if self._due is not None:
             return Answer(Code.BUSY)
         if self.faults.strikes("card_full") or self._used_bytes >= self._capacity_bytes:
@@ -429,24 +433,6 @@ class PtpCameraSimulator:
 
 
 _WITHOUT_SESSION = (Operation.GET_DEVICE_INFO, Operation.OPEN_SESSION)
-_ANSWERS: dict[int, str] = {
-    Operation.GET_DEVICE_INFO: "_device_info",
-    Operation.OPEN_SESSION: "_open_session",
-    Operation.CLOSE_SESSION: "_close_session",
-    Operation.GET_STORAGE_IDS: "_storage_ids",
-    Operation.GET_STORAGE_INFO: "_storage_info",
-    Operation.GET_NUM_OBJECTS: "_count_objects",
-    Operation.GET_OBJECT_HANDLES: "_object_handles",
-    Operation.GET_OBJECT_INFO: "_object_info",
-    Operation.GET_OBJECT: "_object",
-    Operation.GET_THUMB: "_thumb",
-    Operation.DELETE_OBJECT: "_delete",
-    Operation.INITIATE_CAPTURE: "_capture",
-    Operation.GET_PROPERTY_DESCRIPTION: "_describe",
-    Operation.GET_PROPERTY: "_read",
-    Operation.SET_PROPERTY: "_write",
-}
-"""Names of the methods that answer: a subclass may answer otherwise."""
 
 
 class PtpUsbFunction(UsbFunction):
@@ -483,7 +469,7 @@ class PtpUsbFunction(UsbFunction):
         self.camera.power_up()
 
     def bulk_out(self, endpoint: int, data: bytes) -> int:
-        """Gather containers: a command, then its data where it has some."""
+        """Gather containers: a command, then its data, if any."""
         self._received += data
         while len(self._received) >= HEADER_SIZE:
             try:

@@ -40,7 +40,7 @@ _MISSED = -1
 
 @dataclass(frozen=True)
 class Motion:
-    """How an object moves: it swings to either side of its place, and turns about its centre.
+    """An object's motion: a swing to either side of its place, and a turn about its centre.
 
     swing: farthest in S and T, in widths, and in disparity, as quoted; it goes to and fro once in
     `period_s`, fastest at time 0. turn_rad_s: about the axes S, T and D; a card turns about D

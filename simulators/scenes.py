@@ -49,7 +49,7 @@ class RenderedScene:
 
 @dataclass(frozen=True)
 class Scene:
-    """A built-in scene: what it is for, its disparities, and how a random generator builds it."""
+    """A built-in scene: its purpose, range of disparities, and builder of a random world."""
 
     description: str
     disparity_px: tuple[float, float]
@@ -89,8 +89,8 @@ def render(
 def flow_px(name: str, size: tuple[int, int], seed: int, from_s: float, to_s: float) -> np.ndarray:
     """Return the exact optical flow of the centre view of an odd count of views.
 
-    It follows the point that each pixel's centre sees at one time to where it is at the other: no
-    estimate.
+    The scene point at each pixel's centre is followed from the first time to the second, without
+    an estimate.
 
     Returns:
         (y, x, 2) float64, pixels to the right and downwards; NaN where that point is hidden at the

@@ -1,20 +1,22 @@
-"""A stage without physics, which is where it is sent.
+"""A stage without physics, at the target as soon as a move ends.
 
-For what is measured or tested around devices: its own time is none, or exactly as asked for.
+For measurements and tests around devices: a move takes no time, or exactly the stated time.
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Self
 
 from drivers.camera import Limits
 from drivers.clock import Clock
 from drivers.errors import LimitExceededError, NotHomedError
+from drivers.stage import Stage
 
 TRAVEL_UM = (0.0, 100_000.0)
 
 
-class StillStage:
-    """A `drivers.stage.Stage` whose moves take `move_s` on its clock, however far they go."""
+class StillStage(Stage):
+    """A stage whose moves take `move_s` on its clock, however far they go."""
+
+    axes: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -51,10 +53,6 @@ class StillStage:
         self.moves += 1
         return dict(targets_um)
 
-    def move_by_um(self, steps_um: Mapping[str, float]) -> dict[str, float]:
-        """Be that much further."""
-        return self.move_to_um({a: self.position_um(a) + step for a, step in steps_um.items()})
-
     def position_um(self, axis: str) -> float:
         """Where the axis is; raises `NotHomedError`."""
         if axis not in self._at_um:
@@ -89,9 +87,3 @@ class StillStage:
 
     def close(self) -> None:
         """Keep nothing open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()

@@ -59,7 +59,7 @@ def step(x: np.ndarray, edge: float, softness: float) -> np.ndarray:
 
 
 def rectangle(side: int, margin: float = 0.02) -> np.ndarray:
-    """Alpha that fades at the edges of a card, so that they are smooth in every view."""
+    """Alpha that fades at the edges of a card, for smooth edges in every view."""
     p, q = grid(side)
     inside = np.minimum(np.minimum(p, 1 - p), np.minimum(q, 1 - q))
     return step(inside, margin / 2, margin / 3)
@@ -292,8 +292,8 @@ def film(colour: str, opacity: float, side: int = 256) -> np.ndarray:
 def lattice(rng: np.random.Generator, cells: int, side: int = 1024) -> np.ndarray:
     """Round wires, woven diagonally, shaded across."""
     p, q = grid(side)
-    one, other = (p + q) * cells, (p - q) * cells
-    near = np.minimum(np.abs(one % 1 - 0.5), np.abs(other % 1 - 0.5)) / 0.075
+    rising, falling = (p + q) * cells, (p - q) * cells
+    near = np.minimum(np.abs(rising % 1 - 0.5), np.abs(falling % 1 - 0.5)) / 0.075
     light = np.sqrt(np.clip(1 - near * near, 0, 1))
     rust = 0.16 * noise(rng, side, 3, 80)
     shade = np.clip(0.15 + 0.65 * light + rust, 0, 1)

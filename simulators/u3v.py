@@ -416,23 +416,9 @@ class U3vCameraSimulator(UsbFunction):
         if self.faults.strikes("wrong_size", block):
             rows -= 2
             payload = payload[: len(payload) * rows // (rows + 2)]
-        leader = struct.pack(
-            "<IHHQHHQIIIIIHH",
-            0x4C563355,
-            0,
-            LEADER_SIZE,
-            block,
-            0,
-            0x0001,
-            round(start_s * 1e9),
-            form.code,
-            columns,
-            rows,
-            left,
-            top,
-            0,
-            0,
-        )
+        head = struct.pack("<IHHQHH", 0x4C563355, 0, LEADER_SIZE, block, 0, 0x0001)
+        image = (form.code, columns, rows, left, top, 0, 0)
+        leader = head + struct.pack("<QIIIIIHH", round(start_s * 1e9), *image)
         status = DISCARDED if self.faults.strikes("discarded", block) else OK
         trailer = struct.pack(
             "<IHHQHHQI", 0x54563355, 0, TRAILER_SIZE, block, status, 0, len(payload), rows

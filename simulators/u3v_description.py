@@ -1,6 +1,6 @@
 """The XML in which the simulated USB3 Vision camera describes itself, and where its registers lie.
 
-It holds one of every kind of node that a driver must follow: plain and masked registers, floats,
+The XML has every kind of node that a driver must follow: plain and masked registers, floats,
 formulas, converters, choices, commands, limits and locks that other registers set. Source: EMVA
 GenICam Standard 2.1.1; Standard Features Naming Convention 2.7.
 """

@@ -1,8 +1,8 @@
 """A USB bus in memory: a pyusb backend that hosts simulated devices, down to their packets.
 
 Pass it wherever pyusb takes a backend: `open_device(kind, backend=bus)`. A device is any object
-with the hooks of `UsbFunction`; what it returns is cut into packets here, so that a read ends
-where a real one would. Waiting costs time on the injected clock only. Source: USB 2.0
+with the hooks of `UsbFunction`; its messages are cut into packets here, so that a read ends as on
+a real bus. Waiting costs time on the injected clock only. Source: USB 2.0
 specification, 5.8 and 9.4; return codes as `usb.backend.libusb1` gives them.
 """
 
@@ -114,7 +114,11 @@ class UsbFunction:
 
 @dataclass(eq=False)
 class Plug:
-    """A device on the bus: where it is, who holds it, and what is on its way to the host."""
+    """A device on the bus: its address, its holders and the bytes on their way to the host.
+
+    denied: opening it is refused, as without a udev rule. kernel_driver: a driver of the kernel
+    holds it until it is detached. claims: who holds each interface, by its number.
+    """
 
     function: UsbFunction
     address: int
@@ -159,31 +163,11 @@ class SimulatedUsb(usb.backend.IBackend):
     def unplug(self, function: UsbFunction) -> None:
         """Pull the device's cable: a program that has it open gets errors."""
         with self._lock:
-            self._find(function).present = False
+            self.plug_of(function).present = False
             self._plugs = [plug for plug in self._plugs if plug.function is not function]
 
-    def deny(self, function: UsbFunction, denied: bool = True) -> None:
-        """Refuse to open the device, as without a udev rule."""
-        self._find(function).denied = denied
-
-    def seize(self, function: UsbFunction, holder: object = "desktop") -> None:
-        """Let another program claim all interfaces; `release` frees them."""
-        for interface in function.spec.interfaces:
-            self._find(function).claims[interface.number] = holder
-
-    def release(self, function: UsbFunction) -> None:
-        """Take every claim away."""
-        self._find(function).claims.clear()
-
-    def bind_kernel_driver(self, function: UsbFunction) -> None:
-        """Let a driver of the kernel hold the device until it is detached."""
-        self._find(function).kernel_driver = True
-
-    def kernel_driver_bound(self, function: UsbFunction) -> bool:
-        """Whether the kernel's driver holds the device."""
-        return self._find(function).kernel_driver
-
-    def _find(self, function: UsbFunction) -> Plug:
+    def plug_of(self, function: UsbFunction) -> Plug:
+        """Return where a device is plugged in; raises `ValueError` where it is not."""
         for plug in self._plugs:
             if plug.function is function:
                 return plug
@@ -331,7 +315,7 @@ class SimulatedUsb(usb.backend.IBackend):
         _plug(dev_handle).kernel_driver = True
 
     def clear_halt(self, dev_handle: Handle, ep: int) -> None:
-        """Make an endpoint usable again; what was on its way is lost."""
+        """Make an endpoint usable again; pending bytes are lost."""
         plug = _plug(dev_handle)
         plug.halted.discard(ep)
         plug.pending.pop(ep, None)

@@ -10,11 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from drivers.clock import Clock
-from drivers.errors import (
-    PortGoneError,
-    PortNotFoundError,
-    TransportTimeoutError,
-)
+from drivers.errors import PortGoneError, PortNotFoundError, TransportTimeoutError
 from drivers.transport import Transport
 
 READ_SIZE = 4096
@@ -23,17 +19,13 @@ TICK_S = 0.002
 
 
 class Firmware(Protocol):
-    """A simulated device on the end of a wire."""
+    """A simulated device on the end of a wire.
 
-    @property
-    def unplugged(self) -> bool:
-        """Whether the wire has been pulled."""
-        ...
+    unplugged: whether the wire has been pulled. plugs: count of how often the wire was plugged in.
+    """
 
-    @property
-    def plugs(self) -> int:
-        """How often the wire has been plugged in."""
-        ...
+    unplugged: bool
+    plugs: int
 
     def feed(self, data: bytes) -> bytes:
         """Take bytes from the host; return those that fell due for the host by now."""
@@ -118,25 +110,21 @@ class MemoryTransport(Transport):
 class PtyServer:
     """Serves firmware on a pseudo-terminal, in a thread, while its `with` block lasts.
 
-    `port` is the name to open. Pulling the plug closes it under the reader's feet; plugging in
-    again opens a new one, whose name may be another, as a USB port's may. `link` is a path that
-    always leads to it, as /dev/serial/by-id does; it must be free, or an earlier link. POSIX only.
+    `port` is the name to open, while `is_open`. Pulling the plug closes the port under the
+    reader's feet; plugging in again opens a new port, possibly with another name, like a USB port.
+    `link` is a path that always leads to the open port, as /dev/serial/by-id does; it must be free,
+    or an earlier link. POSIX only.
     """
 
     def __init__(self, firmware: Firmware, link: Path | None = None) -> None:
         self.port = ""
         self._firmware, self._link = firmware, link
         self._wake_read, self._wake_write = os.pipe()
-        self._opened = False
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the port can be opened now."""
-        return self._opened
+        self.is_open = False
 
     def __enter__(self) -> Self:
         self._open()
-        self._opened = True
+        self.is_open = True
         self._thread = threading.Thread(target=self._serve, name=f"serve {self.port}", daemon=True)
         self._thread.start()
         return self
@@ -151,7 +139,7 @@ class PtyServer:
         try:
             while True:
                 self._follow_plug()
-                sources = self._sources() if self._opened else []
+                sources = self._sources() if self.is_open else []
                 ready, _, _ = select.select([*sources, self._wake_read], [], [], TICK_S)
                 if self._wake_read in ready:
                     return
@@ -162,14 +150,14 @@ class PtyServer:
                         answer += self._firmware.feed(data)
                 self._follow_plug()
                 answer += self._firmware.due()
-                if self._opened and answer:
+                if self.is_open and answer:
                     self._write(answer)
         finally:
-            if self._opened:
+            if self.is_open:
                 self._close()
 
     def _send(self, channel: Any, send: Callable[[bytes], int], data: bytes) -> None:
-        """Send bytes as the host takes them; one that takes none does not delay unplug or end."""
+        """Send bytes as the host takes them; a host that takes none delays no unplug and no end."""
         while data and not self._firmware.unplugged:
             ready, free, _ = select.select([self._wake_read], [channel], [], TICK_S)
             if ready:
@@ -180,12 +168,12 @@ class PtyServer:
 
     def _follow_plug(self) -> None:
         plugged = not self._firmware.unplugged
-        if self._opened and not plugged:
-            self._opened = False
+        if self.is_open and not plugged:
+            self.is_open = False
             self._close()
-        elif plugged and not self._opened:
+        elif plugged and not self.is_open:
             self._open()
-            self._opened = True
+            self.is_open = True
 
     def _open(self) -> None:
         # Windows has no pseudo-terminals; the wire in memory must import there too.

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from drivers.clock import Clock
 from drivers.zaber_codec import DEFAULT_RESOLUTION, FLAG_MEANINGS, SPEED_SCALE, lrc
-from simulators.firmware import SimulatedController
+from simulators.firmware import SimulatedController, earliest_s
 from simulators.motion import AxisSpec, End, Motion, Motor
 
 __all__ = ["BENCH_AXES", "AxisSpec", "Motion", "ZaberChain"]
@@ -47,14 +47,13 @@ class _RefusedError(Exception):
 
 
 class _Axis:
-    """One motor with its settings and its flags."""
+    """A motor with its settings and warning flags."""
 
     def __init__(self, spec: AxisSpec, clock: Clock, peripheral_id: int | None) -> None:
         self.spec = spec
         self.peripheral_id = peripheral_id
         self.flags = {"WR", "WH"}
         self.driver_enabled = True
-        self.drift_um = 0.0
         self.settings = {
             "maxspeed": round(spec.max_speed_um_s / spec.microstep_um * SPEED_SCALE),
             "limit.approach.maxspeed": round(
@@ -79,8 +78,6 @@ class _Axis:
         elif end is End.ARRIVED and self._homing:
             self.motor.count_from_here()
             self.flags -= {"WR", "WH"}
-        self.motor.drift(self.drift_um)
-        self.drift_um = 0.0
         return True
 
     @property
@@ -237,19 +234,19 @@ class ZaberChain(SimulatedController):
     def position_um(self, device: int, axis: int) -> float:
         """Return where the axis really is, whatever its counter says: um from the home switch."""
         with self._lock:
-            one = self._devices[device].axes[axis - 1]
-            one.advance()
-            return one.motor.nut_um
+            found = self._devices[device].axes[axis - 1]
+            found.advance()
+            return found.motor.nut_um
 
     def displace(self, device: int, axis: int, distance_um: float) -> None:
         """Push an axis that stands; its encoder notices."""
         with self._lock:
-            one = self._devices[device].axes[axis - 1]
-            one.motor.drift(distance_um)
-            one.flags.add("WM")
+            found = self._devices[device].axes[axis - 1]
+            found.motor.drift(distance_um)
+            found.flags.add("WM")
 
     def power_cycle(self) -> None:
-        """Switch the chain off and on: the axes stay where they are and forget where that is."""
+        """Switch the chain off and on: the axes stay in place and lose their reference."""
         with self._lock:
             for device in self._devices.values():
                 device.axes = [axis.restarted() for axis in device.axes]
@@ -269,8 +266,8 @@ class ZaberChain(SimulatedController):
                     self._send(_encode("!", text, device))
 
     def _next_event_s(self) -> float | None:
-        ends_s = [axis.motor.ends_s for device in self._devices.values() for axis in device.axes]
-        return min((one for one in ends_s if one is not None), default=None)
+        devices = self._devices.values()
+        return earliest_s(axis.motor.ends_s for device in devices for axis in device.axes)
 
     def _answer(self, line: bytes) -> None:
         self._advance()
@@ -304,35 +301,31 @@ class ZaberChain(SimulatedController):
             if axis_number:
                 axes = [device.axes[axis_number - 1]]
             name = words[0] if words else ""
-            if name not in self._commands:
-                raise self._not_modelled(words)
-            data = self._commands[name](self, device, axes, axis_number, words[1:])
+            if act := self._simple.get(name):
+                for axis in axes:
+                    act(axis)
+                data = None
+            elif name in self._commands:
+                data = self._commands[name](self, device, axes, axis_number, words[1:])
+            else:
+                raise _not_modelled(words)
             outcome = "OK"
         except _RefusedError as refusal:
             outcome, data = "RJ", str(refusal)
         status = "BUSY" if any(axis.busy for axis in axes) else "IDLE"
         label = "" if message_id is None else f"{message_id:02d} "
-        text = f"{address:02d} {axis_number} {label}{outcome} {status} {_flag(axes)} {data}"
+        text = f"{address:02d} {axis_number} {label}{outcome} {status} {_flag(axes)} {data or '0'}"
         return _encode("@", text, device)
 
-    def _not_modelled(self, words: list[str]) -> _RefusedError:
-        """Return the refusal of a command, having logged that it may exist on a real device."""
-        _log.warning("not modelled, refused: %s", " ".join(words))
-        return _RefusedError("BADCOMMAND")
-
-    def _poll(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        return "0"
-
-    def _home(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _home(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         for axis in axes:
-            axis.home(self._stalls(axis))
-        return "0"
+            axis.home(self._stalls(axis.motor))
 
-    def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         """`move abs|rel DISTANCE [SPEED]`, `move vel SPEED`, `move min|max [SPEED]`."""
         kind, *numbers = words or [""]
         if kind not in MOVE_NUMBERS:
-            raise self._not_modelled(["move", *words])
+            raise _not_modelled(["move", *words])
         fewest, most = MOVE_NUMBERS[kind]
         if not fewest <= len(numbers) <= most:
             raise _RefusedError("BADCOMMAND")
@@ -350,43 +343,23 @@ class ZaberChain(SimulatedController):
                 axis.stop()
             else:
                 speed = speeds[0] if speeds else None
-                axis.move_abs(target, self._stalls(axis), self._start_s(), speed)
-        return "0"
+                axis.move_abs(target, self._stalls(axis.motor), self._start_s(), speed)
 
-    def _stalls(self, axis: _Axis) -> bool:
-        """Arm on the axis the faults that its next move meets; return whether it stalls."""
-        if self.faults.strikes("drift", self._command):
-            axis.drift_um = self.drift_um
-        axis.motor.busy_forever |= self.faults.strikes("busy_forever", self._command)
-        return self.faults.strikes("stall", self._command)
-
-    def _stop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        for axis in axes:
-            axis.stop()
-        return "0"
-
-    def _estop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
-        for axis in axes:
-            axis.halt()
-        return "0"
-
-    def _system(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _system(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         if words != ["reset"]:
-            raise self._not_modelled(["system", *words])
+            raise _not_modelled(["system", *words])
         if number:
             raise _RefusedError("DEVICEONLY")
         for axis in device.axes:
             axis.advance()
             axis.motor.halt()
         device.axes = [axis.restarted() for axis in device.axes]
-        return "0"
 
-    def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         if words != ["enable"]:
             raise _RefusedError("BADCOMMAND")
         for axis in axes:
             axis.enable()
-        return "0"
 
     def _warnings(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
         flags = _flags(axes)
@@ -394,7 +367,7 @@ class ZaberChain(SimulatedController):
             for axis in axes:
                 axis.clear_warnings()
         elif words:
-            raise self._not_modelled(["warnings", *words])
+            raise _not_modelled(["warnings", *words])
         return " ".join([f"{len(flags):02d}", *flags])
 
     def _get(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
@@ -407,17 +380,17 @@ class ZaberChain(SimulatedController):
             ids = [axis.peripheral_id for axis in axes if axis.peripheral_id is not None]
             if not ids:
                 raise _RefusedError("BADCOMMAND")
-            return " ".join(str(one) if setting == "peripheral.id" else "0" for one in ids)
+            return " ".join(str(i) if setting == "peripheral.id" else "0" for i in ids)
         if setting in axes[0].settings:
             return " ".join(str(axis.settings[setting]) for axis in axes)
         whole = device.settings | device.constants
         if setting not in whole:
-            raise self._not_modelled(["get", setting])
+            raise _not_modelled(["get", setting])
         if number:
             raise _RefusedError("DEVICEONLY")
         return str(whole[setting])
 
-    def _set(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> str:
+    def _set(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         if len(words) != 2:
             raise _RefusedError("BADCOMMAND")
         setting, value = words[0], _integer(words[1])
@@ -432,27 +405,35 @@ class ZaberChain(SimulatedController):
                     raise _RefusedError("BADDATA")
                 axis.settings[setting] = value
         elif setting not in device.settings:
-            raise self._not_modelled(["set", *words])
+            raise _not_modelled(["set", *words])
         elif number:
             raise _RefusedError("DEVICEONLY")
         elif value not in (0, 1):
             raise _RefusedError("BADDATA")
         else:
             device.settings[setting] = value
-        return "0"
 
-    _commands: Mapping[str, Callable[..., str]] = {
-        "": _poll,
+    _simple: Mapping[str, Callable[[_Axis], None]] = {
+        "": lambda axis: None,
+        "stop": _Axis.stop,
+        "estop": _Axis.halt,
+    }
+    """Commands that ask the same of every axis, whatever follows them."""
+    _commands: Mapping[str, Callable[..., str | None]] = {
         "home": _home,
         "move": _move,
-        "stop": _stop,
-        "estop": _estop,
         "system": _system,
         "driver": _driver,
         "warnings": _warnings,
         "get": _get,
         "set": _set,
     }
+
+
+def _not_modelled(words: list[str]) -> _RefusedError:
+    """Return the refusal of a command, having logged that it may exist on a real device."""
+    _log.warning("not modelled, refused: %s", " ".join(words))
+    return _RefusedError("BADCOMMAND")
 
 
 def _parse(body: str) -> tuple[int, int, int | None, list[str]]:

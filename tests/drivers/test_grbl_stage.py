@@ -1,8 +1,10 @@
 """What is Grbl's own: alarms, resets, modes, work offsets, and homing that says nothing."""
 
 import math
+from functools import partial
 
 import pytest
+from stage_rigs import after_first_sleep
 
 from drivers import grbl_codec as codec
 from drivers.errors import (
@@ -42,7 +44,7 @@ class Bench:
         return stage
 
     def say(self, line):
-        """Send a line as another program would; return what is said to it."""
+        """Send a line as another program would; return the controller's answer."""
         return self.device.feed(line).decode("ascii")
 
 
@@ -159,14 +161,8 @@ def test_a_limit_switch_stops_all_loses_the_position_and_homing_resets_it(bench)
 
 def test_a_reset_while_it_moves_is_a_lost_position(bench, monkeypatch):
     stage = bench.homed()
-    sleep, resets = bench.clock.sleep, []
-
-    def sleep_and_reset(duration_s):
-        sleep(duration_s)
-        if not resets:
-            resets.append(bench.transport.write(codec.SOFT_RESET))
-
-    monkeypatch.setattr(bench.clock, "sleep", sleep_and_reset)
+    reset = partial(bench.transport.write, codec.SOFT_RESET)
+    after_first_sleep(monkeypatch, bench.clock, 0.0, reset)
     with pytest.raises(LostPositionError) as caught:
         stage.move_to_um({"x": -20_000.0})
     assert caught.value.reply in ("ALARM:3", "")

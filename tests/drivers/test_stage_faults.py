@@ -1,11 +1,11 @@
-"""Every stage over simulated firmware whose truth is known: its accuracy, and every fault of it."""
+"""Every stage over simulated firmware with known true positions: accuracy, and every fault."""
 
 import math
 import threading
 from contextlib import suppress
 
 import pytest
-from stage_rigs import RIGS, SIMULATED, opened, simulated_rig  # noqa: F401
+from stage_rigs import RIGS, SIMULATED, after_first_sleep, opened, simulated_rig  # noqa: F401
 
 from drivers.errors import (
     DriverError,
@@ -87,16 +87,7 @@ def test_a_stop_from_elsewhere_ends_a_move_in_an_error_and_keeps_the_position(
 ):
     stage, axis = homed(simulated)
     start_um = stage.move_to_um({axis: middle_um(stage, axis)})[axis]
-    sleep, stops = simulated.clock.sleep, []
-
-    def sleep_and_stop(duration_s):
-        sleep(duration_s)
-        if not stops:
-            sleep(0.3)
-            stops.append(True)
-            stage.stop([axis])
-
-    monkeypatch.setattr(simulated.clock, "sleep", sleep_and_stop)
+    after_first_sleep(monkeypatch, simulated.clock, 0.3, lambda: stage.stop([axis]))
     with pytest.raises(PositionMismatchError):
         stage.move_by_um({axis: 9000.0})
     read_um = stage.position_um(axis)
@@ -208,8 +199,10 @@ def test_a_move_that_never_reached_the_device_is_an_error_and_not_repeated(simul
     here_um = simulated.true_um(axis)
     moves = count_moves(simulated)
     simulated.device.faults.inject("drop_command", when=simulated.is_move)
+    start_s = simulated.clock.now_s()
     with pytest.raises(PositionMismatchError) as caught:
         stage.move_to_um({axis: middle_um(stage, axis)})
+    assert simulated.clock.now_s() - start_s < START_GRACE_S + 4 * simulated.timeout_on_clock_s
     assert caught.value.axis == axis
     assert len(moves) == 1
     assert simulated.true_um(axis) == pytest.approx(here_um, abs=0.01)
@@ -309,15 +302,7 @@ def test_power_lost_and_back_means_home_again(simulated):
 
 def test_power_lost_during_a_move_is_not_success(simulated, monkeypatch):
     stage, axis = homed(simulated, approach_um=0.0)
-    sleep, cycled = simulated.clock.sleep, []
-
-    def sleep_and_lose_power(duration_s):
-        sleep(duration_s)
-        if not cycled:
-            cycled.append(True)
-            simulated.device.power_cycle()
-
-    monkeypatch.setattr(simulated.clock, "sleep", sleep_and_lose_power)
+    after_first_sleep(monkeypatch, simulated.clock, 0.0, simulated.device.power_cycle)
     with pytest.raises(DriverError, match="home"):
         stage.move_to_um({axis: middle_um(stage, axis)})
     assert not stage.is_homed(axis)
@@ -351,7 +336,7 @@ def test_polling_beside_a_move_mixes_up_no_replies(simulated):
     stage.home()
     axis, other = stage.axes[0], stage.axes[-1]
     middle = middle_um(stage, axis)
-    stage.move_to_um({one: middle_um(stage, one) for one in stage.axes})
+    stage.move_to_um({axis: middle_um(stage, axis) for axis in stage.axes})
     done, polled, failures = threading.Event(), [], []
 
     def poll():
@@ -403,15 +388,6 @@ def test_an_answer_that_came_late_is_not_left_for_the_next_question(in_memory):
         assert stage.position_um(axis) == pytest.approx(in_memory.true_um(axis), abs=4.0)
     else:
         assert in_memory.transport.waiting() == 0
-
-
-def test_an_axis_that_has_not_begun_is_waited_for_only_so_long(simulated):
-    stage, axis = homed(simulated, approach_um=0.0)
-    simulated.device.faults.inject("drop_command", when=simulated.is_move)
-    start_s = simulated.clock.now_s()
-    with pytest.raises(PositionMismatchError):
-        stage.move_to_um({axis: middle_um(stage, axis)})
-    assert simulated.clock.now_s() - start_s < START_GRACE_S + 4 * simulated.timeout_on_clock_s
 
 
 def count_moves(rig):

@@ -429,10 +429,7 @@ def test_a_frame_that_does_not_come_whole_is_reported_and_the_next_one_comes(
     bench = Bench(mosaic)
     camera = bench.open()
     bench.simulator.faults.inject(fault)
-    with pytest.raises(
-        (CaptureError, RawFrameError),
-        match=complaint.replace("40x48", ".*").replace("38x48", ".*"),
-    ):
+    with pytest.raises((CaptureError, RawFrameError), match=complaint):
         camera.snap()
     assert not bench.simulator.streaming
     np.testing.assert_array_equal(camera.snap().mosaic, mosaic)
@@ -462,13 +459,6 @@ def test_faults_strike_the_frame_or_the_register_that_they_are_armed_for(bench, 
     assert camera.features.number("Width") == SHAPE[1]
     with pytest.raises(UsbTimeoutError):
         camera.features.number("WidthMax")
-
-
-def test_only_one_frame_is_lost_where_only_its_end_is_missing(bench, faults):
-    stream = bench.open().stream()
-    next(stream)
-    faults.inject("lost_trailer")
-    assert [next(stream).metadata["frames_lost"] for _ in range(2)] == ["1", "0"]
 
 
 def test_the_end_of_another_frame_does_not_make_this_one_whole(bench):
@@ -581,7 +571,7 @@ def test_a_description_that_unpacks_without_end_is_refused(bench):
 
 
 def described_as(bench, old, new):
-    """Change what the camera says of itself, as another maker would have it."""
+    """Return the camera, opened with another maker's wording in its description."""
     assert old in bench.simulator.description
     bench.simulator._file = simulation._zip(bench.simulator.description.replace(old, new))
     bench.simulator.plugged()
@@ -652,7 +642,7 @@ def test_a_camera_without_an_exposure_is_refused(bench):
 
 
 SEEDS = st.integers(0, 1 << 62)
-"""Of the damage done: what hypothesis would draw bit by bit takes longer than what it tests."""
+"""Of the random damage: hypothesis draws single bits more slowly than the test runs."""
 KINDS = ("keep", "keep", "keep", "drop", "cut", "grow", "change", "change", "noise")
 
 
@@ -765,4 +755,4 @@ def test_an_array_of_stale_bytes_before_the_first_frame_is_passed_over(bench):
     bench.simulator._start = start_after_rubbish
     np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
     assert isinstance(camera._stream._buffers, dict)
-    assert all(isinstance(one, array.array) for one in camera._stream._buffers.values())
+    assert all(isinstance(buffer, array.array) for buffer in camera._stream._buffers.values())

@@ -203,12 +203,6 @@ def test_a_reply_without_the_promised_checksum_is_not_believed():
         stage.position_um("mask_x")
 
 
-def test_a_command_may_arrive_in_pieces():
-    chain = ZaberChain(ManualClock())
-    assert chain.feed(b"/1 1 10 ge") == b""
-    assert chain.feed(b"t pos\n").startswith(b"@01 1 10 OK IDLE WR 0")
-
-
 @pytest.mark.parametrize(
     ("start_um", "needed"),
     [(0.0, False), (90.0, False), (90.1, True), (100.0, True), (500.0, True)],
@@ -226,19 +220,6 @@ def test_a_tolerance_finer_than_half_a_microstep_is_refused():
 def test_a_port_that_does_not_exist_is_named():
     with pytest.raises(PortNotFoundError, match="/dev/no-such-port does not exist"):
         SerialTransport("/dev/no-such-port")
-
-
-def test_a_write_that_blocks_is_a_timeout(monkeypatch):
-    with PtyServer(ZaberChain(ManualClock())) as server:
-        transport = SerialTransport(server.port, write_timeout_s=0.01)
-
-        def block(self, data):
-            raise serial.SerialTimeoutException("Write timeout")
-
-        monkeypatch.setattr(serial.Serial, "write", block)
-        with pytest.raises(TransportTimeoutError, match=r"within 0\.01 s"):
-            transport.write(b"/\n")
-        transport.close()
 
 
 def test_an_operating_system_error_on_the_port_means_that_it_is_gone(monkeypatch):
@@ -334,7 +315,7 @@ def test_firmware_without_checksums_is_read_twice(bench):
 
 def test_devices_are_found_with_their_axes(bench):
     found = find_devices(bench.transport, bench.clock)
-    assert [(one.address, one.axis_count) for one in found] == [(1, 2), (2, 2)]
+    assert [(device.address, device.axis_count) for device in found] == [(1, 2), (2, 2)]
     assert found[0].serial_number != found[1].serial_number
     assert found[0].firmware == "7.38"
 

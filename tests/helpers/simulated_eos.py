@@ -69,7 +69,7 @@ ISOS = (0, *(code for code in range(0x48, 0x69) if code % 8 in (0, 3, 5)))
 CARD = 2
 LISTED = 3
 AS_STANDARD = {0x9101: Operation.GET_STORAGE_IDS, 0x9102: Operation.GET_STORAGE_INFO}
-"""EOS operations that other programs use, and what they do."""
+"""EOS operations of other programs, and the equal operations of the standard."""
 OFFSETS = {"object": 8, "storage": 12, "format": 16, "size": 28, "parent": 32, "name": 40}
 """Of the fields in a record of a new object, as libgphoto2 reads them."""
 
@@ -129,8 +129,8 @@ class EosCameraSimulator(PtpCameraSimulator):
             self._remote = bool(arguments[0])
         elif code == EosOperation.SET_EVENT_MODE:
             self._telling = bool(arguments[0])
-            for one in EosProperty:
-                self._tell_property(one)
+            for known in EosProperty:
+                self._tell_property(known)
         elif code == EosOperation.GET_EVENT:
             records, self._records = self._records, []
             return Answer(data=b"".join((*records, RECORD.pack(RECORD.size, 0))))
@@ -141,7 +141,7 @@ class EosCameraSimulator(PtpCameraSimulator):
         elif code == EosOperation.RELEASE_ON:
             pressed, self._button = self._button, self._button | arguments[0]
             if pressed == 1 and self._button == 3:
-                return Answer(self._capture(arguments, b"", transaction).code)
+                return Answer(self._initiate_capture(arguments, b"", transaction).code)
         elif code == EosOperation.RELEASE_OFF:
             self._button &= ~arguments[0]
         return Answer()

@@ -203,6 +203,20 @@ def opened():
         yield stack
 
 
+def after_first_sleep(monkeypatch, clock, later_s, act):
+    """Let `act` be called once, so long after time has passed for the first time."""
+    sleep, acts = clock.sleep, [act]
+
+    def sleep_and_act(duration_s):
+        sleep(duration_s)
+        if acts:
+            act = acts.pop()
+            sleep(later_s)
+            act()
+
+    monkeypatch.setattr(clock, "sleep", sleep_and_act)
+
+
 def simulated_rig(name, opened, tmp_path, monkeypatch):
     """Return the rig of one of the names in `SIMULATED`."""
     protocol, wire = name.split("-")

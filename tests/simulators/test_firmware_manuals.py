@@ -19,7 +19,7 @@ from simulators.zaber import ZaberChain
 
 
 class Wire:
-    """One controller on one clock: what it says to bytes, and later by itself."""
+    """A controller and its clock; a call sends bytes and returns all answers until a time."""
 
     def __init__(self, make, *arguments, **settings):
         self.clock = ManualClock()
@@ -29,7 +29,7 @@ class Wire:
     def __call__(self, data, after_s=0.0):
         said = self.device.feed(data)
         end_s = self.clock.now_s() + after_s
-        # From event to event: what a firmware does next, it does at the time of the last one.
+        # From event to event: firmware acts at the time of an event, not at the end of a sleep.
         while (next_s := self.device.next_due_s()) is not None and next_s < end_s:
             self.clock.sleep(max(0.0, next_s - self.clock.now_s()) + 1e-9)
             said += self.device.due()
@@ -109,7 +109,7 @@ def test_a_zaber_checksum_is_that_of_the_manuals_example():
 def test_zaber_replies_are_formatted_as_the_manual_says(zaber, command, reply):
     replies = zaber.ask(command)
     if "BUSY" in reply:
-        replies = [re.sub(r"BUSY \S\S", "BUSY --", one) for one in replies]
+        replies = [re.sub(r"BUSY \S\S", "BUSY --", line) for line in replies]
     assert replies == [reply]
 
 
@@ -184,7 +184,8 @@ def test_a_zaber_homes_at_its_approach_speed(zaber):
     ("kind", "place"),
     [
         ("abs 5000", 5000), ("rel 700", 1700), ("rel -300", 700), ("min", 0), ("max", 200_000),
-        ("vel -50000", 0), ("abs 5000 40000", 5000),
+        ("vel -50000", 0), ("vel 200000", 200_000), ("abs 5000 40000", 5000),
+        ("max 100000", 200_000),
     ],
 )  # fmt: skip
 def test_each_kind_of_zaber_move_ends_where_the_manual_says(homed_zaber, kind, place):
@@ -209,6 +210,9 @@ def test_zaber_flags_are_listed_by_severity_and_raised_by_what_the_manual_says(h
     assert homed_zaber.data("1 1 11 warnings") == "03 FS WM WR"
     homed_zaber.device.power_cycle()
     assert homed_zaber.data("1 1 12 warnings") == "02 WR WH"
+    homed_zaber.ask("1 0 13 home", after_s=60.0)
+    assert homed_zaber.data("1 0 14 system reset") == "0"
+    assert homed_zaber.data("1 1 15 warnings") == "02 WR WH"
 
 
 def test_a_zaber_without_its_driver_moves_only_once_that_is_enabled(homed_zaber):
@@ -230,12 +234,23 @@ def test_a_finer_zaber_resolution_scales_places_and_settings(homed_zaber):
     # `maxspeed` ends at 16384 times the resolution.
     assert homed_zaber.data("1 1 7 set maxspeed 2097152") == "0"
     assert homed_zaber.data("1 1 8 set maxspeed 2097153") == "BADDATA"
+    for move in ("move vel", "move abs 10"):
+        assert homed_zaber.data(f"1 1 9 {move} 2097153") == "BADDATA"
+        assert homed_zaber.data(f"1 1 10 {move} 2097152") == "0"
 
 
 def test_a_zaber_that_may_sends_an_alert_when_a_move_ends(homed_zaber):
     homed_zaber.ask("1 0 1 set comm.alert 1")
     said = homed_zaber(b"/" + checked(b"1 1 2 move rel 400") + b"\n", after_s=10.0)
     assert said.splitlines()[-1] == b"!" + checked(b"01 1 IDLE --")
+
+
+def test_what_is_not_modelled_is_refused_and_logged(zaber, apt, caplog):
+    for command in ("servo 1 get", "get knob.mode"):
+        assert zaber.data(f"1 1 1 {command}") == "BADCOMMAND"
+        assert f"not modelled, refused: {command}" in caplog.text
+    assert apt(short(0x0500)) == b""
+    assert "not modelled, passed over: message 0x0500" in caplog.text
 
 
 def test_a_zaber_without_checksums_leaves_them_out(zaber):
@@ -402,6 +417,12 @@ def test_apt_updates_come_ten_times_a_second_and_end_without_acknowledgement(apt
     assert apt(b"", after_s=5.0) == b""
 
 
+def test_apt_keeps_the_limit_switches_that_it_is_sent(apt):
+    limits = struct.pack("<HHHIIH", 1, 3, 1, 10, 20, 2)
+    apt(long(0x0423, limits))
+    assert apt(short(0x0424, 1)) == long(0x0425, limits, HOST, UNIT)
+
+
 @pytest.mark.parametrize(
     ("question", "answer"),
     [
@@ -481,11 +502,11 @@ def test_a_grbl_report_has_its_fields_in_the_documents_order(grbl):
 
 def test_grbl_repeats_the_offset_every_tenth_report_at_rest_and_every_thirtieth_in_motion(grbl):
     reports = [grbl.report() for _ in range(41)]
-    offset = [at for at, one in enumerate(reports) if "WCO" in one]
+    offset = [at for at, report in enumerate(reports) if "WCO" in report]
     assert [b - a for a, b in pairwise(offset)] == [10] * (len(offset) - 1)
     grbl.say("$J=G91 X-150 F60")
     moving = [grbl.report() for _ in range(90)]
-    offset = [at for at, one in enumerate(moving) if "WCO" in one]
+    offset = [at for at, report in enumerate(moving) if "WCO" in report]
     assert offset[-1] - offset[-2] == 30
 
 
@@ -577,10 +598,10 @@ def test_grbl_alarms_have_the_documents_numbers(grbl):
 )
 def test_grbl_reports_its_accessories_by_the_documents_letters(word, letters):
     device = Grbl(options="VHM", settings={22: 0, 20: 0})
-    for one in word.split():
-        assert device.say(one) == ["ok"]
+    for part in word.split():
+        assert device.say(part) == ["ok"]
     reports = [device.report() for _ in range(12)]
-    shown = re.search(r"\|A:(\w+)", next(one for one in reports if "Ov:" in one))
+    shown = re.search(r"\|A:(\w+)", next(report for report in reports if "Ov:" in report))
     assert (shown[1] if shown else "") == letters
 
 
@@ -601,8 +622,39 @@ def test_a_grbl_axis_homes_downwards_where_its_bit_says(grbl):
     ]  # fmt: skip
 
 
+@pytest.fixture
+def free_grbl():
+    return Grbl(settings={20: 0, 21: 0, 22: 0})
+
+
+def test_grbl_loses_the_bytes_that_its_receive_buffer_cannot_hold(free_grbl):
+    lines = [b"G1 F60 X-%d\n" % number for number in range(1, 40)]
+    answered = free_grbl(b"".join(lines)).count(b"ok")
+    unanswered = sum(len(line) for line in lines[answered:])
+    # RX_BUFFER_SIZE of Grbl 1.1's serial.h: ends of lines are held as well.
+    assert unanswered - free_grbl.device.lost_bytes == 128
+    assert answered < len(lines)
+
+
+def test_grbl_counted_by_answers_loses_nothing(free_grbl):
+    for number in range(1, 20):
+        assert free_grbl.say(f"G1 F6000 X-{number}", after_s=1.0) == ["ok"]
+    assert free_grbl.device.lost_bytes == 0
+
+
+def test_check_mode_parses_and_moves_nothing_and_sleep_wants_a_reset(free_grbl):
+    assert free_grbl.say("$C") == ["[MSG:Enabled]", "ok"]
+    assert free_grbl.say("G1 F600 X-5", after_s=2.0) == ["ok"]
+    assert free_grbl.say("G2 X1 Y1 I1") == ["error:20"]
+    assert len(set(free_grbl.place())) == 1
+    assert "Grbl 1.1h" in str(free_grbl.say("$C"))
+    assert "[MSG:Sleeping]" in free_grbl.say("$SLP")
+    assert free_grbl.say("G1 F600 X-5") == ["error:9"]
+    assert b"Grbl 1.1h" in free_grbl(b"\x18")
+
+
 def test_a_hold_of_grbl_ends_in_hold_0_and_is_taken_up_by_a_tilde(grbl):
-    grbl.say("G91 G1 F300 X-50", after_s=1.0)
+    grbl.say("G91 G1 F300 X-40\nG1 X-10", after_s=1.0)
     assert re.match(r"<Run\|.*\|FS:300,0", grbl.report())
     assert grbl(b"!?").decode().startswith("<Hold:1|")
     grbl.clock.sleep(5.0)
