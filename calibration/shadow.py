@@ -573,7 +573,7 @@ class Shadow:
         slopes: int,
         each: int,
         by_view: int,
-    ) -> tuple[NDArray[np.float64], ...]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return readings, slopes, each, by_view of `_read`, the latter three empty where 0."""
         views_open, stage_um, frame = opening
         if slopes and len(self._tables) == 1:
