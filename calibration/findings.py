@@ -1,4 +1,4 @@
-"""What the whiteboards say is wrong with the bench, in words; all of it is in Psi."""
+"""What the whiteboards say is wrong with the bench, and what to measure again, in words."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board_angle import BoardAngle, Leaning
-from calibration.fit import Fit
+from calibration.boards import Board
+from calibration.choice import HeldOut
+from calibration.fit import MOST_MORE_BOARDS, Fit
 from calibration.levels import Levels
 from calibration.placement import Placement
 from calibration.planning import PinholeWorth
+from calibration.shadow import ShadowMask
 
+LARGEST_FLICKER = 0.01
+LARGEST_MOVE_UM = 1.0
+FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
+"""Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 SIGNIFICANT = 5.0
 LEAST_MOVE_UM = 0.2
 NOTEWORTHY = {
@@ -182,3 +189,81 @@ def dust_finding(dusty: NDArray[np.bool_]) -> str:
         f"dust moved on the sensor between references and whiteboards: {int(dusty.sum())} pixels "
         f"({dusty.mean():.1%}) are excluded; clean the sensor, and capture all again"
     )
+
+
+def hands_findings(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[str]:
+    """Return how far hands put pinholes off their holes; nothing where no hand did."""
+    lever = mask.lens_um / mask.distance_um
+    pairs = zip(fit.boards, boards, strict=True)
+    off_um = [float(np.hypot(*check.moved_um)) * lever for check, board in pairs if board.loose]
+    if not off_um:
+        return []
+    return [f"hands put pinholes up to {max(off_um):.0f} um off their holes: corrected for"]
+
+
+def residual_advice(held: HeldOut) -> str:
+    """Return by how much held-out whiteboards differ from Psi, the worst kinds first."""
+    order = sorted(held.groups, key=lambda name: -held.groups[name])
+    worst = ", ".join(f"{name} ({held.groups[name]:.1f})" for name in order[:4])
+    return (
+        f"the validation whiteboards differ from Psi by {held.relative_error:.2%} of their "
+        f"level: residual {held.chi2:.1f} x noise variance, largest of {worst}; look at the "
+        "residual map in the report"
+    )
+
+
+def fit_advice(fit: Fit) -> list[str]:
+    """Return what the fit says to measure again: flicker, moved stage, too few frames."""
+    found = []
+    flickering = [
+        check
+        for check in fit.boards
+        if abs(check.brightness - 1) > max(LARGEST_FLICKER, 5 * check.brightness_deviation)
+    ]
+    if flickering:
+        worst = max(flickering, key=lambda check: abs(check.brightness - 1))
+        others = f" ({len(flickering)} of {len(fit.boards)} whiteboards differ)"
+        found.append(
+            f"{worst.name}: {worst.brightness - 1:+.1%} in brightness against the other "
+            f"whiteboards{others if len(flickering) > 1 else ''}; the lamp is not steady: let it "
+            "warm up, and capture it again"
+        )
+    found += _moves(fit)
+    if fit.undecided:
+        shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
+        more = f"capture {fit.more_boards} more of the same kinds, or a few through a pinhole"
+        if fit.more_boards >= MOST_MORE_BOARDS:
+            more = "capture some through a pinhole"
+        found.append(
+            f"too few whiteboards to measure {len(fit.undecided)} parameter(s) ({shown}), which "
+            f"keep the design's values: {more}"
+        )
+    return found
+
+
+def _moves(fit: Fit) -> list[str]:
+    """Return in words that the mask stands elsewhere than the stage says, if that matters."""
+    moved = [
+        check
+        for check in fit.boards
+        if np.hypot(*check.moved_um) > max(LARGEST_MOVE_UM, 5 * check.moved_deviation_um)
+    ]
+    if not moved:
+        return []
+    worst = max(moved, key=lambda check: float(np.hypot(*check.moved_um)))
+    words = (
+        f"the mask is not where the stage reports it in {len(moved)} of {len(fit.boards)} "
+        f"whiteboards, by up to ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
+        f"{worst.name}; Psi's deviation includes it: "
+    )
+    times_s = np.array([check.taken_s for check in fit.boards])
+    places_um = np.array([check.moved_um for check in fit.boards])
+    times_s, places_um = times_s - times_s.mean(), places_um - places_um.mean(axis=0)
+    rate = times_s @ places_um / max(float(times_s @ times_s), 1e-12)
+    left = np.square(places_um - times_s[:, None] * rate).sum() / np.square(places_um).sum()
+    if len(fit.boards) >= FEWEST_FOR_DRIFT and left < DRIFT_LEAVES:
+        per_minute = 60 * float(np.hypot(*rate))
+        words += f"it drifts by {per_minute:.2g} um/min; fasten it, let the bench settle"
+    else:
+        words += "let the stage approach every place from the same side, and settle"
+    return [words + ", and capture again"]

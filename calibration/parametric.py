@@ -16,8 +16,9 @@ from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
-BAND_PIXELS = 2**16
-"""Of Psi at once: its derivatives by 41 parameters take 20 MB."""
+BAND_PIXELS = 2**14
+"""Coefficients computed at once: their derivatives by 41 parameters, and by what each of 25 views
+sees, take 22 MB."""
 Stages = Sequence[tuple[float, float]]
 SAMPLED = 3_000
 
@@ -137,10 +138,13 @@ def psi_deviation(
         chosen = views_open((views_v, views_u), (v, u))
         for band, samples, channels in _bands(layout, shot, stored):
             how = samples, channels, chosen, stages[shot], shot
-            slopes = samples_shadow.with_slopes(*how)[1]
-            squares = np.square(slopes @ root).sum(axis=1)
             if len(astray2):
-                squares += np.square(samples_shadow.own_slopes(*how)) @ np.asarray(astray2)
+                slopes, by_view = samples_shadow.slopes_by_view(*how)
+                by_view = by_view.reshape(len(slopes), -1, len(astray2)).sum(axis=1)
+                squares = np.square(slopes @ root).sum(axis=1) + by_view**2 @ np.asarray(astray2)
+            else:
+                slopes = samples_shadow.with_slopes(*how)[1]
+                squares = np.square(slopes @ root).sum(axis=1)
             target = deviation[shot, v, u, band, stored]
             target[...] = (np.sqrt(squares) / scale).reshape(target.shape)
     return deviation

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration import findings as words
+from calibration import refusals
 from calibration.board_angle import add_error, board_over_angle, leaning, take_out
 from calibration.boards import (
     Board,
@@ -33,16 +35,7 @@ from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, 
 from calibration.defects import View, find_defects, loss_variance
 from calibration.dust import moved_dust
 from calibration.errors import CalibrationError
-from calibration.findings import (
-    angle_findings,
-    dust_finding,
-    leaning_findings,
-    level_findings,
-    mask_findings,
-    unwatched,
-    views_assumed,
-)
-from calibration.fit import MOST_MORE_BOARDS, OFFSETS, Fit, fit_placement
+from calibration.fit import OFFSETS, fit_placement
 from calibration.frames import MeanFrame
 from calibration.levels import Levels, fit_levels
 from calibration.locator import SOFT_EDGES
@@ -58,16 +51,6 @@ from calibration.parametric import (
     shot_stages,
 )
 from calibration.planning import pinhole_worth
-from calibration.refusals import (
-    FREE_GRADIENT,
-    refuse_another_bench,
-    refuse_another_mask,
-    refuse_odd_fit,
-    refuse_tilted_board,
-    refuse_uneven_board,
-    refuse_unfit,
-    refuse_without_mask,
-)
 from calibration.shadow import Shadow, ShadowMask, shadow_mask
 from calibration.whiteboard import (
     LAMP_COLOURS,
@@ -81,12 +64,8 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import PsiLayout
 
-LARGEST_FLICKER = 0.01
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
-LARGEST_MOVE_UM = 1.0
-FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
-"""Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 REGISTERED_MISS = 3.0
 """Residual of a mask that is registered alone, over that of a fitted mask."""
 
@@ -141,240 +120,318 @@ def calibrate(
     references, by the degrees that the board was turned.
     Raises CalibrationError for whatever makes the whiteboards unfit.
     """
-    advice: list[str] = []
-    turned = turned or {}
-    sets = [held_out, *filter(None, (few, pinholes)), *turned.values()]
-    refuse_unfit(sets)
-    good = np.logical_and.reduce([sensor_blemishes(boards) for boards in sets])
-    channels = channels_of(design)
-    levels = fit_levels(list(dict.fromkeys(check for boards in sets for check in boards.checks)))
-    findings = level_findings(levels)
-    if levels is not None:
-        how = levels, channels, dict[int, MeanFrame]()
-        held_out = held_out.levelled(*how)
-        few = None if few is None else few.levelled(*how)
-        pinholes = None if pinholes is None else pinholes.levelled(*how)
-        turned = {turn: boards.levelled(*how) for turn, boards in turned.items()}
-    seen_colours = crosstalk(held_out, channels, good)
-    judges = as_readings(held_out, design, good)
-    if not judges:
-        raise CalibrationError(
-            "no validation whiteboard: capture one more with the aperture open, to judge Psi by"
-        )
-    for board in judges:
-        refuse_without_mask(board)
-    stage_um = shot_stages(camera)[0]
-    modelled = bool({"parametric", "mixed", "combined"} & set(routes))
+    work = _Work(camera, design, set(routes), held_out, few, pinholes, dict(turned or {}), on_stage)
+    work.correct_lamp_and_response()
+    work.read_validation()
+    if not work.modelled or pinholes is not None:
+        work.compare_with_design()
+    if work.modelled:
+        work.fit_models()
+    if {"free", "combined"} & work.routes:
+        work.measure_views(empty, on_plane)
+    work.count_common_errors()
+    chosen, why = work.choose_route()
+    if work.crosstalk is not None:
+        work.separate_colours(work.crosstalk)
+    work.correct_board_and_views(chosen)
+    return Outcome(
+        chosen,
+        why,
+        {name: known for name, known in work.calibrations.items() if name in routes},
+        {name: held for name, held in work.judged.items() if name in routes},
+        work.frames,
+        work.models.get("parametric"),
+        work.models.get("mixed"),
+        work.good,
+        tuple(work.advice),
+        tuple(work.findings),
+        tuple(work.list_unwatched(chosen)),
+        work.crosstalk,
+    )
+
+
+@dataclass
+class _Work:
+    """The whiteboards of a calibration, and what its steps have made of them.
+
+    sets: every set as captured; the others are as under a steady lamp after
+    `correct_lamp_and_response`. good: (pixel_y, pixel_x), pixels to use. judges, seen: held-out
+    whiteboards and those that are fitted, as readings. plain: the mask as designed. shadow: of the
+    mask as registered or fitted. bare: calibrations of the models without their misfit.
+    """
+
+    camera: Camera
+    design: PsiLayout
+    routes: set[str]
+    held_out: BoardSet
+    few: BoardSet | None
+    pinholes: BoardSet | None
+    turned: dict[float, BoardSet]
+    on_stage: Callable[[str], None]
+    levels: Levels | None = None
+    crosstalk: Crosstalk | None = None
+    judges: list[Board] = field(default_factory=list)
+    seen: list[Board] = field(default_factory=list)
+    plain: ShadowMask | None = None
     shadow: Shadow | None = None
-    if not modelled or pinholes is not None:
-        boards = pinholes or held_out
-        odd, shadow = _unlike_the_design(
-            camera, design, boards, judges, good, seen_colours, not modelled
-        )
-        findings += odd
-    calibrations: dict[str, Calibration] = {}
-    bare: dict[str, Calibration] = {}
-    judged: dict[str, HeldOut] = {}
-    frames: dict[str, int] = {}
-    parametric = mixed = plain = None
-    seen: list[Board] = []
-    if modelled:
-        if few is None:
+    models: dict[str, Parametric] = field(default_factory=dict)
+    bare: dict[str, Calibration] = field(default_factory=dict)
+    calibrations: dict[str, Calibration] = field(default_factory=dict)
+    judged: dict[str, HeldOut] = field(default_factory=dict)
+    frames: dict[str, int] = field(default_factory=dict)
+    advice: list[str] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.sets = [
+            self.held_out, *filter(None, (self.few, self.pinholes)), *self.turned.values()
+        ]  # fmt: skip
+        refusals.refuse_unfit(self.sets)
+        self.good = np.logical_and.reduce([sensor_blemishes(boards) for boards in self.sets])
+        self.stages = shot_stages(self.camera)
+
+    @property
+    def modelled(self) -> bool:
+        """Whether a route asked for fits the mask."""
+        return bool({"parametric", "mixed", "combined"} & self.routes)
+
+    @property
+    def best_model(self) -> Parametric | None:
+        """The mask as fitted, with its defects where they are known."""
+        return self.models.get("mixed") or self.models.get("parametric")
+
+    def correct_lamp_and_response(self) -> None:
+        """Fit lamp, response and crosstalk, and correct the whiteboards for the former two."""
+        channels = channels_of(self.design)
+        checks = dict.fromkeys(check for boards in self.sets for check in boards.checks)
+        self.levels = fit_levels(list(checks))
+        self.findings += words.level_findings(self.levels)
+        if self.levels is not None:
+            how = self.levels, channels, dict[int, MeanFrame]()
+            self.held_out = self.held_out.levelled(*how)
+            self.few = self.few and self.few.levelled(*how)
+            self.pinholes = self.pinholes and self.pinholes.levelled(*how)
+            self.turned = {turn: boards.levelled(*how) for turn, boards in self.turned.items()}
+        self.crosstalk = crosstalk(self.held_out, channels, self.good)
+
+    def read_validation(self) -> None:
+        """Read the held-out whiteboards."""
+        self.judges = as_readings(self.held_out, self.design, self.good)
+        if not self.judges:
+            raise CalibrationError(
+                "no validation whiteboard: capture one more with the aperture open, to judge Psi by"
+            )
+        for board in self.judges:
+            refusals.refuse_without_mask(board)
+
+    def compare_with_design(self) -> None:
+        """Register the mask, and fit it where no route does: another mask or board is refused.
+
+        Cameras whose mask is not modelled are not compared. Of the whiteboards through the pinhole
+        the middle view and two corners' are enough. Only a fit distinguishes another distance and
+        references with less light from whiteboards that every coefficient follows.
+        """
+        try:
+            mask = shadow_mask(self.camera, self.design.size)
+        except CalibrationError:
+            return
+        if self.crosstalk is not None:
+            mask = mixing(mask, self.crosstalk.seen)
+        v, u = self.camera.views
+        wanted = [(v // 2, u // 2), (0, 0), (v - 1, u - 1)]
+        boards = self.pinholes or self.held_out
+        some = [frame for frame in boards.frames if frame.shot == 0 and frame.pinhole in wanted]
+        some.sort(key=lambda frame: wanted.index(frame.pinhole or wanted[0]))
+        seen = as_readings(boards.with_frames(some), self.design, self.good)
+        placement = refusals.refuse_another_mask(seen or self.judges, self.camera, mask)
+        self.shadow = Shadow(mask, placement)
+        refusals.refuse_tilted_board(self.shadow, self.judges, REGISTERED_MISS)
+        if self.modelled:
+            return
+        seen = [*seen, *self.judges]
+        start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
+        fit = fit_placement(seen, self.camera, mask, start=start)
+        refusals.refuse_odd_fit(fit, seen)
+        self.shadow = Shadow(mask, fit.placement)
+        refusals.refuse_tilted_board(self.shadow, seen, limits=refusals.FREE_GRADIENT)
+        # Smaller differences are left to the measured Psi: few whiteboards do not determine them.
+        self.findings += words.mask_findings(fit, ("distance_share", "clear"))
+
+    def fit_models(self) -> None:
+        """Fit the mask, its dust and defects, and calibrate by the fits."""
+        if self.few is None:
             raise CalibrationError("the calibration method parametric was given no whiteboards")
-        on_stage("parametric fit")
-        seen = as_readings(few, design, good)
-        for board in seen:
-            refuse_without_mask(board)
-        plain = shadow_mask(camera, design.size)
-        mask = plain if seen_colours is None else mixing(plain, seen_colours.seen)
-        fit = fit_placement(seen, camera, mask)
-        advice += fit_advice(fit)
-        refuse_odd_fit(fit, seen)
-        dusty = moved_dust(Shadow(mask, fit.placement), seen)
+        self.on_stage("parametric fit")
+        self.seen = as_readings(self.few, self.design, self.good)
+        for board in self.seen:
+            refusals.refuse_without_mask(board)
+        self.plain = mask = shadow_mask(self.camera, self.design.size)
+        if self.crosstalk is not None:
+            mask = mixing(mask, self.crosstalk.seen)
+        fit = fit_placement(self.seen, self.camera, mask)
+        self.advice += words.fit_advice(fit)
+        refusals.refuse_odd_fit(fit, self.seen)
+        dusty = moved_dust(Shadow(mask, fit.placement), self.seen)
         if dusty.any():
-            findings.append(dust_finding(dusty))
-            good = good & ~dusty
-            seen, judges = ([board.without(dusty) for board in some] for some in (seen, judges))
-            fit = fit_placement(seen, camera, mask, start=fit.placement)
-        findings += _hands_finding(fit, seen, mask)
-        parametric = with_misfit(Parametric(fit, mask), seen)
-        if {"mixed", "combined"} & set(routes) and design.binning == 1:
-            on_stage("defects of the mask")
-            mixed = with_misfit(_mixed(seen, camera, parametric), seen)
-        for name, model in (("parametric", parametric), ("mixed", mixed)):
-            if model is not None:
-                model = replace(model, of_defects=_missed_at_defects(model, [*seen, *judges]))
-                on_stage(f"Psi, {name}")
-                bare[name] = _calibration(model, camera, design, few, good)
-                calibrations[name] = _with_misfit_variance(bare[name], model)
-                judged[name] = _judged(name, model, judges, seen)
-                frames[name] = few.exposures
-    best = mixed or parametric
-    if best is not None:
-        refuse_tilted_board(best.shadow, [*judges, *seen])
-        findings += mask_findings(best.fit)
-        findings += filter(None, [best.mask.repeats.words])
-    if {"free", "combined"} & set(routes):
-        if pinholes is None:
+            self.findings.append(words.dust_finding(dusty))
+            self.good = self.good & ~dusty
+            self.seen = [board.without(dusty) for board in self.seen]
+            self.judges = [board.without(dusty) for board in self.judges]
+            fit = fit_placement(self.seen, self.camera, mask, start=fit.placement)
+        self.findings += words.hands_findings(fit, self.seen, mask)
+        model = self.models["parametric"] = with_misfit(Parametric(fit, mask), self.seen)
+        if {"mixed", "combined"} & self.routes and self.design.binning == 1:
+            self.on_stage("defects of the mask")
+            self.models["mixed"] = with_misfit(_mixed(self.seen, self.camera, model), self.seen)
+        for name, fitted in self.models.items():
+            missed = _missed_at_defects(fitted, [*self.seen, *self.judges])
+            model = replace(fitted, of_defects=missed)
+            self.on_stage(f"Psi, {name}")
+            self.bare[name] = self._calibration_by(model, self.few)
+            self.calibrations[name] = _with_misfit_variance(self.bare[name], model)
+            self.judged[name] = _judged_model(name, model, self.judges, self.seen)
+            self.frames[name] = self.few.exposures
+        best = self.models.get("mixed", model)
+        self.shadow = best.shadow
+        refusals.refuse_tilted_board(self.shadow, [*self.judges, *self.seen])
+        self.findings += words.mask_findings(best.fit)
+        self.findings += filter(None, [best.mask.repeats.words])
+
+    def _calibration_by(self, model: Parametric, boards: BoardSet) -> Calibration:
+        layout = self.design
+        psi = model.psi(layout, self.stages)
+        # Whiteboards of single views show what the model misses of each; sums, how far they stray.
+        astray2 = model.fit.astray2 if model.misfit is None else ()
+        covariance = model.fit.covariance
+        deviation = psi_deviation(model.shadow, layout, self.stages, covariance, astray2)
+        if model.defects is not None and model.defects.count:
+            deviation = _with_defect_variance(deviation, model, layout, self.stages)
+        white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])
+        return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), self.good)
+
+    def measure_views(self, empty: NewArray, on_plane: Callable[[str], None]) -> None:
+        """Measure every view through the pinhole, and combine that with the model."""
+        if self.pinholes is None:
             raise CalibrationError("the calibration method free was given no whiteboards")
-        on_stage("Psi, free")
-        free = replace(measure_psi(pinholes, design, empty, on_plane), good=good)
+        self.on_stage("Psi, free")
+        free = replace(measure_psi(self.pinholes, self.design, empty, on_plane), good=self.good)
+        best = self.best_model
         if best is not None:
-            _correct_pinhole_places(free, best, seen, design)
-        calibrations["free"] = free
-        at_first = (b for b in judges if b.shot == 0 and np.allclose(b.stage_um, stage_um))
-        if (still := next(at_first, None)) is None:
+            _correct_pinhole_places(free, best, self.seen, self.design)
+        at_first = (b for b in self.judges if b.shot == 0)
+        still = next((b for b in at_first if np.allclose(b.stage_um, self.stages[0])), None)
+        if still is None:
             raise CalibrationError(
                 "the calibration method free is judged by an open whiteboard with the mask where "
                 "the first shot has it: capture a validation whiteboard there"
             )
-        judged["free"] = _judged_measured("free", free, still, design.binning)
-        frames["free"] = pinholes.exposures
-        if "combined" in routes and best is not None and few is not None:
-            on_stage("Psi, combined")
-            both = combined(free, bare["mixed" if mixed is not None else "parametric"], good)
-            calibrations["combined"] = both
-            judged["combined"] = _judged_measured("combined", both, still, design.binning)
-            frames["combined"] = few.exposures
-    for name, known in calibrations.items():
-        add_error(known, _unsteady(name, sets, [*judges, *seen], parametric))
-        if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
-            _add_mask_moves(known, parametric, design, shot_stages(camera))
-    chosen, why = choose([judged[name] for name in judged if name in routes])
-    refuse_another_bench(chosen)
-    if chosen.chi2 > LARGEST_CHI2:
-        missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
-        add_error(calibrations[chosen.route], missed)
-        advice.append(
-            f"the validation whiteboards differ from Psi by {chosen.relative_error:.2%} of their "
-            f"level: residual {chosen.chi2:.1f} x noise variance, largest of "
-            f"{_worst_groups(chosen)}; look at the residual map in the report"
-        )
-    if seen_colours is not None:
-        findings.append(
-            f"the colour filters pass up to {seen_colours.largest:.1%} of the other colours: Psi "
+        self._add_measured("free", free, still, self.pinholes)
+        if "combined" in self.routes and best is not None and self.few is not None:
+            self.on_stage("Psi, combined")
+            bare = self.bare.get("mixed") or self.bare["parametric"]
+            self._add_measured("combined", combined(free, bare, self.good), still, self.few)
+
+    def _add_measured(self, name: str, known: Calibration, still: Board, boards: BoardSet) -> None:
+        """Take up a measured Psi, judged by its sum over the views against an open whiteboard."""
+        predicted = predicted_by_psi(known.psi, still)
+        variance = prediction_variance(known.deviation, still, self.design.binning)
+        self.calibrations[name] = known
+        self.judged[name] = worst({"open aperture": judge(name, still, predicted, variance)})
+        self.frames[name] = boards.exposures
+
+    def count_common_errors(self) -> None:
+        """Add to the deviations what unsteady light and a mask that moves make of every Psi."""
+        parametric = self.models.get("parametric")
+        for name, known in self.calibrations.items():
+            add_error(known, self._unsteady(name))
+            if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
+                # A model's covariance has it.
+                covariance = np.zeros_like(parametric.fit.covariance)
+                covariance[OFFSETS, OFFSETS] = np.eye(2) * parametric.fit.moved_um**2
+                moved = psi_deviation(parametric.shadow, self.design, self.stages, covariance)
+                np.sqrt(np.square(known.deviation) + np.square(moved), out=known.deviation)
+
+    def _unsteady(self, route: str) -> float:
+        """Return the relative error that shutter and lamp leave in all of a Psi alike.
+
+        Every whiteboard is divided by the references, which are as unsteady as it is: from frame to
+        frame, as repeats show, which their number averages; and slowly, as the fit shows. Of single
+        views as measured through a pinhole each has its own beside.
+        """
+        shared = {id(frame): frame for boards in self.sets for frame in boards.references.values()}
+        references, dark_dn = list(shared.values()), self.sets[0].dark.mean_dn
+        repeats = [(reference.count, reference.unsteady2(dark_dn)) for reference in references]
+        fast2, slow2 = unsteadiness2([*self.judges, *self.seen], repeats), 0.0
+        if "parametric" in self.models:
+            slow2 = self.models["parametric"].fit.brightness_spread ** 2
+        spread2 = slow2 + fast2 * float(np.mean([1 / reference.count for reference in references]))
+        if route == "free":
+            frames = [frame for boards in self.sets for frame in boards.frames if frame.pinhole]
+            spread2 += slow2 + fast2 * float(np.mean([1 / frame.count for frame in frames]))
+        return float(np.sqrt(spread2))
+
+    def choose_route(self) -> tuple[str, str]:
+        """Return the route to use, and why in words."""
+        chosen, why = choose([held for name, held in self.judged.items() if name in self.routes])
+        refusals.refuse_another_bench(chosen)
+        if chosen.chi2 > LARGEST_CHI2:
+            missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
+            add_error(self.calibrations[chosen.route], missed)
+            self.advice.append(words.residual_advice(chosen))
+        return chosen.route, why
+
+    def separate_colours(self, seen: Crosstalk) -> None:
+        """Give every Psi three colours a pixel."""
+        self.findings.append(
+            f"the colour filters pass up to {seen.largest:.1%} of the other colours: Psi "
             "has three colours for every pixel"
         )
-        if plain is None or best is None:
+        if self.plain is None or (best := self.best_model) is None:
             raise CalibrationError(
                 "the colour filters pass other colours, and the calibration method free does not "
                 "show which: add open whiteboards, for the method parametric"
             )
-        others = other_colours(best, plain, seen_colours, design, shot_stages(camera))
-        calibrations = {
-            name: in_three_colours(known, others) for name, known in calibrations.items()
+        others = other_colours(best, self.plain, seen, self.design, self.stages)
+        for name, known in self.calibrations.items():
+            self.calibrations[name] = in_three_colours(known, others)
+
+    def correct_board_and_views(self, chosen: str) -> None:
+        """Take the white board's unevenness out, and count what lamp or board may make of views."""
+        board = None
+        if self.turned:
+            open_boards = {
+                turn: as_readings(boards, self.design, self.good)[0]
+                for turn, boards in self.turned.items()
+            }
+            board = board_over_angle(self.calibrations[chosen].psi, open_boards, self.shadow)
+            refusals.refuse_uneven_board(board)
+            self.findings += words.angle_findings(board)
+            if board.uneven:
+                for known in self.calibrations.values():
+                    take_out(board, known)
+        if "parametric" in self.models:
+            model = self.models["parametric"]
+            leans = leaning(model.fit, model.mask, board)
+            self.findings += words.leaning_findings(leans, bool(self.turned))
+            for known in self.calibrations.values():
+                add_error(known, leans.lopsided)
+
+    def list_unwatched(self, chosen: str) -> list[str]:
+        """Return what no whiteboard measured, in words."""
+        sets, layout = self.sets, self.design
+        lamps = {lamp for boards in sets for _, lamp in boards.references}
+        watched = {
+            "lamp": any(check.masks_in for boards in sets for check in boards.checks),
+            "response": self.levels is not None and self.levels.bend_known,
+            "colours": layout.colour is None or layout.binning > 1 or lamps >= set(LAMP_COLOURS),
+            "turned": bool(self.turned),
         }
-    board = None
-    if turned:
-        open_boards = {turn: as_readings(own, design, good)[0] for turn, own in turned.items()}
-        shadow = shadow if best is None else best.shadow
-        board = board_over_angle(calibrations[chosen.route].psi, open_boards, shadow)
-        refuse_uneven_board(board)
-        findings += angle_findings(board)
-        if board.uneven:
-            for known in calibrations.values():
-                take_out(board, known)
-    if parametric is not None:
-        leans = leaning(parametric.fit, parametric.mask, board)
-        findings += leaning_findings(leans, bool(turned))
-        for known in calibrations.values():
-            add_error(known, leans.lopsided)
-    not_known = unwatched(_missing(sets, levels, design, bool(turned)))
-    if best is not None and all(board.views_open.all() for board in seen):
-        stated = calibrations[chosen.route].stated_error
-        not_known.append(views_assumed(pinhole_worth(best, seen, stated)))
-    return Outcome(
-        chosen.route,
-        why,
-        {name: known for name, known in calibrations.items() if name in routes},
-        {name: held for name, held in judged.items() if name in routes},
-        frames,
-        parametric,
-        mixed,
-        good,
-        tuple(advice),
-        tuple(findings),
-        tuple(not_known),
-        seen_colours,
-    )
-
-
-def _unsteady(
-    route: str, sets: Sequence[BoardSet], boards: Sequence[Board], parametric: Parametric | None
-) -> float:
-    """Return the relative error that shutter and lamp leave in all of a Psi alike.
-
-    Every whiteboard is divided by the references, which are as unsteady as it is: from frame to
-    frame, as repeats show, which their number averages; and slowly, as the fit shows. Of single
-    views as measured through a pinhole each has its own beside.
-    """
-    references = list({id(f): f for boards in sets for f in boards.references.values()}.values())
-    dark_dn = sets[0].dark.mean_dn
-    fast2 = unsteadiness2(
-        boards, [(reference.count, reference.unsteady2(dark_dn)) for reference in references]
-    )
-    slow2 = 0.0 if parametric is None else parametric.fit.brightness_spread**2
-    spread2 = slow2 + fast2 * float(np.mean([1 / reference.count for reference in references]))
-    if route == "free":
-        pinholes = [frame.count for boards in sets for frame in boards.frames if frame.pinhole]
-        spread2 += slow2 + fast2 * float(np.mean([1 / count for count in pinholes]))
-    return float(np.sqrt(spread2))
-
-
-def _missing(
-    sets: Sequence[BoardSet], levels: Levels | None, layout: PsiLayout, turned: bool
-) -> list[str]:
-    """Return what was not watched, by the names of `findings.UNWATCHED`."""
-    lamps = {lamp for boards in sets for _, lamp in boards.references}
-    coloured = layout.colour is None or layout.binning > 1 or lamps >= set(LAMP_COLOURS)
-    seen_again = any(check.masks_in for boards in sets for check in boards.checks)
-    watched = {
-        "lamp": seen_again,
-        "response": levels is not None and levels.bend_known,
-        "colours": coloured,
-        "turned": turned,
-    }
-    return [name for name, known in watched.items() if not known]
-
-
-def _unlike_the_design(
-    camera: Camera,
-    layout: PsiLayout,
-    boards: BoardSet,
-    judges: Sequence[Board],
-    good: NDArray[np.bool_],
-    crosstalk: Crosstalk | None,
-    fitted: bool,
-) -> tuple[list[str], Shadow | None]:
-    """Return what of the mask is off, and its shadow.
-
-    Raises CalibrationError for another mask, or a tilted board. Nothing for cameras whose mask is
-    not modelled. Of those through the pinhole the middle view
-    and two corners' are enough. fitted: the mask is fitted to these as well, which distinguishes
-    another distance and references with less light from whiteboards that every coefficient follows.
-    """
-    try:
-        mask = shadow_mask(camera, layout.size)
-    except CalibrationError:
-        return [], None
-    if crosstalk is not None:
-        mask = mixing(mask, crosstalk.seen)
-    v, u = camera.views
-    wanted = [(v // 2, u // 2), (0, 0), (v - 1, u - 1)]
-    some = [frame for frame in boards.frames if frame.shot == 0 and frame.pinhole in wanted]
-    some.sort(key=lambda frame: wanted.index(frame.pinhole or wanted[0]))
-    seen = as_readings(boards.with_frames(some), layout, good)
-    placement = refuse_another_mask(seen or judges, camera, mask)
-    refuse_tilted_board(Shadow(mask, placement), judges, REGISTERED_MISS)
-    if not fitted:
-        return [], Shadow(mask, placement)
-    seen = [*seen, *judges]
-    start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
-    fit = fit_placement(seen, camera, mask, start=start)
-    refuse_odd_fit(fit, seen)
-    refuse_tilted_board(Shadow(mask, fit.placement), seen, limits=FREE_GRADIENT)
-    # Smaller differences are left to the measured Psi: few whiteboards do not determine them.
-    return mask_findings(fit, ("distance_share", "clear")), Shadow(mask, fit.placement)
+        found = words.unwatched([name for name, known in watched.items() if not known])
+        best = self.best_model
+        if best is not None and all(board.views_open.all() for board in self.seen):
+            stated = self.calibrations[chosen].stated_error
+            found.append(words.views_assumed(pinhole_worth(best, self.seen, stated)))
+        return found
 
 
 def _mixed(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
@@ -446,7 +503,7 @@ def _missed_at_defects(model: Parametric, boards: Sequence[Board]) -> float:
     return max(missed / taken, 0.0) if taken > 0 else 0.0
 
 
-def _judged(
+def _judged_model(
     name: str, model: Parametric, judges: Sequence[Board], seen: Sequence[Board]
 ) -> HeldOut:
     """Return the worst of the held-out whiteboards and of those that open single views or parts."""
@@ -469,18 +526,6 @@ def _judged(
                 through = f"views ({v[0]}, {u[0]}) to ({v[1]}, {u[1]})"
             groups[through] = judged(board)
     return worst(groups)
-
-
-def _judged_measured(name: str, known: Calibration, board: Board, binning: int) -> HeldOut:
-    """Return how a measured Psi, summed over its views, fits the open whiteboard."""
-    predicted = predicted_by_psi(known.psi, board)
-    variance = prediction_variance(known.deviation, board, binning)
-    return worst({"open aperture": judge(name, board, predicted, variance)})
-
-
-def _worst_groups(held: HeldOut) -> str:
-    order = sorted(held.groups, key=lambda name: -held.groups[name])
-    return ", ".join(f"{name} ({held.groups[name]:.1f})" for name in order[:4])
 
 
 def _light_cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
@@ -531,46 +576,6 @@ def _correct_pinhole_places(
             )
             variance += np.square(lost * right)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
-
-
-def _hands_finding(fit: Fit, seen: Sequence[Board], mask: ShadowMask) -> list[str]:
-    """Return how far hands put pinholes off their holes; nothing where no hand did."""
-    loose = [
-        float(np.hypot(*check.moved_um)) * mask.lens_um / mask.distance_um
-        for check, board in zip(fit.boards, seen, strict=True)
-        if board.loose
-    ]
-    if not loose:
-        return []
-    return [f"hands put pinholes up to {max(loose):.0f} um off their holes: corrected for"]
-
-
-def _add_mask_moves(
-    known: Calibration, model: Parametric, layout: PsiLayout, stages: Stages
-) -> None:
-    """Count in a measured Psi's deviation that the mask may stand elsewhere: models have it."""
-    covariance = np.zeros_like(model.fit.covariance)
-    covariance[OFFSETS, OFFSETS] = np.eye(2) * model.fit.moved_um**2
-    moved = psi_deviation(model.shadow, layout, stages, covariance)
-    np.sqrt(np.square(known.deviation) + np.square(moved), out=known.deviation)
-
-
-def _calibration(
-    model: Parametric,
-    camera: Camera,
-    layout: PsiLayout,
-    boards: BoardSet,
-    good: NDArray[np.bool_],
-) -> Calibration:
-    stages = shot_stages(camera)
-    psi = model.psi(layout, stages)
-    # Whiteboards of single views show what the model misses of each; sums, how far they stray.
-    astray2 = model.fit.astray2 if model.misfit is None else ()
-    deviation = psi_deviation(model.shadow, layout, stages, model.fit.covariance, astray2)
-    if model.defects is not None and model.defects.count:
-        deviation = _with_defect_variance(deviation, model, layout, stages)
-    white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])
-    return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
 
 
 def _with_defect_variance(
@@ -624,65 +629,3 @@ def _white(boards: BoardSet, layout: PsiLayout, shot: int) -> NDArray[np.float32
         above = reference.mean_dn - boards.dark_at(reference.exposure_s).mean_dn
         total += above / reference.exposure_s
     return total.astype(np.float32)
-
-
-def fit_advice(fit: Fit) -> list[str]:
-    """Return what the fit says to measure again: flicker, moved stage, too few frames."""
-    found = []
-    flickering = [
-        check
-        for check in fit.boards
-        if abs(check.brightness - 1) > max(LARGEST_FLICKER, 5 * check.brightness_deviation)
-    ]
-    if flickering:
-        worst_of = max(flickering, key=lambda check: abs(check.brightness - 1))
-        others = (
-            f" ({len(flickering)} of {len(fit.boards)} whiteboards differ)"
-            if len(flickering) > 1
-            else ""
-        )
-        found.append(
-            f"{worst_of.name}: {worst_of.brightness - 1:+.1%} in brightness against the other "
-            f"whiteboards{others}; the lamp is not steady: let it warm up, and capture it again"
-        )
-    found += _moves(fit)
-    if fit.undecided:
-        shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
-        more = (
-            "capture some through a pinhole"
-            if fit.more_boards >= MOST_MORE_BOARDS
-            else f"capture {fit.more_boards} more of the same kinds, or a few through a pinhole"
-        )
-        found.append(
-            f"too few whiteboards to measure {len(fit.undecided)} parameter(s) ({shown}), which "
-            f"keep the design's values: {more}"
-        )
-    return found
-
-
-def _moves(fit: Fit) -> list[str]:
-    """Return in words that the mask stands elsewhere than the stage says, if that matters."""
-    moved = [
-        check
-        for check in fit.boards
-        if np.hypot(*check.moved_um) > max(LARGEST_MOVE_UM, 5 * check.moved_deviation_um)
-    ]
-    if not moved:
-        return []
-    worst = max(moved, key=lambda check: float(np.hypot(*check.moved_um)))
-    words = (
-        f"the mask is not where the stage reports it in {len(moved)} of {len(fit.boards)} "
-        f"whiteboards, by up to ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
-        f"{worst.name}; Psi's deviation includes it: "
-    )
-    times_s = np.array([check.taken_s for check in fit.boards])
-    places_um = np.array([check.moved_um for check in fit.boards])
-    times_s, places_um = times_s - times_s.mean(), places_um - places_um.mean(axis=0)
-    rate = times_s @ places_um / max(float(times_s @ times_s), 1e-12)
-    left = np.square(places_um - times_s[:, None] * rate).sum() / np.square(places_um).sum()
-    if len(fit.boards) >= FEWEST_FOR_DRIFT and left < DRIFT_LEAVES:
-        per_minute = 60 * float(np.hypot(*rate))
-        words += f"it drifts by {per_minute:.2g} um/min; fasten it, let the bench settle"
-    else:
-        words += "let the stage approach every place from the same side, and settle"
-    return [words + ", and capture again"]

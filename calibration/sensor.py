@@ -24,6 +24,7 @@ from calibration.robust import deviation_of
 
 Array = NDArray[np.floating]
 Frame = NDArray[np.uint16]
+Flags = NDArray[np.bool_]
 BLOCKS = 12
 TILES = 8
 """Across: with BLOCKS down, the parts of a frame of which the brightest show saturation."""
@@ -45,7 +46,7 @@ QUANTISED_DN2, QUANTISED_DN = 0.24, 0.40
 ROUNDED_DN = 0.2
 """What rounding may add to a mean of pixels that hardly differ: 1/pi at most, 0.2 at 0.16 DN."""
 BRIGHTER_DEVIATIONS = 10.0
-EVERY = np.arange(BLOCKS)
+EVERY = np.ones((BLOCKS, TILES), dtype=bool)
 HOT_DEVIATIONS = 8.0
 DEAD_SHARE = 0.5
 
@@ -70,7 +71,7 @@ class TransferCurve:
 
 @dataclass(frozen=True)
 class Nonuniformity:
-    """What differs between pixels, without noise: its variance, and the variance of that."""
+    """The variance of what differs between pixels without noise, and the estimate's variance."""
 
     variance: float
     uncertainty: float
@@ -110,7 +111,7 @@ class SensorSheet:
     dead_pixels: int
     curve: TransferCurve
     linearity_residual: Array
-    good: NDArray[np.bool_]
+    good: Flags
     deviations: dict[str, float] = field(default_factory=dict)
     saturated: bool = True
     quantised: bool = False
@@ -133,11 +134,11 @@ class SensorSheet:
         for name, (words, unit) in QUANTITIES.items():
             words += self.bound(name)
             found.append((words, float(getattr(self, name)), self.deviations.get(name), unit))
-        for words, one, scale, unit in (
+        for words, differences, scale, unit in (
             ("DSNU", self.dsnu, 1 / self.gain_dn_per_electron, "e"),
             ("PRNU", self.prnu, 100.0, "%"),
         ):
-            bound, (value, deviation) = self.bound(words.lower()), one.figure(scale)
+            bound, (value, deviation) = self.bound(words.lower()), differences.figure(scale)
             if "at most" in bound:
                 value, deviation = max(value, scale * QUANTISED_DN), 0.0
             found.append((words + bound, value, deviation or None, unit))
@@ -163,54 +164,53 @@ OF_SATURATION = ("full_well_electrons", "saturation_dn", "snr_max_db", "dynamic_
 
 
 @dataclass(frozen=True, eq=False)
-class _Level:
-    """Statistics of one pair by block of rows, tile across and phase of the filter."""
+class _Levels:
+    """Statistics of pairs by block of rows, tile across and phase of the filter.
 
-    exposure_s: float
+    exposure_s: (pair,). mean, variance, clipped: (pair, block, tile, phase), NaN without pixels.
+    """
+
+    exposure_s: Array
     mean: Array
     variance: Array
     clipped: Array
 
-    def of(self, blocks: NDArray[np.intp], name: str) -> Array:
-        """Return the mean over blocks of a statistic, by phase."""
-        return np.nanmean(getattr(self, name)[blocks], axis=(0, 1))
-
-    def brightest(self, blocks: NDArray[np.intp], bright: NDArray[np.bool_], name: str) -> Array:
-        """Return the mean over the bright tiles, by phase."""
-        chosen = np.zeros_like(bright)
-        chosen[blocks] = bright[blocks]
-        return np.nanmean(getattr(self, name)[chosen if chosen.any() else bright], axis=0)
+    def over(self, tiles: Flags, name: str) -> Array:
+        """Return the mean of a statistic over the tiles flagged, (pair, phase)."""
+        return np.nanmean(getattr(self, name)[:, tiles], axis=1)
 
 
 def _phases(frame: NDArray) -> list[NDArray]:
     return [frame[y::2, x::2] for y in range(2) for x in range(2)]
 
 
-def _level(pair: Pair, good: NDArray[np.bool_], white_level_dn: int) -> _Level:
+def _level(
+    pair: Pair, good: Flags, white_level_dn: int
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return exposure, mean, variance and clipped share of a pair, see `_Levels`."""
     if pair.first.shape != pair.second.shape or pair.first.shape != good.shape:
         raise CalibrationError(
             f"exposure of {pair.exposure_s:g} s: frames of {pair.first.shape} and "
             f"{pair.second.shape} differ from {good.shape}: are they of one camera?"
         )
     mean, variance, clipped = (np.full((BLOCKS, TILES, 4), np.nan) for _ in range(3))
-    planes = zip(*(_phases(one) for one in (pair.first, pair.second, good)), strict=True)
-    for phase, (a, b, use) in enumerate(planes):
+    for phase, planes in enumerate(
+        zip(*map(_phases, (pair.first, pair.second, good)), strict=True)
+    ):
         rows, columns = (
             np.linspace(0, length, count + 1).astype(int)
-            for length, count in zip(a.shape, (BLOCKS, TILES), strict=True)
+            for length, count in zip(planes[0].shape, (BLOCKS, TILES), strict=True)
         )
         for block, tile in np.ndindex(BLOCKS, TILES):
-            part = (
-                slice(rows[block], rows[block + 1]),
-                slice(columns[tile], columns[tile + 1]),
-            )
-            x, y = (one[part][use[part]].astype(np.float64) for one in (a, b))
+            down = slice(rows[block], rows[block + 1])
+            x, y, use = (plane[down, columns[tile] : columns[tile + 1]] for plane in planes)
+            x, y = x[use].astype(np.float64), y[use].astype(np.float64)
             if len(x) < 2:
                 continue
             mean[block, tile, phase] = (x.mean() + y.mean()) / 2
             variance[block, tile, phase] = 0.5 * np.var(x - y, ddof=1)
             clipped[block, tile, phase] = np.mean(x >= white_level_dn)
-    return _Level(pair.exposure_s, mean, variance, clipped)
+    return pair.exposure_s, mean, variance, clipped
 
 
 def _line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
@@ -228,68 +228,49 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
     four below saturation; few pairs are held at a time. Raises CalibrationError for too few
     exposures, flats no brighter than the dark, and sizes that differ.
     """
-    if len({pair.exposure_s for pair in darks}) < 2:
+    times_s = [pair.exposure_s for pair in darks]
+    if len(set(times_s)) < 2:
         raise CalibrationError("the dark current needs dark pairs at two exposures at least")
-    hot = _hot(darks)
+    hot = _hot(darks[int(np.argmax(times_s))])
     good = ~hot
-    dark_levels = [_level(pair, good, white_level_dn) for pair in darks]
-    levels: list[_Level] = []
-    unsaturated: list[tuple[float, Pair]] = []
-    loudest, light = 0.0, np.zeros(0)
-    for pair in flats:
-        level = _level(pair, good, white_level_dn)
-        levels.append(level)
-        # A phase that saturates loses its variance.
-        quietest = float(level.of(EVERY, "variance").min())
-        if np.nanmax(level.clipped) < CLIPPED_SHARE and quietest > loudest:
-            mean, loudest = float(level.of(EVERY, "mean").mean()), quietest
-            light = level.mean
-            unsaturated = [one for one in unsaturated if one[0] > HELD_SHARE * mean]
-            unsaturated.append((mean, pair))
-    if len(levels) < 4 or not unsaturated:
-        raise CalibrationError(
-            f"{len(levels)} flat exposures: the photon transfer curve needs four at least, and "
-            "some below saturation"
-        )
-    brightest_dn, brightest = unsaturated[-1]
+    dark = _stacked(_level(pair, good, white_level_dn) for pair in darks)
+    flat, unsaturated = _read_flats(flats, good, white_level_dn)
+    brightest_dn, light, brightest = unsaturated[-1]
     dead = _dead(brightest, darks[0])
     good &= ~dead
-    bright = _brightest(light - min(one.of(EVERY, "mean").mean() for one in dark_levels))
-    everything = _figures(dark_levels, levels, EVERY, bright)
-    without = [
-        _figures(dark_levels, levels, np.delete(EVERY, block), bright) for block in range(BLOCKS)
-    ]
-    factor = (BLOCKS - 1) / np.sqrt(BLOCKS)
-    deviations = {
-        name: float(factor * np.std([one[name] for one in without])) for name in everything
-    }
-    quantised = everything["dark_variance_dn2"] < QUANTISED_DN2
+    light = light - dark.over(EVERY, "mean").mean(axis=1).min()
+    share = np.nanmean(light / np.nanmax(light, axis=(0, 1)), axis=2)
+    bright = share >= BRIGHTEST_SHARE * np.nanmax(share)
+    points = _transfer_points(dark, flat, EVERY, bright)
+    figures = points.figures()
+    quantised = points.dark_variance_dn2 < QUANTISED_DN2
+    deviations = _deviations(dark, flat, bright)
     if quantised:
         # Without noise to spread them, mean darks are rounded alike.
-        times_s = [pair.exposure_s for pair in darks]
-        rounded = ROUNDED_DN / (max(times_s) - min(times_s)) / everything["gain_dn_per_electron"]
+        current_dn = ROUNDED_DN / (max(times_s) - min(times_s))
         for name, more in (
-            ("black_level_dn", ROUNDED_DN), ("dark_current_electrons_per_s", rounded)
-        ):  # fmt: skip
+            ("black_level_dn", ROUNDED_DN),
+            ("dark_current_electrons_per_s", current_dn / figures["gain_dn_per_electron"]),
+        ):
             deviations[name] = float(np.hypot(deviations[name], more))
-    black_dn = everything["black_level_dn"]
-    half_dn = black_dn + PRNU_SHARE * (brightest_dn - black_dn)
-    lit = min(unsaturated, key=lambda one: abs(one[0] - half_dn))[1]
-    points = _points(levels, EVERY, bright, _dark_line(dark_levels, EVERY))
     saturation, step = points.saturation
-    share = step / np.sqrt(3) / saturation
     for name, slope in (
-        ("full_well_electrons", everything["full_well_electrons"]),
+        ("full_well_electrons", figures["full_well_electrons"]),
         ("saturation_dn", saturation),
         ("snr_max_db", 10 / np.log(10)),
         ("dynamic_range_db", 20 / np.log(10)),
     ):
-        deviations[name] = float(np.hypot(deviations[name], share * slope))
-    shortest = min(darks, key=lambda one: one.exposure_s)
-    black_clipped = np.mean([np.mean(one == 0) for one in (shortest.first, shortest.second)])
+        of_step = step / np.sqrt(3) / saturation * slope
+        deviations[name] = float(np.hypot(deviations[name], of_step))
+    half_dn = points.black_dn + PRNU_SHARE * (brightest_dn - points.black_dn)
+    lit = min(unsaturated, key=lambda held: abs(held[0] - half_dn))[2]
+    shortest = darks[int(np.argmin(times_s))]
+    black_clipped = np.mean([np.mean(frame == 0) for frame in (shortest.first, shortest.second)])
+    variance, last = flat.over(bright, "variance"), int(np.argmax(flat.exposure_s))
+    fell = variance[last] < FALLEN_SHARE * variance.max(axis=0)
     return SensorSheet(
-        **everything,
-        exposures=len(levels),
+        **figures,
+        exposures=len(flat.exposure_s),
         dsnu=_nonuniformity(darks[0], None, good),
         prnu=_nonuniformity(lit, darks[0], good),
         hot_pixels=int(hot.sum()),
@@ -297,36 +278,63 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
         curve=TransferCurve(
             points.signal.ravel(), points.variance.ravel(), points.exposure_s.ravel()
         ),
-        linearity_residual=_linearity(points).ravel(),
+        linearity_residual=points.linearity().ravel(),
         good=good,
         deviations=deviations,
-        saturated=_saturated(levels, bright),
+        saturated=bool(np.nanmax(flat.clipped[last]) >= CLIPPED_SHARE or fell.any()),
         quantised=quantised,
         black_clipped=bool(black_clipped > CLIPPED_BLACK),
     )
 
 
-def _brightest(light: Array) -> NDArray[np.bool_]:
-    """Return which tiles have nearly as much light as the brightest, (block, tile)."""
-    share = np.nanmean(light / np.nanmax(light, axis=(0, 1)), axis=2)
-    return share >= BRIGHTEST_SHARE * np.nanmax(share)
+def _stacked(levels: Iterable[tuple]) -> _Levels:
+    return _Levels(*(np.array(values) for values in zip(*levels, strict=True)))
 
 
-def _dark_line(darks: Sequence[_Level], blocks: NDArray[np.intp]) -> tuple[float, float, float]:
-    """Return the dark signal's slope in DN/s, the black level, and the variance at no exposure."""
-    times = np.array([one.exposure_s for one in darks])
-    means = np.array([one.of(blocks, "mean").mean() for one in darks])
-    variances = np.array([one.of(blocks, "variance").mean() for one in darks])
-    slope, black = _line(times, means, np.ones_like(times))
-    _, variance = _line(times, variances, 1 / np.maximum(variances, 1e-9) ** 2)
-    return slope, black, max(variance, 1e-9)
+def _read_flats(
+    flats: Iterable[Pair], good: Flags, white_level_dn: int
+) -> tuple[_Levels, list[tuple[float, Array, Pair]]]:
+    """Return the flats' levels, and (mean in DN, by tile, pair) of those bright and unsaturated."""
+    levels: list[tuple] = []
+    unsaturated: list[tuple[float, Array, Pair]] = []
+    loudest = 0.0
+    for pair in flats:
+        level = _level(pair, good, white_level_dn)
+        levels.append(level)
+        _, means, variances, clipped = level
+        # A phase that saturates loses its variance.
+        quietest = float(np.nanmean(variances, axis=(0, 1)).min())
+        if np.nanmax(clipped) < CLIPPED_SHARE and quietest > loudest:
+            mean, loudest = float(np.nanmean(means, axis=(0, 1)).mean()), quietest
+            unsaturated = [held for held in unsaturated if held[0] > HELD_SHARE * mean]
+            unsaturated.append((mean, means, pair))
+    if len(levels) < 4 or not unsaturated:
+        raise CalibrationError(
+            f"{len(levels)} flat exposures: the photon transfer curve needs four at least, and "
+            "some below saturation"
+        )
+    return _stacked(levels), unsaturated
+
+
+def _deviations(dark: _Levels, flat: _Levels, bright: Flags) -> dict[str, float]:
+    """Return the figures' deviations by a jackknife over blocks of rows."""
+    without = []
+    for block in range(BLOCKS):
+        tiles = EVERY.copy()
+        tiles[block] = False
+        without.append(_transfer_points(dark, flat, tiles, bright).figures())
+    factor = (BLOCKS - 1) / np.sqrt(BLOCKS)
+    return {
+        name: float(factor * np.std([figures[name] for figures in without])) for name in without[0]
+    }
 
 
 @dataclass(frozen=True, eq=False)
 class _Points:
     """Signal, variance, exposure and clipped share of the flats, all (level, phase).
 
-    bright_signal, bright_variance: of the brightest tiles.
+    bright_signal, bright_variance: of the brightest tiles. dark_dn_per_s, black_dn: slope and
+    start of the dark signal. dark_variance_dn2: at no exposure.
     """
 
     signal: Array
@@ -335,13 +343,16 @@ class _Points:
     clipped: Array
     bright_signal: Array
     bright_variance: Array
+    dark_dn_per_s: float
+    black_dn: float
+    dark_variance_dn2: float
 
     @property
     def saturation(self) -> tuple[float, float]:
         """The signal where all pixels are full, else that of the greatest variance; the step.
 
-        Between two exposures the latter, EMVA 1288's saturation point, is known to their step: by
-        so much it may be higher.
+        Between two exposures the latter, EMVA 1288's saturation point, is known to their step: it
+        may be higher by that step.
         """
         found = []
         for phase in range(self.signal.shape[1]):
@@ -357,138 +368,124 @@ class _Points:
                 found.append((float(signal[loudest]), float(step)))
         return max(found)
 
+    def figures(self) -> dict[str, float]:
+        """Return the quantities of `SensorSheet` that follow from the curve."""
+        dark = self.dark_variance_dn2
+        saturation, _ = self.saturation
+        if saturation < BRIGHTER_DEVIATIONS * np.sqrt(dark):
+            raise CalibrationError("the flats are no brighter than the dark: is the lamp on?")
+        below = (self.bright_signal <= FIT_SHARE * saturation) & (self.signal > 0)
+        if below.sum() < 3:
+            raise CalibrationError(
+                "fewer than three flats lie below 70 % of saturation: add shorter exposures"
+            )
+        # The dark point anchors the line.
+        x, y = np.append(self.signal[below], 0.0), np.append(self.variance[below], dark)
+        expected = y
+        for _ in range(2):
+            # By the measured variance a level that is low by chance would count more.
+            gain, zero = _line(x, y, 1 / np.maximum(expected, 1e-9) ** 2)
+            expected = gain * x + zero
+        if gain <= 0:
+            raise CalibrationError(
+                "the variance does not grow with the light: are these frames as the sensor gave "
+                "them?"
+            )
+        read_dn = np.sqrt(max(dark - QUANTISATION_DN2, 0))
+        if dark < QUANTISED_DN2:
+            read_dn = QUANTISED_DN
+        well, read = saturation / gain, read_dn / gain
+        least = np.sqrt(read**2 + QUANTISATION_DN2 / gain**2) + 0.5
+        residual = self.linearity()
+        return {
+            "gain_dn_per_electron": gain,
+            "read_noise_electrons": float(read),
+            "dark_current_electrons_per_s": self.dark_dn_per_s / gain,
+            "black_level_dn": self.black_dn,
+            "dark_variance_dn2": dark,
+            "full_well_electrons": well,
+            "saturation_dn": saturation,
+            "linearity_error_percent": float((np.nanmax(residual) - np.nanmin(residual)) / 2),
+            "snr_max_db": float(10 * np.log10(max(well, 1e-9))),
+            "dynamic_range_db": float(20 * np.log10(max(well / least, 1e-9))),
+        }
 
-def _points(
-    flats: Sequence[_Level],
-    blocks: NDArray[np.intp],
-    bright: NDArray[np.bool_],
-    dark_line: tuple[float, float, float],
-) -> _Points:
-    slope, black, _ = dark_line
-    times = np.array([[one.exposure_s] * 4 for one in flats])
-    dark = black + slope * times
+    def linearity(self) -> Array:
+        """Return deviations from the line through 5 to 95 % of saturation, percent; NaN outside."""
+        residual = np.full(self.signal.shape, np.nan)
+        low, high = (share * self.saturation[0] for share in LINEAR_RANGE)
+        for phase in range(4):
+            y, t = self.signal[:, phase], self.exposure_s[:, phase]
+            inside = (y >= low) & (self.bright_signal[:, phase] <= high)
+            if inside.sum() < 3:
+                continue
+            slope, zero = _line(t[inside], y[inside], 1 / y[inside] ** 2)
+            line = slope * t[inside] + zero
+            residual[inside, phase] = 100 * (y[inside] - line) / line
+        if np.isnan(residual).all():
+            raise CalibrationError(
+                "fewer than three flats lie between 5 and 95 % of saturation: add exposures"
+            )
+        return residual
+
+
+def _transfer_points(dark: _Levels, flat: _Levels, tiles: Flags, bright: Flags) -> _Points:
+    """Return the photon transfer curve of some tiles, (block, tile) flags."""
+    means = dark.over(tiles, "mean").mean(axis=1)
+    variances = dark.over(tiles, "variance").mean(axis=1)
+    slope, black = _line(dark.exposure_s, means, np.ones_like(means))
+    _, variance = _line(dark.exposure_s, variances, 1 / np.maximum(variances, 1e-9) ** 2)
+    times_s = flat.exposure_s[:, None].repeat(4, axis=1)
+    dark_dn = black + slope * times_s
+    lit = tiles & bright if (tiles & bright).any() else bright
     return _Points(
-        np.array([one.of(blocks, "mean") for one in flats]) - dark,
-        np.array([one.of(blocks, "variance") for one in flats]),
-        times,
-        np.array([np.nanmax(one.clipped[blocks], axis=(0, 1)) for one in flats]),
-        np.array([one.brightest(blocks, bright, "mean") for one in flats]) - dark,
-        np.array([one.brightest(blocks, bright, "variance") for one in flats]),
+        flat.over(tiles, "mean") - dark_dn,
+        flat.over(tiles, "variance"),
+        times_s,
+        np.nanmax(flat.clipped[:, tiles], axis=1),
+        flat.over(lit, "mean") - dark_dn,
+        flat.over(lit, "variance"),
+        slope,
+        black,
+        max(variance, 1e-9),
     )
 
 
-def _saturated(flats: Sequence[_Level], bright: NDArray[np.bool_]) -> bool:
-    """Return whether the brightest flat lies past saturation: clipped, or of less variance."""
-    brightest = max(flats, key=lambda one: one.exposure_s)
-    most = np.max([one.brightest(EVERY, bright, "variance") for one in flats], axis=0)
-    fell = brightest.brightest(EVERY, bright, "variance") < FALLEN_SHARE * most
-    return bool(np.nanmax(brightest.clipped) >= CLIPPED_SHARE or fell.any())
-
-
-def _figures(
-    darks: Sequence[_Level],
-    flats: Sequence[_Level],
-    blocks: NDArray[np.intp],
-    bright: NDArray[np.bool_],
-) -> dict[str, float]:
-    slope, black, dark = dark_line = _dark_line(darks, blocks)
-    points = _points(flats, blocks, bright, dark_line)
-    saturation, _ = points.saturation
-    if saturation < BRIGHTER_DEVIATIONS * np.sqrt(dark):
-        raise CalibrationError("the flats are no brighter than the dark: is the lamp on?")
-    below = (points.bright_signal <= FIT_SHARE * saturation) & (points.signal > 0)
-    if below.sum() < 3:
-        raise CalibrationError(
-            "fewer than three flats lie below 70 % of saturation: add shorter exposures"
-        )
-    # The dark point anchors the line.
-    x, y = np.append(points.signal[below], 0.0), np.append(points.variance[below], dark)
-    expected = y
-    for _ in range(2):
-        # By the measured variance a level that is low by chance would count more.
-        gain, zero = _line(x, y, 1 / np.maximum(expected, 1e-9) ** 2)
-        expected = gain * x + zero
-    if gain <= 0:
-        raise CalibrationError(
-            "the variance does not grow with the light: are these frames as the sensor gave them?"
-        )
-    read_dn = np.sqrt(max(dark - QUANTISATION_DN2, 0))
-    if dark < QUANTISED_DN2:
-        read_dn = QUANTISED_DN
-    well, read = saturation / gain, read_dn / gain
-    least = np.sqrt(read**2 + QUANTISATION_DN2 / gain**2) + 0.5
-    residual = _linearity(points)
-    return {
-        "gain_dn_per_electron": gain,
-        "read_noise_electrons": float(read),
-        "dark_current_electrons_per_s": slope / gain,
-        "black_level_dn": black,
-        "dark_variance_dn2": dark,
-        "full_well_electrons": well,
-        "saturation_dn": saturation,
-        "linearity_error_percent": float((np.nanmax(residual) - np.nanmin(residual)) / 2),
-        "snr_max_db": float(10 * np.log10(max(well, 1e-9))),
-        "dynamic_range_db": float(20 * np.log10(max(well / least, 1e-9))),
-    }
-
-
-def _linearity(points: _Points) -> Array:
-    """Return deviations from the line through 5 to 95 % of saturation, percent; NaN outside."""
-    residual = np.full(points.signal.shape, np.nan)
-    low, high = (share * points.saturation[0] for share in LINEAR_RANGE)
-    for phase in range(4):
-        y, t = points.signal[:, phase], points.exposure_s[:, phase]
-        inside = (y >= low) & (points.bright_signal[:, phase] <= high)
-        if inside.sum() < 3:
-            continue
-        slope, zero = _line(t[inside], y[inside], 1 / y[inside] ** 2)
-        line = slope * t[inside] + zero
-        residual[inside, phase] = 100 * (y[inside] - line) / line
-    if np.isnan(residual).all():
-        raise CalibrationError(
-            "fewer than three flats lie between 5 and 95 % of saturation: add exposures"
-        )
-    return residual
-
-
-def _hot(darks: Sequence[Pair]) -> NDArray[np.bool_]:
+def _hot(longest: Pair) -> Flags:
     """Return pixels whose longest dark frame stands out."""
-    longest = max(darks, key=lambda one: one.exposure_s)
     mean = (longest.first.astype(np.float64) + longest.second) / 2
     off = mean - np.median(mean)
     return np.abs(off) > HOT_DEVIATIONS * max(deviation_of(off), 0.5)
 
 
-def _dead(flat: Pair, dark: Pair) -> NDArray[np.bool_]:
+def _dead(flat: Pair, dark: Pair) -> Flags:
     """Return pixels that see less than half of what their colour's do."""
     signal = (flat.first.astype(np.float64) + flat.second - dark.first - dark.second) / 2
     dead = np.zeros(signal.shape, dtype=bool)
-    for y in range(2):
-        for x in range(2):
-            part = signal[y::2, x::2]
-            dead[y::2, x::2] = part < DEAD_SHARE * np.median(part)
+    for part, below in zip(_phases(signal), _phases(dead), strict=True):
+        below[...] = part < DEAD_SHARE * np.median(part)
     return dead
 
 
-def _nonuniformity(pair: Pair, dark: Pair | None, good: NDArray[np.bool_]) -> Nonuniformity:
+def _nonuniformity(pair: Pair, dark: Pair | None, good: Flags) -> Nonuniformity:
     """Return what differs between pixels, in DN, or with a dark pair as a share of the signal.
 
     A smooth quadratic is taken out of each phase of each frame first: the lamp's falloff and its
     flicker are not the pixels'.
     """
     rows, columns = (count // 2 * 2 for count in good.shape)
-    frames = [one.astype(np.float64) for one in (pair.first, pair.second)]
+    frames = [pair.first.astype(np.float64), pair.second.astype(np.float64)]
     if dark is not None:
-        # One dark each, so that their noise does not vary together.
-        frames = [one - black for one, black in zip(frames, (dark.first, dark.second), strict=True)]
+        # A dark of its own each, so that their noise does not vary together.
+        frames = [frames[0] - dark.first, frames[1] - dark.second]
     variances, uncertainties = [], []
-    planes = (_phases(one[:rows, :columns]) for one in (*frames, good))
-    for first, second, use in zip(*planes, strict=True):
+    planes = (_phases(plane[:rows, :columns]) for plane in (*frames, good))
+    for *both, use in zip(*planes, strict=True):
         # Each frame's own surface: the lamp may differ between them.
-        surfaces = [_quadratic(one, use) for one in (first, second)]
+        surfaces = [_quadratic(plane, use) for plane in both]
         a, b = (
-            np.where(use, (one - smooth) / (smooth if dark is not None else 1.0), 0)
-            for one, smooth in zip((first, second), surfaces, strict=True)
+            np.where(use, (plane - smooth) / (smooth if dark is not None else 1.0), 0)
+            for plane, smooth in zip(both, surfaces, strict=True)
         )
         variances.append(float(np.sum(a * b) / use.sum()))
         uncertainties.append(_uncertainty(a, b, float(use.sum())))
@@ -503,8 +500,8 @@ def _uncertainty(a: Array, b: Array, count: float) -> float:
     Rows and columns that differ from frame to frame make it less sure than pixels alone do.
     """
 
-    def of_product(one: Array, other: Array, count: float) -> float:
-        both, noise = float(np.mean(one * other)), float(np.mean((one - other) ** 2) / 2)
+    def of_product(first: Array, second: Array, count: float) -> float:
+        both, noise = float(np.mean(first * second)), float(np.mean((first - second) ** 2) / 2)
         return (both**2 + (max(both, 0.0) + noise) ** 2) / count
 
     # Two phases of the filter share each row and each column.
@@ -512,7 +509,7 @@ def _uncertainty(a: Array, b: Array, count: float) -> float:
     return of_product(a, b, count) + sum(lines)
 
 
-def _quadratic(values: Array, use: NDArray[np.bool_]) -> Array:
+def _quadratic(values: Array, use: Flags) -> Array:
     """Return the quadratic surface through the pixels to use, (y, x)."""
     y, x = (np.linspace(-1, 1, count) for count in values.shape)
     yy, xx = np.meshgrid(y, x, indexing="ij")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -32,8 +33,6 @@ GLASS_INDEX = 1.52
 ANY_COLOUR = 3
 OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
-OWN_PIXELS = 2**12
-"""Whose derivatives are held at once."""
 SPARE_UM = 900.0
 """Beyond the beam, for a mask that sits askew."""
 SEARCH_UM = 600.0
@@ -205,198 +204,268 @@ def _turns(placement: Placement) -> NDArray[np.float64]:
     )
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def _read(
-    pixels,
-    channels,
-    cells,
-    tables,
-    reach,
-    turns,
-    lengths,
-    numbers,
-    views_open,
-    aperture,
-    out,
-    slope,
-    each,
-    by_view,
-):
-    """Set out (n,) to the readings of pixels (n, 2), and slope (n, parameter) if it has rows.
+class _Rays(NamedTuple):
+    """What the rays of a frame follow from: camera, placement and stage, lengths in um.
 
-    each (n, view), if it has rows, is set to what every open view adds, and by_view (n, view, 5) to
-    the reading's derivatives by the mask as that view alone sees it: its x and y, its blur along
-    columns and rows, and across both.
-
-    numbers: size (rows, columns), binning. lengths: cell, rho, d / D, pitch, aperture cell, corner,
-    aperture corner, offset x, y, bend, clear, leak, vignetting, falloff, tilt x, y, bow, glass,
-    lens.
+    rows, columns, binning: of the light field's samples. corner_um, far_um: from the middle to the
+    corner of the picture, and to the outermost view. design_share, distance_share: of the mask,
+    d / D and rho. reach: of a footprint, cells. The others are those of `ShadowMask` and
+    `Placement`, offsets with the stage's place.
     """
-    cell_um, ratio, designed, pitch_um, view_um, corner_um, far_um = lengths[:7]
-    off_x, off_y, bend, clear, leak, vignetting, falloff = lengths[7:14]
-    tilt_x, tilt_y, bow, glass, lens_um = lengths[14:]
-    rows, columns, binning = numbers
+
+    rows: int
+    columns: int
+    binning: int
+    pitch_um: float
+    view_um: float
+    corner_um: float
+    far_um: float
+    lens_um: float
+    cell_um: float
+    reach: float
+    design_share: float
+    distance_share: float
+    offset_x_um: float
+    offset_y_um: float
+    distortion_um: float
+    clear: float
+    leak: float
+    vignetting: float
+    falloff: float
+    tilt_x_rad: float
+    tilt_y_rad: float
+    bow_um: float
+    glass_um: float
+
+
+@njit(forceinline=True)
+def _centred_um(index, count, step_um):
+    """Return the place of one of `count` samples, or views, that lie around 0."""
+    return (index - (count - 1) / 2) * step_um
+
+
+@njit(forceinline=True)
+def _light_factors(rays, x_um, y_um, u_um, v_um):
+    """Return x.u, |u|^2 (shares of corners) and what vignetting and falloff make of a ray."""
+    lean = (x_um * u_um + y_um * v_um) / (rays.corner_um * rays.far_um)
+    far = (u_um * u_um + v_um * v_um) / (rays.far_um * rays.far_um)
+    return lean, far, 1 + rays.vignetting * lean, 1 + rays.falloff * far
+
+
+@njit(forceinline=True)
+def _light_sums(rays, aperture, x_um, y_um):
+    """Return the weights of all views summed, and the sum's slopes by vignetting and falloff."""
+    views_v, views_u = aperture.shape
+    total, by_vignetting, by_falloff = 0.0, 0.0, 0.0
+    for v in range(views_v):
+        for u in range(views_u):
+            u_um = _centred_um(u, views_u, rays.view_um)
+            v_um = _centred_um(v, views_v, rays.view_um)
+            lean, far, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
+            total += aperture[v, u] * leaning * falling
+            by_vignetting += aperture[v, u] * lean * falling
+            by_falloff += aperture[v, u] * far * leaning
+    return total, by_vignetting, by_falloff
+
+
+@njit(forceinline=True)
+def _ray_on_mask(rays, x_um, y_um, u_um, v_um):
+    """Return where a ray meets the mask's plane, x and y, its slopes, and the glass's share."""
+    to_u, to_v = (u_um - x_um) / rays.lens_um, (v_um - y_um) / rays.lens_um
+    steep = to_u * to_u + to_v * to_v
+    refracted = 1 / np.sqrt(GLASS_INDEX**2 * (1 + steep) - steep) - 1 / GLASS_INDEX
+    square = (x_um * x_um + y_um * y_um) / rays.corner_um**2
+    cube = square / rays.corner_um
+    farther_um = rays.tilt_x_rad * x_um + rays.tilt_y_rad * y_um + rays.bow_um * square
+    more = farther_um + rays.glass_um * refracted
+    ratio, bend = rays.distance_share, rays.distortion_um * cube
+    xi_x = (1 - ratio) * x_um + ratio * u_um + bend * x_um - rays.offset_x_um + more * to_u
+    xi_y = (1 - ratio) * y_um + ratio * v_um + bend * y_um - rays.offset_y_um + more * to_v
+    return xi_x, xi_y, to_u, to_v, refracted
+
+
+@njit(forceinline=True)
+def _interpolate_shares(tables, start, shares):
+    """Set shares (kind, cell) to those of a footprint from `start`, in cells; return its first."""
+    first = int(np.floor(start))
+    steps = tables.shape[1] - 1
+    place = (start - first) * steps
+    below = min(int(place), steps - 1)
+    part = place - below
+    for kind in range(tables.shape[0]):
+        for k in range(tables.shape[2]):
+            above = part * tables[kind, below + 1, k]
+            shares[kind, k] = (1 - part) * tables[kind, below, k] + above
+    return first
+
+
+@njit(forceinline=True)
+def _sum_footprint(cells, top, left, channel, down, across, values):
+    """Return what a footprint passes, and that by column, row, rho and blur.
+
+    down, across: (kind, cell), of one kind where no derivatives are needed. values: (4,), scratch.
+    """
+    height, width, kinds = cells.shape[0], cells.shape[1], across.shape[0]
+    passed, by_column, by_row, by_ratio, by_blur = 0.0, 0.0, 0.0, 0.0, 0.0
+    for a in range(max(-top, 0), min(down.shape[1], height - top)):
+        values[:] = 0
+        for b in range(max(-left, 0), min(across.shape[1], width - left)):
+            for kind in range(kinds):
+                values[kind] += cells[top + a, left + b, channel] * across[kind, b]
+        passed += down[0, a] * values[0]
+        if kinds > 1:
+            by_column += down[0, a] * values[1]
+            by_row += down[1, a] * values[0]
+            by_ratio += down[0, a] * values[2] + down[2, a] * values[0]
+            by_blur += down[0, a] * values[3] + down[3, a] * values[0]
+    return passed, by_column, by_row, by_ratio, by_blur
+
+
+@njit(forceinline=True)
+def _sum_softenings(cells, top, left, channel, down, across):
+    """Return the derivatives of what a footprint passes by blur in x, in y, and across both."""
+    height, width = cells.shape[0], cells.shape[1]
+    blur_x, blur_y, crossed = 0.0, 0.0, 0.0
+    for a in range(max(-top, 0), min(down.shape[1], height - top)):
+        for b in range(max(-left, 0), min(across.shape[1], width - left)):
+            cell = cells[top + a, left + b, channel]
+            blur_x += cell * down[0, a] * across[3, b]
+            blur_y += cell * down[3, a] * across[0, b]
+            crossed += cell * down[1, a] * across[1, b]
+    return blur_x, blur_y, crossed
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def _read(pixels, channels, cells, tables, turns, rays, views_open, aperture, out):
+    """Set out (readings (n,), slopes (n, parameter), each (n, view), by_view (n, view, 5)).
+
+    slopes, each, by_view: where they have rows; each is what every open view adds, by_view the
+    reading's derivatives by the mask as that view alone sees it: its x and y, its blur along
+    columns and rows, and across both. tables: (kind, place, cell), of one kind where slopes has no
+    rows, see `share_tables`; turns: see `_turns`.
+    """
+    readings, slopes, each, by_view = out
     height, width = cells.shape[0], cells.shape[1]
     views_v, views_u = aperture.shape
-    count = tables.shape[2]
-    steps = tables.shape[1] - 1
-    wanted = slope.shape[0] > 0
-    scalars = 16
-    parts = binning * binning
+    kinds, scalars = tables.shape[0], len(SCALARS)
+    parts = rays.binning * rays.binning
+    b = turns / rays.cell_um
     for n in prange(pixels.shape[0]):
-        across = np.empty((4, count))
-        down = np.empty((4, count))
-        value = np.zeros(4)
+        across, down = np.empty((kinds, tables.shape[2])), np.empty((kinds, tables.shape[2]))
+        values = np.zeros(4)
         gradient = np.zeros(scalars + views_v * views_u)
         channel = channels[n]
-        reading = 0.0
+        readings[n] = 0.0
         for part in range(parts):
-            y = pixels[n, 0] * binning + part // binning
-            x = pixels[n, 1] * binning + part % binning
-            y_um = (y - (rows - 1) / 2) * pitch_um
-            x_um = (x - (columns - 1) / 2) * pitch_um
-            square = (x_um * x_um + y_um * y_um) / corner_um**2
-            cube = square / corner_um
-            farther_um = tilt_x * x_um + tilt_y * y_um + bow * square
-            weight_sum, leaning_sum, far_sum = 0.0, 0.0, 0.0
-            for v in range(views_v):
-                for u in range(views_u):
-                    v_um = (v - (views_v - 1) / 2) * view_um
-                    u_um = (u - (views_u - 1) / 2) * view_um
-                    lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
-                    far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
-                    leaning, falling = 1 + vignetting * lean, 1 + falloff * far
-                    weight_sum += aperture[v, u] * leaning * falling
-                    leaning_sum += aperture[v, u] * lean * falling
-                    far_sum += aperture[v, u] * far * leaning
+            y = pixels[n, 0] * rays.binning + part // rays.binning
+            x = pixels[n, 1] * rays.binning + part % rays.binning
+            y_um = _centred_um(y, rays.rows, rays.pitch_um)
+            x_um = _centred_um(x, rays.columns, rays.pitch_um)
+            square = (x_um * x_um + y_um * y_um) / rays.corner_um**2
+            total, by_vignetting, by_falloff = _light_sums(rays, aperture, x_um, y_um)
             here = 0.0
-            here_gradient = np.zeros(scalars + views_v * views_u)
+            slope = np.zeros(scalars + views_v * views_u)
             for v in range(views_v):
                 for u in range(views_u):
                     if not views_open[v, u]:
                         continue
-                    v_um = (v - (views_v - 1) / 2) * view_um
-                    u_um = (u - (views_u - 1) / 2) * view_um
-                    to_u, to_v = (u_um - x_um) / lens_um, (v_um - y_um) / lens_um
-                    steep = to_u * to_u + to_v * to_v
-                    refracted = 1 / np.sqrt(GLASS_INDEX**2 * (1 + steep) - steep) - 1 / GLASS_INDEX
-                    more = farther_um + glass * refracted
-                    xi_x = (1 - ratio) * x_um + ratio * u_um + bend * cube * x_um - off_x
-                    xi_y = (1 - ratio) * y_um + ratio * v_um + bend * cube * y_um - off_y
-                    xi_x += more * to_u
-                    xi_y += more * to_v
-                    column = (turns[0, 0, 0] * xi_x + turns[0, 0, 1] * xi_y) / cell_um + width / 2
-                    row = (turns[0, 1, 0] * xi_x + turns[0, 1, 1] * xi_y) / cell_um + height / 2
-                    left = int(np.floor(column - reach))
-                    top = int(np.floor(row - reach))
-                    place = (column - reach - left) * steps
-                    j = min(int(place), steps - 1)
-                    part_x = place - j
-                    place = (row - reach - top) * steps
-                    i = min(int(place), steps - 1)
-                    part_y = place - i
-                    kinds = 4 if wanted else 1
-                    for kind in range(kinds):
-                        for k in range(count):
-                            across[kind, k] = (1 - part_x) * tables[kind, j, k] + part_x * tables[
-                                kind, j + 1, k
-                            ]
-                            down[kind, k] = (1 - part_y) * tables[kind, i, k] + part_y * tables[
-                                kind, i + 1, k
-                            ]
-                    passed, by_column, by_row, by_ratio, by_blur = 0.0, 0.0, 0.0, 0.0, 0.0
-                    for a in range(count):
-                        if top + a < 0 or top + a >= height:
-                            continue
-                        value[:] = 0
-                        for b in range(count):
-                            if left + b < 0 or left + b >= width:
-                                continue
-                            cell = cells[top + a, left + b, channel]
-                            for kind in range(kinds):
-                                value[kind] += cell * across[kind, b]
-                        passed += down[0, a] * value[0]
-                        if wanted:
-                            by_column += down[0, a] * value[1]
-                            by_row += down[1, a] * value[0]
-                            by_ratio += down[0, a] * value[2] + down[2, a] * value[0]
-                            by_blur += down[0, a] * value[3] + down[3, a] * value[0]
-                    lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
-                    far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
-                    leaning, falling = 1 + vignetting * lean, 1 + falloff * far
-                    share = aperture[v, u] * leaning * falling / weight_sum
-                    through = leak + (clear - leak) * passed
+                    v_um = _centred_um(v, views_v, rays.view_um)
+                    u_um = _centred_um(u, views_u, rays.view_um)
+                    xi_x, xi_y, to_u, to_v, refracted = _ray_on_mask(rays, x_um, y_um, u_um, v_um)
+                    column = b[0, 0, 0] * xi_x + b[0, 0, 1] * xi_y + width / 2
+                    row = b[0, 1, 0] * xi_x + b[0, 1, 1] * xi_y + height / 2
+                    left = _interpolate_shares(tables, column - rays.reach, across)
+                    top = _interpolate_shares(tables, row - rays.reach, down)
+                    passed, by_column, by_row, by_ratio, by_blur = _sum_footprint(
+                        cells, top, left, channel, down, across, values
+                    )
+                    lean, far, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
+                    share = aperture[v, u] * leaning * falling / total
+                    through = rays.leak + (rays.clear - rays.leak) * passed
+                    view = v * views_u + u
                     here += share * through
                     if each.shape[0] > 0:
-                        each[n, v * views_u + u] += share * through / parts
-                    if not wanted:
+                        each[n, view] += share * through / parts
+                    if kinds == 1:
                         continue
-                    gain = share * (clear - leak)
-                    to_x = gain * (by_column * turns[0, 0, 0] + by_row * turns[0, 1, 0]) / cell_um
-                    to_y = gain * (by_column * turns[0, 0, 1] + by_row * turns[0, 1, 1]) / cell_um
-                    here_gradient[0] -= to_x
-                    here_gradient[1] -= to_y
+                    gain = share * (rays.clear - rays.leak)
+                    by_x = gain * (by_column * b[0, 0, 0] + by_row * b[0, 1, 0])
+                    by_y = gain * (by_column * b[0, 0, 1] + by_row * b[0, 1, 1])
+                    slope[0] -= by_x
+                    slope[1] -= by_y
                     for t in range(3):
-                        here_gradient[2 + t] += (
-                            gain
-                            * (
-                                by_column * (turns[t + 1, 0, 0] * xi_x + turns[t + 1, 0, 1] * xi_y)
-                                + by_row * (turns[t + 1, 1, 0] * xi_x + turns[t + 1, 1, 1] * xi_y)
-                            )
-                            / cell_um
-                        )
-                    here_gradient[5] += designed * (
-                        to_x * (u_um - x_um) + to_y * (v_um - y_um) + gain * by_ratio
-                    )
-                    here_gradient[6] += cube * (to_x * x_um + to_y * y_um)
-                    here_gradient[7] += gain * by_blur
+                        column = b[t + 1, 0, 0] * xi_x + b[t + 1, 0, 1] * xi_y
+                        row = b[t + 1, 1, 0] * xi_x + b[t + 1, 1, 1] * xi_y
+                        slope[2 + t] += gain * (by_column * column + by_row * row)
+                    by_distance = by_x * (u_um - x_um) + by_y * (v_um - y_um) + gain * by_ratio
+                    slope[5] += rays.design_share * by_distance
+                    slope[6] += square / rays.corner_um * (by_x * x_um + by_y * y_um)
+                    slope[7] += gain * by_blur
+                    slope[8] += share * passed
+                    slope[9] += share * (1 - passed)
+                    slope[10] += share * lean / leaning * through
+                    slope[11] += share * far / falling * through
+                    along = by_x * to_u + by_y * to_v
+                    slope[12] += along * x_um
+                    slope[13] += along * y_um
+                    slope[14] += along * square
+                    slope[15] += along * refracted
+                    slope[scalars + view] += share / aperture[v, u] * through
                     if by_view.shape[0] > 0:
-                        blur_x, blur_y, crossed = 0.0, 0.0, 0.0
-                        for a in range(count):
-                            for b in range(count):
-                                if 0 <= top + a < height and 0 <= left + b < width:
-                                    cell = cells[top + a, left + b, channel]
-                                    blur_x += cell * down[0, a] * across[3, b]
-                                    blur_y += cell * down[3, a] * across[0, b]
-                                    crossed += cell * down[1, a] * across[1, b]
-                        view = by_view[n, v * views_u + u]
-                        view[0] -= to_x / parts
-                        view[1] -= to_y / parts
-                        view[2] += gain * blur_x / parts
-                        view[3] += gain * blur_y / parts
-                        view[4] += gain * crossed / (cell_um * parts)
-                    here_gradient[8] += share * passed
-                    here_gradient[9] += share * (1 - passed)
-                    here_gradient[10] += share * lean / leaning * through
-                    here_gradient[11] += share * far / falling * through
-                    along = to_x * to_u + to_y * to_v
-                    here_gradient[12] += along * x_um
-                    here_gradient[13] += along * y_um
-                    here_gradient[14] += along * square
-                    here_gradient[15] += along * refracted
-                    here_gradient[scalars + v * views_u + u] += share / aperture[v, u] * through
-            reading += here / parts
-            if wanted:
-                here_gradient[10] -= here * leaning_sum / weight_sum
-                here_gradient[11] -= here * far_sum / weight_sum
+                        blur_x, blur_y, crossed = _sum_softenings(
+                            cells, top, left, channel, down, across
+                        )
+                        by_view[n, view, 0] -= by_x / parts
+                        by_view[n, view, 1] -= by_y / parts
+                        by_view[n, view, 2] += gain * blur_x / parts
+                        by_view[n, view, 3] += gain * blur_y / parts
+                        by_view[n, view, 4] += gain * crossed / (rays.cell_um * parts)
+            readings[n] += here / parts
+            if kinds > 1:
+                slope[10] -= here * by_vignetting / total
+                slope[11] -= here * by_falloff / total
                 for v in range(views_v):
                     for u in range(views_u):
-                        v_um = (v - (views_v - 1) / 2) * view_um
-                        u_um = (u - (views_u - 1) / 2) * view_um
-                        lean = (x_um * u_um + y_um * v_um) / (corner_um * far_um)
-                        far = (u_um * u_um + v_um * v_um) / (far_um * far_um)
-                        here_gradient[scalars + v * views_u + u] -= (
-                            here * (1 + vignetting * lean) * (1 + falloff * far) / weight_sum
-                        )
-                for p in range(gradient.shape[0]):
-                    gradient[p] += here_gradient[p] / parts
-        out[n] = reading
-        if wanted:
-            slope[n, :] = gradient
+                        u_um = _centred_um(u, views_u, rays.view_um)
+                        v_um = _centred_um(v, views_v, rays.view_um)
+                        _, _, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
+                        slope[scalars + v * views_u + u] -= here * leaning * falling / total
+                for p in range(len(gradient)):
+                    gradient[p] += slope[p] / parts
+        if kinds > 1:
+            slopes[n, :] = gradient
+
+
+@njit(cache=True, parallel=True)
+def _find_footprints(pixels, cells, table, turns, rays, chosen, aperture, out):
+    """Set out to what `Shadow.footprints` returns of pixels (n, 2) and views chosen (view, 2)."""
+    corners, shares, weights = out
+    views_v, views_u = aperture.shape
+    for n in prange(len(pixels)):
+        y_um = _centred_um(pixels[n, 0], rays.rows, rays.pitch_um)
+        x_um = _centred_um(pixels[n, 1], rays.columns, rays.pitch_um)
+        total, _, _ = _light_sums(rays, aperture, x_um, y_um)
+        for k in range(len(chosen)):
+            v, u = chosen[k]
+            v_um = _centred_um(v, views_v, rays.view_um)
+            u_um = _centred_um(u, views_u, rays.view_um)
+            xi_x, xi_y, _, _, _ = _ray_on_mask(rays, x_um, y_um, u_um, v_um)
+            for axis in range(2):
+                turn = turns[0, 1 - axis] / rays.cell_um
+                start = turn[0] * xi_x + turn[1] * xi_y + cells.shape[axis] / 2 - rays.reach
+                corners[n, k, axis] = int(np.floor(start))
+                place = int(np.rint((start - corners[n, k, axis]) * TABLE_STEPS))
+                shares[axis, n, k] = table[place]
+            _, _, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
+            weights[n, k] = aperture[v, u] * leaning * falling / total
 
 
 class Shadow:
-    """The shadow of one placement: readings and derivatives of any pixels."""
+    """The shadow of one placement: readings and derivatives of any pixels.
+
+    All take pixels (n, 2), row and column, and the colour that each sees, (n,), or ANY_COLOUR;
+    views_open (v, u), where the mask stands, x and y in um, and the frame of the pattern.
+    """
 
     def __init__(self, mask: ShadowMask, placement: Placement) -> None:
         self.mask, self.placement = mask, placement
@@ -414,12 +483,8 @@ class Shadow:
         stage_um: tuple[float, float] = (0.0, 0.0),
         frame: int = 0,
     ) -> NDArray[np.float64]:
-        """Return what pixels (n, 2), row and column, read of a white board, (n,).
-
-        channels: (n,), the colour each sees, or ANY_COLOUR. views_open: (v, u). stage_um: where
-        the mask stands, x and y. frame: of the pattern.
-        """
-        return self._both(pixels, channels, views_open, stage_um, frame)[0]
+        """Return what pixels read of a white board, (n,)."""
+        return self._run(pixels, channels, (views_open, stage_um, frame), 0, 0, 0)[0]
 
     def with_slopes(
         self,
@@ -429,8 +494,8 @@ class Shadow:
         stage_um: tuple[float, float] = (0.0, 0.0),
         frame: int = 0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the readings (n,) and their derivatives (n, parameter), as `readings`."""
-        return self._both(pixels, channels, views_open, stage_um, frame, len(pixels))[:2]
+        """Return the readings (n,) and their derivatives (n, parameter)."""
+        return self._run(pixels, channels, (views_open, stage_um, frame), 1, 0, 0)[:2]
 
     def slopes_by_view(
         self,
@@ -445,27 +510,8 @@ class Shadow:
         The latter by what each view alone sees of the mask, (n, view x 5): x, y, blur along columns
         and rows, all in um, and across both, in cells times um.
         """
-        by_view = np.zeros((len(pixels), self._aperture.size, OF_VIEW))
-        count = len(pixels)
-        slope = self._both(pixels, channels, views_open, stage_um, frame, count, 0, by_view)[1]
-        return slope, by_view.reshape(count, -1)
-
-    def own_slopes(
-        self,
-        pixels: Pixels,
-        channels: NDArray[np.uint8],
-        views_open: NDArray[np.bool_],
-        stage_um: tuple[float, float] = (0.0, 0.0),
-        frame: int = 0,
-    ) -> NDArray[np.float64]:
-        """Return the derivatives of one open view's readings by what it alone sees, (n, 5)."""
-        found = np.empty((len(pixels), OF_VIEW))
-        for first in range(0, len(pixels), OWN_PIXELS):
-            part = slice(first, first + OWN_PIXELS)
-            how = pixels[part], channels[part], views_open, stage_um, frame
-            by_view = self.slopes_by_view(*how)[1].reshape(-1, self._aperture.size, OF_VIEW)
-            found[part] = by_view.sum(axis=1)
-        return found
+        out = self._run(pixels, channels, (views_open, stage_um, frame), 1, 0, 1)
+        return out[1], out[3].reshape(len(pixels), -1)
 
     def coefficients(
         self,
@@ -474,9 +520,9 @@ class Shadow:
         stage_um: tuple[float, float] = (0.0, 0.0),
         frame: int = 0,
     ) -> NDArray[np.float64]:
-        """Return Psi's coefficients of pixels (n, 2) and the colours they see, (n, v, u)."""
+        """Return Psi's coefficients of pixels and the colours they see, (n, v, u)."""
         every = np.ones(self.mask.views, dtype=bool)
-        each = self._both(pixels, channels, every, stage_um, frame, 0, len(pixels))[2]
+        each = self._run(pixels, channels, (every, stage_um, frame), 0, 1, 0)[2]
         return each.reshape(len(pixels), *self.mask.views)
 
     def footprints(
@@ -488,117 +534,66 @@ class Shadow:
         down and across, (n, view, cell) each; and what each view counts in the reading (n, view).
         Pixels must be samples (binning 1).
         """
-        mask, at = self.mask, self.placement
-        if mask.binning != 1:
+        if self.mask.binning != 1:
             raise CalibrationError("defects are sought on sensors whose pixels are samples")
-        ratio = mask.distance_um * (1 + at.distance_share) / mask.lens_um
-        y, x = (
-            (pixels[:, axis] - (mask.size[axis] - 1) / 2)[:, None] * mask.pitch_um
-            for axis in (0, 1)
-        )
-        chosen = np.argwhere(views_open)
-        grid_v, grid_u = (
-            (np.arange(count) - (count - 1) / 2) * mask.aperture_cell_um for count in mask.views
-        )
-        square = (x**2 + y**2) / mask.corner_um**2
-        bend = at.distortion_um * square / mask.corner_um
-        to_u, to_v = (
-            (grid_u[chosen[:, 1]] - x) / mask.lens_um,
-            (grid_v[chosen[:, 0]] - y) / mask.lens_um,
-        )
-        steep = to_u**2 + to_v**2
-        refracted = 1 / np.sqrt(GLASS_INDEX**2 * (1 + steep) - steep) - 1 / GLASS_INDEX
-        farther_um = at.tilt_x_rad * x + at.tilt_y_rad * y + at.bow_um * square
-        more = farther_um + at.glass_um * refracted
-        xi_x = (1 - ratio) * x + ratio * grid_u[chosen[:, 1]] + bend * x + more * to_u
-        xi_y = (1 - ratio) * y + ratio * grid_v[chosen[:, 0]] + bend * y + more * to_v
-        xi_x = xi_x - at.offset_x_um - stage_um[0]
-        xi_y = xi_y - at.offset_y_um - stage_um[1]
-        turn = self._turns[0] / mask.cell_um
-        height, width = mask.cells.shape[1:3]
-        starts = [
-            turn[1, 0] * xi_x + turn[1, 1] * xi_y + height / 2 - self._reach,
-            turn[0, 0] * xi_x + turn[0, 1] * xi_y + width / 2 - self._reach,
-        ]
-        corners = np.stack([np.floor(start).astype(np.int64) for start in starts], axis=-1)
-        shares = []
-        for axis, start in enumerate(starts):
-            place = np.rint((start - corners[..., axis]) * TABLE_STEPS).astype(np.int64)
-            shares.append(self._tables[0][place])
-
-        def counted(v: Array, u: Array, y: Array, x: Array) -> Array:
-            leaning = (x * u + y * v) / (mask.corner_um * self._far_um)
-            far = (u**2 + v**2) / self._far_um**2
-            return (1 + at.vignetting * leaning) * (1 + at.falloff * far)
-
-        every = np.argwhere(np.ones(mask.views, dtype=bool))
-        totals = sum(
-            self._aperture[v, u] * counted(grid_v[v], grid_u[u], y[:, 0], x[:, 0]) for v, u in every
-        )
-        weights = np.stack(
-            [
-                self._aperture[v, u] * counted(grid_v[v], grid_u[u], y[:, 0], x[:, 0]) / totals
-                for v, u in chosen
-            ],
-            axis=1,
-        )
+        chosen, table = np.argwhere(views_open), self._tables[0]
+        shape = len(pixels), len(chosen)
+        corners = np.empty((*shape, 2), dtype=np.int64)
+        shares, weights = np.empty((2, *shape, table.shape[1])), np.empty(shape)
+        cells, rays = self.mask.cells[0], self._rays(stage_um)
+        out = corners, shares, weights
+        _find_footprints(pixels, cells, table, self._turns, rays, chosen, self._aperture, out)
         return corners, shares[0], shares[1], weights
 
-    def _both(
+    def _rays(self, stage_um: tuple[float, float]) -> _Rays:
+        mask, at = self.mask, self.placement
+        design_share = mask.distance_um / mask.lens_um
+        return _Rays(
+            *mask.size,
+            mask.binning,
+            mask.pitch_um,
+            mask.aperture_cell_um,
+            mask.corner_um,
+            self._far_um,
+            mask.lens_um,
+            mask.cell_um,
+            self._reach,
+            design_share,
+            design_share * (1 + at.distance_share),
+            float(at.offset_x_um + stage_um[0]),
+            float(at.offset_y_um + stage_um[1]),
+            *(getattr(at, name) for name in _Rays._fields[_Rays._fields.index("distortion_um") :]),
+        )
+
+    def _run(
         self,
         pixels: Pixels,
         channels: NDArray[np.uint8],
-        views_open: NDArray[np.bool_],
-        stage_um: tuple[float, float],
-        frame: int,
-        slopes: int = 0,
-        views: int = 0,
-        by_view: NDArray[np.float64] | None = None,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        mask, at = self.mask, self.placement
+        opening: tuple[NDArray[np.bool_], tuple[float, float], int],
+        slopes: int,
+        each: int,
+        by_view: int,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return readings, slopes, each, by_view of `_read`, the latter three empty where 0."""
+        views_open, stage_um, frame = opening
         if slopes and len(self._tables) == 1:
-            self._tables = share_tables(mask, at)[0]
-        out = np.empty(len(pixels))
-        slope = np.empty((slopes, len(SCALARS) + self._aperture.size))
-        each = np.zeros((views, self._aperture.size))
-        designed = mask.distance_um / mask.lens_um
-        lengths = np.array(
-            [
-                mask.cell_um,
-                designed * (1 + at.distance_share),
-                designed,
-                mask.pitch_um,
-                mask.aperture_cell_um,
-                mask.corner_um,
-                self._far_um,
-                at.offset_x_um + stage_um[0],
-                at.offset_y_um + stage_um[1],
-                at.distortion_um,
-                at.clear,
-                at.leak,
-                at.vignetting,
-                at.falloff,
-                at.tilt_x_rad,
-                at.tilt_y_rad,
-                at.bow_um,
-                at.glass_um,
-                mask.lens_um,
-            ]
+            self._tables = share_tables(self.mask, self.placement)[0]
+        count, views = len(pixels), self._aperture.size
+        out = (
+            np.empty(count),
+            np.empty((slopes * count, len(SCALARS) + views)),
+            np.zeros((each * count, views)),
+            np.zeros((by_view * count, views, OF_VIEW)),
         )
         _read(
             np.ascontiguousarray(pixels, dtype=np.int64),
             np.ascontiguousarray(channels, dtype=np.uint8),
-            mask.cells[frame % len(mask.cells)],
-            self._tables,
-            self._reach,
+            self.mask.cells[frame % len(self.mask.cells)],
+            self._tables if slopes else self._tables[:1],
             self._turns,
-            lengths,
-            np.array([*mask.size, mask.binning], dtype=np.int64),
+            self._rays(stage_um),
             np.ascontiguousarray(views_open, dtype=np.bool_),
             self._aperture,
             out,
-            slope,
-            each,
-            np.zeros((0, 0, OF_VIEW)) if by_view is None else by_view,
         )
-        return out, slope, each
+        return out

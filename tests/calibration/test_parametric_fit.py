@@ -16,12 +16,13 @@ from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_
 from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
 from calibration.defects import View, find_defects, loss_variance, mask_with_losses
 from calibration.errors import CalibrationError
+from calibration.findings import fit_advice
 from calibration.fit import FitSettings, fit_placement, shares_of_prior
 from calibration.locator import register
 from calibration.openings import CENTRED, parts, views_open
 from calibration.parametric import psi_at, psi_deviation, psi_information, shot_stages
 from calibration.placement import SCALARS, Placement, Tolerances, designed_placement, labels
-from calibration.routes import calibrate, fit_advice
+from calibration.routes import calibrate
 from calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix
 from simulators.bench import MountingErrors
