@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +34,7 @@ from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.processing.memory import peak_memory_mib, task_bytes
 from emmc_rig.processing.pool import Pool
+from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import emptied
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
@@ -371,11 +372,11 @@ def compute_blocks(
     job: BlockJob,
     frames: Frames,
     pool: Pool,
-    on_block: Callable[[int, int], None] = lambda done, of: None,
+    watcher: Watcher,
 ) -> Blocks:
     """Return the blocks of a capture, computed by a pool, those done before left as they are.
 
-    on_block: called with the blocks done and their number. Raises WorkersError, AppError, and what
+    watcher: gets the blocks done. Raises WorkersError, AppError, and what
     a block raises.
     """
     started = running_s()
@@ -390,7 +391,7 @@ def compute_blocks(
     done = {task.block.name: kept for task in tasks if (kept := done_block(task)) is not None}
     left = [task for task in tasks if task.block.name not in done]
     if done:
-        on_block(len(done), len(tasks))
+        watcher.at(len(done), len(tasks))
     for task, _ in pool.run(block_task, left):
         computed = done_block(task)
         if computed is None:
@@ -399,7 +400,7 @@ def compute_blocks(
                 "Psi and results on a disk that all workers share"
             )
         done[task.block.name] = computed
-        on_block(len(done), len(tasks))
+        watcher.at(len(done), len(tasks))
     ordered = [done[block.name] for block in grid]
     took_s = running_s() - started
     return Blocks(job, grid, survey, ordered, took_s, pool.size)

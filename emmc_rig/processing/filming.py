@@ -60,6 +60,7 @@ from emmc_rig.processing.reconstructing import (
 )
 from emmc_rig.processing.result import Result
 from emmc_rig.processing.session_capture import SessionCapture
+from emmc_rig.progress import Watcher
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
 from emmc_rig.session.readings import FilmPlace, film_frames, film_places
@@ -74,7 +75,6 @@ from reconstruction.adaptive.film import Film
 from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, film_methods, find_method
-from reconstruction.result import Progress
 from reconstruction.verdict.rules import LEVELS
 from reconstruction.verdict.run import reconstruct_judged
 
@@ -225,9 +225,7 @@ class FilmJob:
     method: str
     settings: MethodSettings
 
-    def settle(
-        self, capture: SessionCapture, psi_path: Path | None, on_note: Callable[[str], None]
-    ) -> None:
+    def settle(self, capture: SessionCapture, psi_path: Path | None, watcher: Watcher) -> None:
         """Write what all frames have alike, unless an earlier run of the same film did.
 
         Raises AppError, CalibrationError.
@@ -243,13 +241,13 @@ class FilmJob:
             if _open(path)[0]["fingerprint"] == fingerprint:
                 StoredPsi(self.kept / PSI).verify()
                 done = len(list((self.kept / FRAMES).glob(DONE)))
-                on_note(f"goes on with an earlier run; frames done: {done}")
+                watcher.tell(f"goes on with an earlier run; frames done: {done}")
                 return
         if path.exists():
-            on_note("starts anew: an earlier run was of other frames, settings or version")
+            watcher.tell("starts anew: an earlier run was of other frames, settings or version")
             path.unlink()  # before all else: without it nothing is gone on from
         emptied(self.kept)
-        scale = capture.scale(psi_path, on_note)
+        scale = capture.scale(psi_path, watcher)
         psi = scale.psi if given is None else given
         if psi.frames_shape != scale.psi.frames_shape:
             raise AppError(f"{psi_path}: is not of this session's shots and frames")
@@ -331,8 +329,7 @@ def reconstruct_film_session(
     psi_path: Path | None = None,
     settings: MethodSettings | None = None,
     memory: int | None = None,
-    on_step: Callable[[Progress], None] = lambda progress: None,
-    on_note: Callable[[str], None] = lambda text: None,
+    watcher: Watcher | None = None,
     workers: int | None = None,
     cluster: str | None = None,
 ) -> dict[str, Any]:
@@ -340,8 +337,8 @@ def reconstruct_film_session(
 
     Goes on after the frames that an earlier run finished, if it was of the same film, method,
     settings and version. psi_path: of another Psi than that of the session's whiteboards. memory:
-    bytes that must be enough. on_step: called with the frames done, from any thread. on_note:
-    called with what becomes of an earlier run. workers, cluster: see `opened_pool`, for segments
+    bytes that must be enough. watcher: gets the frames done, from any thread, and as a note what
+    becomes of an earlier run. workers, cluster: see `opened_pool`, for segments
     beside each other; None of both: this process and its threads.
     Raises AppError, CalibrationError; StoppedError by Ctrl-C.
     """
@@ -350,14 +347,15 @@ def reconstruct_film_session(
         kept, session = kept_folder(new).absolute(), capture.session
         job = FilmJob(session.folder, kept, method, settings or MethodSettings())
         count, places = capture.planned_frames, film_places(session)
-        job.settle(capture, psi_path, on_note)
+        watcher = watcher or Watcher()
+        job.settle(capture, psi_path, watcher)
         tasks = _segments(job, places)
 
         def on_frame() -> None:
-            on_step(Progress(len(list((kept / FRAMES).glob(DONE))), None, None, count))
+            watcher.at(len(list((kept / FRAMES).glob(DONE))), count)
 
         try:
-            failed = _computed(job, tasks, workers, cluster, memory, on_frame, on_note)
+            failed = _computed(job, tasks, workers, cluster, memory, on_frame, watcher)
         except KeyboardInterrupt as stop:
             raise StoppedError(
                 f"stopped by Ctrl-C; frames that are done are kept in {out}, and the same command "
@@ -392,14 +390,14 @@ def _computed(
     cluster: str | None,
     memory: int | None,
     on_frame: Callable[[], None],
-    on_note: Callable[[str], None],
+    watcher: Watcher,
 ) -> dict[int, str]:
     """Do all segments by workers, or by this process where none are asked for.
 
     Returns why frames could not be reconstructed, by place.
     """
     if len(tasks) == 1 and (cluster is not None or (workers or 1) > 1):
-        on_note(
+        watcher.tell(
             "one segment, which workers cannot share: the setting film: {segment: 50} makes "
             "segments of 50 frames, the first of each without those before it"
         )

@@ -18,7 +18,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.pages.page import number
 from emmc_rig.processing.pool import Pool
-from emmc_rig.progress import Silent, Watcher
+from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.store.journal import Lines
 from emmc_rig.study.rows import described, digest_of, plain
@@ -257,7 +257,7 @@ def _group_measured(task: tuple[Study, Sequence]) -> tuple[list[dict], str | Non
     study, group = task
     results: list[dict] = []
     try:
-        with closing(study.measured(group, Silent())) as measured:
+        with closing(study.measured(group, Watcher())) as measured:
             results.extend(map(plain, measured))
     except NotApplicableError as why:
         return results, str(why)
