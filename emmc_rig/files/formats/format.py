@@ -57,7 +57,7 @@ class Film:
     frames: Mapping[int, Path]
     shape: tuple[int, ...]
     open_result: Callable[[str], Export]
-    watcher: Watcher = field(default_factory=Watcher)
+    watcher: Watcher = field(default_factory=Watcher, repr=False, compare=False)
 
     @property
     def missing(self) -> list[int]:
