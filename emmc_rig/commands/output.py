@@ -40,7 +40,6 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from emmc_rig.errors import StoppedError
 from emmc_rig.progress import Watcher
 
 console = Console(stderr=True)
@@ -187,8 +186,7 @@ def columns() -> tuple[ProgressColumn, ...]:
 def shown_progress(stage: str | None = None) -> Iterator[Shown]:
     """Yield what shows progress until the block ends; a stage named here has begun.
 
-    The last bar is filled if the block ends well. A KeyboardInterrupt that says what is kept
-    becomes a StoppedError.
+    The last bar is filled if the block ends well.
     """
     with Progress(*columns(), console=console, disable=not console.is_terminal) as progress:
         shown = (
@@ -197,10 +195,5 @@ def shown_progress(stage: str | None = None) -> Iterator[Shown]:
         )  # fmt: skip
         if stage is not None:
             shown.begin(stage)
-        try:
-            yield shown
-        except KeyboardInterrupt as stop:
-            if str(stop):
-                raise StoppedError(str(stop)) from stop
-            raise
+        yield shown
         shown.finish()

@@ -9,10 +9,10 @@ from pages import Page
 from pools import Posting
 from view_files import save_views
 
+from emmc_rig.errors import StoppedError
 from emmc_rig.files.results import METRICS
 from emmc_rig.progress import Watcher
 from emmc_rig.study import trial
-from emmc_rig.study.points import StudyStopped
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.curves import (
     POOLED,
@@ -222,7 +222,7 @@ def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path)
         return once(*arguments)
 
     monkeypatch.setattr(trial, "reconstruct", stopping)
-    with pytest.raises(StudyStopped, match="1 of 4 points are kept"):
+    with pytest.raises(StoppedError, match="1 of 4 points are kept"):
         run_stability(quick(), tmp_path / "out", Watcher())
     run_stability(quick(), tmp_path / "out", Watcher())
     assert len(calls) == 1 + 4
