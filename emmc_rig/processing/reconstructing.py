@@ -16,7 +16,7 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
-from emmc_rig.errors import ERRORS, AppError, StoppedError
+from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.psi import FRAMES, StoredPsi
 from emmc_rig.files.result_files import LIGHT_FIELD, MAPS, RESULT_GROUP, holds_light_field
@@ -30,8 +30,9 @@ from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import validated
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
-from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
+from emmc_rig.processing.block_tasks import Blocks, block_job, compute_blocks
 from emmc_rig.processing.captures import Capture, opened_capture
+from emmc_rig.processing.jobs import kept_words
 from emmc_rig.processing.memory import (
     BASE_BYTES,
     Ceiling,
@@ -267,11 +268,8 @@ def reconstruct_undrawn(
     else:
         saved.verify()
         check_frames(saved.frames_shape, frames.readings)
-        job = BlockJob(
-            kept_folder(out).absolute(), psi_path.absolute(), method, dictionary_spec, settings,
-            frames.noise_sigma, fingerprint_of(saved, frames, method, dictionary_spec, settings),
-        )  # fmt: skip
-
+        kept = kept_folder(out).absolute()
+        job = block_job(kept, psi_path.absolute(), frames, method, dictionary_spec, settings)
         with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
             blocks = compute_blocks(job, frames, workers, watcher)
             if as_zarr:
@@ -423,15 +421,12 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
         with result_folder(
             out, "reconstruct", belongs_to=capture.own_place, resumes=True
         ) as folder:
-            try:
+
+            def kept() -> str:
+                return "blocks that are done are" if (folder.parent / KEPT).is_dir() else ""
+
+            with kept_words(out, kept):
                 metrics, draw = reconstruct_undrawn(capture, folder, **given)
-            except KeyboardInterrupt as stop:
-                if not (folder.parent / KEPT).is_dir():
-                    raise
-                raise StoppedError(
-                    f"stopped by Ctrl-C; blocks that are done are kept in {out}, and the same "
-                    "command goes on"
-                ) from stop
         if draw is not None:  # the result is on the disk, whatever happens to its page
             with result_folder(
                 out, "reconstruct", belongs_to=capture.own_place, adds=True
