@@ -195,7 +195,7 @@ def test_a_frame_after_which_nothing_was_noted_is_made_again(
     [
         (None, "starts anew"),  # of other settings
         ("next-000.npz", "goes on with an earlier run; frames done"),
-        ("scale.npz", "starts anew"),
+        ("calibration.h5", "starts anew"),
         ("psi.h5", "starts anew"),
     ],
 )
@@ -234,7 +234,7 @@ def test_ctrl_c_says_that_frames_are_kept(session, tmp_path):
     def stop():
         raise KeyboardInterrupt
 
-    with pytest.raises(StoppedError, match="frames that are done are kept in"):
+    with pytest.raises(StoppedError, match="1 of 6 frames are kept in"):
         reconstructed(session, tmp_path / "out", METHOD, watcher=Recorder(1, stop))
 
 
