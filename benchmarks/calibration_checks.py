@@ -61,7 +61,7 @@ from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
-from emmc_rig.progress import Silent
+from emmc_rig.progress import Watcher
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry, frame_file
 from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
@@ -226,7 +226,7 @@ def check_session(size: Size, seed: int) -> Iterator[Row]:
     camera = settings.camera
     fine = fine_scene(BUILT_IN[1], 2, 2, size=size.pixels, views=camera.views, seed=seed)
     rig, bench = rig_to_calibrate(settings, fine.samples)
-    with simulated_session(simulated_plan(settings), camera, rig, Silent()) as session:
+    with simulated_session(simulated_plan(settings), camera, rig, Watcher()) as session:
         found, (_, seen) = emmc.calibrate(session), session_frames(session)
     true, known, good = true_psi(camera, rig, bench), found.calibration, found.outcome.good
     error, stated = true_error(known.psi, true, good), stated_error(known, good)
@@ -275,7 +275,7 @@ def captured_scene(spec: str, settings: CalibrateSettings, known: Calibration) -
     shots = tuple(PlannedShot() for _ in camera.shots)
     checks = Checks(largest_saturated_share=1.0)
     plan = Plan(camera=settings.camera_name, shots=shots, whiteboards=None, checks=checks)
-    with simulated_session(plan, camera, rig, Silent()) as session:
+    with simulated_session(plan, camera, rig, Watcher()) as session:
         frames = shot_readings(session, scale_of(known, session))
     variance = np.square(frames.deviation)
     return Captured(frames.readings, variance, frames.usable, fine.scene.light_field)

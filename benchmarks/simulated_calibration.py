@@ -30,7 +30,7 @@ from emmc_rig.processing.board_plan import (
 )
 from emmc_rig.processing.calibrating import calibrate
 from emmc_rig.processing.session_calibration import SessionCalibration
-from emmc_rig.progress import Silent, Watcher
+from emmc_rig.progress import Watcher
 from simulators.bench import Bench
 from simulators.effects import ORDINARY, Flaws, flawed
 
@@ -191,7 +191,7 @@ def calibrate_simulated(
 
     Raises AppError or CalibrationError.
     """
-    watcher = watcher or Silent()
+    watcher = watcher or Watcher()
     camera, route = settings.camera, settings.route
     watcher.begin("plan", None)
     plan = simulated_plan(settings)

@@ -14,11 +14,9 @@ import yaml
 from numpy.typing import NDArray
 
 from calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.plan import Boards, Checks, Darks, Plan, PlannedShot
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.files.dictionaries import open_dictionary
@@ -28,10 +26,9 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.result import Result
-from emmc_rig.progress import Silent, Watcher
+from emmc_rig.progress import Event, Watcher
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.frame_means import decoded
-from emmc_rig.session.journal import Figures
 from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import shot_frames, shot_readings
@@ -85,15 +82,16 @@ class _Stages:
         self.seconds[name] = self.clock() - started
 
 
-class FrameSteps(CaptureWatcher):
-    """A capture shown as steps of a stage, one a frame."""
+class FrameSteps(Watcher):
+    """Shows a capture as steps of a stage: a step for each frame that passed its checks."""
 
     def __init__(self, watcher: Watcher) -> None:
         self._watcher = watcher
 
-    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+    def event(self, event: Event) -> None:
         """Count a frame."""
-        self._watcher.step(planned.id)
+        if event.name == "frame.taken":
+            self._watcher.step(event.facts["id"])
 
 
 @contextmanager
@@ -126,7 +124,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     Writes light_field.h5, psi.h5, frames.h5, maps.h5, metrics.json and report.html. Raises the
     errors of the layers below, each one line.
     """
-    watcher = watcher or Silent()
+    watcher = watcher or Watcher()
     find_method(settings.method)
     stages = _Stages(watcher)
     camera = settings.camera

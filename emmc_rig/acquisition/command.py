@@ -21,7 +21,7 @@ from emmc_rig.acquisition.checks import refuse_impossible
 from emmc_rig.acquisition.control import Control, interruptible
 from emmc_rig.acquisition.devices import identity_of
 from emmc_rig.acquisition.estimate import Estimate, known_exposures, pace_of
-from emmc_rig.acquisition.events import EventWatcher, OnEvent
+from emmc_rig.acquisition.events import Listener, OnEvent, RunEnd, emit_end
 from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.film import refuse_impossible_film
 from emmc_rig.acquisition.metering import first_meterings
@@ -31,7 +31,6 @@ from emmc_rig.acquisition.replay import missing_words, replaying, there
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.until import Until, refuse_unless_shots_can_be_spared
-from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.rig_config import AnyRig, Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
@@ -43,6 +42,7 @@ from emmc_rig.model.errors import CameraError
 from emmc_rig.model.files import SYSTEM_DISK, Disk
 from emmc_rig.model.settings import validated
 from emmc_rig.pages.session_sheet import quick_pictures, write_sheet
+from emmc_rig.progress import Watcher
 from emmc_rig.session.journal import UntilEntry, metered
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
@@ -89,7 +89,7 @@ class FrontEnd:
     take, once nothing speaks against it; where it says no, nothing is made or moved.
     """
 
-    watcher: CaptureWatcher = field(default_factory=CaptureWatcher)
+    watcher: Watcher = field(default_factory=Watcher)
     ask: Ask = ask_at_prompt
     agreed: Callable[[Estimate], bool] = lambda expected: True
     control: Control = field(default_factory=Control)
@@ -401,7 +401,7 @@ def capture_session(
             write_sheet(session, session.folder, quick_pictures(session))
         except AppError as fault:
             front.watcher.tell(f"no report: {fault}")
-    front.watcher.ended(session, outcome)
+    emit_end(front.watcher, session, outcome)
     if not outcome.complete:
         raise StoppedError(
             f"stopped: {outcome.missing} of {len(session.needed)} frames are still to be taken",
@@ -418,7 +418,7 @@ def capture(
     out: str | Path | None = None,
     until_db: float | None = None,
     other_devices: bool = False,
-    watcher: CaptureWatcher | None = None,
+    watcher: Watcher | None = None,
     on_event: OnEvent | None = None,
     ask: Ask = ask_at_prompt,
 ) -> Session:
@@ -430,8 +430,8 @@ def capture(
         out: folder of the session (default: PLAN-session beside the plan).
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
         other_devices: a session may go on with a camera or stage of another serial number.
-        watcher: gets what is captured.
-        on_event: is called with each `emmc_rig.acquisition.events.Event`, as `frame.written` or
+        watcher: observes the capture.
+        on_event: is called with each event of `emmc_rig.acquisition.events`, as `frame.written` or
             `shot.done`; one that raises is not called again.
         ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
 
@@ -448,9 +448,9 @@ def capture(
         required(rig, RigChoice, "rig", 'what emmc_rig.rig returns, or its name, as "simulated"')
     description = None if rig is None else rig.description
     folder = None if out is None else path_of(out, "out", "the folder of the new session")
-    watching = watcher or CaptureWatcher()
+    watching = watcher or Watcher()
     if on_event is not None:
-        watching = EventWatcher(on_event, watching)
+        watching = Listener(on_event, watching)
     front = FrontEnd(watching, ask)
     captured = capture_session(plan, description, folder, until_db, front, other_devices)
     assert captured is not None  # nobody is asked whether to agree

@@ -21,7 +21,6 @@ from emmc_rig.acquisition.focus import FocusFound, focused, sharpness
 from emmc_rig.acquisition.metering import METERABLE_LEVELS, METERING_TRIES
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.retries import Mending
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
 from emmc_rig.errors import AppError
 from emmc_rig.session.brightness import figures, level_of, next_exposure_s
@@ -57,14 +56,16 @@ class Sent:
 class Spans:
     """The seconds from the start of a run in which each step of a frame began and ended."""
 
-    def __init__(self, now_s: Callable[[], float], watcher: CaptureWatcher) -> None:
-        self._now_s, self._watcher = now_s, watcher
+    def __init__(
+        self, now_s: Callable[[], float], on_step: Callable[[str, PlannedFrame], None]
+    ) -> None:
+        self._now_s, self._on_step = now_s, on_step
         self.seconds: dict[str, tuple[float, float]] = {}
 
     @contextmanager
     def __call__(self, step: str, planned: PlannedFrame) -> Iterator[None]:
         """Time a step of a frame, and show it."""
-        self._watcher.step(step, planned)
+        self._on_step(step, planned)
         began_s = self._now_s()
         yield
         self.seconds[step] = began_s, self._now_s()

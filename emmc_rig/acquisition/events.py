@@ -1,4 +1,4 @@
-"""What happens in a capture, as events: for a lab's own code, or as lines of JSON.
+"""Events of a capture: for a lab's own code, as lines of JSON, and for displays of this program.
 
 | event | facts |
 |---|---|
@@ -12,149 +12,104 @@
 | `message` | `text`: retries, what metering and `--until` decided |
 | `verdict` | `level`, `reasons`: of the exposures, at the end |
 | `end` | `complete`, `taken`, `missing`, `retries`, `seconds`, `session` |
+
+Displays of this program also get objects with some events, and events that no JSON line states:
+
+| event | facts | objects |
+|---|---|---|
+| `step` | `id`, `step`: attend, move, expose, write, ... begins | `planned` |
+| `planned` | `planned`: frames to take in all, at each change | |
+| `frame.taken` | see above | `planned`, `frame` |
+| `pause`, `resume` | see above | `asked`: the work at the bench that a person is asked for |
+| `light field` | `shots`: those reconstructed so far | `result` |
 """
 
 from __future__ import annotations
 
-import json
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Container
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
-from drivers.raw import RawFrame
-from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
-from emmc_rig.session.brightness import level_of
+from emmc_rig.progress import Event, Watcher
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
-from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
-if TYPE_CHECKING:
-    from reconstruction.result import Reconstruction
+OnEvent = Callable[[Event], None]
+PUBLIC = frozenset(
+    {
+        *("begin", "frame.taken", "frame.written", "shot.done", "left", "pause", "resume"),
+        *("message", "verdict", "end"),
+    }
+)
+"""Names of the events in the first table."""
+DISPLAYED = PUBLIC | {"step", "planned", "light field"}
 
 
 @dataclass(frozen=True)
-class Event:
-    """name, facts: see the table above; at_s: seconds since the capture was asked for."""
+class RunEnd:
+    """How a run ended: complete, or stopped by whoever controls it."""
 
-    name: str
-    at_s: float
-    facts: Mapping[str, Any]
-
-    def line(self) -> str:
-        """Return it as one line of JSON."""
-        return json.dumps({"event": self.name, "at_s": self.at_s, **self.facts}, allow_nan=False)
+    complete: bool
+    taken: int
+    missing: int
+    retries: int
+    seconds: float
 
 
-OnEvent = Callable[[Event], None]
+class Listener(Watcher):
+    """Gives the events of a capture to a function, after another watcher had them.
 
-
-class EventWatcher(CaptureWatcher):
-    """A `CaptureWatcher` that makes events of what is captured, and calls another watcher too.
-
-    on_event: called from the thread in which it happens, one call at a time. One that raises is
-    not called again: a capture does not end for that.
+    on_event: called from the thread in which an event happens, for one event at a time. A function
+    that raises is not called again, which the other watcher is told: the capture goes on.
+    names: of the events to give.
     """
 
-    def __init__(self, on_event: OnEvent, other: CaptureWatcher | None = None) -> None:
+    def __init__(
+        self,
+        on_event: OnEvent,
+        other: Watcher | None = None,
+        names: Container[str] = PUBLIC,
+    ) -> None:
         self._on_event: OnEvent | None = on_event
-        self._other = other or CaptureWatcher()
-        self._began_s = self._asked_s = time.perf_counter()
+        self._other, self._names = other or Watcher(), names
+        self._began_s = time.perf_counter()
         self._lock = threading.RLock()
-        self._done = self._planned = 0
-
-    def begin(self, done: int, planned: int) -> None:
-        """So many frames are there already."""
-        self._done, self._planned = done, planned
-        self._other.begin(done, planned)
-        self._emit("begin", done=done, planned=planned)
-
-    def more(self, planned: int) -> None:
-        """So many frames are to be taken in all."""
-        self._planned = planned
-        self._other.more(planned)
-
-    def step(self, name: str, frame: PlannedFrame) -> None:
-        """A step of a frame: no event, there are too many."""
-        self._other.step(name, frame)
-
-    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """A frame passed its checks."""
-        self._other.taken(planned, frame, found)
-        self._emit(
-            "frame.taken",
-            **_named(planned),
-            exposure_s=frame.exposure_s,
-            level=level_of(frame, found),
-            saturated=found.saturated,
-        )
-
-    def stored(self, frame: PlannedFrame) -> None:
-        """A frame is on the disk."""
-        self._done += 1
-        self._other.stored(frame)
-        self._emit("frame.written", **_named(frame), done=self._done, planned=self._planned)
-
-    def shot_done(self, shot: int) -> None:
-        """Every frame of a shot is on the disk."""
-        self._other.shot_done(shot)
-        self._emit("shot.done", shot=shot)
-
-    def light_field(self, shots: Sequence[int], result: Reconstruction) -> None:
-        """What shots give so far: no event, the journal states its figures."""
-        self._other.light_field(shots, result)
-
-    def left(self, seconds: float, guessed: int) -> None:
-        """How long the rest will take."""
-        self._other.left(seconds, guessed)
-        self._emit("left", seconds=round(seconds, 3), guessed=guessed)
-
-    def asked(self, what: str) -> None:
-        """Somebody has to do something at the bench: a pause."""
-        self._other.asked(what)
-        if what:
-            self._asked_s = time.perf_counter()
-            self._emit("pause", reason=f"please {what}")
-        else:
-            self._emit("resume", seconds=round(time.perf_counter() - self._asked_s, 3))
-
-    def paused(self, reason: str) -> None:
-        """The capture waits."""
-        self._other.paused(reason)
-        self._emit("pause", reason=reason)
-
-    def resumed(self, seconds: float) -> None:
-        """It goes on."""
-        self._other.resumed(seconds)
-        self._emit("resume", seconds=round(seconds, 3))
 
     def tell(self, message: str) -> None:
-        """Something that people should know."""
+        """Give a note to the other watcher as such, and to the function as an event."""
         self._other.tell(message)
-        self._emit("message", text=message)
+        self._give(Event("message", {"text": message}))
 
-    def ended(self, session: Session, outcome: RunEnd) -> None:
-        """A run is over."""
-        self._other.ended(session, outcome)
-        reasons = exposure_reasons(shot_exposures(session))
-        level = reasons[0].level if reasons else "trust"
-        self._emit("verdict", level=level, reasons=[asdict(reason) for reason in reasons])
-        self._emit("end", **asdict(outcome), session=str(session.folder))
+    def event(self, event: Event) -> None:
+        """Give an event to the other watcher and to the function."""
+        self._other.event(event)
+        self._give(event)
 
-    def _emit(self, name: str, **facts: Any) -> None:
+    def _give(self, event: Event) -> None:
         with self._lock:
-            if self._on_event is None:
+            if self._on_event is None or event.name not in self._names:
                 return
-            at_s = round(time.perf_counter() - self._began_s, 6)
             try:
-                self._on_event(Event(name, at_s, facts))
+                at_s = round(time.perf_counter() - self._began_s, 6)
+                self._on_event(replace(event, at_s=at_s))
             except Exception as fault:
                 self._on_event = None
                 what = f"{type(fault).__name__}: {fault}".partition("\n")[0]
-                self._other.tell(f"no more events, on_event failed at {name} ({what})")
+                self._other.tell(f"no more events, on_event failed at {event.name} ({what})")
 
 
-def _named(frame: PlannedFrame) -> dict[str, Any]:
+def named(frame: PlannedFrame) -> dict[str, Any]:
+    """Return the facts that name a frame in an event."""
     return {"id": frame.id, "kind": frame.kind, "shot": frame.bench.shot}
+
+
+def emit_end(watcher: Watcher, session: Session, outcome: RunEnd) -> None:
+    """Emit the verdict on a session's exposures, and how the run ended."""
+    reasons = exposure_reasons(shot_exposures(session))
+    level = reasons[0].level if reasons else "trust"
+    plain = [asdict(reason) for reason in reasons]
+    watcher.event(Event("verdict", {"level": level, "reasons": plain}))
+    watcher.event(Event("end", {**asdict(outcome), "session": str(session.folder)}))

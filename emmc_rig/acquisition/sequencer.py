@@ -31,6 +31,7 @@ from emmc_rig.acquisition.checks import check, is_same, refuse_impossible
 from emmc_rig.acquisition.control import Control, uninterrupted
 from emmc_rig.acquisition.devices import Devices, Spans
 from emmc_rig.acquisition.estimate import known_exposures, pace_of
+from emmc_rig.acquisition.events import RunEnd, named
 from emmc_rig.acquisition.film import (
     ARRIVAL_POLL_S,
     INTERRUPTED,
@@ -45,7 +46,6 @@ from emmc_rig.acquisition.focus import FocusFound
 from emmc_rig.acquisition.metering import asked_of_scene, first_meterings, metered_exposure_s
 from emmc_rig.acquisition.plan import Boards, Plan
 from emmc_rig.acquisition.retries import Budget, mending
-from emmc_rig.acquisition.watcher import CaptureWatcher, RunEnd
 from emmc_rig.acquisition.writer import Writer
 from emmc_rig.bench.environment import read_all
 from emmc_rig.bench.hardware import FOCUS, Rig
@@ -55,7 +55,8 @@ from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import validated
-from emmc_rig.session.brightness import figures
+from emmc_rig.progress import Event, Watcher
+from emmc_rig.session.brightness import figures, level_of
 from emmc_rig.session.frame_file import decode_frame, frame_entry, frame_file
 from emmc_rig.session.journal import (
     ComparedEntry,
@@ -101,14 +102,14 @@ class Sequencer:
         session: Session,
         plan: Plan,
         rig: Rig,
-        watcher: CaptureWatcher | None = None,
+        watcher: Watcher | None = None,
         control: Control | None = None,
         choose: Choose | None = None,
         between: Between | None = None,
         wall: Callable[[], str] = wall_time,
     ) -> None:
         self._session, self._plan, self._rig = session, plan, rig
-        self._watcher = watcher or CaptureWatcher()
+        self._watcher = watcher or Watcher()
         self._control = control or Control()
         self._choose = choose or (lambda now_s: session.missing())
         self._between = between
@@ -126,7 +127,7 @@ class Sequencer:
         self._metered: dict[str, FrameEntry] = {}
         self._left_of_shot: dict[int, set[str]] = {}
         self._began_s = 0.0
-        self._taken = self._run = self._more = 0
+        self._taken = self._run = self._more = self._done = self._planned = 0
         # How long the frame before took to hand over: its own line is written by then.
         self._handed: dict[str, tuple[float, float]] = {}
         self._may_saturate = _may_saturate(session.frames)
@@ -191,7 +192,8 @@ class Sequencer:
         self._discard_damaged(set(session.stored))
         self._metered = first_meterings(session)
         missing, needed = session.missing(), len(session.needed)
-        self._watcher.begin(needed - len(missing), needed)
+        self._done, self._planned = needed - len(missing), needed
+        self._emit("begin", done=self._done, planned=needed)
         refuse_impossible(self._rig, missing)
         self._left_of_shot = self._missing_of_shots()
 
@@ -290,7 +292,7 @@ class Sequencer:
         # A simulated frame may come out as it was before.
         self._before = None
         self._more += len(ids)
-        self._watcher.more(len(self._session.needed) + self._more)
+        self._count_planned()
         self._watcher.tell(f"taken once more: {', '.join(ids)}")
 
     def _missing_of_shots(self) -> dict[int, set[str]]:
@@ -318,13 +320,13 @@ class Sequencer:
         if why and not control.stopping:
             began_s = self._now_s()
             self._note(HaltEntry(kind="paused", reason=why))
-            self._watcher.paused(why)
+            self._emit("pause", reason=why)
             while why and not control.stopping:
                 control.wait()
                 why = reason()
             seconds = self._now_s() - began_s
             self._note(ResumedEntry(seconds=seconds))
-            self._watcher.resumed(seconds)
+            self._emit("resume", seconds=round(seconds, 3))
         return not control.stopping
 
     # Take.
@@ -412,12 +414,12 @@ class Sequencer:
     def _take(self, planned: PlannedFrame) -> None:
         """Take a frame, with as many tries as it needs, and learn from it how long frames take."""
         attempts = 0
-        span = Spans(self._now_s, self._watcher)
+        span = Spans(self._now_s, self._emit_step)
 
         def attempt() -> None:
             nonlocal attempts, span
             attempts += 1
-            span = Spans(self._now_s, self._watcher)
+            span = Spans(self._now_s, self._emit_step)
             self._take_once(planned, span, attempts)
 
         began_s, before_um = self._now_s(), dict(self._devices.sent.offsets_um)
@@ -451,9 +453,9 @@ class Sequencer:
             if place is not None:
                 read_um |= place.um
                 unsure_um = dict.fromkeys(place.um, place.deviation_um)
-        self._watcher.taken(planned, frame, found)
+        self._emit_taken(planned, frame, found)
         span.seconds.update(self._handed)
-        handing = Spans(self._now_s, self._watcher)
+        handing = Spans(self._now_s, self._emit_step)
         with handing("hand over", planned):
             self._hand_over(
                 planned,
@@ -486,7 +488,7 @@ class Sequencer:
                 return True
             self._retrying(left[0].id, partial(take, left))
         self._writer.flush()
-        self._watcher.more(len(session.needed) + self._more)
+        self._count_planned()
         return not left
 
     def _begin_segment(self, planned: PlannedFrame) -> None:
@@ -553,14 +555,14 @@ class Sequencer:
         A segment's first must pass every check; a flash or darkness later is the scene's own.
         """
         planned, frame, found = left[0], arrived.frame, figures(arrived.frame)
-        self._watcher.step("check", planned)
+        self._emit_step("check", planned)
         if arrived.film_s == 0:
             check(planned, frame, found, self._before, self._plan.checks)
         if self._before is not None and is_same(frame.mosaic, self._before):
             self._drop(left, arrived.place + 1, lambda place: SENT_TWICE)
             return
         left.pop(0)
-        self._watcher.taken(planned, frame, found)
+        self._emit_taken(planned, frame, found)
         self._hand_over(planned, frame, found, {}, film_s=arrived.film_s, **beside)
         self._before = frame.mosaic
         self._taken += 1
@@ -684,7 +686,7 @@ class Sequencer:
         if not asked.asked:
             return False
         self._left_of_shot = self._missing_of_shots()
-        self._watcher.more(len(session.needed) + self._more)
+        self._count_planned()
         return True
 
     def _report_remaining(self, taken: PlannedFrame) -> None:
@@ -697,7 +699,7 @@ class Sequencer:
         decided = metered(self._session.journal.entries)
         known = known_exposures(self._plan, self._metered, decided)
         rest = self._pace.estimate(left, known, self._devices.sent.offsets_um)
-        self._watcher.left(rest.seconds, rest.guessed)
+        self._emit("left", seconds=round(rest.seconds, 3), guessed=rest.guessed)
 
     def _retrying(self, name: str, attempt: Callable[[], None]) -> None:
         """Try until it works or the budget is spent."""
@@ -760,7 +762,7 @@ class Sequencer:
         spans_s: dict[str, tuple[float, float]],
     ) -> None:
         """Write a frame and its journal line; runs in the writer's thread."""
-        self._watcher.step("write", planned)
+        self._emit_step("write", planned)
         began_s = self._now_s()
         file = frame_file(frame)
 
@@ -770,12 +772,13 @@ class Sequencer:
 
         session, shot = self._session, planned.bench.shot
         session.store(planned, file, written)
-        self._watcher.stored(planned)
+        self._done += 1
+        self._emit("frame.written", **named(planned), done=self._done, planned=self._planned)
         left = self._left_of_shot.get(shot, set())
         if planned.id in left:
             left.remove(planned.id)
             if not left:
-                self._watcher.shot_done(shot)
+                self._emit("shot.done", shot=shot)
 
     def _verify_stored(self, ids: set[str]) -> None:
         """Read back what was written; a damaged frame is spent from the budget and taken again."""
@@ -796,6 +799,29 @@ class Sequencer:
             session.discard(name, fault)
             self._watcher.tell(f"{fault}; it is taken again")
         return damaged
+
+    # Make known.
+
+    def _emit(self, name: str, **facts: Any) -> None:
+        self._watcher.event(Event(name, facts))
+
+    def _emit_step(self, step: str, planned: PlannedFrame) -> None:
+        facts = {"id": planned.id, "step": step}
+        self._watcher.event(Event("step", facts, {"planned": planned}))
+
+    def _emit_taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
+        facts = {
+            **named(planned),
+            "exposure_s": frame.exposure_s,
+            "level": level_of(frame, found),
+            "saturated": found.saturated,
+        }
+        self._watcher.event(Event("frame.taken", facts, {"planned": planned, "frame": frame}))
+
+    def _count_planned(self) -> None:
+        """Count the frames to take in all, which are more or fewer than before."""
+        self._planned = len(self._session.needed) + self._more
+        self._emit("planned", planned=self._planned)
 
     def _note(self, entry: Entry) -> None:
         self._writer.put(partial(self._session.note, entry))

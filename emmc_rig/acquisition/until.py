@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from calibration.scale import Scale
 from calibration.shadow import shadow_mask
 from emmc_rig.acquisition.plan import Plan
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
+from emmc_rig.progress import Event, Watcher
 from emmc_rig.session.journal import DecidedEntry, ended, of_kind
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
@@ -69,7 +69,7 @@ def refuse_unless_shots_can_be_spared(plan: Plan, camera: Camera) -> None:
 class Until:
     """Says what a `Sequencer` takes next, of a session with a target; use it within one run."""
 
-    def __init__(self, session: Session, watcher: CaptureWatcher) -> None:
+    def __init__(self, session: Session, watcher: Watcher) -> None:
         self._session, self._watcher = session, watcher
         self._scale: Scale | None = None
 
@@ -139,7 +139,7 @@ class Until:
         """Return the PSNR that the light field of some shots is stated to have, and advice."""
         self._scale = self._scale or session_scale(self._session)
         result = light_field_so_far(self._session, self._scale, shots)
-        self._watcher.light_field(shots, result)
+        self._watcher.event(Event("light field", {"shots": shots}, {"result": result}))
         return stated_psnr_db(result), result.advice
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
@@ -24,11 +25,10 @@ from emmc_rig.commands.options import (
 from emmc_rig.commands.output import emit, give_result, json_wanted, say, tell
 from emmc_rig.commands.verdict import show_reason
 from emmc_rig.errors import ERRORS, AppError
+from emmc_rig.progress import Event, Watcher
 
 if TYPE_CHECKING:
     from emmc_rig.acquisition.control import Control
-    from emmc_rig.acquisition.events import Event
-    from emmc_rig.acquisition.watcher import CaptureWatcher
 
 OptionalPath = Path | None
 
@@ -154,7 +154,7 @@ def _run(
     from emmc_rig.acquisition.command import FrontEnd, asked_folder, capture_session
     from emmc_rig.acquisition.control import Control, pressed_keys
     from emmc_rig.acquisition.estimate import Estimate
-    from emmc_rig.acquisition.events import EventWatcher
+    from emmc_rig.acquisition.events import Listener
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.files.results import shown_bytes, shown_seconds
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
@@ -163,7 +163,7 @@ def _run(
 
     control = Control(stays=page == "steers")
     display = CaptureDisplay(Console(stderr=True, quiet=json_wanted.get()), control)
-    watcher: CaptureWatcher = EventWatcher(_print_line) if json_wanted.get() else display
+    watcher: Watcher = Listener(_print_line) if json_wanted.get() else display
 
     def ask(what: str) -> None:
         terminal = sys.stdin.isatty()
@@ -172,7 +172,8 @@ def _run(
                 f"somebody has to {what}: answer on a page (--steer), "
                 "run this on a terminal, or automate the lamp and masks"
             )
-        watcher.asked(what)
+        began_s, objects = time.perf_counter(), {"asked": what}
+        watcher.event(Event("pause", {"reason": f"please {what}"}, objects))
         wish = f"please {what}, then press Enter"
         with display.aside():
             if page != "steers":
@@ -181,7 +182,8 @@ def _run(
                 tell(f"{wish}, or on the page" if terminal else f"please {what}")
                 with pressed_keys() as pressed:
                     control.until_answered(pressed)
-        watcher.asked("")
+        seconds = round(time.perf_counter() - began_s, 3)
+        watcher.event(Event("resume", {"seconds": seconds}, objects))
 
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
@@ -230,15 +232,16 @@ def _run(
 def _page(
     folder: Path,
     control: Control,
-    other: CaptureWatcher,
+    other: Watcher,
     does: Literal["shows", "steers"],
     until_db: float | None,
     host: str,
-) -> Iterator[CaptureWatcher]:
-    """Serve the page of a capture, and say where, until the block ends; yield what it watches by.
+) -> Iterator[Watcher]:
+    """Serve the page of a capture, and say where, until the block ends; yield its watcher.
 
-    other: called too.
+    other: another watcher of the capture, which that watcher passes all on to.
     """
+    from emmc_rig.acquisition.events import DISPLAYED, Listener
     from emmc_rig.live.server import (
         LOCAL_HOSTS,
         address,
@@ -249,7 +252,7 @@ def _page(
     )
     from emmc_rig.live.session_page import SessionPage
 
-    page, token = SessionPage(folder, control, other, until_db is None), new_token()
+    page, token = SessionPage(folder, control, until_db is None), new_token()
     to_act = "start `emmc-rig capture` with --steer"
     made = application(page, token, does == "shows", names_of(host), to_act)
     with served(made, host) as port:
@@ -260,7 +263,7 @@ def _page(
         page.start()
         why = ""
         try:
-            yield page
+            yield Listener(page.event, other, DISPLAYED)
         except ERRORS as fault:
             why = str(fault)
             raise

@@ -8,27 +8,24 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import Progress, TaskID
 from rich.text import Text
 
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.control import Control, pressed_keys
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.commands.output import columns
 from emmc_rig.files.results import shown_seconds
-from emmc_rig.session.brightness import level_of
-from emmc_rig.session.journal import Figures
-from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.progress import Event, Watcher
 
 KEY_POLL_S = 0.1
 PAUSE_KEY, STOP_KEY = "p", "q"
 
 
-class CaptureDisplay(CaptureWatcher):
-    """A `CaptureWatcher` of the sequencer."""
+class CaptureDisplay(Watcher):
+    """Shows a capture and its keys, see `emmc_rig.acquisition.events`."""
 
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control
@@ -75,61 +72,47 @@ class CaptureDisplay(CaptureWatcher):
                 live.start()
             self._asking = False
 
-    def begin(self, done: int, planned: int) -> None:
-        """Start the bar."""
+    def event(self, event: Event) -> None:
+        """Show an event of a capture."""
+        facts = event.facts
+        match event.name:
+            case "begin":
+                done, planned = facts["done"], facts["planned"]
+                self._set_bar(description="frames", total=planned, completed=done)
+                if done:
+                    self.tell(f"{done} of {planned} frames are captured already")
+            case "planned":
+                self._set_bar(total=facts["planned"])
+            case "step" if facts["step"] != "write":
+                paused = "paused (p: go on): " if self._control.paused else ""
+                self._doing = f"{paused}{facts['id']}: {facts['step']}"
+                self._set_detail()
+            case "frame.taken":
+                self._line = Text(
+                    f"{facts['id']}: {facts['exposure_s'] or 0:g} s, brightest "
+                    f"{facts['level']:.0%} of white, saturated {facts['saturated']:.2%}"
+                )
+            case "frame.written":
+                self._set_bar(advance=1)
+            case "left":
+                guessed = facts["guessed"]
+                unknown = f" (excludes {guessed} exposures not metered yet)" if guessed else ""
+                self._left = f"about {shown_seconds(facts['seconds'])} left{unknown}"
+                self._set_detail()
+            case "pause" if "asked" not in event.objects:
+                self.tell(f"waiting: {facts['reason']}")
+            case "resume" if "asked" not in event.objects:
+                self.tell(f"going on after {shown_seconds(facts['seconds'])}")
+            case "message":
+                line = f"emmc-rig capture: {facts['text']}"
+                self._console.print(line, highlight=False, soft_wrap=True)
+
+    def _set_bar(self, **parts: Any) -> None:
         if self._task is not None:
-            self._progress.update(self._task, description="frames", total=planned, completed=done)
-        if done:
-            self.tell(f"{done} of {planned} frames are captured already")
+            self._progress.update(self._task, **parts)
 
-    def more(self, planned: int) -> None:
-        """Lengthen the bar."""
-        if self._task is not None:
-            self._progress.update(self._task, total=planned)
-
-    def step(self, name: str, frame: PlannedFrame) -> None:
-        """Say what is under way."""
-        if name != "write":
-            paused = "paused (p: go on): " if self._control.paused else ""
-            self._doing = f"{paused}{frame.id}: {name}"
-            self._update()
-
-    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """Show how bright the frame is."""
-        if self._live is None:
-            return
-        self._line = Text(
-            f"{planned.id}: {frame.exposure_s or 0:g} s, brightest {level_of(frame, found):.0%} of "
-            f"white, saturated {found.saturated:.2%}"
-        )
-
-    def stored(self, frame: PlannedFrame) -> None:
-        """Advance the bar."""
-        if self._task is not None:
-            self._progress.update(self._task, advance=1)
-
-    def left(self, seconds: float, guessed: int) -> None:
-        """Show how long the rest will take."""
-        unknown = f" (excludes {guessed} exposures not metered yet)" if guessed else ""
-        self._left = f"about {shown_seconds(seconds)} left{unknown}"
-        self._update()
-
-    def paused(self, reason: str) -> None:
-        """Say why nothing happens."""
-        self.tell(f"waiting: {reason}")
-
-    def resumed(self, seconds: float) -> None:
-        """Say that it goes on."""
-        self.tell(f"going on after {shown_seconds(seconds)}")
-
-    def tell(self, message: str) -> None:
-        """Print a line."""
-        self._console.print(f"emmc-rig capture: {message}", highlight=False, soft_wrap=True)
-
-    def _update(self) -> None:
-        if self._task is not None:
-            detail = "; ".join(filter(None, (self._left, self._doing)))
-            self._progress.update(self._task, detail=detail)
+    def _set_detail(self) -> None:
+        self._set_bar(detail="; ".join(filter(None, (self._left, self._doing))))
 
     def _drawn(self) -> Group:
         return Group(self._line, self._progress)

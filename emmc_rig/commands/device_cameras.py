@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drivers.cameras import CAMERA_HELP
-from emmc_rig.commands.output import Quiet, give_result, show_table, shown_progress, tell
+from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 from emmc_rig.errors import AppError
+from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import new_file, refuse_inside_session
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
 
 
 @contextmanager
-def _followed(device: Any, progress: Quiet) -> Iterator[None]:
+def _followed(device: Any, progress: Watcher) -> Iterator[None]:
     """Show how a picture comes over the wire, where the camera reports it."""
     if not hasattr(device, "on_progress"):
         yield

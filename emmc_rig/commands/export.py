@@ -85,7 +85,7 @@ def export(
         else:
             facts = {"shape": list(film.shape), "missing_frames": film.missing}
             bars.begin("write", len(film.frames))
-            known[form].write_whole_film(folder, replace(film, on_frame=bars.step))
+            known[form].write_whole_film(folder, replace(film, watcher=bars))
         files = [path for path in folder.rglob("*") if path.is_file()]
         written = sum(path.stat().st_size for path in files)
         write_metrics(

@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 from rich.box import SIMPLE
@@ -40,10 +40,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from emmc_rig.errors import StoppedError
-
-if TYPE_CHECKING:
-    from reconstruction.result import Progress as SolverProgress
+from emmc_rig.progress import Watcher
 
 console = Console(stderr=True)
 json_wanted: ContextVar[bool] = ContextVar("json_wanted", default=False)
@@ -104,29 +101,18 @@ def emit(event: str, **facts: Any) -> None:
     print(json.dumps({"event": event, **facts}, allow_nan=False), flush=True)
 
 
-class Quiet:
-    """A `Watcher` that shows no progress."""
+class Shown(Watcher):
+    """A watcher of a command: shows notes, and no progress."""
 
-    def begin(self, stage: str, steps: int | None = None) -> None:
-        """Begin a stage; the one before is done. steps: None where not known."""
-
-    def step(self, detail: str = "") -> None:
-        """Show another step as done; from any thread."""
-
-    def at(self, done: float, steps: float | None, detail: str = "") -> None:
-        """Show how many steps are done."""
-
-    def advance(self, progress: SolverProgress) -> None:
-        """Show how far a solver is."""
-        change = progress.relative_change
-        detail = "" if change is None else f"change {change:.1e}"
-        self.at(progress.step, progress.total, detail)
+    def tell(self, message: str) -> None:
+        """Print a note."""
+        say("note", message)
 
     def finish(self) -> None:
         """End the last stage."""
 
 
-class Lines(Quiet):
+class Lines(Shown):
     """Progress as lines of JSON."""
 
     def __init__(self) -> None:
@@ -155,7 +141,7 @@ class Lines(Quiet):
         emit("step", stage=self._stage, done=done, steps=steps, detail=detail)
 
 
-class Bars(Quiet):
+class Bars(Shown):
     """Progress as bars on a terminal."""
 
     def __init__(self, progress: Progress) -> None:
@@ -197,23 +183,17 @@ def columns() -> tuple[ProgressColumn, ...]:
 
 
 @contextmanager
-def shown_progress(stage: str | None = None) -> Iterator[Quiet]:
+def shown_progress(stage: str | None = None) -> Iterator[Shown]:
     """Yield what shows progress until the block ends; a stage named here has begun.
 
-    The last bar is filled if the block ends well. A KeyboardInterrupt that says what is kept
-    becomes a StoppedError.
+    The last bar is filled if the block ends well.
     """
     with Progress(*columns(), console=console, disable=not console.is_terminal) as progress:
         shown = (
             Lines() if json_wanted.get() else Bars(progress) if console.is_terminal
-            else Quiet()
+            else Shown()
         )  # fmt: skip
         if stage is not None:
             shown.begin(stage)
-        try:
-            yield shown
-        except KeyboardInterrupt as stop:
-            if str(stop):
-                raise StoppedError(str(stop)) from stop
-            raise
+        yield shown
         shown.finish()

@@ -151,10 +151,9 @@ def reconstruct(
         bars.begin(method if len(places) == 1 else f"{method}, {len(places)} captures", None)
         done = []
         for place, outcome in reconstruct_captures(
-            places, workers, cluster, limit, lambda step: bars.advance(step),
+            places, workers, cluster, limit, bars,
             method=method, psi_path=psi, dictionary_spec=dictionary, settings=chosen, truth=truth,
             chosen=why, as_zarr=as_zarr, without_shots=without_shots or (), frame=frame,
-            on_note=lambda text: say("note", text),
         ):  # fmt: skip
             if isinstance(outcome, Exception) and len(places) == 1:
                 raise outcome
@@ -183,9 +182,7 @@ def _film(capture: Any, out: Path, strict: bool, **given: Any) -> None:
     from emmc_rig.processing.filming import reconstruct_film_session
 
     with shown_progress(given["method"]) as bars:
-        metrics = reconstruct_film_session(
-            capture, out, on_step=bars.advance, on_note=lambda text: say("note", text), **given
-        )
+        metrics = reconstruct_film_session(capture, out, watcher=bars, **given)
     film = metrics["film"]
     if "assumed" in metrics:
         say("note", metrics["assumed"])

@@ -105,7 +105,7 @@ def verify(session: Folder) -> None:
     opened = Session(session)
     with shown_progress() as progress:
         progress.begin("verify", len(opened.stored))
-        verdict = verified(opened, progress.step)
+        verdict = verified(opened, progress)
     for line in verdict.lines():
         tell(line)
     if verdict.is_complete:
@@ -141,13 +141,13 @@ def export(
             raise typer.BadParameter("--compress: no effect with --dng; leave it out")
         with shown_progress() as progress:
             progress.begin("export", len(opened.stored))
-            export_dng(opened, out, progress.step)
+            export_dng(opened, out, progress)
         tell(f"wrote {len(opened.stored)} DNG files into {out}")
         give_result(out, frames=len(opened.stored))
         return
     with shown_progress() as progress:
         progress.begin("export", len(opened.needed))
-        export_hdf5(opened, out, compress, progress.step)
+        export_hdf5(opened, out, compress, progress)
     tell(f"wrote {out}, {shown_bytes(out.stat().st_size)}")
     give_result(out, bytes=out.stat().st_size)
 

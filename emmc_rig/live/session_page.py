@@ -13,9 +13,7 @@ from calibration.errors import CalibrationError
 from calibration.scale import Scale
 from drivers.raw import RawFrame
 from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.events import Event, EventWatcher
 from emmc_rig.acquisition.until import METHOD, light_field_so_far
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hands import hole_name
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import stated_words
@@ -24,7 +22,7 @@ from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.pages.session_sheet import HEADINGS, small_jpeg, stored_jpeg
-from emmc_rig.session.journal import Figures
+from emmc_rig.progress import Event, Watcher
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
@@ -39,24 +37,17 @@ class _EndedError(Exception):
     """The capture is over, and nobody waits for its light field any more."""
 
 
-class SessionPage(EventWatcher):
+class SessionPage(Watcher):
     """A `emmc_rig.live.server.Page`, and the watcher of the capture that it shows.
 
-    folder: of the session. other: called too. computes: reconstructs after each shot what is on
-    the disk; where the capture itself does (`--until`) its light field is shown.
+    folder: of the session. computes: reconstructs the light field after each shot, from the frames
+    on the disk; without, the light field of the capture itself (`--until`) is shown.
     """
 
     files: tuple[str, ...] = ("session.html", "session.js", *COMMON_FILES)
     urgent: frozenset[str] = frozenset({"pause", "stop", "done"})
 
-    def __init__(
-        self,
-        folder: Path,
-        control: Control,
-        other: CaptureWatcher | None = None,
-        computes: bool = True,
-    ) -> None:
-        super().__init__(self._heard, other)
+    def __init__(self, folder: Path, control: Control, computes: bool = True) -> None:
         self._folder, self._control, self._computes = folder, control, computes
         self._changed = threading.Condition()
         self._frames: dict[str, dict[str, Any]] = {}
@@ -136,26 +127,20 @@ class SessionPage(EventWatcher):
     def touch(self) -> None:
         """Take no notice: the capture goes on whether somebody looks or not."""
 
-    def step(self, name: str, frame: PlannedFrame) -> None:
-        """Show what is under way."""
-        super().step(name, frame)
-        if name == "attend" and frame is not self._attended:
-            self._attended, self._refusal = frame, ""
-        if name != "write":
-            self._publish(step=f"{frame.id}: {name}")
+    def event(self, event: Event) -> None:
+        """Show an event of the capture."""
+        if event.name == "light field":
+            self._show_result(event.facts["shots"], event.objects["result"])
+            return
+        small = small_jpeg(event.objects["frame"]) if event.name == "frame.taken" else b""
+        with self._changed:
+            self._take_note(event, dict(event.facts), small)
 
-    def asked(self, what: str) -> None:
-        """Show what somebody has to do, where on the plate, and why once more; "": it is done."""
-        before, asked = self._state["asked"], None
-        more: dict[str, Any] = {}
-        if what:
-            self._wishes += 1
-            self._control.answered = False
-            asked = {"number": self._wishes, "text": what, **self._asked_hole(what)}
-        elif before and before["hole"]:
-            more["last_hole"] = before["hole"]
-        self._publish(asked=asked, by_hand=True, **more)
-        super().asked(what)
+    def _ask(self, what: str) -> dict[str, Any]:
+        """Return what the page asks for: the work, the hole on the plate, and why once more."""
+        self._wishes += 1
+        self._control.answered = False
+        return {"number": self._wishes, "text": what, **self._asked_hole(what)}
 
     def _asked_hole(self, what: str) -> dict[str, Any]:
         """Return the hole (v, u) that is asked for, the plate's, and what was wrong before."""
@@ -173,16 +158,8 @@ class SessionPage(EventWatcher):
             (v for v in every if f"through {hole_name(v, self._views)}" in self._refusal), None
         )
 
-    def taken(self, planned: PlannedFrame, frame: RawFrame, found: Figures) -> None:
-        """Keep what is shown of a frame."""
-        self._small[planned.id] = small_jpeg(frame)
-        self._newest = self._state["frame"] + 1, frame
-        self._publish(frame=self._newest[0])
-        super().taken(planned, frame, found)
-
-    def light_field(self, shots: Sequence[int], result: Reconstruction) -> None:
-        """Show what these shots give."""
-        super().light_field(shots, result)
+    def _show_result(self, shots: Sequence[int], result: Reconstruction) -> None:
+        """Show the light field that these shots give."""
         number = 1 if self._pictures is None else self._pictures.number + 1
         self._pictures = Pictures(number, export_of(result.light_field, result.maps))
         stated = stated_words(result.stated)
@@ -194,37 +171,52 @@ class SessionPage(EventWatcher):
             self._state.update(parts)
             self._state["version"] += 1
 
-    def _heard(self, event: Event) -> None:
-        with self._changed:
-            self._take_note(event, dict(event.facts))
-
-    def _take_note(self, event: Event, facts: dict[str, Any]) -> None:
-        if event.name == "begin":
-            self._begin(facts)
-        elif event.name == "frame.taken":
-            self._frames[facts["id"]] = {**facts, "number": self._state["frame"], "stored": False}
-            self._publish_frames()
-        elif event.name == "frame.written":
-            self._frames[facts["id"]]["stored"] = True
-            if facts["kind"] != "shot":
-                self._scale = None
-            self._publish_frames(planned=facts["planned"] - self._retaken)
-        elif event.name == "shot.done":
-            self._shots.add(facts["shot"])
-            self._wanted = self._computes
-            self._changed.notify_all()
-        elif event.name in ("pause", "resume"):
-            self._publish(paused=facts if event.name == "pause" else None, wish="", step="")
-        elif event.name in ("left", "verdict", "end"):
-            self._publish(**{event.name: facts})
-        elif event.name == "message":
-            lines = [*self._state["messages"], facts["text"]]
-            more: dict[str, Any] = {}
-            if self._attended and facts["text"].startswith(f"{self._attended.id}, try "):
-                self._refusal = facts["text"].partition(": ")[2]
-                if wrong := self._wrong_hole():
-                    more["last_hole"] = list(wrong)
-            self._publish(messages=lines[-SHOWN_MESSAGES:], **more)
+    def _take_note(self, event: Event, facts: dict[str, Any], small: bytes) -> None:
+        """Change the state by an event; small: the picture of a frame that was taken."""
+        more: dict[str, Any] = {}
+        match event.name:
+            case "begin":
+                self._begin(facts)
+            case "step":
+                planned = event.objects["planned"]
+                if facts["step"] == "attend" and planned is not self._attended:
+                    self._attended, self._refusal = planned, ""
+                if facts["step"] != "write":
+                    self._publish(step=f"{planned.id}: {facts['step']}")
+            case "frame.taken":
+                number = self._state["frame"] + 1
+                self._small[facts["id"]] = small
+                self._newest = number, event.objects["frame"]
+                self._frames[facts["id"]] = {**facts, "number": number, "stored": False}
+                self._publish_frames(frame=number)
+            case "frame.written":
+                self._frames[facts["id"]]["stored"] = True
+                if facts["kind"] != "shot":
+                    self._scale = None
+                self._publish_frames(planned=facts["planned"] - self._retaken)
+            case "shot.done":
+                self._shots.add(facts["shot"])
+                self._wanted = self._computes
+                self._changed.notify_all()
+            case "pause":
+                if what := event.objects.get("asked"):
+                    more = {"asked": self._ask(what), "by_hand": True}
+                self._publish(paused=facts, wish="", step="", **more)
+            case "resume":
+                if before := self._state["asked"]:
+                    more = {"asked": None}
+                    if before["hole"]:
+                        more["last_hole"] = before["hole"]
+                self._publish(paused=None, wish="", step="", **more)
+            case "left" | "verdict" | "end":
+                self._publish(**{event.name: facts})
+            case "message":
+                if self._attended and facts["text"].startswith(f"{self._attended.id}, try "):
+                    self._refusal = facts["text"].partition(": ")[2]
+                    if wrong := self._wrong_hole():
+                        more["last_hole"] = list(wrong)
+                lines = [*self._state["messages"], facts["text"]]
+                self._publish(messages=lines[-SHOWN_MESSAGES:], **more)
 
     def _begin(self, facts: dict[str, Any]) -> None:
         """Show what is there already."""
@@ -255,9 +247,9 @@ class SessionPage(EventWatcher):
     def _publish_frames(self, **more: Any) -> None:
         known = list(self._frames.values())
         self._publish(
-            frames=[dict(one) for one in known[-SHOWN_FRAMES:]],
+            frames=[dict(frame) for frame in known[-SHOWN_FRAMES:]],
             taken=len(known),
-            done=sum(one["stored"] for one in known),
+            done=sum(frame["stored"] for frame in known),
             **more,
         )
 
@@ -323,7 +315,7 @@ class SessionPage(EventWatcher):
                 session = Session(self._folder)
                 self._scale = scale = self._scale or session_scale(session)
                 self._show_field(f"{METHOD} at work", shots)
-                self.light_field(shots, light_field_so_far(session, scale, shots, self._go_on))
+                self._show_result(shots, light_field_so_far(session, scale, shots, self._go_on))
             except _EndedError:
                 return
             except (AppError, CalibrationError, ReconstructionError, SensingError) as fault:
@@ -335,7 +327,8 @@ class SessionPage(EventWatcher):
 
     def _show_field(self, stage: str, shots: Sequence[int], why: str = "") -> None:
         shown = None if self._pictures is None else self._pictures.facts()
-        of = sorted({one["shot"] for one in self._frames.values() if one["kind"] == "shot"})
+        frames = self._frames.values()
+        of = {frame["shot"] for frame in frames if frame["kind"] == "shot"}
         self._publish(
             light_field={
                 "stage": stage,

@@ -1,18 +1,18 @@
 """Blocks of a capture as tasks for workers, each on the disk once it is done.
 
     KEPT/                       see `emmc_rig.store.folders.kept_folder`
-        frames.h5               the frames, and what was settled for all blocks
+        job.json                what was settled for all blocks, see `emmc_rig.processing.jobs`
+        frames.h5               the frames
         block-000-001.h5        the arrays of a block's part, its figures and evidence
 
-Each appears whole, and says what it is of. A block that is there, of the same capture and as its
-checksums say, is not computed again.
+A block that is there, of the same capture and as its checksums say, is not computed again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,9 +32,10 @@ from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
+from emmc_rig.processing.jobs import Store, digest_of, run_job, settled
 from emmc_rig.processing.memory import peak_memory_mib, task_bytes
 from emmc_rig.processing.pool import Pool
-from emmc_rig.store.folders import emptied
+from emmc_rig.progress import Watcher
 from emmc_rig.version import __version__
 from reconstruction.dictionary import Dictionary
 from reconstruction.methods import MethodSettings, find_method
@@ -69,7 +70,7 @@ class BlockJob:
     """What the blocks of a capture are computed from; picklable, so that workers get it.
 
     psi_path, kept: absolute, on a disk that all workers share. dictionary: see `open_dictionary`.
-    fingerprint: see `fingerprint_of`.
+    digest: see `block_job`.
     """
 
     kept: Path
@@ -78,7 +79,7 @@ class BlockJob:
     dictionary: str | None
     settings: MethodSettings
     noise_sigma: float
-    fingerprint: str
+    digest: str
 
     @cached_property
     def psi(self) -> StoredPsi:
@@ -112,21 +113,28 @@ class BlockTask:
         return self.job.kept / f"{self.block.name}.h5"
 
 
-def fingerprint_of(
-    psi: StoredPsi, frames: Frames, method: str, dictionary: str | None, settings: MethodSettings
-) -> str:
-    """Return a SHA-256 of all that the light field follows from."""
-    digest = hashlib.sha256()
-    for array in (frames.readings, frames.usable):
-        digest.update(np.ascontiguousarray(array).view(np.uint8).data)
+def block_job(
+    kept: Path,
+    psi_path: Path,
+    frames: Frames,
+    method: str,
+    dictionary: str | None,
+    settings: MethodSettings,
+) -> BlockJob:
+    """Return the job of a capture, with the digest of all that the light field follows from."""
     atoms = Path(dictionary) if dictionary is not None else None
     content = atoms.read_bytes() if atoms is not None and atoms.is_file() else b""
-    what = (
-        psi.checksum, frames.shape, frames.noise_sigma, method, dictionary,
-        hashlib.sha256(content).hexdigest(), settings.model_dump(mode="json"), __version__,
-    )  # fmt: skip
-    digest.update(json.dumps(what).encode())
-    return digest.hexdigest()
+    inputs = {
+        "psi": StoredPsi(psi_path).checksum,
+        "frames": frames.sha256,
+        "noise_sigma": frames.noise_sigma,
+        "method": method,
+        "dictionary": [dictionary, hashlib.sha256(content).hexdigest()],
+        "settings": settings.model_dump(mode="json"),
+        "version": __version__,
+    }
+    digest = digest_of(inputs)
+    return BlockJob(kept, psi_path, method, dictionary, settings, frames.noise_sigma, digest)
 
 
 def _write(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) -> None:
@@ -137,8 +145,8 @@ def _write(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) 
             file.create_dataset(name, data=values, fletcher32=True)
 
 
-def _read(path: Path, fingerprint: str) -> dict[str, Any] | None:
-    """Return what a file says of itself; None where it is missing, damaged or of another job."""
+def _read(path: Path, digest: str) -> dict[str, Any] | None:
+    """Return the figures of a block's file; None where it is missing, damaged or of another job."""
     try:
         with stored_arrays(path, AppError, REMEDY) as stored:
             for name in map(str, stored.file):
@@ -146,7 +154,7 @@ def _read(path: Path, fingerprint: str) -> dict[str, Any] | None:
             about = parse_json(stored.array(ABOUT).tobytes(), path.name, AppError)
     except AppError:
         return None
-    return about if about["fingerprint"] == fingerprint else None
+    return about if about["digest"] == digest else None
 
 
 def survey_task(job: BlockJob) -> CaptureSurvey:
@@ -155,8 +163,8 @@ def survey_task(job: BlockJob) -> CaptureSurvey:
     return surveyed(job.method, job.psi, frames, dictionary, job.settings)
 
 
-def block_task(task: BlockTask) -> None:
-    """Compute a block in a worker, and write its file.
+def block_task(task: BlockTask) -> Generator[tuple[str, None], None, None]:
+    """Compute a block in a worker, and write its file; yield its name.
 
     Raises AppError naming the block where it fails, and OSError where it cannot be written.
     """
@@ -174,7 +182,7 @@ def block_task(task: BlockTask) -> None:
         task.path,
         solved.arrays,
         {
-            "fingerprint": task.job.fingerprint,
+            "digest": task.job.digest,
             "result": {
                 key: getattr(result, key) for key in ("status", "advice", "steps", "parameters")
             },
@@ -184,6 +192,7 @@ def block_task(task: BlockTask) -> None:
             "peak_mib": peak_memory_mib(),
         },
     )
+    yield task.block.name, None
 
 
 def _variance(block: Block, arrays: Mapping[str, NDArray]) -> float | None:
@@ -213,47 +222,66 @@ class DoneBlock:
     peak_mib: float
 
 
-def done_block(task: BlockTask) -> DoneBlock | None:
-    """Return a block that is done and whole on the disk, else None."""
-    kept = _read(task.path, task.job.fingerprint)
-    if kept is None:
-        return None
-    figures = kept["result"]
-    figures["status"] = Status(figures["status"])
-    result = Reconstruction(
-        method=task.job.method,
-        light_field=np.empty((0, 0, 0, 0, 3), np.float32),
-        objective=(),
-        seconds=kept["seconds"],
-        **figures,
-    )
-    evidence = kept["evidence"]
-    verdict = None if evidence is None else verdict_from(Evidence.from_dict(evidence))
-    return DoneBlock(result, verdict, kept["variance"], kept["peak_mib"])
+@dataclass(frozen=True)
+class BlockFiles(Store[None, DoneBlock]):
+    """The files of blocks, which workers write; tasks: by the names of their blocks."""
+
+    tasks: Mapping[str, BlockTask]
+
+    def get(self, name: str) -> DoneBlock | None:
+        """Return a block that is done and whole on the disk, else None."""
+        task = self.tasks[name]
+        kept = _read(task.path, task.job.digest)
+        if kept is None:
+            return None
+        figures = kept["result"]
+        figures["status"] = Status(figures["status"])
+        result = Reconstruction(
+            method=task.job.method,
+            light_field=np.empty((0, 0, 0, 0, 3), np.float32),
+            objective=(),
+            seconds=kept["seconds"],
+            **figures,
+        )
+        evidence = kept["evidence"]
+        verdict = None if evidence is None else verdict_from(Evidence.from_dict(evidence))
+        return DoneBlock(result, verdict, kept["variance"], kept["peak_mib"])
+
+    def add(self, name: str, result: None) -> DoneBlock:
+        """Return a block that a worker wrote; raises AppError where it cannot be read here."""
+        done = self.get(name)
+        if done is None:
+            raise AppError(
+                f"{self.tasks[name].path}: a worker wrote it, but it cannot be read here; put "
+                "frames, Psi and results on a disk that all workers share"
+            )
+        return done
 
 
-def _settled(job: BlockJob, frames: Frames, pool: Pool, alone: bool) -> CaptureSurvey:
+def _surveyed(
+    job: BlockJob, frames: Frames, pool: Pool, alone: bool, watcher: Watcher
+) -> CaptureSurvey:
     """Return what holds for all blocks, from an earlier run where it is of the same capture.
 
-    Frames are on the disk then. alone: there is one block, which settles everything by itself.
+    Frames are on the disk then. alone: there is a single block, which settles everything by itself.
     """
-    kept = _read(job.kept / FRAMES, job.fingerprint)
-    if kept is not None:
-        known: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in kept["survey"].items()
-        }
-        known["settings"] = MethodSettings.model_validate(known["settings"])
-        return CaptureSurvey(**known)
-    emptied(job.kept)
-    arrays = {"readings": frames.readings, "usable": frames.usable}
-    _write(job.kept / FRAMES, arrays, {"fingerprint": ""})
-    if alone:
-        survey = CaptureSurvey.of_one_block(job.settings, len(frames.readings))
-    else:
-        ((_, survey),) = pool.run(survey_task, [job])
-    plain = {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
-    _write(job.kept / FRAMES, arrays, {"fingerprint": job.fingerprint, "survey": plain})
-    return survey
+
+    def settle() -> dict[str, Any]:
+        arrays = {"readings": frames.readings, "usable": frames.usable}
+        _write(job.kept / FRAMES, arrays, {})
+        if alone:
+            survey = CaptureSurvey.of_one_block(job.settings, len(frames.readings))
+        else:
+            ((_, survey),) = pool.run(survey_task, [job])
+        return {**asdict(survey), "settings": survey.settings.model_dump(mode="json")}
+
+    def kept() -> str:
+        return f"blocks done: {len(list(job.kept.glob('block-*.h5')))}"
+
+    plain = settled(job.kept, job.digest, settle, watcher, kept)
+    known: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items()}
+    known["settings"] = MethodSettings.model_validate(known["settings"])
+    return CaptureSurvey(**known)
 
 
 @dataclass(frozen=True)
@@ -371,11 +399,11 @@ def compute_blocks(
     job: BlockJob,
     frames: Frames,
     pool: Pool,
-    on_block: Callable[[int, int], None] = lambda done, of: None,
+    watcher: Watcher,
 ) -> Blocks:
     """Return the blocks of a capture, computed by a pool, those done before left as they are.
 
-    on_block: called with the blocks done and their number. Raises WorkersError, AppError, and what
+    watcher: gets the blocks done. Raises WorkersError, AppError, and what
     a block raises.
     """
     started = running_s()
@@ -383,23 +411,20 @@ def compute_blocks(
     multiple = multiple_of(psi.binning, dictionary, job.settings)
     grid = Grid(psi.size, multiple, 0, job.settings.blocks)
     pool.fit(task_bytes(psi, grid))
-    survey = _settled(job, frames, pool, len(grid) == 1)
+    survey = _surveyed(job, frames, pool, len(grid) == 1, watcher)
     grid = replace(grid, halo=survey.halo)
     pool.fit(task_bytes(psi, grid))
-    tasks = [BlockTask(job, survey, block) for block in grid]
-    done = {task.block.name: kept for task in tasks if (kept := done_block(task)) is not None}
-    left = [task for task in tasks if task.block.name not in done]
-    if done:
-        on_block(len(done), len(tasks))
-    for task, _ in pool.run(block_task, left):
-        computed = done_block(task)
-        if computed is None:
-            raise AppError(
-                f"{task.path}: a worker wrote it, but it cannot be read here; put frames, "
-                "Psi and results on a disk that all workers share"
-            )
-        done[task.block.name] = computed
-        on_block(len(done), len(tasks))
+    tasks = {block.name: BlockTask(job, survey, block) for block in grid}
+    done = run_job(
+        list(tasks),
+        lambda missing: [tasks[name] for name in missing],
+        block_task,
+        BlockFiles(tasks),
+        watcher,
+        job.kept.parents[1],
+        "blocks",
+        pool,
+    )
     ordered = [done[block.name] for block in grid]
     took_s = running_s() - started
     return Blocks(job, grid, survey, ordered, took_s, pool.size)

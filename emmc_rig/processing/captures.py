@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Protocol
 from emmc_rig.files.psi import StoredPsi, psi_beside, read_frames
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import is_session
 
 if TYPE_CHECKING:
     from reconstruction.verdict.rules import Reason
-
-Note = Callable[[str], None]
 
 
 class Capture(Protocol):
@@ -46,12 +45,12 @@ class Capture(Protocol):
         ...
 
     def frames(
-        self, psi: Path | None, place: int | None, out: Path, on_note: Note
+        self, psi: Path | None, place: int | None, out: Path, watcher: Watcher
     ) -> tuple[Frames, Path]:
         """Return readings, and the file of their Psi, which is written into `out` if need be.
 
-        psi: the file of another Psi. place: of the one frame of a film, from 0. on_note: told
-        which Psi it is. Raises AppError, SensingError or CalibrationError.
+        psi: the file of another Psi. place: of the one frame of a film, from 0. watcher:
+        gets the name of Psi as a note. Raises AppError, SensingError or CalibrationError.
         """
         ...
 
@@ -78,7 +77,7 @@ class FolderCapture:
         return psi_beside(self.folder)
 
     def frames(
-        self, psi: Path | None, place: int | None, out: Path, on_note: Note
+        self, psi: Path | None, place: int | None, out: Path, watcher: Watcher
     ) -> tuple[Frames, Path]:
         """Return readings, and the file of their Psi."""
         return read_frames(self.folder), psi or self.psi_file()

@@ -3,45 +3,45 @@
 Segments of a film do not depend on each other: each is a task for a worker, which goes on after the
 last frame that was done.
 
-KEPT/                   see `emmc_rig.store.folders.kept_folder`
-    psi.h5, scale.npz   what readings are made by, and what all frames are of
-    next-001.npz        what the next frame of segment 1 goes on from
-    frames/000007/      the result of frame 7, whole
+KEPT/                         see `emmc_rig.store.folders.kept_folder`
+    psi.h5, calibration.h5    the scale that makes readings, of all frames
+    job.json                  see `emmc_rig.processing.jobs`
+    next-001.npz              the state from which segment 1 goes on
+    frames/000007/            the result of frame 7, whole
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 from zipfile import BadZipFile
 
+import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.frames import MeanFrame, SensorGain
-from calibration.scale import Scale
-from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.errors import AppError
 from emmc_rig.files.films import FRAMES
 from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.result_files import read_metrics
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics
+from emmc_rig.files.scales import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.model.arguments import refusal, required
 from emmc_rig.model.camera import psi_of_shot
 from emmc_rig.model.files import PART, whole_file, whole_folder
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix, SensingError
+from emmc_rig.processing.jobs import Store, digest_of, kept_words, run_job, settled
 from emmc_rig.processing.memory import (
     BASE_BYTES,
     Ceiling,
@@ -50,7 +50,7 @@ from emmc_rig.processing.memory import (
     peak_memory_mib,
     task_bytes,
 )
-from emmc_rig.processing.pool import opened_pool
+from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.reconstructing import (
     PSI_TAKES,
     OnStep,
@@ -60,25 +60,23 @@ from emmc_rig.processing.reconstructing import (
 )
 from emmc_rig.processing.result import Result
 from emmc_rig.processing.session_capture import SessionCapture
+from emmc_rig.progress import Watcher
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
 from emmc_rig.session.readings import FilmPlace, film_frames, film_places
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import (
-    emptied,
     kept_folder,
     result_folder,
 )
 from emmc_rig.version import __version__
 from reconstruction.adaptive.film import Film
-from reconstruction.adaptive.parts import put_together, taken_apart
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, film_methods, find_method
-from reconstruction.result import Progress
 from reconstruction.verdict.rules import LEVELS
 from reconstruction.verdict.run import reconstruct_judged
 
-SCALE, ABOUT = "scale.npz", "plain"
+ABOUT = "plain"
 DONE = "[0-9]*"
 """The folders of frames that are done; others are of frames that are being written, or were."""
 DAMAGED = (
@@ -198,8 +196,8 @@ def reconstruct_film(
             if chosen.film.segment and place % chosen.film.segment == 0:
                 latest = first
             shot = place % psi.shots
-            one = frame if isinstance(frame, Frames) else np.asarray(frame)[np.newaxis]
-            taken = as_frames(psi_of_shot(psi, shot), one, noise_sigma, None)
+            single = frame if isinstance(frame, Frames) else np.asarray(frame)[np.newaxis]
+            taken = as_frames(psi_of_shot(psi, shot), single, noise_sigma, None)
             result, latest = latest.next(psi, shot, taken, method, chosen, on_step)
             yield result
 
@@ -225,55 +223,50 @@ class FilmJob:
     method: str
     settings: MethodSettings
 
-    def settle(
-        self, capture: SessionCapture, psi_path: Path | None, on_note: Callable[[str], None]
-    ) -> None:
+    def settle(self, capture: SessionCapture, psi_path: Path | None, watcher: Watcher) -> None:
         """Write what all frames have alike, unless an earlier run of the same film did.
 
         Raises AppError, CalibrationError.
         """
-        path, given = self.kept / SCALE, None if psi_path is None else StoredPsi(psi_path).load()
+        given = None if psi_path is None else StoredPsi(psi_path).load()
         session = capture.session
-        stored = [entry.model_dump(mode="json") for entry in session.stored.values()]
-        settings = self.settings.model_dump(mode="json")
-        of_psi = None if given is None else given.checksum()
-        what = stored, session.digests, of_psi, self.method, settings, __version__
-        fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-        with suppress(*DAMAGED):
-            if _open(path)[0]["fingerprint"] == fingerprint:
-                StoredPsi(self.kept / PSI).verify()
-                done = len(list((self.kept / FRAMES).glob(DONE)))
-                on_note(f"goes on with an earlier run; frames done: {done}")
-                return
-        if path.exists():
-            on_note("starts anew: an earlier run was of other frames, settings or version")
-            path.unlink()  # before all else: without it nothing is gone on from
-        emptied(self.kept)
-        scale = capture.scale(psi_path, on_note)
-        psi = scale.psi if given is None else given
-        if psi.frames_shape != scale.psi.frames_shape:
-            raise AppError(f"{psi_path}: is not of this session's shots and frames")
-        if not is_one_block(psi.size, self.settings):
-            raise AppError(
-                f"frames of {'x'.join(map(str, psi.size))} are more than one block, and films are "
-                "reconstructed as a whole: raise the setting blocks: {whole: SAMPLES}"
-            )
-        psi.save(self.kept / PSI)
-        (self.kept / FRAMES).mkdir()
-        arrays: dict[str, NDArray] = {}
-        plain = taken_apart(scale, arrays)
-        _save(path, {"fingerprint": fingerprint, "scale": plain}, arrays)
+        inputs = {
+            "stored": [entry.model_dump(mode="json") for entry in session.stored.values()],
+            "session": session.digests,
+            "psi": None if given is None else given.checksum(),
+            "method": self.method,
+            "settings": self.settings.model_dump(mode="json"),
+            "version": __version__,
+        }
 
-    def scale(self) -> Scale:
-        """Return what turns frames into readings, with the Psi that all are reconstructed by."""
-        psi = StoredPsi(self.kept / PSI).load()
-        about, arrays = _open(self.kept / SCALE)
-        return put_together(about["scale"], arrays, (Scale, MeanFrame, SensorGain), lambda: psi)
+        def settle() -> None:
+            scale = capture.scale(psi_path, watcher)
+            psi = scale.psi if given is None else given
+            if psi.frames_shape != scale.psi.frames_shape:
+                raise AppError(f"{psi_path}: is not of this session's shots and frames")
+            if not is_one_block(psi.size, self.settings):
+                raise AppError(
+                    f"frames of {'x'.join(map(str, psi.size))} are more than one block, and films "
+                    "are reconstructed as a whole: raise the setting blocks: {whole: SAMPLES}"
+                )
+            psi.save(self.kept / PSI)
+            with h5py.File(self.kept / CALIBRATION_FILE, "w") as file:
+                write_scale(file, scale)
+            (self.kept / FRAMES).mkdir()
+
+        def done() -> str:
+            return f"frames done: {len(self.done())}"
+
+        settled(self.kept, digest_of(inputs), settle, watcher, done)
+
+    def done(self) -> list[Path]:
+        """Return the folders of the frames that are done, in order."""
+        return sorted((self.kept / FRAMES).glob(DONE))
 
 
 @dataclass(frozen=True)
 class SegmentTask:
-    """A segment of a film: its number, and its places in time."""
+    """A segment of a film: its number, and its places in time, also of frames that are missing."""
 
     job: FilmJob
     number: int
@@ -285,30 +278,54 @@ class SegmentTask:
         return self.job.kept / f"next-{self.number:03d}.npz"
 
 
-def segment_task(
-    task: SegmentTask, on_frame: Callable[[], None] = lambda: None
-) -> Mapping[int, str]:
+@dataclass(frozen=True)
+class FrameFolders(Store[str, str]):
+    """The folders of a film's frames, which tasks write; results are why a frame failed, or ""."""
+
+    job: FilmJob
+
+    def get(self, name: str) -> str | None:
+        """Return "" for a frame that is done."""
+        return "" if (self.job.kept / FRAMES / name).is_dir() else None
+
+    def add(self, name: str, result: str) -> str:
+        """Return why a frame failed."""
+        return result
+
+    def count(self) -> int:
+        """Return how many frames are done."""
+        return len(self.job.done())
+
+
+def segment_task(task: SegmentTask) -> Generator[tuple[str, str], None, None]:
     """Reconstruct the frames of a segment that are not done, each to the disk.
 
-    Returns why frames could not be reconstructed, by place. on_frame: called after each. Raises
-    AppError.
+    Yields the name of each frame, and why it could not be reconstructed or "". Raises AppError.
     """
-    job, session, scale = task.job, Session(task.job.session), task.job.scale()
+    job, session, scale = task.job, Session(task.job.session), open_scale(task.job.kept)
     reasons = exposure_reasons(shot_exposures(session))
     latest = Latest(Film(job.settings.film), place=task.places.start - 1)
     with suppress(*DAMAGED):
         latest = Latest.opened(task.path, scale.psi)
+    for place, why in latest.failed.items():
+        yield name_of(place), why
     for at, frames in film_frames(session, scale, range(latest.place + 1, task.places.stop)):
         latest, shot = replace(latest, place=at.place), scale.shots.index(at.shot)
+        why = ""
         try:
             result, latest = latest.next(scale.psi, shot, frames, job.method, job.settings)
         except ReconstructionError as fault:
-            latest = replace(latest, failed={**latest.failed, at.place: str(fault)})
+            why = str(fault)
+            latest = replace(latest, failed={**latest.failed, at.place: why})
         else:
             _write(replace(result, verdict=result.verdict.with_reasons(reasons)), at, task)
         latest = latest.saved(task.path, scale.psi)
-        on_frame()
-    return latest.failed
+        yield name_of(at.place), why
+
+
+def name_of(place: int) -> str:
+    """Return the name of a frame's folder."""
+    return f"{place:06d}"
 
 
 def _write(result: Result, frame: FilmPlace, task: SegmentTask) -> None:
@@ -320,7 +337,7 @@ def _write(result: Result, frame: FilmPlace, task: SegmentTask) -> None:
         "shot": frame.shot + 1,
         "peak_gib": peak_memory_mib() / 2**10,
     }
-    with whole_folder(task.job.kept / FRAMES / f"{frame.place:06d}") as partial:
+    with whole_folder(task.job.kept / FRAMES / name_of(frame.place)) as partial:
         result.write(partial, {**result.metrics(), **of_film})
 
 
@@ -331,8 +348,7 @@ def reconstruct_film_session(
     psi_path: Path | None = None,
     settings: MethodSettings | None = None,
     memory: int | None = None,
-    on_step: Callable[[Progress], None] = lambda progress: None,
-    on_note: Callable[[str], None] = lambda text: None,
+    watcher: Watcher | None = None,
     workers: int | None = None,
     cluster: str | None = None,
 ) -> dict[str, Any]:
@@ -340,29 +356,37 @@ def reconstruct_film_session(
 
     Goes on after the frames that an earlier run finished, if it was of the same film, method,
     settings and version. psi_path: of another Psi than that of the session's whiteboards. memory:
-    bytes that must be enough. on_step: called with the frames done, from any thread. on_note:
-    called with what becomes of an earlier run. workers, cluster: see `opened_pool`, for segments
+    bytes that must be enough. watcher: gets the frames done, from any thread, and as a note what
+    becomes of an earlier run. workers, cluster: see `opened_pool`, for segments
     beside each other; None of both: this process and its threads.
     Raises AppError, CalibrationError; StoppedError by Ctrl-C.
     """
     _refuse_without_films(method)
-    with result_folder(out, "reconstruct", belongs_to=capture.own_place, resumes=True) as new:
+    watcher = watcher or Watcher()
+    with (
+        result_folder(out, "reconstruct", belongs_to=capture.own_place, resumes=True) as new,
+        kept_words(out, lambda: "frames that are done are"),
+    ):
         kept, session = kept_folder(new).absolute(), capture.session
         job = FilmJob(session.folder, kept, method, settings or MethodSettings())
         count, places = capture.planned_frames, film_places(session)
-        job.settle(capture, psi_path, on_note)
+        job.settle(capture, psi_path, watcher)
         tasks = _segments(job, places)
-
-        def on_frame() -> None:
-            on_step(Progress(len(list((kept / FRAMES).glob(DONE))), None, None, count))
-
-        try:
-            failed = _computed(job, tasks, workers, cluster, memory, on_frame, on_note)
-        except KeyboardInterrupt as stop:
-            raise StoppedError(
-                f"stopped by Ctrl-C; frames that are done are kept in {out}, and the same command "
-                "goes on"
-            ) from stop
+        names = [name_of(at.place) for at in places]
+        with _workers(job, len(tasks), workers, cluster, memory, watcher) as pool:
+            reasons = run_job(
+                names,
+                lambda missing: [
+                    task for task in tasks if not {*map(name_of, task.places)}.isdisjoint(missing)
+                ],
+                segment_task,
+                FrameFolders(job),
+                watcher,
+                out,
+                "frames",
+                pool,
+            )
+        failed = {int(name): why for name, why in sorted(reasons.items()) if why}
         times_s = {at.place: at.time_s for at in places}
         metrics = _metrics(job, session, count, times_s, failed)
         whole = shutil.ignore_patterns(f".*{PART}")
@@ -385,55 +409,30 @@ def _segments(job: FilmJob, places: Sequence[FilmPlace]) -> list[SegmentTask]:
     return [SegmentTask(job, number, among) for number, among in enumerate(found)]
 
 
-def _computed(
+@contextmanager
+def _workers(
     job: FilmJob,
-    tasks: Sequence[SegmentTask],
+    segments: int,
     workers: int | None,
     cluster: str | None,
     memory: int | None,
-    on_frame: Callable[[], None],
-    on_note: Callable[[str], None],
-) -> dict[int, str]:
-    """Do all segments by workers, or by this process where none are asked for.
-
-    Returns why frames could not be reconstructed, by place.
-    """
-    if len(tasks) == 1 and (cluster is not None or (workers or 1) > 1):
-        on_note(
+    watcher: Watcher,
+) -> Iterator[Pool | None]:
+    """Yield the workers that share segments; None where this process does them all."""
+    if segments == 1 and (cluster is not None or (workers or 1) > 1):
+        watcher.tell(
             "one segment, which workers cannot share: the setting film: {segment: 50} makes "
             "segments of 50 frames, the first of each without those before it"
         )
-    shared = cluster is not None or (workers is not None and len(tasks) > 1)
+    shared = cluster is not None or (workers is not None and segments > 1)
     count, ceiling = workers or 1, None
     if memory is not None:
         saved, settings = StoredPsi(job.kept / PSI), job.settings
         own = own_bytes(saved, settings, False, False)
         ceiling = Ceiling(memory, BASE_BYTES + own if shared else own)
         count = min(count, ceiling.workers(task_bytes(saved, assumed_grid(saved, settings))))
-    if not shared:
-        failed = [segment_task(task, on_frame) for task in tasks]
-    else:
-        with opened_pool(count, cluster, ceiling) as pool, _repeated(on_frame):
-            failed = [why for _, why in pool.run(segment_task, tasks)]
-    return dict(sorted(one for why in failed for one in why.items()))
-
-
-@contextmanager
-def _repeated(call: Callable[[], None], every_s: float = 1.0) -> Iterator[None]:
-    """Call a function again and again in a thread, until the block ends."""
-    ended = Event()
-
-    def work() -> None:
-        while not ended.wait(every_s):
-            call()
-
-    thread = Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+    with opened_pool(count, cluster, ceiling) if shared else nullcontext() as pool:
+        yield pool
 
 
 def _linked(path: str | Path, place: str | Path) -> None:
@@ -452,17 +451,17 @@ def _metrics(
     failed: Mapping[int, str],
 ) -> dict[str, Any]:
     """Return the metrics of a film of which all frames are done."""
-    done = [read_metrics(path) for path in sorted((job.kept / FRAMES).glob(DONE))]
+    done = [read_metrics(path) for path in job.done()]
     if not done:
         raise AppError(f"{session.folder}: {next(iter(failed.values()), 'no frame')}")
     rate = of_kind(session.journal.entries, FilmEntry)[0].rate_hz
     anew = [
-        one["frame"]
-        for before, one in pairwise(done)
-        if one["segment"] == before["segment"] and not FOLLOWS & one["parameters"].keys()
+        frame["frame"]
+        for before, frame in pairwise(done)
+        if frame["segment"] == before["segment"] and not FOLLOWS & frame["parameters"].keys()
     ]
-    took_s = sum(one["seconds"] for one in done)
-    levels = Counter(one["verdict"]["level"] for one in done)
+    took_s = sum(frame["seconds"] for frame in done)
+    levels = Counter(frame["verdict"]["level"] for frame in done)
     worst = max(done, key=_doubt)
     shown = ("frame", "time_s", "stated_db", "stated_interval_db")
     return {
@@ -471,7 +470,7 @@ def _metrics(
             "frames": count,
             "rate": rate,
             "times_s": _all_times(times_s, count, rate),
-            "missing": sorted(set(range(count)) - {one["frame"] for one in done}),
+            "missing": sorted(set(range(count)) - {frame["frame"] for frame in done}),
             "failed": {str(place): why for place, why in failed.items()},
             "begun_anew": anew,
             "verdicts": {level: levels[level] for level in LEVELS},
@@ -482,7 +481,7 @@ def _metrics(
         "seconds": took_s,
         "verdict": worst["verdict"],
         "psi_sha256": StoredPsi(job.kept / PSI).checksum,
-        "peak_gib": max(one["peak_gib"] for one in done),
+        "peak_gib": max(frame["peak_gib"] for frame in done),
         "program_peak_gib": peak_memory_mib() / 2**10,
     }
 

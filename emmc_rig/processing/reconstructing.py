@@ -16,7 +16,7 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
-from emmc_rig.errors import ERRORS, AppError, StoppedError
+from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.psi import FRAMES, StoredPsi
 from emmc_rig.files.result_files import LIGHT_FIELD, MAPS, RESULT_GROUP, holds_light_field
@@ -30,8 +30,9 @@ from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import validated
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
-from emmc_rig.processing.block_tasks import BlockJob, Blocks, compute_blocks, fingerprint_of
+from emmc_rig.processing.block_tasks import Blocks, block_job, compute_blocks
 from emmc_rig.processing.captures import Capture, opened_capture
+from emmc_rig.processing.jobs import kept_words
 from emmc_rig.processing.memory import (
     BASE_BYTES,
     Ceiling,
@@ -41,6 +42,7 @@ from emmc_rig.processing.memory import (
 )
 from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures, open_result
+from emmc_rig.progress import Notes, Watcher
 from emmc_rig.store.folders import (
     KEPT,
     kept_folder,
@@ -221,17 +223,6 @@ def is_one_block(size: tuple[int, int], settings: MethodSettings | None) -> bool
     return size[0] * size[1] <= (settings or MethodSettings()).blocks.whole
 
 
-def reconstruct_folder(folder: Path, out: Path, *given: Any, **named: Any) -> dict:
-    """Reconstruct a folder's frames into an existing folder `out`; return the metrics.
-
-    given, named: the further arguments of `reconstruct_undrawn`.
-    """
-    metrics, draw = reconstruct_undrawn(opened_capture(folder), out, *given, **named)
-    if draw is not None:
-        draw(out, source=str(out))
-    return metrics
-
-
 def reconstruct_undrawn(
     capture: Capture,
     out: Path,
@@ -240,13 +231,12 @@ def reconstruct_undrawn(
     dictionary_spec: str | None = None,
     settings: MethodSettings | None = None,
     truth: str | None = None,
-    on_step: OnStep | None = None,
+    watcher: Watcher | None = None,
     chosen: str | None = None,
     pool: Pool | None = None,
     as_zarr: bool = False,
     without_shots: Sequence[int] = (),
     frame: int | None = None,
-    on_note: Callable[[str], None] = lambda text: None,
 ) -> tuple[dict, Callable[..., None] | None]:
     """Reconstruct a capture's frames into an existing folder `out`, all but the page.
 
@@ -258,13 +248,13 @@ def reconstruct_undrawn(
     was captured, when known, to compare with. chosen: why this method, for the metrics. pool: by
     default as many processes as threads; if one is given, it computes small light fields, too.
     as_zarr: write light field and maps as one Zarr group, by the pool, and no page.
-    without_shots: counted from 1, that are not used. frame: of a session's film, alone. on_note:
-    told which Psi it is.
+    without_shots: counted from 1, that are not used. frame: of a session's film, alone.
+    watcher: gets steps, and the name of Psi as a note.
     """
     find_method(method)
-    settings = settings or MethodSettings()
+    settings, watcher = settings or MethodSettings(), watcher or Watcher()
     assumed = psi_path is None and capture.assumed
-    frames, psi_path = capture.frames(psi_path, frame, out, on_note)
+    frames, psi_path = capture.frames(psi_path, frame, out, watcher)
     frames = _without(frames, without_shots)
     saved = StoredPsi(psi_path)
     in_memory = is_one_block(saved.size, settings) and not as_zarr
@@ -274,21 +264,14 @@ def reconstruct_undrawn(
     if assumed:
         further["assumed"] = PSI_ASSUMED
     if in_memory and pool is None:
-        result = _solved(saved.load(), frames, method, dictionary_spec, settings, on_step)
+        result = _solved(saved.load(), frames, method, dictionary_spec, settings, watcher.advance)
     else:
         saved.verify()
         check_frames(saved.frames_shape, frames.readings)
-        job = BlockJob(
-            kept_folder(out).absolute(), psi_path.absolute(), method, dictionary_spec, settings,
-            frames.noise_sigma, fingerprint_of(saved, frames, method, dictionary_spec, settings),
-        )  # fmt: skip
-
-        def on_block(done: int, of: int) -> None:
-            if on_step is not None:
-                on_step(Progress(done, None, None, of))
-
+        kept = kept_folder(out).absolute()
+        job = block_job(kept, psi_path.absolute(), frames, method, dictionary_spec, settings)
         with nullcontext(pool) if pool is not None else opened_pool(get_num_threads()) as workers:
-            blocks = compute_blocks(job, frames, workers, on_block)
+            blocks = compute_blocks(job, frames, workers, watcher)
             if as_zarr:
                 blocks.write_shards(out / RESULT_GROUP, workers)
         further |= blocks.metrics()
@@ -387,14 +370,14 @@ def reconstruct_captures(
     workers: int | None,
     cluster: str | None,
     memory: int | None,
-    on_step: Callable[[Progress], None],
+    watcher: Watcher,
     **given: Any,
 ) -> Iterator[tuple[Place, dict | Exception]]:
     """Yield each capture with its metrics, or with what it failed by, in the order they are done.
 
     workers: processes; None and one capture that is one block: this process and its threads.
-    memory: bytes of all processes together, kept by computing less at a time. on_step: called with
-    the progress of a single capture, or with the captures done. given: see `reconstruct_undrawn`.
+    memory: bytes of all processes together, kept by computing less at a time. watcher: gets the
+    steps of a single capture, or the captures done. given: see `reconstruct_undrawn`.
     Raises WorkersError, and AppError for a ceiling that is too low.
     """
     alone = len(places) == 1
@@ -411,16 +394,18 @@ def reconstruct_captures(
     shared = not alone or workers is not None or cluster is not None or memory is not None
     with opened_pool(count, cluster, ceiling) if shared else nullcontext() as pool:
         if pool is None or alone:
-            yield places[0], _outcome(places[0], pool=pool, on_step=on_step, **given)
+            yield places[0], _outcome(places[0], pool=pool, watcher=watcher, **given)
             return
+        notes = Notes(watcher)
         with ThreadPoolExecutor(min(at_a_time, pool.size + 1)) as threads:
             futures = {
-                threads.submit(_outcome, place, pool=pool, **given): place for place in places
+                threads.submit(_outcome, place, pool=pool, watcher=notes, **given): place
+                for place in places
             }
             try:
                 for done, future in enumerate(as_completed(futures), 1):
                     outcome = future.result()
-                    on_step(Progress(done, None, None, len(places)))
+                    watcher.at(done, len(places))
                     yield futures[future], outcome
             except BaseException:
                 for future in futures:
@@ -436,15 +421,12 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
         with result_folder(
             out, "reconstruct", belongs_to=capture.own_place, resumes=True
         ) as folder:
-            try:
+
+            def kept() -> str:
+                return "blocks that are done are" if (folder.parent / KEPT).is_dir() else ""
+
+            with kept_words(out, kept):
                 metrics, draw = reconstruct_undrawn(capture, folder, **given)
-            except KeyboardInterrupt as stop:
-                if not (folder.parent / KEPT).is_dir():
-                    raise
-                raise StoppedError(
-                    f"stopped by Ctrl-C; blocks that are done are kept in {out}, and the same "
-                    "command goes on"
-                ) from stop
         if draw is not None:  # the result is on the disk, whatever happens to its page
             with result_folder(
                 out, "reconstruct", belongs_to=capture.own_place, adds=True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from emmc_rig.model.camera import camera_of as camera_of_psi
 from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.progress import Silent, Watcher
+from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import sensor_pairs
 from emmc_rig.session.frame_means import camera_of, taken_shots
 from emmc_rig.session.measured_psi import (
@@ -161,7 +161,7 @@ def calibrate_session(
     if not isinstance(session, Session):
         takes = "a session, or its folder; or whiteboards as arrays, with poses and a camera"
         session = Session(path_of(session, "session", takes))
-    return _calibrated(session, method, sensor, watcher or Silent(), in_memory)
+    return _calibrated(session, method, sensor, watcher or Watcher(), in_memory)
 
 
 def calibrate_into(
@@ -180,34 +180,31 @@ def calibrate_into(
     return calibration
 
 
-def calibrated_scale(
-    session: Session,
-    on_note: Callable[[str], None] = lambda text: None,
-    watcher: Watcher | None = None,
-) -> Scale:
+def calibrated_scale(session: Session, watcher: Watcher | None = None) -> Scale:
     """Return the scale that is stored in a session; measured and stored first where there is none.
 
-    on_note: told in a sentence which calibration it is. A stored calibration whose frames or
+    watcher: gets the name of the calibration as a note. A stored calibration whose frames or
     program version differ is measured again, by its own method.
 
     Raises AppError or CalibrationError.
     """
+    tell = (watcher or Watcher()).tell
     known, words = stored_scale(session)
     if known is not None:
-        on_note(f"Psi: {words}")
+        tell(f"Psi: {words}")
         return known
     if not is_judged(session):
         return measured_scale(session)
     place, method = session.folder / CALIBRATION, _method_of(session)
     if words:
-        on_note(f"{words}: measured again, method {method}")
+        tell(f"{words}: measured again, method {method}")
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(result_folder(place, "calibrate", belongs_to=place))
         except AppError as fault:
-            on_note(f"the calibration is not stored: {fault}")
+            tell(f"the calibration is not stored: {fault}")
             return measured_scale(session)
-        calibrate_into(folder, session, method, False, watcher or Silent())
+        calibrate_into(folder, session, method, False, Watcher())
     return open_scale(place)
 
 
@@ -228,15 +225,8 @@ def _calibrated(
         raise AppError(f"method {method}: use one of {', '.join(METHODS)}")
     started = time.perf_counter()
     watcher.begin("frames", None)
-    whiteboards = (frame for frame in session.frames if frame.kind == "whiteboard")
-    planes = len({(one.bench.shot, one.view, one.bench.lamp) for one in whiteboards})
-    outcome = session_outcome(
-        session,
-        None if method == "auto" else METHODS[method],
-        lambda name: watcher.begin(name, planes if name == "Psi, free" else None),
-        empty,
-        watcher.step,
-    )
+    routes = None if method == "auto" else METHODS[method]
+    outcome = session_outcome(session, routes, empty, watcher)
     title = session.header["title"] or session.folder.name
     metrics = calibration_metrics(outcome, title, str(session.folder), method, started)
     shots = taken_shots(session)

@@ -12,8 +12,8 @@ from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.scales import CALIBRATION_FILE, open_scale
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.captures import Note
 from emmc_rig.processing.session_calibration import calibrated_scale
+from emmc_rig.progress import Watcher
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_means import frame_shape, session_darks, taken_shots
 from emmc_rig.session.measured_psi import psi_is_assumed
@@ -58,10 +58,10 @@ class SessionCapture:
         return path
 
     def frames(
-        self, psi: Path | None, place: int | None, out: Path, on_note: Note
+        self, psi: Path | None, place: int | None, out: Path, watcher: Watcher
     ) -> tuple[Frames, Path]:
         """Return readings, and the file of their Psi: its own is written to `out`."""
-        own, frames = session_frames(self.session, self.scale(psi, on_note), place)
+        own, frames = session_frames(self.session, self.scale(psi, watcher), place)
         if psi is None:
             own.save(out / PSI)
         return frames, psi or out / PSI
@@ -75,14 +75,14 @@ class SessionCapture:
         """Return what speaks against the exposures of its shots."""
         return exposure_reasons(shot_exposures(self.session))
 
-    def scale(self, psi: Path | None, on_note: Note = lambda text: None) -> Scale:
+    def scale(self, psi: Path | None, watcher: Watcher | None = None) -> Scale:
         """Return what makes readings of the frames.
 
         psi: of another calibration, whose whiteboards then scale the readings; darks are those of
         this session, if it has darks. Raises AppError for a calibration of other frames.
         """
         if psi is None or not (psi.parent / CALIBRATION_FILE).is_file():
-            return calibrated_scale(self.session, on_note)
+            return calibrated_scale(self.session, watcher)
         scale, session = open_scale(psi), self.session
         fits = scale.psi.frames_shape[1:] == frame_shape(session)
         if not fits or not set(taken_shots(session)) <= set(scale.shots):

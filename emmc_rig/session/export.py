@@ -17,7 +17,7 @@ Frames pass one at a time: memory stays flat. Source: NeXus definitions 2024.02,
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from drivers.camera import CameraIdentity
 from drivers.dng import Facts
 from drivers.raw import captured_at
 from emmc_rig.errors import AppError
+from emmc_rig.progress import Watcher
 from emmc_rig.session.frame_file import dng_of
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import FrameEntry, ImportedEntry, RunEntry, of_kind
@@ -47,7 +48,7 @@ def export_hdf5(
     session: Session,
     path: Path,
     compress: bool = False,
-    on_frame: Callable[[str], None] = lambda frame_id: None,
+    watcher: Watcher | None = None,
 ) -> None:
     """Write a session to an HDF5 file: whole, or not at all.
 
@@ -80,15 +81,13 @@ def export_hdf5(
             file.require_group("entry/instrument/detector"),
             lines[0].shape,
             compress,
-            on_frame,
+            watcher or Watcher(),
         )
         file["entry/data"].attrs.update(signal="data", axes=["frame_id", ".", "."])
         file["entry/data/data"] = h5py.SoftLink("/entry/instrument/detector/data")
 
 
-def export_dng(
-    session: Session, folder: Path, on_frame: Callable[[str], None] = lambda frame_id: None
-) -> None:
+def export_dng(session: Session, folder: Path, watcher: Watcher | None = None) -> None:
     """Write every stored frame as a DNG with its facts into a folder, named as in the session.
 
     Its mosaic as the camera gave it, levels in whole DN. Exposure, ISO (100 at gain 1 where the
@@ -96,6 +95,7 @@ def export_dng(
     ImageUniqueID the session's id followed by 16 digits of the frame's own. Every frame's digest is
     checked on the way. Raises AppError where a frame is not good, or nothing can be written.
     """
+    watcher = watcher or Watcher()
     frames = [frame for frame in session.frames if frame.id in session.stored]
     if not frames:
         raise AppError(f"{session.folder}: no frame was captured yet; resume it")
@@ -118,7 +118,7 @@ def export_dng(
             identity = CameraIdentity(maker, model, serial)
             data = dng_of(frame, identity, facts=facts)
             (new / line.file).with_suffix(".dng").write_bytes(data)
-            on_frame(planned.id)
+            watcher.step(planned.id)
 
 
 def _iso(line: FrameEntry, imported: bool) -> int | None:
@@ -226,7 +226,7 @@ def _write_frames(
     detector: h5py.Group,
     shape: tuple[int, int],
     compress: bool,
-    on_frame: Callable[[str], None],
+    watcher: Watcher,
 ) -> None:
     frames = session.needed
     packing = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compress else {}
@@ -239,4 +239,4 @@ def _write_frames(
             name = frames[place].id
             raise AppError(f"{session.folder}: frame {name} has another size than the first")
         data[place] = frame.mosaic
-        on_frame(frames[place].id)
+        watcher.step(frames[place].id)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from emmc_rig.files.psi import PSI
 from emmc_rig.files.scales import open_scale
 from emmc_rig.model.camera import Camera, build_imaging_matrix, psi_layout
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import SessionBoards, board_sets, whiteboards
 from emmc_rig.session.frame_means import (
     camera_of,
@@ -49,13 +50,12 @@ def session_calibration(session: Session) -> Calibration:
 def session_outcome(
     session: Session,
     routes: Sequence[str] | None = None,
-    on_stage: Callable[[str], None] = lambda name: None,
     empty: NewArray = in_memory,
-    on_plane: Callable[[str], None] = lambda what: None,
+    watcher: Watcher | None = None,
 ) -> Outcome:
     """Return Psi by the calibration methods named, with the choice among them.
 
-    By default by every method that the session has the whiteboards for. empty, on_plane: of the
+    By default by every method that the session has the whiteboards for. empty: of the
     method free, see `measure_psi`.
 
     Raises AppError where the session has not what a method needs, or CalibrationError.
@@ -65,7 +65,7 @@ def session_outcome(
     size = k * rows, k * columns
     boards = board_sets(session, channels_of(psi_layout(camera, size)))
     where = f"{session.folder}: its plan has"
-    return boards_outcome(camera, size, boards, where, routes, on_stage, empty, on_plane)
+    return boards_outcome(camera, size, boards, where, routes, empty, watcher)
 
 
 def boards_outcome(
@@ -74,9 +74,8 @@ def boards_outcome(
     boards: SessionBoards,
     where: str,
     routes: Sequence[str] | None = None,
-    on_stage: Callable[[str], None] = lambda name: None,
     empty: NewArray = in_memory,
-    on_plane: Callable[[str], None] = lambda what: None,
+    watcher: Watcher | None = None,
 ) -> Outcome:
     """Return Psi of whiteboards, see `session_outcome`.
 
@@ -107,6 +106,9 @@ def boards_outcome(
             "plan-whiteboards",
         )
     assert held_out is not None
+    watcher = watcher or Watcher()
+    frames = () if pinholes is None else pinholes.frames
+    planes = len({(frame.shot, frame.pinhole, frame.lamp) for frame in frames})
     return calibrate(
         camera,
         design,
@@ -114,10 +116,10 @@ def boards_outcome(
         held_out,
         few if set(routes) - {"free"} else None,
         pinholes,
-        on_stage=on_stage,
+        on_stage=lambda name: watcher.begin(name, planes if name == "Psi, free" else None),
         turned=boards.turned,
         empty=empty,
-        on_plane=on_plane,
+        on_plane=watcher.step,
     )
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from emmc_rig.errors import AppError
+from emmc_rig.progress import Watcher
 from emmc_rig.session.journal import FrameEntry, dropped
 from emmc_rig.session.session import Session
 
@@ -69,15 +70,14 @@ class Verdict:
 
 
 def verify_frames(
-    session: Session,
-    entries: Iterable[FrameEntry],
-    on_frame: Callable[[str], None] = lambda frame_id: None,
+    session: Session, entries: Iterable[FrameEntry], watcher: Watcher | None = None
 ) -> dict[str, str]:
     """Return, by id, what is wrong with the files of journal lines; nothing for good ones."""
+    step = (watcher or Watcher()).step
 
     def fault_of(entry: FrameEntry) -> tuple[str, str]:
         fault = _fault(session, entry)
-        on_frame(entry.id)
+        step(entry.id)
         return entry.id, fault
 
     with ThreadPoolExecutor(THREADS, "verify") as pool:
@@ -98,10 +98,7 @@ def _fault(session: Session, entry: FrameEntry) -> str:
     return ""
 
 
-def verify(
-    session: Session,
-    on_frame: Callable[[str], None] = lambda frame_id: None,
-) -> Verdict:
+def verify(session: Session, watcher: Watcher | None = None) -> Verdict:
     """Return what became of a session; raises AppError when its plan cannot be read at all."""
     frozen = []
     for name in session.digests:
@@ -111,7 +108,7 @@ def verify(
             frozen.append(str(fault))
     planned = {frame.id for frame in session.needed}
     stored = {name: entry for name, entry in session.stored.items() if name in planned}
-    damaged = verify_frames(session, stored.values(), on_frame)
+    damaged = verify_frames(session, stored.values(), watcher)
     leftovers, foreign = session.unexpected_files()
     gone = len(dropped(session.journal.entries))
     return Verdict(

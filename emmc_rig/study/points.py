@@ -17,19 +17,18 @@ from typing import Any, ClassVar, Generic, TypeVar
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.pages.page import number
+from emmc_rig.processing.jobs import Store, digest_of, kept_words, run_job
 from emmc_rig.processing.pool import Pool
-from emmc_rig.progress import Silent, Watcher
+from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import Listing, refuse_edited, refuse_inside_session
 from emmc_rig.store.journal import Lines
-from emmc_rig.study.rows import described, digest_of, plain
+from emmc_rig.study.rows import described, plain
 from emmc_rig.version import __version__
 
 P = TypeVar("P", bound=Hashable)
 Results = Generator[dict, None, None]
-
-
-class StudyStopped(KeyboardInterrupt):
-    """Ctrl-C; the points measured so far are kept."""
+LEFT_OUT = "left out"
+"""Key of why a point has no result."""
 
 
 class NotApplicableError(AppError):
@@ -44,7 +43,7 @@ def study_folder(out: Path, journal: str, command: str) -> Iterator[Path]:
     `result_folder`; what that would refuse is refused here, before anything is measured.
 
     Raises AppError when the folder holds something else, or results that were edited, where a
-    session is, and where nothing can be written; StudyStopped at Ctrl-C.
+    session is, and where nothing can be written; StoppedError at Ctrl-C.
     """
     refuse_inside_session(out)
     folder = Path(os.path.abspath(out))
@@ -56,36 +55,23 @@ def study_folder(out: Path, journal: str, command: str) -> Iterator[Path]:
             f"{out}: the folder holds something else than an earlier {command}; "
             "choose another folder or empty it"
         )
-    with _stopped_with_words(out):
+    with kept_words(out, lambda: "what was measured is"):
         refuse_edited(folder, command)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / journal).touch()
         yield folder
 
 
-@contextmanager
-def _stopped_with_words(out: Path, what: Callable[[], str] = lambda: "what was measured is"):
-    """Say at Ctrl-C and at a full disk what is kept: raise StudyStopped and AppError."""
-    try:
-        yield
-    except StudyStopped:
-        raise
-    except KeyboardInterrupt as stop:
-        raise StudyStopped(
-            f"stopped by Ctrl-C; {what()} kept in {out}: run the same command again to go on"
-        ) from stop
-    except OSError as fault:
-        raise AppError(
-            f"{out}: cannot be written ({fault.strerror or fault}); {what()} kept: "
-            "make room and run the same command again to go on"
-        ) from fault
+class Journal(Store[dict, dict]):
+    """Results by digest, a JSON line each.
 
+    inputs: returns what a new result depends on, by its digest. A result is not kept where its
+    `keep` is False, or where it says why a point is left out.
+    """
 
-class Journal:
-    """The results so far, by digest."""
-
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, inputs: Callable[[str], Mapping[str, object]]) -> None:
         self._results: dict[str, dict] = {}
+        self._inputs = inputs
         path.touch()
         self._lines = Lines(path)
         for line in self._lines.lines:
@@ -98,15 +84,17 @@ class Journal:
     def __len__(self) -> int:
         return len(self._results)
 
-    def get(self, digest: str) -> dict | None:
-        """Return a point's result, None when it is not measured."""
-        return self._results.get(digest)
+    def get(self, name: str) -> dict | None:
+        """Return the result of a digest, None where the point is not measured."""
+        return self._results.get(name)
 
-    def add(self, digest: str, inputs: Mapping[str, object], result: dict) -> None:
+    def add(self, name: str, result: dict) -> dict:
         """Keep a result: it is on the disk when this returns. Raises OSError when it cannot be."""
-        entry = {"digest": digest, "inputs": inputs, "result": result}
-        self._lines.append(f"{json.dumps(entry, allow_nan=False)}\n".encode())
-        self._results[digest] = result
+        if result.get("keep", True) and LEFT_OUT not in result:
+            entry = {"digest": name, "inputs": self._inputs(name), "result": result}
+            self._lines.append(f"{json.dumps(entry, allow_nan=False)}\n".encode())
+            self._results[name] = result
+        return result
 
 
 @dataclass
@@ -135,7 +123,7 @@ class Study(Generic[P]):
         """
         return described(point)
 
-    def measured(self, points: Sequence[P], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[P]) -> Results:
         """Yield the result of each point of a group, in order.
 
         Raises NotApplicableError where the rest of the group cannot be measured.
@@ -152,6 +140,8 @@ class Study(Generic[P]):
 
     def words(self, point: P, result: dict) -> str:
         """Return a measured point in words."""
+        if LEFT_OUT in result:
+            return f"excluded: {self.label(point)}"
         if "failed" in result:
             return f"{self.label(point)}: {result['failed']}"
         if "psnr_db" not in result:
@@ -180,85 +170,59 @@ class Study(Generic[P]):
         Points of one digest are measured once. pool: workers that share the groups of points, where
         figures do not depend on how busy the machine is.
 
-        Raises StudyStopped at Ctrl-C, AppError when the folder cannot be written, and what the
+        Raises StoppedError at Ctrl-C, AppError when the folder cannot be written, and what the
         study does for wrong input; what is measured is kept in each case.
         """
-        points = list(dict.fromkeys(points))
-        self.results, self.left_out = {}, {}
-        digests, unfit = self._digests(points)
-        known: dict[str, dict] = {}
-        with _stopped_with_words(
-            self.folder, lambda: f"{len(known)} of {len(set(digests.values()))} {self.noun} are"
-        ):
-            journal = Journal(self.folder / self.journal)
-            missing: dict[str, P] = {}
-            for point, digest in digests.items():
-                result = journal.get(digest)
-                if result is not None:
-                    known[digest] = result
-                else:
-                    missing.setdefault(digest, point)
-            before = f", {len(known)} kept from before" if known else ""
-            watcher.begin(self.stage + before, len(missing))
-            groups: dict[Hashable, list[P]] = {}
-            for point in missing.values():
-                groups.setdefault(self.group(point), []).append(point)
-            for point, result in self._all_measured(list(groups.values()), watcher, pool):
-                if result.get("keep", True):
-                    journal.add(digests[point], self.all_inputs(point), result)
-                known[digests[point]] = result
-                watcher.step(self.words(point, result))
-        self.results = {p: known[d] for p, d in digests.items() if d in known}
-        why = {digests[point]: reason for point, reason in self.left_out.items()}
-        self.left_out = {p: why[d] for p, d in digests.items() if d in why} | unfit
-        return self.results
-
-    def _digests(self, points: Iterable[P]) -> tuple[dict[P, str], dict[P, str]]:
-        """Return the digests of the points that can be measured, and why the others cannot be."""
         digests: dict[P, str] = {}
         unfit: dict[P, str] = {}
-        for point in points:
+        for point in dict.fromkeys(points):
             try:
                 digests[point] = self.digest(point)
             except NotApplicableError as why:
                 unfit[point] = str(why)
-        return digests, unfit
+        first: dict[str, P] = {}
+        for point, digest in digests.items():
+            first.setdefault(digest, point)
 
-    def _all_measured(
-        self, groups: list[list[P]], watcher: Watcher, pool: Pool | None
-    ) -> Iterator[tuple[P, dict]]:
-        """Yield points as they are measured; leave out those that cannot be."""
-        if pool is not None:
-            for (_, group), (results, why) in pool.run(
-                _group_measured, [(self, g) for g in groups]
-            ):
-                yield from zip(group, results, strict=False)
-                if why is not None:
-                    self._leave_out(group[len(results) :], why, watcher)
-            return
-        for group in groups:
-            done = 0
-            with closing(self.measured(group, watcher)) as results:
-                try:
-                    for point, result in zip(group, results, strict=True):
-                        done += 1
-                        yield point, plain(result)
-                except NotApplicableError as why:
-                    self._leave_out(group[done:], str(why), watcher)
+        def groups(missing: Sequence[str]) -> list[list[tuple[str, P]]]:
+            found: dict[Hashable, list[tuple[str, P]]] = {}
+            for digest in missing:
+                found.setdefault(self.group(first[digest]), []).append((digest, first[digest]))
+            return list(found.values())
 
-    def _leave_out(self, points: Iterable[P], why: str, watcher: Watcher) -> None:
-        for point in points:
-            self.left_out[point] = why
-            watcher.step(f"excluded: {self.label(point)}")
+        self.results, self.left_out = {}, {}
+        with kept_words(self.folder, lambda: "what was measured is"):
+            path = self.folder / self.journal
+            journal = Journal(path, lambda digest: self.all_inputs(first[digest]))
+        known = run_job(
+            list(first),
+            groups,
+            self.measured_group,
+            journal,
+            watcher,
+            self.folder,
+            self.noun,
+            pool,
+            self.stage,
+            lambda digest, result: self.words(first[digest], result),
+        )
+        for point, digest in digests.items():
+            if LEFT_OUT in known[digest]:
+                self.left_out[point] = known[digest][LEFT_OUT]
+            else:
+                self.results[point] = known[digest]
+        self.left_out |= unfit
+        return self.results
 
-
-def _group_measured(task: tuple[Study, Sequence]) -> tuple[list[dict], str | None]:
-    """Measure a group in a worker; return its results, and why the rest of it cannot be."""
-    study, group = task
-    results: list[dict] = []
-    try:
-        with closing(study.measured(group, Silent())) as measured:
-            results.extend(map(plain, measured))
-    except NotApplicableError as why:
-        return results, str(why)
-    return results, None
+    def measured_group(
+        self, group: Sequence[tuple[str, P]]
+    ) -> Generator[tuple[str, dict], None, None]:
+        """Yield digest and result of the points of a group, or why they are left out."""
+        left = iter(group)
+        with closing(self.measured([point for _, point in group])) as results:
+            try:
+                for result in results:
+                    yield next(left)[0], plain(result)
+            except NotApplicableError as why:
+                for digest, _ in left:
+                    yield digest, {LEFT_OUT: str(why)}

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
-import json
 import os
 import platform
 import re
@@ -20,12 +18,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
-
-
-def digest_of(inputs: Mapping[str, object]) -> str:
-    """Return a digest of plain data, the same for equal content in any order of keys."""
-    text = json.dumps(inputs, sort_keys=True, allow_nan=False)
-    return hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
 
 
 def plain(result: Mapping[str, object]) -> dict:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from capture_rigs import begun, plan_and_camera, request_for, still_rig
 from simulated_disk import SimulatedDisk
+from watching import Acting
 
 from drivers.dng import encode_dng
 from drivers.errors import DriverError
@@ -32,7 +33,6 @@ from emmc_rig.acquisition.control import Control, interruptible
 from emmc_rig.acquisition.plan import Checks, Retries
 from emmc_rig.acquisition.retries import GaveUpError, Mending, mending
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
 from emmc_rig.errors import AppError
@@ -147,14 +147,13 @@ def stopped_after(count, text=SMALL):
     session, plan = started(rig, text)
     control = Control()
 
-    class Stopper(CaptureWatcher):
-        def taken(self, planned, frame, found):
-            if len(taken) + 1 == count:
-                control.stop()
-            taken.append(planned.id)
+    def stop(event):
+        if len(taken) + 1 == count:
+            control.stop()
+        taken.append(event.facts["id"])
 
     taken = []
-    outcome = Sequencer(session, plan, rig, Stopper(), control).run()
+    outcome = Sequencer(session, plan, rig, Acting(frame_taken=stop), control).run()
     assert not outcome.complete
     assert len(session.stored) == count
     return session, plan, rig, bench
@@ -297,13 +296,12 @@ def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
     rig = still_rig()
     session, plan = started(rig)
 
-    class Impatient(CaptureWatcher):
-        def step(self, name, frame):
-            if name == "expose" and frame.id == "reference-s1-white-r0":
-                raise KeyboardInterrupt
+    def stop(event):
+        if event.facts == {"id": "reference-s1-white-r0", "step": "expose"}:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Sequencer(session, plan, rig, Impatient()).run()
+        Sequencer(session, plan, rig, Acting(step=stop)).run()
     assert rig.attendant.lamp == "off"
     assert rig.stage.stops == 1
     assert session.journal.entries[-1].kind == "stopped"
@@ -359,13 +357,13 @@ def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
     session, plan = started(rig)
     pushed = []
 
-    class Clumsy(CaptureWatcher):
-        def step(self, name, frame):
-            if name == "read back" and frame.kind == "whiteboard" and not pushed:
-                rig.chain.displace(1, 1, 30.0)
-                pushed.append(frame.id)
+    def push(event):
+        frame = event.objects["planned"]
+        if event.facts["step"] == "read back" and frame.kind == "whiteboard" and not pushed:
+            rig.chain.displace(1, 1, 30.0)
+            pushed.append(frame.id)
 
-    assert Sequencer(session, plan, rig, Clumsy()).run().complete
+    assert Sequencer(session, plan, rig, Acting(step=push)).run().complete
     retry = next(iter(of_kind(session.journal.entries, RetryEntry)))
     assert retry.id == pushed[0]
     assert "off its place" in retry.fault or "home" in retry.fault
@@ -496,15 +494,15 @@ def test_the_stage_moves_on_while_a_frame_is_written():
     boards = [frame.id for frame in session.frames if frame.kind == "whiteboard"]
     last = boards[-1]
 
-    class Holding(CaptureWatcher):
-        def step(self, name, frame):
-            if name == "hand over" and frame.kind == "whiteboard":
-                moved.clear()
-            if name == "write" and frame.kind == "whiteboard" and frame.id != last:
-                moves_when_written.append(moved.wait(10))
+    def hold(event):
+        frame, step = event.objects["planned"], event.facts["step"]
+        if step == "hand over" and frame.kind == "whiteboard":
+            moved.clear()
+        if step == "write" and frame.kind == "whiteboard" and frame.id != last:
+            moves_when_written.append(moved.wait(10))
 
     rig.stage.move_to_um = moving
-    assert Sequencer(session, plan, rig, Holding()).run().complete
+    assert Sequencer(session, plan, rig, Acting(step=hold)).run().complete
     assert moves_when_written == [True] * (len(boards) - 1)
 
 
@@ -615,27 +613,23 @@ retries: {per_frame: 8, per_session: 2000}
     rng = np.random.default_rng(11)
     injected = []
 
-    class Saboteur(CaptureWatcher):
-        count = 0
+    def sabotage(event):
+        where = {
+            "move": (rig.chain.faults, STAGE_FAULTS),
+            "read back": (rig.chain.faults, ("drop_reply", "garble_reply", "unplug")),
+            "expose": (rig.still.faults, CAMERA_FAULTS),
+        }.get(event.facts["step"])
+        if where is not None and rng.random() < 0.05:
+            fault = str(rng.choice(where[1]))
+            where[0].inject(fault)
+            injected.append(fault)
 
-        def step(self, name, frame):
-            where = {
-                "move": (rig.chain.faults, STAGE_FAULTS),
-                "read back": (rig.chain.faults, ("drop_reply", "garble_reply", "unplug")),
-                "expose": (rig.still.faults, CAMERA_FAULTS),
-            }.get(name)
-            if where is not None and rng.random() < 0.05:
-                fault = str(rng.choice(where[1]))
-                where[0].inject(fault)
-                injected.append(fault)
-
-        def stored(self, frame):
-            self.count += 1
-            if self.count in (200, 1000):
-                memory.append(resident_bytes())
+    def measure(event):
+        if event.facts["done"] in (200, 1000):
+            memory.append(resident_bytes())
 
     memory = []
-    outcome = Sequencer(session, plan, rig, Saboteur()).run()
+    outcome = Sequencer(session, plan, rig, Acting(step=sabotage, frame_written=measure)).run()
     assert outcome.complete
     assert outcome.taken == 1000
     assert verify(session).is_complete

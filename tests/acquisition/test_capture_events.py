@@ -11,7 +11,7 @@ from simulated_disk import SimulatedDisk
 import emmc_rig as emmc
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.estimate import Pace, known_exposures
-from emmc_rig.acquisition.events import EventWatcher
+from emmc_rig.acquisition.events import Listener
 from emmc_rig.acquisition.metering import first_meterings
 from emmc_rig.acquisition.plan import load_plan
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -91,7 +91,7 @@ class Pausing(Control):
 def test_a_pause_holds_the_run_before_the_next_frame_and_is_journalled():
     heard, control, rig = [], Pausing(after=3, waits=2), still_rig()
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig)
-    outcome = Sequencer(session, plan, rig, EventWatcher(heard.append), control).run()
+    outcome = Sequencer(session, plan, rig, Listener(heard.append), control).run()
     assert outcome.complete
     assert control.waits == 0
     names = [event.name for event in heard]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import StopsAfter, begun, plan_and_camera, request_for
+from capture_rigs import begun, plan_and_camera, request_for, stops_after
 from simulated_disk import SimulatedDisk
 
 from drivers.errors import CameraSettingError
@@ -170,7 +170,7 @@ def test_a_capture_that_goes_on_exposes_as_it_was_decided_before(last):
     disk, control = SimulatedDisk(), Control()
     rig = rig_for(AUTO, brightness=0.05, spot=8.0)
     session, plan = begun(Path("/disk"), disk, rig, AUTO)
-    assert not Sequencer(session, plan, rig, StopsAfter(last, control), control).run().complete
+    assert not Sequencer(session, plan, rig, stops_after(last, control), control).run().complete
     # The lamp is brighter on the next day.
     rig = rig_for(AUTO, brightness=0.06, spot=9.6)
     assert Sequencer(session, plan, rig).run().complete
@@ -185,7 +185,7 @@ def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
     disk, control = SimulatedDisk(), Control()
     rig = rig_for(AUTO)
     session, plan = begun(Path("/disk"), disk, rig, AUTO)
-    Sequencer(session, plan, rig, StopsAfter("shot-0-e0-r0", control), control).run()
+    Sequencer(session, plan, rig, stops_after("shot-0-e0-r0", control), control).run()
     text = AUTO + "metering: {level: 0.35}\n"
     edited, camera = plan_and_camera(text)
     planned = planned_frames(request_for(Path("/disk"), text), rig)

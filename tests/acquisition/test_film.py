@@ -23,11 +23,11 @@ from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.film import Ring, refuse_impossible_film, room_for
 from emmc_rig.acquisition.plan import Plan, new_plan, planned_camera
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.progress import Watcher
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import DroppedEntry, FilmEntry, RetryEntry, of_kind
 from emmc_rig.session.session import Session
@@ -150,14 +150,14 @@ def test_a_frame_that_the_camera_drops_is_named_with_its_place_and_stays_dropped
     assert run.go().taken == 0
 
 
-class Acts(CaptureWatcher):
-    """Does something once a frame is taken, and hears what is told."""
+class Acts(Watcher):
+    """Does something once a frame is taken, and keeps the notes."""
 
     def __init__(self, place, act):
         self.place, self.act, self.messages = place, act, []
 
-    def taken(self, planned, frame, found):
-        if planned.film == self.place:
+    def event(self, event):
+        if event.name == "frame.taken" and event.objects["planned"].film == self.place:
             self.act()
 
     def tell(self, message):

@@ -11,10 +11,10 @@ import yaml
 from capture_rigs import begun, still_rig
 from programs import one_line, program
 from simulated_disk import SimulatedDisk
+from watching import Acting
 
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.acquisition.until import Until, stated_psnr_db
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.session_sheet import events, sheet
@@ -214,14 +214,13 @@ def test_a_stop_while_the_light_field_is_judged_keeps_what_was_taken(every, tmp_
     rig = still_rig(SIZE)
     session = Session(copy)
 
-    class Impatient(CaptureWatcher):
-        def tell(self, message):
-            if "reconstructing" in message:
-                raise KeyboardInterrupt
+    def stop(event):
+        if "reconstructing" in event.facts["text"]:
+            raise KeyboardInterrupt
 
     plan = begun(tmp_path, SimulatedDisk(), rig)[1]
     with pytest.raises(KeyboardInterrupt):
-        Sequencer(session, plan, rig, choose=Until(session, Impatient())).run()
+        Sequencer(session, plan, rig, choose=Until(session, Acting(message=stop))).run()
     again = Session(copy)
     assert again.journal.entries[-1].kind == "stopped"
     assert not of_kind(again.journal.entries, DecidedEntry)

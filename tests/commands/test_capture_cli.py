@@ -119,10 +119,12 @@ def test_a_damaged_frame_fails_the_verification_and_is_taken_again(captured, run
 KILLED_EXPORT = """
 import os, signal, sys
 from pathlib import Path
+from emmc_rig.progress import Watcher
 from emmc_rig.session.export import export_hdf5
 from emmc_rig.session.session import Session
-export_hdf5(Session(Path(sys.argv[1])), Path(sys.argv[2]),
-            on_frame=lambda frame: os.kill(os.getpid(), signal.SIGKILL))
+watcher = Watcher()
+watcher.step = lambda frame: os.kill(os.getpid(), signal.SIGKILL)
+export_hdf5(Session(Path(sys.argv[1])), Path(sys.argv[2]), watcher=watcher)
 """
 
 

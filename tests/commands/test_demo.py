@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from watching import Recorder
 
 from emmc_rig.demo import DemoSettings, run_demo
 from emmc_rig.files.cameras import find_camera
@@ -20,19 +21,6 @@ from reconstruction.methods import MethodSettings
 from reconstruction.tv import TVSettings
 
 SIZE = (96, 128)
-
-
-class Recorder:
-    """A watcher that keeps what it is shown."""
-
-    def __init__(self):
-        self.stages, self.steps = [], 0
-
-    def begin(self, stage, steps):
-        self.stages.append(stage)
-
-    def step(self, detail):
-        self.steps += 1
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +81,7 @@ def test_the_watcher_sees_every_stage_and_exposure(demo):
     _, metrics, watcher = demo
     assert watcher.stages[:3] == ["scene", "design", "capture"]
     assert list(metrics["seconds"]) == watcher.stages
-    assert watcher.steps > metrics["whiteboard_frames"] + metrics["shots"]
+    assert len(watcher.details) > metrics["whiteboard_frames"] + metrics["shots"]
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from filmed import SIZE, light_field_at, write_film
 from programs import one_line, program
+from watching import Recorder
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.films import film_of, open_film
@@ -99,9 +100,9 @@ def test_a_frame_that_was_written_and_is_gone_is_no_frame_that_could_not_be_made
 
 def exported(tmp_path, film, name):
     """Write a film; returns the folder and how many frames were shown as done."""
-    done = []
-    FORMATS[name].write_whole_film(tmp_path, replace(film, on_frame=lambda: done.append(1)))
-    return tmp_path, len(done)
+    watcher = Recorder()
+    FORMATS[name].write_whole_film(tmp_path, replace(film, watcher=watcher))
+    return tmp_path, len(watcher.details)
 
 
 def centre_codes(place):

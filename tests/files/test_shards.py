@@ -17,7 +17,8 @@ from emmc_rig.files import shards
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import StoredPsi, read_frames
 from emmc_rig.files.scenes import open_scene
-from emmc_rig.processing.reconstructing import open_frames, reconstruct_folder
+from emmc_rig.processing.captures import opened_capture
+from emmc_rig.processing.reconstructing import open_frames, reconstruct_undrawn
 from emmc_rig.store.folders import result_folder
 from reconstruction.methods import MethodSettings
 from reconstruction.settings import BlockSettings
@@ -31,9 +32,10 @@ SETTINGS = MethodSettings(
 
 def reconstructed(frames, out, **more):
     with result_folder(out, "reconstruct", resumes=True) as new:
-        return reconstruct_folder(
-            frames, new, "tv", settings=SETTINGS, truth=SCENE, pool=Here(backwards=True), **more
-        )
+        capture, pool = opened_capture(frames), Here(backwards=True)
+        return reconstruct_undrawn(
+            capture, new, "tv", settings=SETTINGS, truth=SCENE, pool=pool, **more
+        )[0]
 
 
 @pytest.fixture

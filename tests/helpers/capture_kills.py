@@ -19,9 +19,9 @@ from capture_rigs import begun, plan_and_camera, still_rig
 from emmc_rig.acquisition import writer
 from emmc_rig.acquisition.between import Between
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model import files
+from emmc_rig.progress import Watcher
 from emmc_rig.session import journal, lock, session
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
@@ -48,36 +48,28 @@ def hook(rig, frame, note):
 WATCHED = frozenset(module.__file__ for module in (files, lines, journal, lock, session, writer))
 
 
-class Countdown(CaptureWatcher):
+class Countdown(Watcher):
     """Counts events, and kills the process at one of them."""
 
     def __init__(self, number):
         self.number, self.count = number, 0
 
-    def event(self):
+    def count_down(self):
         self.count += 1
         if self.count == self.number:
             os.kill(os.getpid(), signal.SIGKILL)
-
-    def step(self, name, frame):
-        self.event()
 
 
 class Steps(Countdown):
     """Counts the steps of the sequence, and their ends."""
 
-    def taken(self, planned, frame, found):
-        self.event()
-
-    def stored(self, frame):
-        self.event()
+    def event(self, event):
+        if event.name in ("step", "frame.taken", "frame.written"):
+            self.count_down()
 
 
 class Lines(Countdown):
     """Counts lines of the code that stores."""
-
-    def step(self, name, frame):
-        pass
 
     def watch(self):
         threading.settrace(self._trace)
@@ -87,7 +79,7 @@ class Lines(Countdown):
         if frame.f_code.co_filename not in WATCHED:
             return None
         if event == "line":
-            self.event()
+            self.count_down()
         return self._trace
 
 

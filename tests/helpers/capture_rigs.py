@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import yaml
+from watching import Acting
 
 from drivers.camera import CameraIdentity, RawFileCamera
 from drivers.dng import encode_dng
 from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.plan import Plan, planned_camera
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.bench.hardware import Rig
 from simulators.clock import ManualClock
 from simulators.still import StillStage
@@ -107,15 +107,9 @@ class QuietAttendant:
         return [one[1] for one in self.asked if one[0] == "lamp"][-1]
 
 
-class StopsAfter(CaptureWatcher):
-    """Stops a capture once a frame is taken."""
-
-    def __init__(self, frame_id, control):
-        self.frame_id, self.control = frame_id, control
-
-    def taken(self, planned, frame, found):
-        if planned.id == self.frame_id:
-            self.control.stop()
+def stops_after(frame_id, control):
+    """Return a watcher that stops a capture once a frame is taken."""
+    return Acting(frame_taken=lambda event: event.facts["id"] == frame_id and control.stop())
 
 
 def still_rig(size=SIZE) -> Any:

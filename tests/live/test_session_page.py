@@ -23,6 +23,7 @@ from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
+from emmc_rig.progress import Event
 from emmc_rig.session.session import Session
 
 PLAN = {
@@ -57,9 +58,11 @@ class Acting(SessionPage):
         self.todo = list(actions)
         self.reasons = []
 
-    def paused(self, reason):
-        super().paused(reason)
-        self.reasons.append(reason)
+    def event(self, event):
+        super().event(event)
+        if event.name != "pause":
+            return
+        self.reasons.append(event.facts["reason"])
         if self.todo:
             self.todo.pop(0)(self)
         else:
@@ -133,8 +136,8 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
     shown = threading.Event()
 
     class Waiting(Acting):
-        def light_field(self, shots, result):
-            super().light_field(shots, result)
+        def _show_result(self, shots, result):
+            super()._show_result(shots, result)
             if len(shots) == 2:
                 shown.set()
 
@@ -201,7 +204,8 @@ class Answering(SessionPage):
         self.asks = []
 
     def ask(self, what):
-        self.asked(what)
+        asks = {"asked": what}
+        self.event(Event("pause", {"reason": what}, asks))
         asked = self.state()["asked"]
         self.asks.append((asked, self.state()["last_hole"]))
         assert not self.control.answered
@@ -212,7 +216,7 @@ class Answering(SessionPage):
         else:
             self.actions["done"](asked["number"])
         self.control.until_answered()
-        self.asked("")
+        self.event(Event("resume", {"seconds": 0.0}, asks))
         assert self.state()["asked"] is None
 
 

@@ -13,6 +13,7 @@ from emmc_rig.acquisition.command import FrontEnd, capture_session
 from emmc_rig.acquisition.control import Control
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
+from emmc_rig.progress import Event
 from emmc_rig.session.session import Session
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
@@ -111,14 +112,16 @@ class Asking(SessionPage):
         super().__init__(folder, self.control, computes=False)
 
     def ask(self, what):
-        self.asked(what)
+        asks = {"asked": what}
+        self.event(Event("pause", {"reason": what}, asks))
         self.wishes.put(self.state()["asked"])
         self.control.until_answered()
-        self.asked("")
+        self.event(Event("resume", {"seconds": 0.0}, asks))
 
-    def paused(self, reason):
-        super().paused(reason)
-        self.wishes.put(None)
+    def event(self, event):
+        super().event(event)
+        if event.name == "pause" and not event.objects:
+            self.wishes.put(None)
 
 
 @pytest.mark.slow

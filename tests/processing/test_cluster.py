@@ -20,9 +20,10 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.processing import block_tasks
 from emmc_rig.processing import pool as pools
 from emmc_rig.processing.block_tasks import BlockJob, BlockTask
+from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.pool import WorkersError, opened_pool
-from emmc_rig.processing.reconstructing import reconstruct_folder
-from emmc_rig.progress import Silent
+from emmc_rig.processing.reconstructing import reconstruct_undrawn
+from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import result_folder
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.stability_run import run_stability
@@ -83,11 +84,12 @@ def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
     with opened_pool(1, cluster.scheduler_address) as pool:
         assert pool.size == 2
         with result_folder(tmp_path / "there", "reconstruct", resumes=True) as new:
-            metrics = reconstruct_folder(frames, new, "tv", settings=SETTINGS, pool=pool)
+            capture = opened_capture(frames)
+            metrics, _ = reconstruct_undrawn(capture, new, "tv", settings=SETTINGS, pool=pool)
     assert metrics["blocks"] == [2, 3]
     assert numba.get_num_threads() == threads
     with opened_pool(1) as pool, result_folder(tmp_path / "here", "reconstruct") as new:
-        reconstruct_folder(frames, new, "tv", settings=SETTINGS, pool=pool)
+        reconstruct_undrawn(opened_capture(frames), new, "tv", settings=SETTINGS, pool=pool)
     there, here = ((tmp_path / at / "light_field.h5").read_bytes() for at in ("there", "here"))
     assert there == here
 
@@ -98,7 +100,7 @@ def test_a_cluster_shares_the_trials_of_a_sweep(cluster, tmp_path, monkeypatch):
     chosen = stability_settings(True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",))
     monkeypatch.setattr(stability_run, "_write", lambda *_: None)
     ran = [
-        run_stability(chosen, tmp_path / name, Silent(), cluster=address).curves
+        run_stability(chosen, tmp_path / name, Watcher(), cluster=address).curves
         for name, address in (("here", None), ("there", cluster.scheduler_address))
     ]
     for here, there in zip(*ran, strict=True):

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from pools import Here, Posting, children
 from programs import one_line, program
+from watching import Recorder
 
 import emmc_rig as emmc
 from emmc_rig.errors import AppError, StoppedError
@@ -118,12 +119,8 @@ def changed_frames(monkeypatch, change):
     monkeypatch.setattr(filming, "film_frames", frames)
 
 
-def kill_after(frames):
-    def on_step(progress):
-        if progress.step == frames:
-            raise KilledError
-
-    return on_step
+def kill():
+    raise KilledError
 
 
 def test_every_frame_has_its_result_at_its_time(session, whole):
@@ -153,15 +150,15 @@ def test_a_film_is_exported_as_one_page(whole, run):
 
 @pytest.mark.parametrize("done", [4, FRAMES])
 def test_after_a_kill_the_same_command_goes_on_to_the_same_bytes(session, whole, tmp_path, done):
-    out, notes = tmp_path / "out", []
+    out, watcher = tmp_path / "out", Recorder()
     with pytest.raises(KilledError):
-        reconstructed(session, out, METHOD, on_step=kill_after(done))
+        reconstructed(session, out, METHOD, watcher=Recorder(done, kill))
     assert not (out / "metrics.json").exists()
     kept = out / ".emmc-rig.partial/kept/frames"
     before = {path: path.stat().st_mtime_ns for path in kept.rglob("light_field.h5")}
     assert len(before) == done
-    reconstructed(session, out, METHOD, on_note=notes.append)
-    assert notes == [f"goes on with an earlier run; frames done: {done}"]
+    reconstructed(session, out, METHOD, watcher=watcher)
+    assert watcher.notes == [f"goes on with an earlier run; frames done: {done}"]
     after = {path.stat().st_mtime_ns for path in out.rglob("light_field.h5")}
     assert set(before.values()) < after or done == FRAMES
     assert content(out) == content(whole)
@@ -198,22 +195,22 @@ def test_a_frame_after_which_nothing_was_noted_is_made_again(
     [
         (None, "starts anew"),  # of other settings
         ("next-000.npz", "goes on with an earlier run; frames done"),
-        ("scale.npz", "starts anew"),
+        ("calibration.h5", "starts anew"),
         ("psi.h5", "starts anew"),
     ],
 )
 def test_what_an_earlier_run_left_damaged_or_of_another_film_is_not_gone_on_from(
     session, whole, tmp_path, damaged, note
 ):
-    out, notes = tmp_path / "out", []
+    out, watcher = tmp_path / "out", Recorder()
     other = MethodSettings(screening=damaged is not None)
     with pytest.raises(KilledError):
-        reconstructed(session, out, METHOD, settings=other, on_step=kill_after(1))
+        reconstructed(session, out, METHOD, settings=other, watcher=Recorder(1, kill))
     if damaged is not None:
         path = out / ".emmc-rig.partial/kept" / damaged
         path.write_bytes(path.read_bytes()[:-1000])
-    reconstructed(session, out, METHOD, on_note=notes.append)
-    assert [one.split(":")[0] for one in notes] == [note]
+    reconstructed(session, out, METHOD, watcher=watcher)
+    assert [note.split(":")[0] for note in watcher.notes] == [note]
     assert content(out) == content(whole)
 
 
@@ -234,11 +231,11 @@ def test_killed_by_the_system_the_same_command_goes_on_to_the_same_bytes(session
 
 
 def test_ctrl_c_says_that_frames_are_kept(session, tmp_path):
-    def stop(progress):
+    def stop():
         raise KeyboardInterrupt
 
-    with pytest.raises(StoppedError, match="frames that are done are kept in"):
-        reconstructed(session, tmp_path / "out", METHOD, on_step=stop)
+    with pytest.raises(StoppedError, match="1 of 6 frames are kept in"):
+        reconstructed(session, tmp_path / "out", METHOD, watcher=Recorder(1, stop))
 
 
 def test_a_missing_frame_keeps_its_place_and_the_next_goes_on_from_the_one_before(
@@ -353,7 +350,7 @@ def test_workers_do_segments_in_any_order_to_the_same_bytes(session, in_two, tmp
 def test_killed_within_the_second_segment_each_goes_on_where_it_was(
     session, in_two, tmp_path, monkeypatch
 ):
-    out, saved, notes = tmp_path / "out", filming.Latest.saved, []
+    out, saved, watcher = tmp_path / "out", filming.Latest.saved, Recorder()
 
     def killed(latest, *given):
         if latest.place == 5:
@@ -367,8 +364,8 @@ def test_killed_within_the_second_segment_each_goes_on_where_it_was(
     kept = out / ".emmc-rig.partial/kept/frames"
     assert sorted(path.name for path in kept.iterdir()) == ["000004", "000005"]
     before = (kept / "000004/light_field.h5").stat().st_mtime_ns
-    shared(session, out, Here(), monkeypatch, on_note=notes.append)
-    assert notes == ["goes on with an earlier run; frames done: 2"]
+    shared(session, out, Here(), monkeypatch, watcher=watcher)
+    assert watcher.notes == ["goes on with an earlier run; frames done: 2"]
     assert (out / "frames/000004/light_field.h5").stat().st_mtime_ns == before
     assert content(out) == content(in_two)
 
@@ -406,9 +403,9 @@ def test_a_cluster_does_segments_to_the_bytes_of_this_machine(session, in_two, t
 
 
 def test_workers_that_one_segment_leaves_idle_are_named_with_what_to_set(session, whole, tmp_path):
-    notes = []
-    reconstructed(session, tmp_path / "out", METHOD, workers=2, on_note=notes.append)
-    assert ["film: {segment: 50}" in note for note in notes] == [True]
+    watcher = Recorder()
+    reconstructed(session, tmp_path / "out", METHOD, workers=2, watcher=watcher)
+    assert ["film: {segment: 50}" in note for note in watcher.notes] == [True]
     assert content(tmp_path / "out") == content(whole)
 
 

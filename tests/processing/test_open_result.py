@@ -16,7 +16,8 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.exports import open_export
 from emmc_rig.files.films import open_film
 from emmc_rig.files.results import write_metrics
-from emmc_rig.processing.reconstructing import reconstruct_folder
+from emmc_rig.processing.captures import opened_capture
+from emmc_rig.processing.reconstructing import reconstruct_undrawn
 from emmc_rig.store.folders import result_folder
 from reconstruction.verdict.rules import Verdict
 
@@ -121,7 +122,8 @@ def test_what_the_command_wrote_opens_with_the_psi_beside_its_frames(frames, tmp
     source = tmp_path / "frames"
     shutil.copytree(frames, source)
     (tmp_path / "out").mkdir()
-    metrics = reconstruct_folder(source, tmp_path / "out", "tv", truth="deep-occlusions")
+    capture = opened_capture(source)
+    metrics, _ = reconstruct_undrawn(capture, tmp_path / "out", "tv", truth="deep-occlusions")
     opened = emmc.open_result(tmp_path / "out")
     assert opened.metrics()["psnr_db"] == metrics["psnr_db"]
     assert opened.verdict.level == metrics["verdict"]["level"]

@@ -16,9 +16,9 @@ from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.reconstructing import (
     load_settings,
     reconstruct_captures,
-    reconstruct_folder,
 )
 from emmc_rig.processing.result import Result
+from emmc_rig.progress import Watcher
 from reconstruction.adaptive.joint import TextureSettings
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.dictionary import Dictionary
@@ -34,9 +34,20 @@ def frames(tmp_path_factory):
     return folder
 
 
+def reconstructed(folder, out, method, **given):
+    """Return the metrics of a folder's frames, reconstructed as the command does."""
+    places = [(opened_capture(folder), out)]
+    ((_, outcome),) = reconstruct_captures(
+        places, None, None, None, Watcher(), method=method, **given
+    )
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
+
+
 @pytest.mark.parametrize(("method", "dictionary"), [("tv", None), ("dict-omp", "dct")])
 def test_frames_become_a_light_field_with_a_page_and_metrics(frames, tmp_path, method, dictionary):
-    metrics = reconstruct_folder(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
+    metrics = reconstructed(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
     light_field = load_hdf5(tmp_path / "light_field.h5")
     assert light_field.shape == (5, 5, *SIZE, 3)
     assert metrics["method"] == method
@@ -53,11 +64,11 @@ def test_a_result_is_on_the_disk_before_its_page_is_drawn(frames, tmp_path, monk
     monkeypatch.setattr(Result, "draw", stopped)
     places = [(opened_capture(frames), out)]
     with pytest.raises(KeyboardInterrupt):
-        list(reconstruct_captures(places, None, None, None, print, method="tv"))
+        list(reconstruct_captures(places, None, None, None, Watcher(), method="tv"))
     assert load_hdf5(out / "light_field.h5").shape == (5, 5, *SIZE, 3)
     assert json.loads((out / "metrics.json").read_text())["method"] == "tv"
     monkeypatch.undo()
-    ((_, metrics),) = reconstruct_captures(places, None, None, None, print, method="tv")
+    ((_, metrics),) = reconstruct_captures(places, None, None, None, Watcher(), method="tv")
     assert not isinstance(metrics, Exception)
     assert metrics["method"] == "tv"
     assert (out / "report.html").is_file()
@@ -76,7 +87,7 @@ def test_the_noise_level_is_that_of_the_usable_pixels(frames):
 
 def test_folders_that_hold_no_capture_are_refused(frames, tmp_path):
     with pytest.raises(AppError, match=r"holds no frames\.h5"):
-        reconstruct_folder(tmp_path, tmp_path, "tv")
+        reconstructed(tmp_path, tmp_path / "out", "tv")
     whole = (frames / "frames.h5").read_bytes()
     (tmp_path / "frames.h5").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(AppError, match="cannot be read"):
@@ -120,12 +131,14 @@ def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):
     atoms = np.random.default_rng(0).normal(size=(10, 3, 3, 9, 9, 3))
     Dictionary.normalised(atoms, "ksvd").save(tmp_path / "small.h5")
     with pytest.raises(DictionaryError, match="3x3 views"):
-        reconstruct_folder(frames, tmp_path, "dict-omp", dictionary_spec=str(tmp_path / "small.h5"))
+        reconstructed(
+            frames, tmp_path / "out", "dict-omp", dictionary_spec=str(tmp_path / "small.h5")
+        )
 
 
 def test_a_misspelt_method_is_reported_first(tmp_path):
     with pytest.raises(ReconstructionError, match="did you mean 'tv'"):
-        reconstruct_folder(tmp_path, tmp_path, "tvv")
+        reconstructed(tmp_path, tmp_path / "out", "tvv")
 
 
 @pytest.mark.slow
@@ -133,7 +146,7 @@ def test_the_adaptive_method_writes_what_it_found_beside_the_light_field(frames,
     settings = load_settings(None).model_copy(
         update={"adaptive": AdaptiveSettings(texture=TextureSettings(steps=3, refine_steps=1))}
     )
-    metrics = reconstruct_folder(frames, tmp_path, "adaptive", settings=settings, truth=SCENE)
+    metrics = reconstructed(frames, tmp_path, "adaptive", settings=settings, truth=SCENE)
     assert metrics["psnr_db"] > 12
     with h5py.File(tmp_path / "maps.h5") as file:
         shapes = {name: values.shape for name, values in file.items()}

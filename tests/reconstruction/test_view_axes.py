@@ -26,8 +26,9 @@ from emmc_rig.pages.page import light_field_head
 from emmc_rig.pages.report import ReportContent, render
 from emmc_rig.pages.result_figure import draw_results
 from emmc_rig.pages.viewer import render_viewer, viewer_data
+from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.pool import opened_pool
-from emmc_rig.processing.reconstructing import reconstruct_folder
+from emmc_rig.processing.reconstructing import reconstruct_undrawn
 from reconstruction.methods import MethodSettings
 from reconstruction.preview import Preview
 
@@ -379,9 +380,9 @@ def test_blocks_of_a_capture_of_bands_are_kept_as_bands(tmp_path, as_zarr):
     settings = MethodSettings.model_validate({"blocks": {"side": 32, "whole": 32 * 32}})
     (tmp_path / "out").mkdir()
     with opened_pool(1) as pool:
-        metrics = reconstruct_folder(
-            tmp_path, tmp_path / "out", "adaptive-fast", settings=settings, pool=pool,
-            as_zarr=as_zarr,
+        metrics, _ = reconstruct_undrawn(
+            opened_capture(tmp_path), tmp_path / "out", "adaptive-fast", settings=settings,
+            pool=pool, as_zarr=as_zarr,
         )  # fmt: skip
     assert metrics["view_axes"] == list(BANDS)
     assert metrics["blocks"] == [1, 2]

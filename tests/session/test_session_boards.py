@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_rigs import SIZE, PreparedCamera, StopsAfter, begun, still_rig
+from capture_rigs import SIZE, PreparedCamera, begun, still_rig, stops_after
 from simulated_disk import SimulatedDisk
 
 from emmc_rig.acquisition.control import Control
@@ -66,7 +66,7 @@ def captured(boards, stopped_after=None):
 
     session, plan = begun(Path("/disk"), disk, rig(), PLAN + boards)
     if stopped_after:
-        watcher = StopsAfter(stopped_after, control)
+        watcher = stops_after(stopped_after, control)
         assert not Sequencer(session, plan, rig(), watcher, control).run().complete
         session = Session(session.folder, disk)
     assert Sequencer(session, plan, rig()).run().complete

@@ -29,9 +29,9 @@ from drivers.raw import RawFrame
 from emmc_rig.acquisition.amend import amendment
 from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.sequencer import Sequencer
-from emmc_rig.acquisition.watcher import CaptureWatcher
 from emmc_rig.errors import AppError
 from emmc_rig.model.files import SYSTEM_DISK, part_of, write_whole
+from emmc_rig.progress import Watcher
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import (
     FrameEntry,
@@ -50,14 +50,15 @@ from emmc_rig.session.verify import verify
 ROOT = Path("/disk")
 
 
-class Promised(CaptureWatcher):
+class Promised(Watcher):
     """Keeps the frames that the program said are safe."""
 
     def __init__(self):
         self.frames = []
 
-    def stored(self, frame):
-        self.frames.append(frame.id)
+    def event(self, event):
+        if event.name == "frame.written":
+            self.frames.append(event.facts["id"])
 
 
 def run_on(disk, folder=ROOT, watcher=None):

@@ -11,7 +11,7 @@ from view_files import save_views
 
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
-from emmc_rig.progress import Silent
+from emmc_rig.progress import Watcher
 from emmc_rig.study.chart import chart_points, measure
 from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings
 from emmc_rig.study.chart.charting import COLUMNS, run_chart
@@ -52,7 +52,7 @@ def test_a_chart_holds_every_point(quick, tmp_path):
     measured_scene = tmp_path / "shed"
     save_views(measured_scene, render("near-planar", size=(30, 36)).light_field)
     chosen = settings(scenes=["dark", str(measured_scene)])
-    outcome = run_chart(chosen, tmp_path / "out", Silent())
+    outcome = run_chart(chosen, tmp_path / "out", Watcher())
     folder = tmp_path / "out"
     assert [chart.scene for chart in outcome.charts] == ["all scenes", "dark", "shed"]
     with open(folder / "chart.csv", newline="") as file:
@@ -98,7 +98,7 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
 
     monkeypatch.setattr(measure, "measured", full)
     with pytest.raises(AppError, match=r"nothing could be measured: .*not enough memory"):
-        run_chart(settings(), tmp_path / "out", Silent())
+        run_chart(settings(), tmp_path / "out", Watcher())
     assert not (tmp_path / "out" / ChartStudy.journal).read_text()
 
 
@@ -128,5 +128,5 @@ def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, report
 def test_a_real_light_field_is_charted(quick, tmp_path):
     folder = os.environ["EMMC_LIGHTFIELDS"]
     scene = next(path for path in sorted(os.scandir(folder), key=str) if path.is_dir()).path
-    outcome = run_chart(settings(scenes=[scene]), tmp_path / "out", Silent())
+    outcome = run_chart(settings(scenes=[scene]), tmp_path / "out", Watcher())
     assert np.isfinite([mark.psnr_db for mark in outcome.charts[0].marks]).all()

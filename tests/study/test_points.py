@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import pytest
 
-from emmc_rig.errors import AppError
+from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.pages.page import Head, Section, fragment, framed, number
-from emmc_rig.progress import Silent
-from emmc_rig.study.points import Journal, NotApplicableError, Study, StudyStopped, study_folder
+from emmc_rig.progress import Watcher
+from emmc_rig.study.points import Journal, NotApplicableError, Study, study_folder
 from emmc_rig.study.rows import csv_text, plain
 
 
@@ -31,7 +31,7 @@ class Squares(Study[int]):
     def group(self, point):
         return point // 10
 
-    def measured(self, points, watcher):
+    def measured(self, points):
         self.calls.append(list(points))
         for point in points:
             if point == 66:
@@ -42,8 +42,8 @@ class Squares(Study[int]):
                 yield {"square": point * point, "missing": math.inf}
 
 
-class Counted(Silent):
-    """Counts steps, and presses Ctrl-C after some."""
+class Counted(Watcher):
+    """Counts results, and presses Ctrl-C after some."""
 
     def __init__(self, patience=1000):
         self.total, self.steps, self.patience = 0, 0, patience
@@ -51,9 +51,9 @@ class Counted(Silent):
     def begin(self, stage, steps):
         self.total, self.steps = steps, 0
 
-    def step(self, detail):
-        self.steps += 1
-        if self.steps == self.patience:
+    def at(self, done, steps, detail=""):
+        self.steps, self.total = done, steps
+        if done == self.patience:
             raise KeyboardInterrupt
 
 
@@ -67,12 +67,12 @@ def test_points_are_measured_in_groups_and_recalled_in_their_order(tmp_path):
     again, watcher = Squares(None, tmp_path), Counted()
     assert again.run([1, 3, 12], watcher) == {1: results[1], 3: results[3], 12: results[12]}
     assert again.calls == []
-    assert watcher.total == 0
+    assert watcher.steps == watcher.total == 3
 
 
 def test_points_of_one_digest_are_measured_once(tmp_path):
     study = Squares(None, tmp_path)
-    results = study.run([7, 107], Silent())
+    results = study.run([7, 107], Watcher())
     assert study.calls == [[7]]
     assert results[107] == results[7]
 
@@ -88,7 +88,7 @@ def test_what_cannot_be_measured_is_left_out_and_the_others_are_not(tmp_path):
 def test_a_failure_that_may_pass_is_measured_again(tmp_path):
     for _ in range(2):
         study = Squares(None, tmp_path)
-        study.run([55, 5], Silent())
+        study.run([55, 5], Watcher())
         assert [55] in study.calls
         assert study.failures() == ["55: full"]
     assert (tmp_path / "points.jsonl").read_text().count("\n") == 1
@@ -98,44 +98,45 @@ def test_ctrl_c_says_what_is_kept_and_closes_what_measures(tmp_path):
     closed = []
 
     class Closing(Squares):
-        def measured(self, points, watcher):
+        def measured(self, points):
             try:
-                yield from super().measured(points, watcher)
+                yield from super().measured(points)
             finally:
                 closed.append(points)
 
-    with pytest.raises(StudyStopped, match="2 of 4 numbers are kept in"):
+    with pytest.raises(StoppedError, match="2 of 4 numbers are kept in"):
         Closing(None, tmp_path).run([1, 2, 3, 4], Counted(2))
     assert closed == [[1, 2, 3, 4]]
     study = Squares(None, tmp_path)
-    assert len(study.run([1, 2, 3, 4], Silent())) == 4
+    assert len(study.run([1, 2, 3, 4], Watcher())) == 4
     assert study.calls == [[3, 4]]
 
 
 def test_other_figures_of_a_point_are_another_digest(tmp_path, monkeypatch):
-    Squares(None, tmp_path).run([1], Silent())
+    Squares(None, tmp_path).run([1], Watcher())
     monkeypatch.setattr(Squares, "revision", 2)
     study = Squares(None, tmp_path)
-    study.run([1], Silent())
+    study.run([1], Watcher())
     assert study.calls == [[1]]
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
-    with pytest.raises(AppError, match="0 of 1 numbers are kept: make room"):
-        Squares(None, tmp_path / "missing").run([1], Silent())
+    with pytest.raises(AppError, match="what was measured is kept: make room"):
+        Squares(None, tmp_path / "missing").run([1], Watcher())
 
 
 def test_a_torn_line_is_ignored_and_the_next_one_stands_alone(tmp_path):
     path = tmp_path / "points.jsonl"
-    journal = Journal(path)
-    journal.add("a", {}, {"psnr_db": 1.0})
-    journal.add("b", {}, {"psnr_db": 2.0})
+    journal = Journal(path, lambda digest: {})
+    journal.add("a", {"psnr_db": 1.0})
+    journal.add("b", {"psnr_db": 2.0})
     path.write_bytes(path.read_bytes()[:-9])
-    torn = Journal(path)
+    torn = Journal(path, lambda digest: {})
     assert (torn.get("a"), torn.get("b")) == ({"psnr_db": 1.0}, None)
-    torn.add("c", {}, {"psnr_db": 3.0})
-    assert Journal(path).get("c") == {"psnr_db": 3.0}
-    assert Journal(path).get("a") == {"psnr_db": 1.0}
+    torn.add("c", {"psnr_db": 3.0})
+    again = Journal(path, lambda digest: {})
+    assert again.get("c") == {"psnr_db": 3.0}
+    assert again.get("a") == {"psnr_db": 1.0}
 
 
 def test_a_full_disk_is_reported_and_nothing_is_lost(tmp_path, monkeypatch):
@@ -144,20 +145,20 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(tmp_path, monkeypatch):
     def filling(self, *arguments):
         if len(self) == 2:
             raise OSError(28, "No space left on device")
-        add(self, *arguments)
+        return add(self, *arguments)
 
     study = Squares(None, tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(Journal, "add", filling)
         with pytest.raises(AppError, match=r"No space left.*run the same command again"):
-            study.run(range(4), Silent())
-    assert len(Journal(tmp_path / "points.jsonl")) == 2
-    assert len(study.run(range(4), Silent())) == 4
+            study.run(range(4), Watcher())
+    assert len(Journal(tmp_path / "points.jsonl", lambda digest: {})) == 2
+    assert len(study.run(range(4), Watcher())) == 4
 
 
 def test_two_runs_may_share_a_folder(tmp_path):
     one, other = (Squares(None, tmp_path) for _ in range(2))
-    assert one.run([1, 2], Silent()) == other.run([1, 2], Silent())
+    assert one.run([1, 2], Watcher()) == other.run([1, 2], Watcher())
     assert other.calls == []
 
 

@@ -9,10 +9,10 @@ from pages import Page
 from pools import Posting
 from view_files import save_views
 
+from emmc_rig.errors import StoppedError
 from emmc_rig.files.results import METRICS
-from emmc_rig.progress import Silent
+from emmc_rig.progress import Watcher
 from emmc_rig.study import trial
-from emmc_rig.study.points import StudyStopped
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.curves import (
     POOLED,
@@ -160,7 +160,7 @@ def test_a_sweep_holds_every_point(few_steps, tmp_path):
     shed = tmp_path / "shed"
     save_views(shed, render("near-planar", size=(30, 36)).light_field)
     chosen = quick(scenes=["dark", str(shed)], faults=("flicker", "disparity-range"))
-    outcome = run_stability(chosen, tmp_path / "out", Silent())
+    outcome = run_stability(chosen, tmp_path / "out", Watcher())
     folder = tmp_path / "out"
     assert outcome.curves[0].scene == POOLED
     assert any("Disparity range" in line and "shed" in line for line in outcome.left_out)
@@ -185,7 +185,7 @@ def test_a_sweep_holds_every_point(few_steps, tmp_path):
 
 
 def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp_path):
-    run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Silent())
+    run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Watcher())
     lines = (tmp_path / "out" / StabilityStudy.journal).read_text().splitlines()
     assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
 
@@ -193,7 +193,7 @@ def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp
 def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypatch, tmp_path):
     missing = replace(METHODS["dict-omp"], package="no_such_module")
     monkeypatch.setitem(METHODS, "dict-omp", missing)
-    outcome = run_stability(quick(methods=("tv", "dict-omp")), tmp_path / "out", Silent())
+    outcome = run_stability(quick(methods=("tv", "dict-omp")), tmp_path / "out", Watcher())
     assert outcome.left_out == ["dict-omp needs no_such_module: not installed"]
     assert {curve.method for curve in outcome.curves} == {"tv"}
     assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
@@ -204,7 +204,7 @@ def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undraw
     for name, pool in (("alone", None), ("shared", Posting(backwards=True))):
         (tmp_path / name).mkdir()
         sweep = StabilityStudy(chosen, tmp_path / name)
-        found.append(sweep.run(planned(chosen), Silent(), pool))
+        found.append(sweep.run(planned(chosen), Watcher(), pool))
         lines = (tmp_path / name / StabilityStudy.journal).read_text().splitlines()
         assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
     assert list(found[0]) == list(found[1])
@@ -222,15 +222,15 @@ def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path)
         return once(*arguments)
 
     monkeypatch.setattr(trial, "reconstruct", stopping)
-    with pytest.raises(StudyStopped, match="1 of 4 points are kept"):
-        run_stability(quick(), tmp_path / "out", Silent())
-    run_stability(quick(), tmp_path / "out", Silent())
+    with pytest.raises(StoppedError, match="1 of 4 points are kept"):
+        run_stability(quick(), tmp_path / "out", Watcher())
+    run_stability(quick(), tmp_path / "out", Watcher())
     assert len(calls) == 1 + 4
     kept = (tmp_path / "out" / StabilityStudy.journal).read_text()
-    run_stability(quick(), tmp_path / "out", Silent())
+    run_stability(quick(), tmp_path / "out", Watcher())
     assert len(calls) == 1 + 4
     assert (tmp_path / "out" / StabilityStudy.journal).read_text() == kept
-    run_stability(quick(seed=1), tmp_path / "out", Silent())
+    run_stability(quick(seed=1), tmp_path / "out", Watcher())
     assert len(calls) == 1 + 8
 
 
@@ -241,7 +241,7 @@ def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
         return reconstruct(name, psi, frames, *others)
 
     monkeypatch.setattr(trial, "reconstruct", failing)
-    outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Silent())
+    outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Watcher())
     (curve,) = outcome.curves
     assert curve.levels[1:] == (None, None)
     assert place_words(curve.below_best(), curve.strengths) == "1"

@@ -12,8 +12,8 @@ from programs import one_line
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
-from emmc_rig.progress import Silent
-from emmc_rig.study.rows import digest_of
+from emmc_rig.processing.jobs import digest_of
+from emmc_rig.progress import Watcher
 from emmc_rig.study.tables import paper, tables_page, tables_study
 from emmc_rig.study.tables.cells import PARTS, Cell, Setup, cells_of, chosen_parts, scenes_of
 from emmc_rig.study.tables.tables_page import COLUMNS, run_tables
@@ -173,7 +173,7 @@ def small_dictionary():
 def whole(scenes, tmp_path_factory):
     """All tables and figures of two tiny scenes."""
     folder = tmp_path_factory.mktemp("whole") / "out"
-    outcome = run_tables(scenes, folder, None, QUICK, Silent())
+    outcome = run_tables(scenes, folder, None, QUICK, Watcher())
     return folder, outcome
 
 
@@ -247,7 +247,7 @@ def test_a_second_run_does_nothing_again_and_leaves_foreign_files(whole, scenes,
     before = (folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes()
     for name in ("estimate_patches", "scored", "trial_of"):
         monkeypatch.setattr(tables_study, name, None)
-    again = run_tables(scenes, folder, None, QUICK, Silent())
+    again = run_tables(scenes, folder, None, QUICK, Watcher())
     assert again.grids == outcome.grids
     assert before == ((folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes())
     assert (folder / "mine.txt").read_text() == "keep"
@@ -261,7 +261,7 @@ def a_study(scenes, out, settings=QUICK):
 
 def test_sharing_the_coded_patches_changes_no_result(scenes, tmp_path):
     study = a_study(scenes, tmp_path / "out")
-    results = study.measure(Silent())
+    results = study.measure(Watcher())
     for method in ("dict-admm", "tv-dict"):
         cell = Cell("dragons", Setup("ii", 1, noisy=True), method)
         made, dictionary = study.trial(cell), study.dictionary(1)
@@ -336,7 +336,7 @@ def test_a_scene_too_small_or_of_other_views_is_reported_before_anything_is_meas
     ):
         save_hdf5(tmp_path / name / f"{name}.h5", views, {})
         with pytest.raises(Exception, match=why):
-            a_study(tmp_path / name, tmp_path / "out").measure(Silent())
+            a_study(tmp_path / name, tmp_path / "out").measure(Watcher())
 
 
 def test_the_middle_is_cut_to_whole_pixels():

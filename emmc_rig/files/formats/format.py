@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, picture_name, shows_parallax
+from emmc_rig.progress import Watcher
 
 Array = NDArray[np.floating]
 
@@ -46,8 +47,8 @@ class Film:
 
     rate: Hz. times_s: of every place in time, from the first. frames: by place in time, in that
     order, the folder of the result; places without one are missing. shape: of every light field,
-    (v, u, y, x, c). open_result: opens the folder of a result. on_frame: called when a frame of
-    `each` is done with.
+    (v, u, y, x, c). open_result: opens the folder of a result. watcher: gets a step for each
+    frame that is done.
     """
 
     folder: Path
@@ -56,7 +57,7 @@ class Film:
     frames: Mapping[int, Path]
     shape: tuple[int, ...]
     open_result: Callable[[str], Export]
-    on_frame: Callable[[], object] = lambda: None
+    watcher: Watcher = field(default_factory=Watcher, repr=False, compare=False)
 
     @property
     def missing(self) -> list[int]:
@@ -76,7 +77,7 @@ class Film:
         """Yield places in time with their frames, one in memory at once."""
         for place in self.frames:
             yield place, self.opened(place)
-            self.on_frame()
+            self.watcher.step()
 
 
 @dataclass(frozen=True)

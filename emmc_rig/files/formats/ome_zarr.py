@@ -44,7 +44,7 @@ def _write_film(folder: Path, film: Film) -> None:
 
     def frame(place: int) -> Array:
         planes = _planes(film.opened(place).light_field)[None]
-        film.on_frame()
+        film.watcher.step()
         return planes
 
     def lazily(place: int) -> Any:

@@ -227,7 +227,7 @@ class ChartOutcome:
 def run_chart(settings: ChartSettings, out: Path, watcher: Watcher) -> ChartOutcome:
     """Measure into a folder that outlives interruptions, and write everything.
 
-    Raises StudyStopped at Ctrl-C, AppError for wrong input and a folder that cannot be written,
+    Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
     and the errors of the layers below; what is done is kept in each case.
     """
     started = time.perf_counter()

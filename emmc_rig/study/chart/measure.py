@@ -17,7 +17,6 @@ from drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
 from emmc_rig.processing.memory import forget_peak, peak_memory_mib
-from emmc_rig.progress import Watcher
 from emmc_rig.study.chart.chart_points import ChartSettings, Point
 from emmc_rig.study.points import Results, Study
 from emmc_rig.study.rows import available_cores
@@ -111,7 +110,7 @@ class ChartStudy(Study[Point]):
         """All points are measured one after the other."""
         return None
 
-    def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[Point]) -> Results:
         """Yield the points' figures, those of one capture after the other."""
         for point in points:
             try:

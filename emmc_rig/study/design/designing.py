@@ -99,7 +99,7 @@ class Simulations(Study[tuple[str, str]]):
             "method": DEFAULT_METHOD,
         }
 
-    def measured(self, points: Sequence[tuple[str, str]], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[tuple[str, str]]) -> Results:
         """Yield the PSNR of each point: frames by the printed mask's Psi, which is calibrated."""
         for name, scene in points:
             camera = self.cameras[name]

@@ -97,7 +97,7 @@ def run_stability(
     workers: processes that share the trials; None: this one. cluster: the address of a Dask
     scheduler whose workers share them, on a disk shared with them.
 
-    Raises StudyStopped at Ctrl-C, AppError for wrong input and a folder that cannot be written,
+    Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
     and the errors of the layers below; what is done is kept in each case.
     """
     started = time.perf_counter()

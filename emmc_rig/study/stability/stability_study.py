@@ -13,7 +13,6 @@ from pydantic import Field
 
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
-from emmc_rig.progress import Watcher
 from emmc_rig.study.points import Results, Study
 from emmc_rig.study.rows import check_scene_names, check_size, described
 from emmc_rig.study.scores import angular_snr_db
@@ -126,7 +125,7 @@ class StabilityStudy(Study[Point]):
         """Return what all methods of one trial have in common."""
         return replace(point, method="")
 
-    def measured(self, points: Sequence[Point], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[Point]) -> Results:
         """Yield the methods' figures on one trial."""
         made = points[0].trial()
         for point in points:

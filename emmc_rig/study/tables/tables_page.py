@@ -137,7 +137,7 @@ def run_tables(
 
     folder_of_scenes: None takes the built-in ones. only: names with commas; None takes all.
 
-    Raises StudyStopped at Ctrl-C, AppError for wrong input and a folder that cannot be written, and
+    Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written, and
     the errors of the layers below; what is done is kept in each case.
     """
     started = time.perf_counter()

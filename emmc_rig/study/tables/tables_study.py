@@ -226,7 +226,7 @@ class TablesStudy(Study[Cell]):
         """Return what all methods on the same shots have in common."""
         return point.scene, point.setup
 
-    def measured(self, points: Sequence[Cell], watcher: Watcher) -> Results:
+    def measured(self, points: Sequence[Cell]) -> Results:
         """Yield the methods' results on the same shots; patches are coded once."""
         setup, made = points[0].setup, self.trial(points[0])
         settings = self.settings.of(setup)
