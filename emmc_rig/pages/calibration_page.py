@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +25,7 @@ from emmc_rig.pages.page import (
     data_address,
     fragment,
     framed,
+    part,
     provenance_section,
     typed,
 )
@@ -41,6 +42,10 @@ GOOD_CHI2 = 1.5
 """Validation residual, in variances of the noise, above which something is not modelled."""
 GOOD_BAD_PIXELS = 0.02
 """Share of pixels, from which on a reconstruction is doubted (`reconstruction.verdict.rules`)."""
+PSI_SHOWN = (
+    "How much of the light that an open camera gathers each pixel gets from each view, first shot: "
+    "one tile for each view. An open camera gets 1 / number of views from each."
+)
 SURE = 2.0
 """Deviations by which a parameter differs from the design before the page says so."""
 
@@ -115,7 +120,7 @@ def write_calibration_report(
     title = f"Calibration of {metrics['camera']}"
     text = framed(
         title, (), (), sections, ["calibration.css"], head=_head(outcome, metrics),
-        lead=fragment("cards.html", cards=_cards(outcome, metrics, relative_deviation)),
+        lead=part("cards", _cards(outcome, metrics, relative_deviation)),
     )  # fmt: skip
     write_text(path, text)
 
@@ -161,23 +166,22 @@ def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> lis
 
 
 def _methods(outcome: Outcome) -> str:
+    heads = (
+        "Calibration method", "Frames", "Validation residual, x noise",
+        f"Good (below {GOOD_CHI2:g})", "Residual, of the signal",
+    )  # fmt: skip
     rows = [
-        (
-            name,
-            outcome.frames[name],
-            f"{one.chi2:.2f}",
-            "yes" if one.chi2 < GOOD_CHI2 else "no",
-            f"{one.relative_error:.3%}",
-        )
-        for name, one in outcome.judged.items()
-    ]
+        (name, outcome.frames[name], f"{judged.chi2:.2f}",
+         "yes" if judged.chi2 < GOOD_CHI2 else "no", f"{judged.relative_error:.3%}")
+        for name, judged in outcome.judged.items()
+    ]  # fmt: skip
     chosen = list(outcome.judged).index(outcome.chosen)
-    return fragment("calibration_choice.html", rows=rows, chosen=chosen)
+    return part("table", heads, rows, numbers=True, chosen=chosen)
 
 
 def _listed(name: str, title: str, lines: Sequence[str]) -> list[Section]:
     """Return the section of some lines; none without any."""
-    return [Section(name, title, fragment("advice.html", lines=lines))] if lines else []
+    return [Section(name, title, part("bullets", lines))] if lines else []
 
 
 def _kinds(judged: HeldOut) -> str:
@@ -185,7 +189,7 @@ def _kinds(judged: HeldOut) -> str:
     order = sorted(judged.groups.items(), key=lambda item: -item[1])
     rows = [(name, f"{value:.2f}") for name, value in order]
     heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
-    return fragment("figures.html", heads=heads, rows=rows)
+    return part("table", heads, rows, numbers=True)
 
 
 def _fit(metrics: Mapping) -> str:
@@ -224,12 +228,12 @@ def _residuals(judged: Sequence[HeldOut]) -> str:
             "prediction,\nstandard deviations of the noise", "RdBu_r", extent=scale,
         )  # fmt: skip
         titled(axes, one.route, "pixel x")
-    return _pictures({"Residual map": figure})
+    return _drawn({"Residual map": figure})
 
 
-def _pictures(figures: Mapping[str, Figure]) -> str:
-    addresses = {name: data_address(svg_of(one), ".svg") for name, one in figures.items()}
-    return fragment("calibration_pictures.html", pictures=addresses)
+def _drawn(figures: Mapping[str, Figure]) -> str:
+    addresses = {name: data_address(svg_of(figure), ".svg") for name, figure in figures.items()}
+    return part("drawings", addresses)
 
 
 def _psi(outcome: Outcome) -> tuple[str, float]:
@@ -270,7 +274,7 @@ def _psi(outcome: Outcome) -> tuple[str, float]:
         )
         titled(axes, title, "view u")
     relative_deviation = float(np.sqrt(squares[1] / max(squares[0], 1e-30)))
-    return fragment("calibration_psi.html") + _pictures({"Psi": figure}), relative_deviation
+    return part("lead", PSI_SHOWN) + _drawn({"Psi": figure}), relative_deviation
 
 
 def _centre(view: Array) -> Array:
@@ -302,16 +306,12 @@ def _sensor(sheet_: SensorSheet) -> str:
     linearity.axhline(0, color=INK, linewidth=0.8)
     titled(linearity, "Linearity", "exposure, s")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
-    table = fragment("figures.html", heads=heads, rows=_figures(sheet_.rows()))
-    return table + _pictures({"Photon transfer curve": first, "Linearity": second})
-
-
-def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> list[tuple[str, ...]]:
-    """Return quantities with their deviations as rows of a table."""
-    return [
+    rows = [
         (name, f"{value:.5g}", "" if deviation is None else f"{deviation:.2g}", unit)
-        for name, value, deviation, unit in rows
+        for name, value, deviation, unit in sheet_.rows()
     ]
+    table = part("table", heads, rows, numbers=True)
+    return table + _drawn({"Photon transfer curve": first, "Linearity": second})
 
 
 def _provenance(metrics: Mapping) -> dict[str, str]:

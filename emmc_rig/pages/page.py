@@ -187,6 +187,12 @@ def fragment(template: str, **values: object) -> Markup:
     return Markup(ENVIRONMENT.get_template(template).render(**values).lstrip())
 
 
+def part(name: str, *given: object, **values: object) -> Markup:
+    """Return a part of all pages (a macro of parts.html), such as a table; text is escaped."""
+    parts = ENVIRONMENT.get_template("parts.html").module
+    return Markup(getattr(parts, name)(*given, **values).lstrip())
+
+
 def framed(
     title: str,
     about: Sequence[str],
@@ -210,7 +216,7 @@ def framed(
 
 def provenance_section(provenance: Mapping[str, object]) -> Section:
     """Return where everything came from."""
-    body = fragment("provenance.html", rows=provenance)
+    body = part("facts", provenance.items(), code=True)
     return Section("provenance", "Provenance", body, about="Versions, command and settings.")
 
 

@@ -26,6 +26,7 @@ from emmc_rig.pages.page import (
     data_address,
     fragment,
     framed,
+    part,
     provenance_section,
     typed,
 )
@@ -83,7 +84,7 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
         about = f"The accuracy estimated after each of {len(taken)} shots, and which came next."
         sections.append(Section("decisions", "Choice of shots", body, about=about))
     happened = list(events(session))
-    body = fragment("session_events.html", events=happened)
+    body = part("facts", happened)
     sections += [
         *_frames(session, pictures),
         Section(
@@ -96,7 +97,7 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
         **{f"SHA-256 of {name}": digest for name, digest in session.digests.items()},
     }
     sections.append(provenance_section(sources))
-    lead = fragment("cards.html", cards=_cards(session))
+    lead = part("cards", _cards(session))
     about = [_about(session)]
     return framed(
         session.header["title"],
