@@ -84,7 +84,7 @@ class Imported:
 
 @dataclass(frozen=True, eq=False)
 class _Item:
-    """A frame of a file: the row that names it, its number in the file, its pixels on the disk.
+    """A frame of a file, with the row of the file, the number of the frame and its pixels.
 
     read: returns the pixels, (y, x), of the file's own type. raw: the frame of a RAW file, without
     pixels. stated_s, time_s: exposure and time that the file states. shot, exposure_s: as in the

@@ -1,4 +1,4 @@
-"""The page to set up by: the camera behind it, and what is computed from its newest frame.
+"""The page to set up by: camera and stage behind it, and figures of the newest frame.
 
 The camera's thread takes frame after frame while somebody looks; wishes (exposure, gain) are
 carried out between two frames. Levels, mask and light field have a thread each, which takes the

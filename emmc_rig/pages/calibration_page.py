@@ -53,8 +53,8 @@ SURE = 2.0
 class _Parameter(NamedTuple):
     """How a fitted parameter is written: in units of `unit`, each `per_unit` of the fit's.
 
-    design: its value as designed, in the fit's units; None where the mask's file has another for
-    every mask. of: whose property it is, where it differs.
+    design: its value as designed, in the fit's units; None where it differs from mask to mask. of:
+    the part of the camera to blame for a difference.
     """
 
     words: str
@@ -94,7 +94,7 @@ def write_calibration_report(
 
     metrics: as `emmc_rig.calibrate` makes them.
     """
-    unwatched = [one.removeprefix("not measured: ") for one in outcome.unwatched]
+    unwatched = [text.removeprefix("not measured: ") for text in outcome.unwatched]
     psi, relative_deviation = _psi(outcome)
     chosen = outcome.judged[outcome.chosen]
     sections = [
@@ -111,7 +111,7 @@ def write_calibration_report(
         ),
     ]  # fmt: skip
     if outcome.parametric is not None:
-        about = "Where it sits and how it was made, each figure with its standard deviation."
+        about = "Placement and shape of the mask, each figure with its standard deviation."
         sections.append(Section("fit", "Mask as fitted", _fit(metrics), about=about))
     if sensor is not None:
         about = "Gain, noise and linearity after EMVA 1288."
@@ -201,33 +201,33 @@ def _fit(metrics: Mapping) -> str:
     return fragment("calibration_fit.html", fit=metrics["fit"], rows=rows, good_chi2=GOOD_CHI2)
 
 
-def _fitted(one: _Parameter, found: Mapping[str, float], undecided: bool) -> tuple[str, str, str]:
-    """Return a parameter as a row: its name, value and deviation, and what that says."""
-    value, deviation = found["value"] / one.per_unit, found["deviation"] / one.per_unit
+def _fitted(parameter: _Parameter, found: Mapping[str, float], undecided: bool) -> tuple[str, ...]:
+    """Return a parameter as a row: name, value with deviation, and their meaning."""
+    value, deviation = found["value"] / parameter.per_unit, found["deviation"] / parameter.per_unit
     digits = max(0, 1 - math.floor(math.log10(deviation))) if deviation > 0 else 2
-    written = f"{value:.{digits}f} ± {deviation:.{digits}f} {one.unit}"
+    written = f"{value:.{digits}f} ± {deviation:.{digits}f} {parameter.unit}"
     if undecided:
-        return one.words, written, "not known from these whiteboards: taken as designed"
-    if one.design is None:
-        return one.words, written, "measured; Psi has it"
-    away = abs(value - one.design / one.per_unit)
+        return parameter.words, written, "not known from these whiteboards: taken as designed"
+    if parameter.design is None:
+        return parameter.words, written, "measured; Psi has it"
+    away = abs(value - parameter.design / parameter.per_unit)
     if away <= SURE * deviation:
-        return one.words, written, "as designed, within its deviation"
-    return one.words, written, f"{one.of}, not an error: Psi has it"
+        return parameter.words, written, "as designed, within its deviation"
+    return parameter.words, written, f"{parameter.of}, not an error: Psi has it"
 
 
 def _residuals(judged: Sequence[HeldOut]) -> str:
     """Return maps (pixel_y, pixel_x) of what predictions miss, with axes and a scale."""
     figure, panels = sheet(len(judged), 7.0, 4.6, label="pixel y")
-    for axes, one in zip(panels, judged, strict=True):
-        height, width = one.residual.shape
-        small = _shrunk(one.residual, MAP_PX)
+    for axes, board in zip(panels, judged, strict=True):
+        height, width = board.residual.shape
+        small = _shrunk(board.residual, MAP_PX)
         scale = (-0.5, width - 0.5, height - 0.5, -0.5)
         drawn_map(
             axes, small, (-RESIDUAL_SCALE, RESIDUAL_SCALE), "validation whiteboard less "
             "prediction,\nstandard deviations of the noise", "RdBu_r", extent=scale,
         )  # fmt: skip
-        titled(axes, one.route, "pixel x")
+        titled(axes, board.route, "pixel x")
     return _drawn({"Residual map": figure})
 
 
@@ -250,8 +250,8 @@ def _psi(outcome: Outcome) -> tuple[str, float]:
         squares += [np.square(plane, dtype=np.float64).sum() for plane in planes]
         weights, spread = (plane.sum(axis=1) for plane in planes)
         shown = _shrunk(weights, THUMBNAIL_PX), _centre(weights), _centre(spread)
-        for found, one in zip(slices, shown, strict=True):
-            found.append(one)
+        for found, tile in zip(slices, shown, strict=True):
+            found.append(tile)
     titles = (
         "Weights, whole field",
         f"Weights, the middle {slices[1][0].shape[1]} x {slices[1][0].shape[0]} pixels",

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.frames import MeanFrame, SensorGain
 from calibration.scale import Scale
 from emmc_rig.errors import AppError, StoppedError
-from emmc_rig.files.films import FRAMES
+from emmc_rig.files.exports import FRAMES
 from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.result_files import read_metrics
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics

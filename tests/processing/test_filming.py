@@ -20,7 +20,7 @@ from programs import one_line, program
 
 import emmc_rig as emmc
 from emmc_rig.errors import AppError, StoppedError
-from emmc_rig.files.films import open_film
+from emmc_rig.files.exports import open_film
 from emmc_rig.model.arguments import ArgumentError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import load_hdf5
