@@ -1,11 +1,11 @@
-"""What a rig's file has read beside every frame: temperatures and the like, in a thread a source.
+"""Sources that are read beside every frame, such as temperatures, with a thread for each source.
 
     environment:
       - {name: lab, file: /sys/class/thermal/thermal_zone0/temp, scale: 0.001, unit: C}
       - {name: lamp, command: "owread /28.FF/temperature", unit: C}
       - {name: humidity, serial: /dev/ttyACM0, ask: "RH?\\n", unit: "%"}
 
-A source is read again and again; one that fails, or does not answer in time, holds nothing up.
+A source is read again and again; a source that fails or is late does not delay a frame.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SourceConfig(Settings):
 
     @model_validator(mode="after")
     def _one_origin(self) -> Self:
-        if sum(one is not None for one in (self.file, self.command, self.serial)) != 1:
+        if sum(origin is not None for origin in (self.file, self.command, self.serial)) != 1:
             raise ValueError("write one of file:, command: and serial:")
         return self
 
@@ -89,9 +89,9 @@ class Source:
         self._thread.join(CLOSING_S)
 
     def read(self) -> tuple[float, str]:
-        """Return the last value, and "" or why there is none; waits for none but the first.
+        """Return the last value, and "" or the reason why there is none.
 
-        For that one until its limit after the begin, however often it is read.
+        Waits for the first answer only, until `limit_s` after the begin.
         """
         config = self.config
         self._answered.wait(max(0.0, self._begun_s + config.limit_s - time.monotonic()))
@@ -114,7 +114,7 @@ class Source:
 
 def read_all(sources: Iterable[Source]) -> tuple[dict[str, float], dict[str, str]]:
     """Return by name the values of sources, and why those have none that failed."""
-    read = {one.config.name: one.read() for one in sources}
+    read = {source.config.name: source.read() for source in sources}
     values = {name: value for name, (value, fault) in read.items() if not fault}
     return values, {name: fault for name, (_, fault) in read.items() if fault}
 

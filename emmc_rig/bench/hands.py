@@ -52,7 +52,7 @@ class AskingAttendant:
         masks = f"put in the masks {names}" if names else "take all masks out"
         colour = "take any filter out" if chosen == "none" else f"put in the {chosen} filter"
         self._want("masks", masks)
-        if any(one.filter != "none" for one in self._camera.shots):
+        if any(other.filter != "none" for other in self._camera.shots):
             self._want("filter", colour)
 
     def move(self, offsets_um: Mapping[str, float]) -> None:

@@ -11,7 +11,7 @@ import hashlib
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -34,20 +34,22 @@ from drivers.transport import SerialTransport, Transport
 from drivers.u3v import open_camera as open_u3v
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
-from emmc_rig.bench.camera_config import CameraChoice, parse_camera, settings_of
-from emmc_rig.bench.environment import Source
-from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
-from emmc_rig.bench.stage_config import (
+from emmc_rig.bench.device_config import (
     AptAxisConfig,
     AptConfig,
+    CameraChoice,
     GrblConfig,
     MicroManagerConfig,
     PluginConfig,
     SerialConfig,
     ZaberConfig,
+    parse_camera,
     parse_stage,
+    settings_of,
     stage_of,
 )
+from emmc_rig.bench.environment import Source
+from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, Sensor
@@ -131,7 +133,7 @@ class Rig:
     square window, to put its edges between views; None: not known. fixed_positions_um: where
     axes are in a capture that no plan moves, as the focus. recorded_s: of a recording that is
     replayed, the exposure of each frame by its name. hands: axes that the stage has not, which the
-    attendant moves; left: such that stay where they are, as every frame wants them at one place.
+    attendant moves; left: axes among these with the same place in every frame, which nobody moves.
     sources: what is read beside every frame.
     """
 
@@ -237,10 +239,10 @@ def simulated_rig(
     """Return a rig of simulated devices, and the bench that they look at (for its truth).
 
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
-    real one lets moves and exposures take their time; by default they take none. A frame that is
-    announced by its name has its own noise, whatever was exposed before it. rays_per_view: of one
-    pixel; few are quick, and grainy beside a good sensor's noise. flaws: what is wrong with
-    it. focus_um: where a fifth axis, `focus`, has the scene sharp; None: there is none.
+    real one lets moves and exposures take their time; by default they take none. The noise of a
+    frame that is announced by name follows from the name alone. rays_per_view: of one pixel; few
+    rays are quick, and grainy beside a good sensor's noise. flaws: imperfections of the bench.
+    focus_um: place of a fifth axis, `focus`, where the scene is sharp; None: no such axis.
     fixed_positions_um: see `Rig`. fitted: with which axes and camera. Raises AppError for a size
     that the camera's RAW files cannot hold.
     """
@@ -355,12 +357,12 @@ def simulated_rig(
 
 
 def open_stages(specs: Sequence[str | Mapping[str, Any]]) -> Stage:
-    """Return one stage of all that are named, each as `open_stage` takes it; it must be closed.
+    """Return a stage that joins all stages named, see `open_stage`; it must be closed.
 
     Raises AppError, also for an axis that two of them have, or a `DriverError`.
     """
     with ExitStack() as opened:
-        stages = [opened.enter_context(open_stage(one)) for one in specs if one != NO_STAGE]
+        stages = [opened.enter_context(open_stage(spec)) for spec in specs if spec != NO_STAGE]
         if len(stages) == 1:
             combined: Stage = stages[0]
         else:
@@ -376,7 +378,7 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
     """Return the stage that `spec` names, connected; it must be closed.
 
     spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
-    `emmc_rig.bench.stage_config`, or what such a file says;
+    `emmc_rig.bench.device_config`, or what such a file says;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
     once. settings: single settings that replace those of the file.
     Raises AppError or a `DriverError`.
@@ -413,14 +415,7 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
 def _open_micromanager_stage(config: MicroManagerConfig) -> Stage:
     from drivers.micromanager import MicroManagerStage, StageSetup, load_core
 
-    setup = StageSetup(
-        config.axes,
-        config.travel_um,
-        config.homes,
-        config.speed_property,
-        config.speed_unit_um_s,
-        config.speed_um_s,
-    )
+    setup = StageSetup(**{field.name: getattr(config, field.name) for field in fields(StageSetup)})
     return MicroManagerStage(load_core(config.port), setup, SYSTEM_CLOCK, config.stage_settings())
 
 
@@ -447,11 +442,12 @@ def simulated_firmware(protocol: str, clock: Clock) -> SimulatedController:
 def probe_port(port: str) -> str:
     """Return what answers on a port, in words, "" when nothing does; nothing moves.
 
-    A port whose USB adapter states its protocol is asked in that one alone: bytes of another
-    may leave it in the middle of a message. Raises a `PortError` when it cannot be opened.
+    Where the USB adapter states the protocol, only that protocol is tried: bytes of another
+    protocol may leave the device in the middle of a message. Raises a `PortError` when it cannot be
+    opened.
     """
     device = find_port(port)
-    guesses = {one.device: guess_of(one) for one in list_serial_ports()}
+    guesses = {found.device: guess_of(found) for found in list_serial_ports()}
     guess = guesses.get(device, "")
     transport = SerialTransport(port, timeout_s=PROBE_TIMEOUT_S, flow_control=guess == "apt")
     with closing(transport):
@@ -476,9 +472,9 @@ def probe_simulated(protocol: str) -> str:
 
 def _probe_zaber(transport: Transport) -> str:
     return ", ".join(
-        f"device {one.address} (id {one.device_id}, serial number {one.serial_number}, firmware "
-        f"{one.firmware}, axes {one.axis_count})"
-        for one in find_devices(transport)
+        f"device {device.address} (id {device.device_id}, serial number {device.serial_number}, "
+        f"firmware {device.firmware}, axes {device.axis_count})"
+        for device in find_devices(transport)
     )
 
 
@@ -514,8 +510,8 @@ def _stage(config: SerialConfig, transport: Callable[[str], Transport], clock: C
                 steps_per_mm=config.steps_per_mm,
             )
         channels = {
-            name: AptAxis(transport(one.port), _actuator(one), one.destination, one.channel)
-            for name, one in config.axes.items()
+            name: AptAxis(transport(axis.port), _actuator(axis), axis.destination, axis.channel)
+            for name, axis in config.axes.items()
         }
         return AptStage(channels, clock, settings)
     except ValueError as error:
@@ -540,7 +536,7 @@ def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> 
     """Open the camera that `spec` names: a driver, a colon and its address.
 
     One of `drivers.cameras`, `simulated`, that of a plug-in, or a YAML file
-    (`emmc_rig.bench.camera_config`). `backend`: of pyusb, for a simulated bus.
+    (`emmc_rig.bench.device_config`). `backend`: of pyusb, for a simulated bus.
     Raises AppError for any other driver, or the driver's error.
     """
     choice = parse_camera(spec)
@@ -562,7 +558,7 @@ def camera_drivers() -> set[str]:
 
 
 def _options(choice: CameraChoice, driver: Any) -> tuple[Any, ...]:
-    """Return the settings of a camera's YAML file as its driver takes them, () where it has none.
+    """Return the arguments of a driver for the settings of a camera's YAML file, () for none.
 
     Raises AppError for settings that the driver does not know.
     """
@@ -584,10 +580,10 @@ def simulated_bus(clock: Clock) -> SimulatedUsb:
 SCENE_SIZE = (240, 320)
 
 
-def scene_simulator(clock: Clock, seed: int = 0) -> PtpCameraSimulator:
+def scene_simulator(clock: Clock) -> PtpCameraSimulator:
     """Return a simulated camera with a plain lens before a built-in scene."""
     sensor = Sensor(cfa="rggb")
-    noise, rng = sensor.noise, np.random.default_rng(seed)
+    noise, rng = sensor.noise, np.random.default_rng(0)
     view = open_scene("deep-occlusions", SCENE_SIZE, (1, 1)).light_field[0, 0]
     tile = cfa_tile(sensor.cfa)
     repeats = (-(-SCENE_SIZE[0] // tile.shape[0]), -(-SCENE_SIZE[1] // tile.shape[1]), 1)

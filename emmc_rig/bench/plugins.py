@@ -32,7 +32,7 @@ def open_plug_in(group: str, name: str, *arguments: object, **options: Any) -> A
     """
     entry, *others = entry_points(group=group, name=name)
     if others:
-        packages = " and ".join(_package(one) for one in (entry, *others))
+        packages = " and ".join(map(_package, (entry, *others)))
         raise AppError(f"plug-in {name} is in {packages}: uninstall all but one")
     package = f"plug-in {name} ({_package(entry)})"
     try:

@@ -47,8 +47,8 @@ def registered(now: RawFrame, then: RawFrame, longest_px: int | None = None) -> 
     longest_px: only so much of the frames' middle is compared. Frames of different sizes are not
     alike at all.
     """
-    (one, tile), (other, _) = (without_tile(frame, longest_px) for frame in (now, then))
-    found = shift_of(one, other)
+    (plane, tile), (reference, _) = (without_tile(frame, longest_px) for frame in (now, then))
+    found = shift_of(plane, reference)
     return Shift(found.x_px * tile, found.y_px * tile, found.likeness)
 
 
@@ -82,20 +82,20 @@ def shift_of(now: Plane, then: Plane) -> Shift:
     """
     if now.shape != then.shape:
         return Shift(0.0, 0.0, 0.0)
-    one, other = (image - cv2.GaussianBlur(image, (0, 0), SMOOTH_PX) for image in (now, then))
-    if not (one.any() and other.any()):
+    seen, before = (image - cv2.GaussianBlur(image, (0, 0), SMOOTH_PX) for image in (now, then))
+    if not (seen.any() and before.any()):
         return Shift(0.0, 0.0, 0.0)
-    window = cv2.createHanningWindow(one.shape[::-1], cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(other, one, window)
+    window = cv2.createHanningWindow(seen.shape[::-1], cv2.CV_32F)
+    (x, y), _ = cv2.phaseCorrelate(before, seen, window)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, MOST_STEPS, ENOUGH)
     with suppress(cv2.error):
-        _, found = cv2.findTransformECC(other, one, _moving(x, y), cv2.MOTION_TRANSLATION, stop)
+        _, found = cv2.findTransformECC(before, seen, _moving(x, y), cv2.MOTION_TRANSLATION, stop)
         finer_x, finer_y = (float(value) for value in found[:, 2])
         if np.hypot(finer_x - x, finer_y - y) <= FURTHEST_REFINED_PX:
             x, y = finer_x, finer_y
-    moved = cv2.warpAffine(other, _moving(x, y), one.shape[::-1], borderMode=cv2.BORDER_REFLECT)
-    inner = tuple(slice(n // 8, n - n // 8) for n in one.shape)
-    a, b = one[inner].ravel(), moved[inner].ravel()
+    moved = cv2.warpAffine(before, _moving(x, y), seen.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+    inner = tuple(slice(n // 8, n - n // 8) for n in seen.shape)
+    a, b = seen[inner].ravel(), moved[inner].ravel()
     spread = float(a.std() * b.std())
     likeness = float(np.mean((a - a.mean()) * (b - b.mean()))) / spread if spread else 0.0
     return Shift(float(x), float(y), likeness)

@@ -39,7 +39,7 @@ from simulators.still import StillStage
 
 SIMULATED = "simulated"
 IMPORTED = "imported"
-"""What a session has for a rig whose frames are files of another program."""
+"""Kind of rig of a session with files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
 LATER = (
     "focus_um", "fixed_positions_um", "mask", "environment", "axes", "second_stage", "hands_um",
@@ -62,8 +62,8 @@ class Mounting(Settings):
 class AnyRig(Settings):
     """What a rig's file may say of every rig.
 
-    fixed_positions_um: by axis that no plan moves, as `focus`, where it is. mask: how it was found
-    to sit, which sessions keep. environment: what is read beside every frame.
+    fixed_positions_um: positions of axes that no plan moves, such as `focus`. mask: its measured
+    mounting, which sessions keep. environment: sources that are read beside every frame.
     """
 
     renamed: ClassVar = {"stands_um": "fixed_positions_um"}
@@ -74,7 +74,7 @@ class AnyRig(Settings):
     @field_validator("environment")
     @classmethod
     def _names_once(cls, sources: tuple[SourceConfig, ...]) -> tuple[SourceConfig, ...]:
-        names = [one.name for one in sources]
+        names = [source.name for source in sources]
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"two sources are named {name}: give one another name")
@@ -94,13 +94,12 @@ class RealRig(AnyRig):
 
     stage: as `--stage` of `emmc-rig devices`, or what its YAML file says, or a list of several;
     `none` where nothing moves. Its axes are called mask_x, mask_y, aperture_x, aperture_y, as many
-    of them as there are. camera: as its `--camera`. zero_um: by axis, where the mask, or
-    the pinhole of the aperture plate, is centred; of one that a hand moves, what its micrometer
-    reads there. window_um: what aperture_x adds to that for the
-    plate's open window; window_side_um: its side, for plans that open parts of the aperture.
-    Of a recording (camera `folder:DIR`, stage `simulated`) neither has to be given.
-    by_hand: somebody is asked for what no axis moves: lamp, board, masks, pinhole; if
-    not, nothing of that changes, as in a recording that is replayed.
+    of them as there are. camera: as its `--camera`. zero_um: place of each axis that centres the
+    mask or the pinhole of the aperture plate; of an axis that a hand moves, the reading of its
+    micrometer. window_um: aperture_x of the plate's open window, from there; window_side_um: side
+    of the window, for plans that open parts of the aperture. A recording (camera `folder:DIR`,
+    stage `simulated`) needs neither. by_hand: a person is asked for everything that no axis moves:
+    lamp, board, masks, pinhole; if false nothing of these changes, as in the replay of a recording.
     """
 
     stage: StageSpec | list[StageSpec] = NO_STAGE
@@ -114,10 +113,9 @@ class RealRig(AnyRig):
 class SimulatedAxes(AnyRig):
     """Which axes a simulated rig has.
 
-    focus_um: where its focus axis, if it has one, has the scene sharp. axes: of mask_x, mask_y,
-    aperture_x and aperture_y. second_stage: those of them that a second controller moves. hands_um:
-    how far, at most, a hand that moves the others puts them off their places. usb_camera: what the
-    camera speaks.
+    focus_um: place of its focus axis where the scene is sharp; None: no such axis. axes: a subset
+    of mask_x, mask_y, aperture_x and aperture_y. second_stage: axes of a second controller.
+    hands_um: largest error of a hand that moves the other axes. usb_camera: protocol of the camera.
     """
 
     focus_um: float | None = Field(default=None, gt=0)
@@ -144,8 +142,8 @@ class SimulatedFile(SimulatedAxes):
 class ImagedRig(SimulatedAxes):
     """The simulated rig before a scene; size: rows and columns of the light field.
 
-    rays: per view and pixel; calibration to a per cent needs 1024 or more. flaws: what is
-    wrong with it, by the names of `simulators.effects`.
+    rays: per view and pixel; calibration to a per cent needs 1024 or more. flaws: imperfections, by
+    the names of `simulators.effects`.
     """
 
     scene: str
@@ -183,7 +181,7 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
         more = {name: getattr(given, name) for name in LATER}
         return _described(SIMULATED, imaged.model_copy(update=more))
     described = _described("real", validated(RealRig, read, spec, AppError))
-    found = [_stage_file(one, Path(spec).parent) for one in _several(described["stage"])]
+    found = [_stage_file(stage, Path(spec).parent) for stage in _several(described["stage"])]
     described["stage"] = found if isinstance(described["stage"], list) else found[0]
     return described
 
@@ -200,7 +198,7 @@ def _stage_file(stage: StageSpec, beside: Path) -> StageSpec:
 
 
 def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
-    """Return a rig as plain data; without what came later it reads as before there was any."""
+    """Return a rig as plain data, without later settings that have their defaults."""
     described = config.model_dump(mode="json")
     for name in LATER:
         if name in described and getattr(config, name) == type(config).model_fields[
@@ -238,8 +236,8 @@ def rig(
 
     The rest is of the simulated one. scene: what stands before its camera. size: rows and columns
     of the light field. seed: of scene and noise. rays: per view and pixel; calibration to a per
-    cent needs 1024. real_time: moves and exposures take their time. flaws: what is wrong with it,
-    by the names of `simulators.effects`. Raises AppError.
+    cent needs 1024. real_time: moves and exposures take their time. flaws: imperfections, by the
+    names of `simulators.effects`. Raises AppError.
 
     >>> import emmc_rig as emmc
     >>> emmc.rig("simulated", scene="near-planar", size=(24, 32)).description["kind"]
@@ -256,13 +254,13 @@ def rig(
 def opened_rig(description: Mapping[str, Any], camera: Camera, ask: Ask) -> Iterator[Rig]:
     """Yield the rig that a description names, its devices open; camera: as planned.
 
-    ask: tells a person what to do and returns when it is done. Raises AppError or what opening a
+    ask: shows a task to a person, and returns when it is done. Raises AppError or what opening a
     device raises.
     """
     with ExitStack() as opened:
         rig = opened.enter_context(_opened_devices(description, camera, ask))
-        read = [SourceConfig.model_validate(one) for one in description.get("environment", ())]
-        sources = tuple(opened.enter_context(Source(one)) for one in read)
+        read = map(SourceConfig.model_validate, description.get("environment", ()))
+        sources = tuple(opened.enter_context(Source(config)) for config in read)
         yield replace(rig, sources=sources)
 
 

@@ -73,9 +73,8 @@ def conform(
 
 def _suites(device: str) -> list[str]:
     """Return the test suites of a device's name; raises AppError for an unknown name."""
-    from emmc_rig.bench.camera_config import DRIVER_KEYS
+    from emmc_rig.bench.device_config import DRIVER_KEYS, stage_protocols
     from emmc_rig.bench.hardware import camera_drivers
-    from emmc_rig.bench.stage_config import stage_protocols
     from emmc_rig.model.reading import read_yaml
 
     if device.endswith((".yaml", ".yml")):

@@ -54,8 +54,8 @@ def list_devices(rig: RigOption = None) -> None:
     from drivers.ports import guess_of, holder_of, list_serial_ports
 
     if rig is not None:
+        from emmc_rig.bench.device_config import PROTOCOLS
         from emmc_rig.bench.hardware import simulated_bus
-        from emmc_rig.bench.stage_config import PROTOCOLS
 
         simulated_protocol(rig)
         _list_cameras(simulated_bus(SYSTEM_CLOCK))

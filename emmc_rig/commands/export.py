@@ -46,8 +46,7 @@ def export(
     ] = None,
 ) -> None:
     """Export a light field or Psi to other programs, or as a viewer."""
-    from emmc_rig.files.exports import open_export
-    from emmc_rig.files.films import film_of
+    from emmc_rig.files.exports import film_of, open_export
     from emmc_rig.files.formats.registry import ALIASES, FORMATS
     from emmc_rig.files.result_files import holds_light_field
     from emmc_rig.files.results import parse_size, shown_bytes, write_metrics

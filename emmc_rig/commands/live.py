@@ -82,7 +82,6 @@ def live(
         names_of,
         new_token,
     )
-    from emmc_rig.live.setup_page import SetupPage
 
     if rig is not None and (camera or stage):
         raise typer.BadParameter("name either --rig, or --camera and --stage")
@@ -113,10 +112,8 @@ def live(
             webbrowser.open(found)
         watch.start()
         try:
-            words = ("emmc-rig", "capture", str(plan), "--rig", rig or "")
-            following = shlex.join(words) if plan and rig else ""
-            page, to_act = SetupPage(watch, following), "start `emmc-rig live` without --read-only"
-            Server(application(page, token, read_only, hosts, to_act)).run(sockets=[listening])
+            to_act = "start `emmc-rig live` without --read-only"
+            Server(application(watch, token, read_only, hosts, to_act)).run(sockets=[listening])
         except KeyboardInterrupt:
             tell("ended; the stage does not move")
 
@@ -143,6 +140,8 @@ def _watch(
 
     described, scale = find_camera(design), _scale(psi)
     files = Files(plan, None if rig is None or rig == SIMULATED else Path(rig))
+    words = ("emmc-rig", "capture", str(plan), "--rig", rig or "")
+    following = shlex.join(words) if plan and rig else ""
     if plan is not None:
         load_plan(plan)
     with ExitStack() as stack:
@@ -166,7 +165,9 @@ def _watch(
                 centre_um["aperture_x"] += opened.window_um
             field = _light_field(psi, scale, method, described, opened.camera.shape)
             moved = opened.stage if opened.stage.axes else None
-            watch = Watch(opened.camera, moved, look, targets, centre_um, described, field, files)
+            watch = Watch(
+                opened.camera, moved, look, targets, centre_um, described, field, files, following
+            )
         else:
             try:
                 device = stack.enter_context(closing(open_camera(camera or "ptp:")))
@@ -174,7 +175,7 @@ def _watch(
                 raise AppError(f"{fault}; to look around without one: --rig simulated") from fault
             driven = stack.enter_context(open_stage(stage)) if stage is not None else None
             field = _light_field(psi, scale, method, described, device.shape)
-            watch = Watch(device, driven, design=described, light_field=field, files=files)
+            watch = Watch(device, driven, design=described, light_field=field, saved=files)
         stack.callback(watch.close)
         yield watch
 

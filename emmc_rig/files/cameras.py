@@ -64,7 +64,7 @@ def _plain(described: Any) -> Any:
     if isinstance(described, Mapping):
         return {key: _plain(value) for key, value in described.items()}
     if isinstance(described, (list, tuple)):
-        return [_plain(one) for one in described]
+        return [_plain(value) for value in described]
     return described
 
 

@@ -38,7 +38,7 @@ class StoredPsi(PsiLayout):
     """Psi in a file or a Zarr group, of which a window is read at a time.
 
     In a group a shard holds all views of SHARD x SHARD samples. The colour map is read with a
-    window. The checksum is not verified, which would need all of it: `verify` does. Raises
+    window. The checksum is verified by `verify` alone, which reads the whole file. Raises
     SensingError when there is no imaging matrix.
     """
 
@@ -81,7 +81,7 @@ class StoredPsi(PsiLayout):
         return ImagingMatrix(weights, colour, self.binning, self.camera_json, self.view_axes)
 
     def _whole(self, values: NDArray) -> NDArray:
-        """Return values that were read, after a check that no shard of them is missing."""
+        """Return the values; raises SensingError where a shard is missing."""
         return whole(values, self._path, SensingError, AGAIN) if self._sharded else values
 
     @contextmanager

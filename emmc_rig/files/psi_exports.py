@@ -55,7 +55,7 @@ def write_mat(folder: Path, psi: ImagingMatrix, frames: Frames | None) -> None:
         {
             "Psi": matrix,
             **layout,
-            **{name: one.reshape(-1, 1).astype(float) for name, one in columns.items()},
+            **{name: values.reshape(-1, 1).astype(float) for name, values in columns.items()},
         },
         do_compression=True,
     )

@@ -61,7 +61,7 @@ def result_in(folder: Path) -> Path:
         return place
     refuse_missing(folder, "name the folder of a result, or a session")
     if (place / "frames").is_dir() and (place / METRICS).is_file():
-        raise AppError(f"{place}: a film; open one of its frames, such as {place}/frames/000000")
+        raise AppError(f"{place}: a film; open a frame of it, such as {place}/frames/000000")
     if is_session(folder):
         raise AppError(f"{folder}: not reconstructed yet", "reconstruct", folder)
     if holds_frames(folder):

@@ -117,7 +117,7 @@ def save_frames(path: Path, frames: Frames, **more: NDArray) -> None:
 def provenance(settings: Settings | None = None) -> dict[str, object]:
     """Return what makes a figure again: command, versions, commit of a checkout, threads.
 
-    settings: only those that are not default are stated. Threads are those of compiled kernels.
+    settings: only values other than the defaults are listed. Threads are those of compiled kernels.
     """
     known: dict[str, object] = {"command": command_line(), "versions": versions()}
     if commit := _commit():

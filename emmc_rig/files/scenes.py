@@ -40,7 +40,7 @@ BY_PARALLAX = "@by-parallax"
 
 @dataclass(frozen=True)
 class Scene:
-    """A light field (v, u, y, x, 3), where it came from, and its disparity where that is known.
+    """A light field (v, u, y, x, 3) with its origin, and its disparity if known.
 
     `disparity_px` is (y, x), pixels per view step, of the centre view; None for measured scenes.
     NumPy takes a scene as its light field: `psi @ scene`.
@@ -105,7 +105,7 @@ def open_scene(
     Raises:
         SceneError: nothing by that name (the message lists the built-in ones), unreadable,
             or smaller than asked for.
-        ArgumentError: a spec that is none of these, a size or seed that is no number.
+        ArgumentError: a spec of another type, or a size or seed that is no number.
 
     >>> import emmc_rig as emmc
     >>> emmc.scene("near-planar", size=(24, 32))
@@ -152,8 +152,8 @@ def zoomed_scene(
 
     That makes its disparities as many times larger. size: rows and columns of what is returned;
     None takes all of a measured scene, and no zoom. change: of a built-in scene's world, see
-    `simulators.changes`. Raises what `open_scene` does, and SceneError for a measured scene that
-    is to be changed.
+    `simulators.changes`. Raises the errors of `open_scene`, and SceneError for a change of a
+    measured scene.
     """
     if spec not in SCENES:
         if change is not None:
@@ -195,7 +195,7 @@ def fine_scene(
         size: as for `open_scene`, on the coarse grid.
         views: as for `open_scene`, on the coarse grid.
         seed: as for `open_scene`.
-        time_s: when; what is known of the others is the same at any time.
+        time_s: time in a built-in scene that moves; other scenes are the same at all times.
 
     Raises:
         SceneError: as for `open_scene`, or a factor below 1.

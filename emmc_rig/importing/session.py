@@ -1,8 +1,8 @@
-"""Files of another program as a session, as if the sequencer had taken them, or not at all.
+"""Files of another program as a session, as if the sequencer had taken their frames.
 
 Everything is read and checked before anything is written; the session is then written beside its
-place, verified, and takes its name. Each frame keeps the bytes of its file, as frames of a camera
-that is not known do (see `emmc_rig.session.frame_file`); of a file of several, its first frame.
+place, verified, and takes its name. Each frame keeps the bytes of its file, as frames of an unknown
+camera do (see `emmc_rig.session.frame_file`); of a file with several frames the first one does.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import count, groupby
 from pathlib import Path
 
 import numpy as np
@@ -45,9 +45,11 @@ from emmc_rig.session.verify import verify_frames
 from emmc_rig.store.folders import refuse_inside_session
 
 KIND_ORDER = ("dark", "reference", "whiteboard", "open", "check", "turned", VALIDATION, "shot")
+OF_FIRST_SHOT = ("open", VALIDATION, "check", "turned")
+"""Kinds of whiteboards through the whole aperture."""
 TOP_DN = 65_535
 BRIGHTEST = 0.9
-"""What the brightest part of a scene is taken for where nothing states how bright white is."""
+"""Reading of the brightest part of a scene where nothing states how bright white is."""
 FAIR_NOISE = 0.01
 """Of the brightest reading, for values of an unknown unit: three published cameras of other groups
 have 0.008 to 0.01."""
@@ -55,7 +57,7 @@ PROBE = 64
 """Rows and columns at most of the Psi that says how much light a camera's masks let through."""
 FEWEST_TO_HOLD_OUT = 3
 UNIT = 1000.0
-"""Between ms and s, um and mm, which are mistaken for one another."""
+"""Ratio of s to ms, of mm to um and of um to nm: values in the wrong unit differ by it."""
 LEAST_MOVE = 50.0
 """Of a cell: nobody moves a mask or pinhole by less, but 0.02 to 2 cells in mm look like that."""
 MOST_MOVE = 500.0
@@ -74,7 +76,7 @@ FEWEST_PIXELS = 4
 
 @dataclass(frozen=True, eq=False)
 class Imported:
-    """The session, and what was assumed that no file states, a line each."""
+    """The session, and a line for each assumption where no file states the value."""
 
     session: Session
     notes: tuple[str, ...]
@@ -82,9 +84,11 @@ class Imported:
 
 @dataclass(frozen=True, eq=False)
 class _Item:
-    """One frame: its row, which of its file's frames it is, and where its pixels wait.
+    """A frame of a file, with the row of the file, the number of the frame and its pixels.
 
-    read: returns its pixels, (y, x), of the file's own type.
+    read: returns the pixels, (y, x), of the file's own type. raw: the frame of a RAW file, without
+    pixels. stated_s, time_s: exposure and time that the file states. shot, exposure_s: as in the
+    session, once all rows are known.
     """
 
     listed: Listed
@@ -94,6 +98,22 @@ class _Item:
     raw: RawFrame | None
     stated_s: float | None
     time_s: float | None
+    shot: int = 0
+    exposure_s: float = 0.0
+
+    @property
+    def is_shot(self) -> bool:
+        """Whether the frame shows the scene."""
+        return self.listed.row.kind == "shot"
+
+    @property
+    def taken_s(self) -> float | None:
+        """Time of the frame: that of the row, else of the file."""
+        return self.time_s if self.listed.row.time is None else self.listed.row.time
+
+    def error(self, text: str) -> AppError:
+        """Return an error that begins with the place of the frame's row."""
+        return AppError(f"{self.listed.where}: {text}")
 
 
 def import_session(
@@ -125,8 +145,7 @@ def import_session(
         with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
             notes: list[str] = []
             found = list(_items(listed, known, planes, Path(spool), on_file, notes))
-            items, order = _in_capture_order(found)
-            notes += order
+            items = _in_capture_order(found, notes)
             return _Import(items, known, camera, notes).write(out)
     except OSError as fault:
         why = fault.strerror or fault
@@ -147,34 +166,35 @@ def _items(
     seen: dict[object, str] = {}
     first: tuple[str, tuple[int, ...], np.dtype] | None = None
     apart = {row.path.resolve() for row in listed}
-    for one in listed:
-        name = shown_path(one.path)
-        own = read_own(one.path, one.array, apart)
+    wanted_cfa, white_dn = camera.sensor.cfa_name, camera.sensor.noise.white_level_dn
+    for row in listed:
+        name = shown_path(row.path)
+        own = read_own(row.path, row.array, apart)
         apart.update(member.resolve() for member in own.members)
         notes += own.notes
-        frames, tell = _mosaics(own, one, planes), _telling(own, camera)
-        if own.raw is not None:
-            _check_phase(own.raw, camera, name)
-        key = one.path.resolve(), one.array
+        frames, raw = _mosaics(own, name, planes), own.raw
+        if raw is not None and wanted_cfa not in (raw.cfa, "custom"):
+            raise AppError(
+                f"{name}: its colours are {raw.cfa}, the camera's sensor.cfa is {wanted_cfa}"
+            )
+        key = row.path.resolve(), row.array
         if key in seen:
-            raise AppError(f"{one.where}: {name} is there twice, also in {seen[key]}")
-        seen[key] = one.where
+            raise AppError(f"{row.where}: {name} is there twice, also in {seen[key]}")
+        seen[key] = row.where
         digest = hashlib.sha256(own.data or frames.tobytes()).hexdigest()
-        # Bytes that say nothing may be equal by right, as those of darks without noise.
-        if (digest, one.array) in seen and frames.min() != frames.max():
-            raise AppError(f"{name}: the same bytes as in {seen[digest, one.array]}; leave one out")
-        seen[digest, one.array] = name
-        _check_values(frames, name, tell)
-        kind = (
-            frames.dtype if frames.dtype.kind != "u" else np.dtype(frames.dtype.newbyteorder("="))
-        )
+        # Frames of one value throughout may be equal by right: darks without noise.
+        if (digest, row.array) in seen and frames.min() != frames.max():
+            raise AppError(f"{name}: the same bytes as in {seen[digest, row.array]}; leave one out")
+        seen[digest, row.array] = name
+        _check_values(frames, name, white_dn if raw is None else raw.white_level_dn)
+        native = np.dtype(frames.dtype.newbyteorder("=")) if frames.dtype.kind == "u" else None
+        kind = native or frames.dtype
         if first is None:
             first = name, frames.shape[1:], kind
-        if frames.shape[1:] != first[1]:
-            sizes = ["x".join(map(str, size)) for size in (frames.shape[1:], first[1])]
-            raise AppError(f"{name}: {sizes[0]} pixels (y x), and {first[0]} has {sizes[1]}")
+        size, first_size = ("x".join(map(str, pixels)) for pixels in (frames.shape[1:], first[1]))
+        if size != first_size:
+            raise AppError(f"{name}: {size} pixels (y x), and {first[0]} has {first_size}")
         if min(first[1]) < FEWEST_PIXELS:
-            size = "x".join(map(str, first[1]))
             raise AppError(f"{name}: {size} pixels (y x), fewer than a frame has")
         if kind.itemsize != first[2].itemsize or kind.kind != first[2].kind:
             raise AppError(
@@ -182,24 +202,27 @@ def _items(
                 "with the same depth"
             )
         for place, frame in enumerate(frames):
-            waiting = spool / f"{len(seen)}-{place}"
-            np.ascontiguousarray(frame).tofile(waiting)
             page = place // 3 if planes and len(frames) == 3 * len(own.frames) else place
-            yield _Item(
-                one,
-                place,
-                digest,
-                _reader(waiting, frame.dtype, frame.shape),
-                None if own.raw is None else replace(own.raw, original=b"", mosaic=frame[:0]),
-                _known(own.exposures_s[page]),
-                _known(own.times_s[page]),
+            stated_s, time_s = (
+                float(values[page]) if np.isfinite(values[page]) else None
+                for values in (own.exposures_s, own.times_s)
             )
+            read = _spooled(frame, spool / f"{len(seen)}-{place}")
+            levels = None if raw is None else replace(raw, original=b"", mosaic=frame[:0])
+            yield _Item(row, place, digest, read, levels, stated_s, time_s)
         on_file(name)
 
 
-def _in_capture_order(items: Sequence[_Item]) -> tuple[list[_Item], list[str]]:
-    """Return the frames, the files of each glob in the order of capture, and notes on the order."""
-    ordered, notes = [], []
+def _spooled(frame: NDArray, path: Path) -> Callable[[], NDArray]:
+    """Write the pixels of a frame to the disk, and return a function that reads them."""
+    np.ascontiguousarray(frame).tofile(path)
+    dtype, shape = frame.dtype, frame.shape
+    return lambda: np.fromfile(path, dtype).reshape(shape)
+
+
+def _in_capture_order(items: Sequence[_Item], notes: list[str]) -> list[_Item]:
+    """Return the frames, the files of each glob in the order of capture; add notes on the order."""
+    ordered = []
     for pattern, group in groupby(items, key=lambda item: item.listed.pattern):
         files = [list(file) for _, file in groupby(group, key=lambda item: item.listed.where)]
         if pattern:
@@ -210,26 +233,15 @@ def _in_capture_order(items: Sequence[_Item]) -> tuple[list[_Item], list[str]]:
             files = [files[place] for place in order.places]
             notes += [f"{pattern}: {note}" for note in order.notes]
         ordered += [item for file in files for item in file]
-    return ordered, notes
+    return ordered
 
 
-def _reader(path: Path, dtype: np.dtype, shape: tuple[int, ...]) -> Callable[[], NDArray]:
-    return lambda: np.fromfile(path, dtype).reshape(shape)
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _mosaics(own: OwnFrames, one: Listed, planes: bool) -> NDArray:
-    """Return frames (frame, y, x); raises AppError for colour files that are not asked for."""
+def _mosaics(own: OwnFrames, name: str, planes: bool) -> NDArray:
+    """Return frames (frame, y, x); raises AppError for colour files unless `planes` is set."""
     frames = own.frames
     if frames.ndim == 3:
         return frames
-    name = shown_path(one.path)
-    if np.array_equal(frames[..., 0], frames[..., 1]) and np.array_equal(
-        frames[..., 0], frames[..., 2]
-    ):
+    if all(np.array_equal(frames[..., 0], frames[..., c]) for c in (1, 2)):
         raise AppError(f"{name}: a grey picture in three equal colours; write it with one")
     if not planes:
         raise AppError(
@@ -239,19 +251,8 @@ def _mosaics(own: OwnFrames, one: Listed, planes: bool) -> NDArray:
     return np.moveaxis(frames, -1, 1).reshape(-1, *frames.shape[1:3])
 
 
-def _telling(own: OwnFrames, camera: Camera) -> int:
-    """Return the white level of a file in its own units: a RAW file's, or the camera's."""
-    return own.raw.white_level_dn if own.raw is not None else camera.sensor.noise.white_level_dn
-
-
-def _check_phase(raw: RawFrame, camera: Camera, name: str) -> None:
-    wanted = camera.sensor.cfa_name
-    if wanted not in (raw.cfa, "custom"):
-        raise AppError(f"{name}: its colours are {raw.cfa}, the camera's sensor.cfa is {wanted}")
-
-
 def _check_values(frames: NDArray, name: str, white_dn: int) -> None:
-    """Raise AppError for what no sensor reads out."""
+    """Raise AppError for values that no sensor reads out; white_dn: in the file's own units."""
     if frames.dtype.kind == "f" and not np.isfinite(frames).all():
         bad = int(np.count_nonzero(~np.isfinite(frames)))
         raise AppError(f"{name}: {bad} pixel(s) are no numbers (NaN or infinite); correct the file")
@@ -273,103 +274,145 @@ def _check_values(frames: NDArray, name: str, white_dn: int) -> None:
         )
 
 
+def _numbered(items: Sequence[_Item]) -> list[_Item]:
+    """Return the frames with their shots: that of the row, further frames of a file after it."""
+    unnumbered = all(item.listed.row.shot is None for item in items if item.is_shot)
+    found, following = [], count()
+    for item in items:
+        row = item.listed.row
+        if words := row.misuse():
+            raise item.error(words)
+        if not item.is_shot:
+            shot = row.shot or 0
+        elif unnumbered:
+            shot = next(following)
+        elif row.shot is None:
+            raise item.error("kind shot without a shot number, which other shots have")
+        else:
+            shot = row.shot + item.place
+        found.append(replace(item, shot=shot))
+    return found
+
+
+# Units, which nobody checks but the light of the frames and the size of the mask's cells.
+
+
+def _is_unit(ratio: float) -> bool:
+    """Return whether two exposures differ as milliseconds and seconds do."""
+    return any(abs(ratio / unit - 1) < EXPOSURE_AGREEMENT for unit in (UNIT, 1 / UNIT))
+
+
+def _check_agreement(item: _Item, said_s: float, other_s: float, who: str) -> None:
+    """Raise AppError where another source, `who`, states another exposure."""
+    if abs(said_s / other_s - 1) > EXPOSURE_AGREEMENT:
+        unit = ": ms for s? write seconds" if _is_unit(said_s / other_s) else ""
+        raise item.error(f"exposure_s {said_s:g}, but {who} {other_s:g} s{unit}")
+
+
+def _check_mask_place(item: _Item, place: tuple[float, float], camera: Camera, shot: int) -> None:
+    """Raise AppError for a place of the mask, um, that only another unit explains."""
+    own = _own_place(camera, shot) if shot < len(camera.shots) else (0.0, 0.0)
+    cells = [mask.cell_um for mask in camera.masks.values()]
+    largest = max(map(abs, place))
+    small = bool(cells) and 0 < largest < min(cells) / LEAST_MOVE
+    if small or (any(own) and largest and _is_close((UNIT * place[0], UNIT * place[1]), own)):
+        raise item.error(
+            f"mask at {place[0]:g}, {place[1]:g} um, far less than its cells: mm for um? write um"
+        )
+    far = bool(cells) and largest > MOST_MOVE * max(cells) and not _is_close(place, own)
+    if far or (any(own) and _is_close((place[0] / UNIT, place[1] / UNIT), own)):
+        raise item.error(f"mask at {place[0]:g}, {place[1]:g} um: nm for um? write um")
+
+
+def _own_place(camera: Camera, shot: int) -> tuple[float, float]:
+    place = mask_offsets_um(camera, shot)
+    return place.get("mask_x", 0.0), place.get("mask_y", 0.0)
+
+
+def _is_close(place: tuple[float, float], other: tuple[float, float]) -> bool:
+    return bool(np.allclose(place, other, rtol=0.01, atol=1e-6))
+
+
+def _view_of(item: _Item, place_um: tuple[float, float], camera: Camera) -> tuple[int, int]:
+    """Return the view (v, u) that a pinhole at x, y opens; raises AppError where none is."""
+    cell_um, (rows, columns) = camera.lens.aperture_cell_um, camera.views
+    away_um = [
+        np.abs(centred_grid(count, cell_um) - at)
+        for count, at in ((rows, place_um[1]), (columns, place_um[0]))
+    ]
+    off_um = max(along.min() for along in away_um)
+    where = f"the pinhole at {place_um[0]:g}, {place_um[1]:g} um"
+    if off_um > cell_um / 4:
+        raise item.error(
+            f"{where} is {off_um:g} um from the nearest of the camera's {rows}x{columns} views, "
+            f"{cell_um:g} um apart: is the unit um?"
+        )
+    if 0 < max(map(abs, place_um)) < cell_um / LEAST_MOVE:
+        raise item.error(f"{where}, of views {cell_um:g} um apart: mm for um? write um")
+    v, u = (int(along.argmin()) for along in away_um)
+    return v, u
+
+
 # Plan and write.
 
 
 class _Import:
-    """A session in the making."""
+    """A session in the making, of frames in the order of their capture."""
 
     def __init__(
         self, items: list[_Item], camera: Camera, spec: str, notes: Sequence[str] = ()
     ) -> None:
-        self._notes = list(notes)
-        self._items = self._numbered(items)
-        shots = [shot for item, shot in self._items if item.listed.row.kind == "shot"]
+        self._notes, self._own = list(notes), camera
+        self._items = _numbered(items)
+        self._plan = self._planned(self._shot_count(), spec)
+        self._camera = planned_camera(self._plan)
+        self._items = [replace(item, exposure_s=self._exposure_s(item)) for item in self._items]
+        self._check_times()
+        self._check_turns()
+        self._check_darks()
+
+    def _shot_count(self) -> int:
+        """Return the number of shots; raises AppError for a shot without a file."""
+        shots = {item.shot for item in self._items if item.is_shot}
         if not shots:
             raise AppError("no file is a shot: name one at least, of kind shot")
-        count = max(shots) + 1
+        count, have = max(shots) + 1, len(self._own.shots)
         for shot in range(count):
             if shot not in shots:
                 raise AppError(f"shot {shot} has no file, of shots 0 to {count - 1}")
-        for item, shot in self._items:
-            if shot >= count and item.listed.row.shot is not None:
-                raise AppError(
-                    f"{item.listed.where}: there is no shot {shot}, only 0 to {count - 1}"
-                )
-        placed = [shot for item, shot in self._items if _placed(item.listed.row)]
-        if count > len(camera.shots) and count - 1 not in placed:
+        for item in self._items:
+            if item.shot >= count and item.listed.row.shot is not None:
+                raise item.error(f"there is no shot {item.shot}, only 0 to {count - 1}")
+        placed = {item.shot for item in self._items if item.listed.row.mask_um is not None}
+        if count > have and count - 1 not in placed:
             raise AppError(
-                f"shots 0 to {count - 1} have files, and the camera has {len(camera.shots)} "
+                f"shots 0 to {count - 1} have files, and the camera has {have} "
                 "shot(s): write mask_x_um and mask_y_um of the others, or more shots into its file"
             )
-        if count < len(camera.shots):
-            self._notes.append(f"{count} of the camera's {len(camera.shots)} shots have files")
-        self._own = camera
-        self._plan = self._planned(count, spec)
-        self._camera = planned_camera(self._plan)
-        self._exposures_s = [self._exposure_s(item, shot) for item, shot in self._items]
-        self._check_times()
-        self._check_turns()
-        self._check_exposures()
-
-    def _numbered(self, items: list[_Item]) -> list[tuple[_Item, int]]:
-        """Return each frame with its shot: as its row says, further frames of a file after it."""
-        free = all(i.listed.row.shot is None for i in items if i.listed.row.kind == "shot")
-        found, following = [], 0
-        for item in items:
-            row = item.listed.row
-            if row.gain != 1 and row.kind != "shot":
-                raise AppError(
-                    f"{item.listed.where}: gain {row.gain:g}; only shots may have another than 1"
-                )
-            if row.lamp is not None and (row.lamp == "off") != (row.kind == "dark"):
-                raise AppError(f"{item.listed.where}: kind {row.kind} with the lamp {row.lamp}")
-            pinhole = (row.aperture_x_um, row.aperture_y_um) != (None, None)
-            if row.kind != "whiteboard" and pinhole:
-                raise AppError(
-                    f"{item.listed.where}: a pinhole's place with kind {row.kind}; only a "
-                    "whiteboard is taken through one"
-                )
-            if row.turn_deg is not None and row.kind not in ("open", "reference"):
-                raise AppError(
-                    f"{item.listed.where}: turn_deg with kind {row.kind}; boards that are turned "
-                    "are open or reference"
-                )
-            if row.kind == "reference" and (row.mask_x_um or row.mask_y_um):
-                raise AppError(
-                    f"{item.listed.where}: a mask's place with kind reference, which is without "
-                    "masks: is it open?"
-                )
-            if row.kind != "shot":
-                found.append((item, row.shot or 0))
-            elif free:
-                found.append((item, following))
-                following += 1
-            elif row.shot is None:
-                raise AppError(f"{item.listed.where}: other shots have a number, this one has none")
-            else:
-                found.append((item, row.shot + item.place))
-        return found
+        if count < have:
+            self._notes.append(f"{count} of the camera's {have} shots have files")
+        return count
 
     def _planned(self, count: int, spec: str) -> Plan:
         shots = []
         for shot in range(count):
-            items = [i for i, own in self._items if own == shot and i.listed.row.kind == "shot"]
+            items = [item for item in self._items if item.is_shot and item.shot == shot]
             rows = [item.listed.row for item in items]
             said: dict[str, object] = {}
             for key in ("gain", "lamp"):
                 values = {getattr(row, key) for row in rows}
                 if len(values) > 1:
-                    raise AppError(f"{items[-1].listed.where}: {key} differs within shot {shot}")
+                    raise items[-1].error(f"{key} differs within shot {shot}")
                 if values != {None}:
                     said[key] = values.pop()
-            placed = [row for row in rows if _placed(row)]
-            places = {(row.mask_x_um or 0.0, row.mask_y_um or 0.0) for row in placed}
+            places = {row.mask_um for row in rows if row.mask_um is not None}
             if len(places) > 1:
-                raise AppError(f"{items[-1].listed.where}: the mask's place differs within a shot")
+                raise items[-1].error("the mask's place differs within a shot")
             for place in places:
-                self._check_place(place, shot, items[0].listed.where)
-                if shot >= len(self._own.shots) or not _close(place, self._own_place(shot)):
+                _check_mask_place(items[0], place, self._own, shot)
+                if shot >= len(self._own.shots) or not _is_close(
+                    place, _own_place(self._own, shot)
+                ):
                     said["mask_um"] = list(place)
             shots.append(said)
         path = Path(spec)
@@ -377,83 +420,51 @@ class _Import:
         plan = {"title": self._own.title, "camera": camera, "shots": shots}
         return validated(Plan, {**plan, "whiteboards": None, "darks": None}, "import", AppError)
 
-    def _own_place(self, shot: int) -> tuple[float, float]:
-        place = mask_offsets_um(self._own, shot)
-        return place.get("mask_x", 0.0), place.get("mask_y", 0.0)
-
-    def _check_place(self, place: tuple[float, float], shot: int, where: str) -> None:
-        """Raise AppError for a place that only another unit explains."""
-        own = self._own_place(shot) if shot < len(self._own.shots) else (0.0, 0.0)
-        cells = [mask.cell_um for mask in self._own.masks.values()]
-        largest = max(map(abs, place))
-        small = bool(cells) and 0 < largest < min(cells) / LEAST_MOVE
-        scaled = any(own) and _close((UNIT * place[0], UNIT * place[1]), own)
-        if small or (scaled and largest):
-            raise AppError(
-                f"{where}: mask at {place[0]:g}, {place[1]:g} um, far less than its cells: mm "
-                "for um? write um"
-            )
-        far = bool(cells) and largest > MOST_MOVE * max(cells) and not _close(place, own)
-        if far or (any(own) and _close((place[0] / UNIT, place[1] / UNIT), own)):
-            raise AppError(f"{where}: mask at {place[0]:g}, {place[1]:g} um: nm for um? write um")
-
-    def _exposure_s(self, item: _Item, shot: int) -> float:
+    def _exposure_s(self, item: _Item) -> float:
         """Return a frame's exposure: of its row, its file, or for shots the camera's own."""
-        row, where = item.listed.row, item.listed.where
-        said_s, stated_s = row.exposure_s, item.stated_s
+        said_s, stated_s, kind = item.listed.row.exposure_s, item.stated_s, item.listed.row.kind
         if said_s is not None and stated_s is not None:
-            self._compare_exposures(said_s, stated_s, f"{where}: ", "its file states")
-        if said_s is not None or stated_s is not None:
-            known_s = stated_s if said_s is None else said_s
-            assert known_s is not None
+            _check_agreement(item, said_s, stated_s, "its file states")
+        known_s = stated_s if said_s is None else said_s
+        if known_s is not None:
             if known_s > LONGEST_S or known_s <= 0:
-                raise AppError(f"{where}: its file states an exposure of {known_s:g} s")
-            planned_s = self._camera.shots[shot].exposure_s if row.kind == "shot" else None
+                raise item.error(f"its file states an exposure of {known_s:g} s")
+            planned_s = self._camera.shots[item.shot].exposure_s if item.is_shot else None
             if planned_s is not None and _is_unit(known_s / planned_s):
-                self._compare_exposures(known_s, planned_s, f"{where}: ", "the camera's file says")
+                _check_agreement(item, known_s, planned_s, "the camera's file says")
             return known_s
         own_s = self._camera.exposures_s()
-        if row.kind not in ("shot", "dark"):
-            raise AppError(f"{where}: its exposure is not known; write exposure_s into the table")
-        exposure_s = float(own_s[shot] if row.kind == "shot" else max(own_s))
+        if kind not in ("shot", "dark"):
+            raise item.error("its exposure is not known; write exposure_s into the table")
+        exposure_s = float(own_s[item.shot] if item.is_shot else max(own_s))
         self._note(f"exposures that no file states are taken from the camera: {exposure_s:g} s")
         return exposure_s
 
-    def _compare_exposures(self, said_s: float, other_s: float, start: str, who: str) -> None:
-        if abs(said_s / other_s - 1) > EXPOSURE_AGREEMENT:
-            unit = ": ms for s? write seconds" if _is_unit(said_s / other_s) else ""
-            raise AppError(f"{start}exposure_s {said_s:g}, but {who} {other_s:g} s{unit}")
-
-    def _check_exposures(self) -> None:
-        """Raise AppError where the light of one kind of frame shows another unit of another."""
-        by_kind: dict[str, list[float]] = defaultdict(list)
-        for (item, _), exposure_s in zip(self._items, self._exposures_s, strict=True):
-            by_kind[item.listed.row.kind].append(exposure_s)
-        for kind, exposures_s in by_kind.items():
-            longest_s = max(by_kind["shot"])
-            if kind == "dark" and (
-                min(exposures_s) >= UNIT / 2 * longest_s
-                or max(exposures_s) <= min(by_kind["shot"]) * 2 / UNIT
-            ):
-                raise AppError(
-                    f"darks of {min(exposures_s):g} s and shots of {longest_s:g} s: ms for s in "
-                    "one of them? write seconds"
-                )
+    def _check_darks(self) -> None:
+        """Raise AppError where darks and shots have exposures in different units."""
+        darks_s, shots_s = (
+            [item.exposure_s for item in self._items if item.listed.row.kind == kind]
+            for kind in ("dark", "shot")
+        )
+        if darks_s and (
+            min(darks_s) >= UNIT / 2 * max(shots_s) or max(darks_s) <= min(shots_s) * 2 / UNIT
+        ):
+            raise AppError(
+                f"darks of {min(darks_s):g} s and shots of {max(shots_s):g} s: ms for s in one of "
+                "them? write seconds"
+            )
 
     def _check_times(self) -> None:
-        times = [item.time_s if (own := item.listed.row.time) is None else own
-                 for item, _ in self._items]  # fmt: skip
-        known = [time for time in times if time is not None]
-        if known and max(known) - min(known) > ONE_CLOCK_S:
-            first, last = (
-                self._items[times.index(one)][0].listed.where for one in (min(known), max(known))
-            )
+        timed = [item for item in self._items if item.taken_s is not None]
+        known = [(item.taken_s or 0.0, item.listed.where) for item in timed]
+        (first_s, first), (last_s, last) = min(known, default=(0, "")), max(known, default=(0, ""))
+        if last_s - first_s > ONE_CLOCK_S:
             raise AppError(f"{last}: time is over a year after that of {first}: write one clock's")
 
     def _check_turns(self) -> None:
         """Raise AppError for a turned board that was not taken both with masks and without."""
         kinds: dict[float, set[str]] = defaultdict(set)
-        for row in (item.listed.row for item, _ in self._items):
+        for row in (item.listed.row for item in self._items):
             if row.turn_deg is not None:
                 kinds[row.turn_deg].add(row.kind)
         for turn_deg, known in kinds.items():
@@ -468,47 +479,47 @@ class _Import:
             self._notes.append(text)
 
     def _frames(self) -> list[tuple[PlannedFrame, _Item]]:
-        """Return every frame as a plan would name it, with where it comes from."""
+        """Return every frame as a plan would name it, with its file, in the order of the kinds."""
         validating = self._validating()
-        named: list[tuple[int, PlannedFrame, _Item]] = []
+        named: list[tuple[PlannedFrame, _Item]] = []
         counts: Counter[str] = Counter()
         groups: dict[str, dict[object, int]] = defaultdict(dict)
+        brackets: dict[int, set[float]] = defaultdict(set)
+        for item in self._items:
+            if item.is_shot:
+                brackets[item.shot].add(item.exposure_s)
         fitted = fittings(self._camera)
-        for (item, shot), exposure_s in zip(self._items, self._exposures_s, strict=True):
-            row, where = item.listed.row, item.listed.where
-            if item is validating or row.kind == "validation":
-                kind = VALIDATION
-            else:
-                kind = row.kind
+        for item in self._items:
+            row, shot = item.listed.row, item.shot
+            kind = VALIDATION if item is validating or row.kind == "validation" else row.kind
             lamp = "off" if kind == "dark" else row.lamp or "white"
-            at_um = mask_offsets_um(self._camera, shot)
-            if _placed(row) and kind != "shot":
-                self._check_place((row.mask_x_um or 0.0, row.mask_y_um or 0.0), shot, where)
-                at_um = {"mask_x": row.mask_x_um or 0.0, "mask_y": row.mask_y_um or 0.0}
+            at_um: dict[str, float] = dict(mask_offsets_um(self._camera, shot))
             view = None
-            if kind == "whiteboard":
-                if row.aperture_x_um is None and row.aperture_y_um is None:
-                    kind = "open"
-                else:
-                    place = row.aperture_x_um or 0.0, row.aperture_y_um or 0.0
-                    view = self._view(place, where)
-                    at_um |= {"aperture_x": place[0], "aperture_y": place[1]}
+            if row.mask_um is not None and kind != "shot":
+                _check_mask_place(item, row.mask_um, self._own, shot)
+                at_um["mask_x"], at_um["mask_y"] = row.mask_um
+            if kind == "whiteboard" and row.pinhole_um is not None:
+                view = _view_of(item, row.pinhole_um, self._camera)
+                at_um["aperture_x"], at_um["aperture_y"] = row.pinhole_um
+            elif kind == "whiteboard":
+                kind = "open"
             masks_in = kind not in ("reference", "reference-check")
             if row.turn_deg is not None:
                 kind = "turned"
-            kind = "check" if kind == "reference-check" else kind
-            if kind in ("open", VALIDATION, "check", "turned") and shot:
-                raise AppError(f"{where}: whiteboards of the whole aperture must be of shot 0")
+            elif kind == "reference-check":
+                kind = "check"
+            if kind in OF_FIRST_SHOT and shot:
+                raise item.error("whiteboards of the whole aperture must be of shot 0")
 
             def group(name: str, key: object) -> str:
                 return f"{name}-{groups[name].setdefault(key, len(groups[name]))}"
 
             if kind == "dark":
                 of_shot = row.shot is not None
-                name = f"{SHOT_DARK}-{shot}" if of_shot else group("dark", exposure_s)
+                name = f"{SHOT_DARK}-{shot}" if of_shot else group("dark", item.exposure_s)
                 bench = Bench("scene", "off", 0, 0, True)
             elif kind == "shot":
-                name = f"shot-{shot}-e{_step(self._exposures_s, self._items, shot, exposure_s)}"
+                name = f"shot-{shot}-e{sorted(brackets[shot]).index(item.exposure_s)}"
                 bench = Bench("scene", lamp, shot, fitted[shot], True, at_um)
             else:
                 name = {
@@ -520,57 +531,37 @@ class _Import:
                 bench = Bench("whiteboard", lamp, shot, fitted[shot], masks_in, at_um, turn_deg)
             repeat = counts[name]
             counts[name] += 1
-            frame = PlannedFrame(
-                f"{name}-r{repeat}", kind, bench, exposure_s, row.gain, repeat, view
-            )
-            named.append((KIND_ORDER.index(kind), frame, item))
-        named.sort(
-            key=lambda one: (
-                one[0],
-                (one[1].bench.shot, one[1].id) if one[1].kind == "shot" else (),
-            )
-        )
-        return [(frame, item) for _, frame, item in named]
+            exposed = item.exposure_s, row.gain, repeat, view
+            named.append((PlannedFrame(f"{name}-r{repeat}", kind, bench, *exposed), item))
+
+        def order(pair: tuple[PlannedFrame, _Item]) -> tuple:
+            frame, _ = pair
+            of_shots = (frame.bench.shot, frame.id) if frame.kind == "shot" else ()
+            return KIND_ORDER.index(frame.kind), of_shots
+
+        return sorted(named, key=order)
 
     def _validating(self) -> _Item | None:
-        """Return the whiteboard of the whole aperture that is kept to judge by, if none is said."""
-        rows = [(item, item.listed.row) for item, _ in self._items]
+        """Return the last whiteboard of the whole aperture, unless rows name some for validation.
+
+        Returns None for fewer whiteboards than FEWEST_TO_HOLD_OUT, which the fit needs.
+        """
+        if any(item.listed.row.kind == "validation" for item in self._items):
+            return None
         whole = [
             item
-            for item, row in rows
-            if (row.kind == "open" and row.turn_deg is None)
-            or (row.kind == "whiteboard" and row.aperture_x_um is row.aperture_y_um is None)
+            for item in self._items
+            if (item.listed.row.kind == "open" and item.listed.row.turn_deg is None)
+            or (item.listed.row.kind == "whiteboard" and item.listed.row.pinhole_um is None)
         ]
-        if len(whole) < FEWEST_TO_HOLD_OUT or any(row.kind == "validation" for _, row in rows):
+        if len(whole) < FEWEST_TO_HOLD_OUT:
             return None
         self._note(f"{shown_path(whole[-1].listed.path)} validates the calibration: no fit uses it")
         return whole[-1]
 
-    def _view(self, place_um: tuple[float, float], where: str) -> tuple[int, int]:
-        """Return the view (v, u) that a pinhole at x, y opens; raises AppError where none is."""
-        cell_um = self._camera.lens.aperture_cell_um
-        rows, columns = self._camera.views
-        grids = centred_grid(rows, cell_um), centred_grid(columns, cell_um)
-        x_um, y_um = place_um
-        v, u = (
-            int(np.argmin(np.abs(grid - at))) for grid, at in zip(grids, (y_um, x_um), strict=True)
-        )
-        off_um = max(abs(grids[0][v] - y_um), abs(grids[1][u] - x_um))
-        if off_um > cell_um / 4:
-            raise AppError(
-                f"{where}: the pinhole at {x_um:g}, {y_um:g} um is {off_um:g} um from the nearest "
-                f"of the camera's {rows}x{columns} views, {cell_um:g} um apart: is the unit um?"
-            )
-        if 0 < max(abs(x_um), abs(y_um)) < cell_um / LEAST_MOVE:
-            raise AppError(
-                f"{where}: the pinhole at {x_um:g}, {y_um:g} um, of views {cell_um:g} um apart: "
-                "mm for um? write um"
-            )
-        return v, u
-
     def _scale(self) -> int:
-        """Return by what values are multiplied to be whole: 1 for those of a camera."""
-        for item, _ in self._items:
+        """Return the factor that makes values whole numbers: 1 for those of a camera."""
+        for item in self._items:
             pixels = item.read()
             if pixels.dtype.kind == "f" and not np.array_equal(pixels, np.round(pixels)):
                 scale = TOP_DN // self._camera.sensor.noise.white_level_dn
@@ -578,77 +569,69 @@ class _Import:
                 return scale
         return 1
 
+    def _set_noise(self, **values: float) -> None:
+        sensor = self._camera.sensor
+        sensor = sensor.model_copy(update={"noise": sensor.noise.model_copy(update=values)})
+        self._camera = self._camera.model_copy(update={"sensor": sensor})
+
     def write(self, out: Path) -> Imported:
         """Write the session under its name, verified, or nothing; raises AppError."""
         planned, scale = self._frames(), self._scale()
-        noise = self._camera.sensor.noise
+        noise, stated = self._camera.sensor.noise, self._own.sensor.noise.model_fields_set
         gain = noise.gain_dn_per_electron
-        if scale != 1 and "gain_dn_per_electron" not in noise.model_fields_set:
-            shots = [item for frame, item in planned if frame.kind == "shot"]
+        if scale != 1 and "gain_dn_per_electron" not in stated:
+            shots = [item for item in self._items if item.is_shot]
             brightest = max(float(np.percentile(item.read(), BRIGHT_PERCENTILE)) for item in shots)
             gain = brightest * FAIR_NOISE**2
             self._note(f"the noise is taken as {FAIR_NOISE:.0%} of the brightest reading")
-        noise = noise.model_copy(
-            update={
-                "gain_dn_per_electron": gain * scale,
-                "black_level_dn": noise.black_level_dn * scale,
-                "white_level_dn": noise.white_level_dn * scale,
-            }
+        self._set_noise(
+            gain_dn_per_electron=gain * scale,
+            black_level_dn=noise.black_level_dn * scale,
+            white_level_dn=noise.white_level_dn * scale,
         )
-        sensor = self._camera.sensor.model_copy(update={"noise": noise})
-        self._camera = self._camera.model_copy(update={"sensor": sensor})
         for frame, item in planned:
-            found = figures(self._raw(item, frame, scale))
-            span = noise.white_level_dn - noise.black_level_dn
-            if frame.kind == "dark" and found.mean_dn > Checks().largest_dark * span:
-                raise AppError(
-                    f"{item.listed.where}: a dark that is {found.mean_dn / span:.1%} of white on "
-                    "average: is it another kind, or sensor.noise.black_level_dn wrong?"
-                )
-            self._check_light(frame, item, found.saturated, found.bright_dn / span)
-        highest = max(float(item.read().max()) for _, item in planned)
-        if "white_level_dn" not in self._own.sensor.noise.model_fields_set and (
-            highest * scale * WHITE_ABOVE < noise.white_level_dn and planned[0][1].raw is None
-        ):
+            self._check_light(frame, item, scale)
+        highest = max(float(item.read().max()) for item in self._items)
+        if "white_level_dn" not in stated and planned[0][1].raw is None and (
+            highest * WHITE_ABOVE < noise.white_level_dn
+        ):  # fmt: skip
             self._note(
-                f"sensor.noise.white_level_dn is taken as {self._own.sensor.noise.white_level_dn}, "
-                f"as nothing states it, and no value is above {highest:g}: a camera of 12 bits has "
-                "4095"
+                f"sensor.noise.white_level_dn is taken as {noise.white_level_dn}, as nothing "
+                f"states it, and no value is above {highest:g}: a camera of 12 bits has 4095"
             )
         self._set_white(planned, scale)
         plan = yaml.safe_dump(self._plan.model_dump(mode="json", exclude_unset=True))
-        plan = f"# Imported: what stood in a table or globs, as a plan.\n{plan}"
         frozen = Frozen(
-            plan,
+            f"# Imported: what stood in a table or globs, as a plan.\n{plan}",
             self._camera.model_dump(mode="json"),
             {"kind": IMPORTED},
             tuple(frame for frame, _ in planned),
         )
-        about = {
-            "title": self._plan.title or out.name,
-            "created": wall_time(),
-            "command": command_line(),
-            "versions": versions(),
-        }
+        about = {"title": self._plan.title or out.name, "created": wall_time()}
+        about |= {"command": command_line(), "versions": versions()}
         with whole(out) as part:
-            session = Session.create(part, frozen, about)
-            self._store(session, planned, scale)
+            self._store(Session.create(part, frozen, about), planned, scale)
         return Imported(Session(out), tuple(self._notes))
 
-    def _check_light(
-        self, frame: PlannedFrame, item: _Item, saturated: float, bright: float
-    ) -> None:
-        """Raise AppError for a shot, of a bracket the shortest, that shows nothing."""
+    def _check_light(self, frame: PlannedFrame, item: _Item, scale: int) -> None:
+        """Raise AppError for a bright dark, and for a shot's shortest frame that shows nothing."""
+        found, noise = figures(self._raw(item, frame, scale)), self._camera.sensor.noise
+        span = noise.white_level_dn - noise.black_level_dn
+        if frame.kind == "dark" and found.mean_dn > Checks().largest_dark * span:
+            raise item.error(
+                f"a dark that is {found.mean_dn / span:.1%} of white on average: is it another "
+                "kind, or sensor.noise.black_level_dn wrong?"
+            )
         if not frame.id.startswith(f"shot-{frame.bench.shot}-e0-"):
             return
-        what = None
-        if saturated > MOST_SATURATED:
-            what = f"{saturated:.0%} of its pixels are at white"
+        bright, what = found.bright_dn / span, None
+        if found.saturated > MOST_SATURATED:
+            what = f"{found.saturated:.0%} of its pixels are at white"
         elif bright < Checks().smallest_signal:
             what = f"its brightest readings are {max(bright, 0):.1%} of white above black"
         if what is not None:
-            raise AppError(
-                f"{item.listed.where}: shot {frame.bench.shot}: {what}: expose otherwise, or are "
+            raise item.error(
+                f"shot {frame.bench.shot}: {what}: expose otherwise, or are "
                 "sensor.noise.black_level_dn and white_level_dn the file's?"
             )
 
@@ -661,7 +644,7 @@ class _Import:
         session.note(RunEntry(versions=versions(), command=command_line(), camera=camera))
         session.note(ImportedEntry(files=files, notes=self._notes))
         for frame, item in planned:
-            raw = self._raw(item, frame, scale, whole=True)
+            raw = _with_bytes(self._raw(item, frame, scale), item)
             entry = frame_entry(
                 raw, raw.exposure_s or 0.0, frame.gain, run=1, lamp=frame.bench.lamp,
                 commanded_um=dict(frame.bench.offsets_um), figures=figures(raw), wall=wall_time(),
@@ -671,39 +654,33 @@ class _Import:
             raise AppError(f"{fault}; nothing was imported, test disk and memory")
         session.note(CompleteEntry(frames=len(planned)))
 
-    def _raw(self, item: _Item, frame: PlannedFrame, scale: int, whole: bool = False) -> RawFrame:
-        """Return a frame as if from a camera; whole: with the bytes of its file."""
+    def _raw(self, item: _Item, frame: PlannedFrame, scale: int) -> RawFrame:
+        """Return a frame as if from a camera, without the bytes of its file."""
         pixels = item.read()
         if pixels.dtype.kind == "f" or scale != 1:
             pixels = np.round(pixels * np.float64(scale))
         mosaic = np.ascontiguousarray(pixels.astype(np.uint16))
-        row, path, noise = item.listed.row, item.listed.path, self._camera.sensor.noise
+        row, path, sensor = item.listed.row, item.listed.path, self._camera.sensor
         metadata = {"name": path.name, "imported": str(path.resolve())}
         if row.temperature_c is not None:
             metadata["temperature_c"] = f"{row.temperature_c:g}"
-        original, digest = b"", item.digest
-        if whole:
-            is_kept = item.place == 0 and not path.is_dir()
-            original = path.read_bytes() if is_kept else b""
-            if is_kept and hashlib.sha256(original).hexdigest() != digest:
-                raise AppError(f"{shown_path(path)}: changed while it was imported; try again")
-            if not original:
-                original = f"frame {item.place} of {path.name}, SHA-256 {item.digest}".encode()
-                digest = hashlib.sha256(original).hexdigest()
-        levels = np.full((2, 2), float(noise.black_level_dn)), noise.white_level_dn
+        black, white, cfa = (
+            (np.full((2, 2), float(sensor.noise.black_level_dn)), sensor.noise.white_level_dn,
+             sensor.cfa_name) if item.raw is None
+            else (item.raw.black_level_dn, item.raw.white_level_dn, item.raw.cfa)
+        )  # fmt: skip
         if item.raw is not None:
-            levels = item.raw.black_level_dn, item.raw.white_level_dn
             metadata = {**item.raw.metadata, **metadata}
-        cfa = self._camera.sensor.cfa_name if item.raw is None else item.raw.cfa
         return RawFrame(
-            mosaic, levels[0], levels[1], cfa, frame.exposure_s, original, digest,
-            host_time_s=item.time_s if row.time is None else row.time, metadata=metadata,
+            mosaic, black, white, cfa, frame.exposure_s, b"", item.digest,
+            host_time_s=item.taken_s, metadata=metadata,
         )  # fmt: skip
 
     def _set_white(self, planned: list[tuple[PlannedFrame, _Item]], scale: int) -> None:
-        """Say how bright white is where nothing does, by the brightest of the scene.
+        """Set the brightness of white where nothing states it, by the brightest of the scene.
 
-        Raises AppError where the camera says it, and only another unit of time explains the shots.
+        Raises AppError where the camera states it, and only another unit of time explains the
+        shots.
         """
         if any(frame.kind in ("reference", "whiteboard", "open") for frame, _ in planned):
             return
@@ -734,33 +711,20 @@ class _Import:
             f"the camera's electrons_per_s is not known: taken as {electrons_per_s:.3g}, for which "
             f"the brightest readings of the shots are {BRIGHTEST:g}"
         )
-        noise = noise.model_copy(update={"electrons_per_s": electrons_per_s})
-        sensor = self._camera.sensor.model_copy(update={"noise": noise})
-        self._camera = self._camera.model_copy(update={"sensor": sensor})
+        self._set_noise(electrons_per_s=electrons_per_s)
 
 
-def _placed(row: object) -> bool:
-    return (
-        getattr(row, "mask_x_um", None) is not None or getattr(row, "mask_y_um", None) is not None
-    )
+def _with_bytes(raw: RawFrame, item: _Item) -> RawFrame:
+    """Return a frame with the bytes of its file, of which only the first frame is it.
 
-
-def _close(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    return bool(np.allclose(one, other, rtol=0.01, atol=1e-6))
-
-
-def _is_unit(ratio: float) -> bool:
-    """Return whether two exposures differ as milliseconds and seconds do."""
-    return any(abs(ratio / unit - 1) < EXPOSURE_AGREEMENT for unit in (UNIT, 1 / UNIT))
-
-
-def _step(
-    exposures_s: Sequence[float], items: Sequence[tuple[_Item, int]], shot: int, own_s: float
-) -> int:
-    """Return which of its shot's bracket an exposure is, the shortest first."""
-    bracket = {
-        exposure_s
-        for (item, of_shot), exposure_s in zip(items, exposures_s, strict=True)
-        if of_shot == shot and item.listed.row.kind == "shot"
-    }
-    return sorted(bracket).index(own_s)
+    Raises AppError for a file that has changed since it was read.
+    """
+    path, original = item.listed.path, b""
+    if item.place == 0 and not path.is_dir():
+        original = path.read_bytes()
+        if hashlib.sha256(original).hexdigest() != item.digest:
+            raise AppError(f"{shown_path(path)}: changed while it was imported; try again")
+    if original:
+        return replace(raw, original=original)
+    original = f"frame {item.place} of {path.name}, SHA-256 {item.digest}".encode()
+    return replace(raw, original=original, sha256=hashlib.sha256(original).hexdigest())

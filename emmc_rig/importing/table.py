@@ -1,4 +1,4 @@
-"""What the files of another program are: rows of a table, or one kind for all that a glob names."""
+"""Table of another program's files: a row for each file, or globs with a kind for each."""
 
 from __future__ import annotations
 
@@ -68,12 +68,43 @@ class Row(Settings):
     )
     temperature_c: float | None = Field(default=None, ge=-273.15)
 
+    @property
+    def mask_um(self) -> tuple[float, float] | None:
+        """Place of the mask, x and y; None where no column states it."""
+        return _pair(self.mask_x_um, self.mask_y_um)
+
+    @property
+    def pinhole_um(self) -> tuple[float, float] | None:
+        """Place of the pinhole, x and y; None where no column states it."""
+        return _pair(self.aperture_x_um, self.aperture_y_um)
+
+    def misuse(self) -> str:
+        """Return what this kind of file cannot have and the row states, "" for nothing."""
+        kind, masked = self.kind, any(self.mask_um or ())
+        faults = {
+            f"gain {self.gain:g}; only shots may have another than 1":
+                self.gain != 1 and kind != "shot",
+            f"kind {kind} with the lamp {self.lamp}":
+                self.lamp is not None and (self.lamp == "off") != (kind == "dark"),
+            f"a pinhole's place with kind {kind}; only a whiteboard is taken through one":
+                self.pinhole_um is not None and kind != "whiteboard",
+            f"turn_deg with kind {kind}; boards that are turned are open or reference":
+                self.turn_deg is not None and kind not in ("open", "reference"),
+            "a mask's place with kind reference, which is without masks: is it open?":
+                kind == "reference" and masked,
+        }  # fmt: skip
+        return next((words for words, is_so in faults.items() if is_so), "")
+
+
+def _pair(x_um: float | None, y_um: float | None) -> tuple[float, float] | None:
+    return None if x_um is None and y_um is None else (x_um or 0.0, y_um or 0.0)
+
 
 @dataclass(frozen=True)
 class Listed:
-    """A row with where it stands, for messages, and the file that it names.
+    """A row, the place of the row for messages (where), and the path of its file.
 
-    pattern: the glob that named it, whose files have no order of their own; "" of a table's row.
+    pattern: the glob that matched the file, whose files are in no order; "" for rows of a table.
     """
 
     row: Row

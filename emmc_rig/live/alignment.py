@@ -30,7 +30,7 @@ class MaskPlace:
 
     rotation_deg: of the mask, counterclockwise in the picture. scale: 1 as designed; the shadow
     cannot distinguish a stretched mask from one at another distance. offset_um: of the mask, x and
-    y, from where the stage should have it; None where it is not seen. correlation: of frame and
+    y, from the place that the stage states; None for a uniform pattern. correlation: of frame and
     shadow, up to 1. ambiguity: what the offset leaves open, in words, "" for nothing.
     """
 

@@ -1,5 +1,5 @@
 "use strict";
-// What the pages share: one state that the server pushes, actions, and texts that are written once.
+// Both pages: the state that the server pushes, actions, the newest picture, texts.
 const $ = (id) => document.getElementById(id);
 let state = { version: 0 };
 
@@ -29,7 +29,28 @@ let complaint = "";
 function complain(text) { complaint = text; drawTrouble(); }
 
 // What is announced is written only when it changes: a screen reader reads it again otherwise.
-function write(id, text) { if ($(id).textContent !== text) $(id).textContent = text; }
+function write(id, text) { put($(id), text); }
+function put(element, text) { if (element.textContent !== text) element.textContent = text; }
+
+// Show a picture of the frame; while it loads no other is asked for, but `again` is called after it.
+let loading = false, wanted = false;
+async function load(path, again) {
+  if (loading) { wanted = true; return; }
+  loading = true;
+  try {
+    const blob = await (await ask(path)).blob();
+    const before = $("picture").src;
+    $("picture").src = URL.createObjectURL(blob);
+    if (before) URL.revokeObjectURL(before);
+    $("picture").dataset.frame = state.frame;
+    $("picture").hidden = false;
+  } catch (fault) { /* the next state tells why */ }
+  loading = false;
+  if (wanted) { wanted = false; again(); }
+}
+
+// Call a function with every element of a CSS selector.
+function each(selector, call) { document.querySelectorAll(selector).forEach(call); }
 
 // What was read may be hidden; with the next action it is shown again where it still holds.
 let hiddenLines = [], lostSince = "";

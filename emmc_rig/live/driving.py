@@ -1,7 +1,7 @@
-"""The stage behind the page: one move at a time in a thread of its own, and `stop` in another.
+"""The stage behind the page: a thread for moves, one at a time, and another thread for `stop`.
 
-Stopping goes past the thread that moves, and is repeated until that one is done: a move of several
-legs may be about to begin its next. Positions are read while an axis moves.
+A stop passes the thread that moves, and is repeated until the move has ended: a move of several
+legs may be about to begin the next leg. Positions are read while an axis moves.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Driving:
                 thread.join(PATIENCE_S)
 
     def position_um(self, axis: str) -> float | None:
-        """Return where an axis last read to be; None while that is not known."""
+        """Return the last reading of an axis's position; None before the first."""
         return self._positions_um.get(axis)
 
     @property

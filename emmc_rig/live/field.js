@@ -35,12 +35,10 @@ function drawField() {
 
 function choose(what) {
   shownKind = what;
-  for (const one of document.querySelectorAll("[data-show]"))
-    one.setAttribute("aria-pressed", one.dataset.show === what);
-  for (const one of document.querySelectorAll(".of-frame")) one.hidden = onField();
-  for (const one of document.querySelectorAll(".of-field")) one.hidden = !onField();
-  if (onField()) showField(); else if (typeof show === "function") show();
+  each("[data-show]", (choice) => choice.setAttribute("aria-pressed", choice.dataset.show === what));
+  each(".of-frame", (part) => { part.hidden = onField(); });
+  each(".of-field", (part) => { part.hidden = !onField(); });
+  if (onField()) showField(); else show();
 }
 
-for (const one of document.querySelectorAll("[data-show]"))
-  one.addEventListener("click", () => choose(one.dataset.show));
+each("[data-show]", (choice) => choice.addEventListener("click", () => choose(choice.dataset.show)));

@@ -4,8 +4,8 @@ A preview follows every frame (`reconstruction.preview`), until a reconstruction
 takes its place. Methods that take films, with a Psi of one shot, reconstruct while the scene moves:
 when a frame is done, the newest one is the next of the film, and those between are left out. After
 a cut the preview is shown again, and the new scene is begun at once. Other methods begin once the
-scene has stood still, and what they do is dropped as soon as something changes. While the scene
-stands still it is reconstructed once.
+scene has stood still; a change of the scene ends their reconstruction. A scene that stands still is
+reconstructed once.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ CHANGED = 4.0
 scene changed: 1 of noise alone, with a deviation of 0.09 over BLOCK_PX^2 pixels."""
 CUT = 0.5
 """Variance of the difference of two frames' blocks, over the sum of their variances, from which on
-they are not of one scene: 1 where they have nothing in common. `panning-desk` comes to 0.01 within
+they are not of one scene: 1 for uncorrelated frames. `panning-desk` comes to 0.01 within
 0.1 s and 0.25 within 0.5 s, different built-in scenes to 0.65 and more (96x128)."""
 CUT_S = 0.5
 """Frames farther apart may differ as much because the scene moves."""
@@ -106,6 +106,7 @@ class LiveLightField:
         self._reading_per_rate = np.divide(1, white, where=usable, out=np.zeros(white.shape))
         self._reading_per_rate = self._reading_per_rate.astype(np.float32)
         self._held: dict[int, RawFrame] = {}
+        self._shots = 0
         self._since_s, self._seen_s, self._unsettled = clock(), clock(), SETTLING
         self.preview: Preview | None = None
         self._level = 0.0
@@ -212,11 +213,11 @@ class LiveLightField:
 
     def _cut(self, frame: RawFrame) -> bool:
         """Return whether a frame shows another scene than the one held, not the same in motion."""
-        one, other = (
+        now, then = (
             cv2.blur(self._scale.rate(of) * self._reading_per_rate[0], (BLOCK_PX, BLOCK_PX))
             for of in (frame, self._held[0])
         )
-        return bool((one - other).var() > CUT * (one.var() + other.var()))
+        return bool((now - then).var() > CUT * (now.var() + then.var()))
 
     def _scale_of_held(self) -> Scale:
         """Return the scale of the shots of which a frame is held."""
@@ -247,8 +248,6 @@ class LiveLightField:
         axes = self.psi.view_axes
         maps = {"disparity": disparity_of(coarse)} if shows_parallax(axes) else {}
         self._draw(export_of(coarse, maps, view_axes=axes), block)
-
-    _shots = 0
 
     def _noise(self, scale: Scale, readings: Array) -> float:
         """Return the typical deviation of the readings of the frames held."""
@@ -411,7 +410,7 @@ def disparity_of(light_field: Array) -> NDArray[np.float32]:
     )
 
     def gathered(*products: tuple[Array, Array]) -> Array:
-        summed = sum(np.einsum("vuyx,vuyx->yx", one, other) for one, other in products)
+        summed = sum(np.einsum("vuyx,vuyx->yx", left, right) for left, right in products)
         return np.asarray(cv2.blur(np.asarray(summed), (WINDOW_PX, WINDOW_PX)), np.float32)
 
     power = gathered((by_x, by_x), (by_y, by_y))

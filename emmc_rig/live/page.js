@@ -6,28 +6,17 @@ const WIDTHS = [400, 800, 1200, 1600]; // few sizes, so that pages share what is
 const THIRD_STOP = 2 ** (1 / 3);
 const ACTIONS = { centre: "centre the mask", autoexpose: "expose automatically" };
 const view = { x: 0.5, y: 0.5, level: 0, marked: true, bright: false };
-let loading = false, wanted = false, times = [];
+let times = [];
 
-async function show() {
+function show() {
   if (onField() || !state.frame) return; // none before the first frame
-  if (loading) { wanted = true; return; }
-  loading = true;
   const box = $("stage").getBoundingClientRect();
   const wide = Math.max(box.width, box.height) * (window.devicePixelRatio || 1);
-  const px = WIDTHS.find((one) => one >= wide) || WIDTHS.at(-1);
+  const px = WIDTHS.find((width) => width >= wide) || WIDTHS.at(-1);
   const query = new URLSearchParams({
     kind: shownKind, x: view.x, y: view.y, part: PARTS[view.level], marked: view.marked ? 1 : 0, bright: view.bright ? 1 : 0, px,
   });
-  try {
-    const blob = await (await ask("picture.jpg?" + query)).blob();
-    const before = $("picture").src;
-    $("picture").src = URL.createObjectURL(blob);
-    if (before) URL.revokeObjectURL(before);
-    $("picture").dataset.frame = state.frame;
-    $("picture").hidden = false;
-  } catch (fault) { /* the next state tells why */ }
-  loading = false;
-  if (wanted) { wanted = false; show(); }
+  load("picture.jpg?" + query, show);
 }
 
 function draw() {
@@ -38,7 +27,7 @@ function draw() {
   $("exposing").hidden = !exposing;
   if (exposing) write("exposing-text", `exposing, ${Math.ceil(exposing.left_s)} s left of ${Number(exposing.exposure_s.toPrecision(3))}`);
   write("camera", `${settings.camera}, ${settings.shape[0]}x${settings.shape[1]} ${settings.cfa}`);
-  for (const one of document.querySelectorAll(".acts")) one.disabled = state.read_only;
+  each(".acts", (button) => { button.disabled = state.read_only; });
   write("frame", state.frame ? `frame ${state.frame}` : "waiting for the first frame");
   drawSetting("exposure", 1e3 * settings.exposure_s, settings.exposure_limits_s.map((s) => 1e3 * s), "ms");
   drawSetting("gain", settings.gain, settings.gain_limits, "");
@@ -50,7 +39,7 @@ function draw() {
   if (!figures) return;
   const now = performance.now();
   if (times.at(-1)?.frame !== state.frame) times.push({ frame: state.frame, now });
-  times = times.filter((one) => now - one.now < 3000);
+  times = times.filter((time) => now - time.now < 3000);
   const rate = times.length > 1
     ? (times.at(-1).frame - times[0].frame) * 1000 / (times.at(-1).now - times[0].now) : 0;
   write("rate", rate && !state.trouble.camera ? `${rate.toFixed(1)} frames/s` : "");
@@ -86,7 +75,7 @@ function drawHint() {
   drawNext(!$("hint").hidden);
 }
 
-// The first step that is not done; one that hands do has no button, and the next one's may be pressed.
+// The first step that is not done; where hands do it, the button is that of the next step with one.
 let nextStep = -1;
 function drawNext(hinted) {
   const steps = state.steps, number = steps.findIndex((step) => !step.done);
@@ -125,12 +114,12 @@ function drawSteps() {
   state.steps.forEach((step, i) => {
     const [, need, words, press] = parent.children[i].children;
     need.hidden = step.done;
-    if (words.textContent !== step.text) words.textContent = step.text;
-    if (press.textContent !== label(step)) press.textContent = label(step);
+    put(words, step.text);
+    put(press, label(step));
     press.hidden = !label(step);
     press.disabled = state.read_only || (state.busy !== "" && step.action !== "autoexpose");
     parent.children[i].classList.toggle("done", step.done);
-    parent.children[i].toggleAttribute("aria-current", i === state.steps.findIndex((one) => !one.done));
+    parent.children[i].toggleAttribute("aria-current", i === state.steps.findIndex((other) => !other.done));
   });
 }
 
@@ -161,7 +150,7 @@ function openSave() {
 }
 
 async function previewSave() {
-  const what = [...$("takes").querySelectorAll("input:checked")].map((one) => one.value);
+  const what = [...$("takes").querySelectorAll("input:checked")].map((box) => box.value);
   const answer = await act("preview", { what });
   write("saved", "");
   write("diff", answer ? answer.diff || "nothing to change" : "");
@@ -246,9 +235,8 @@ function drawAxes() {
   for (const [axis, told] of axes) {
     const row = $("axes").querySelector(`[data-axis="${CSS.escape(axis)}"]`);
     const known = told.position_um !== null;
-    const text = known ? told.position_um.toFixed(2) + " \u00b5m" : "not homed";
-    if (row.children[1].textContent !== text) row.children[1].textContent = text;
-    for (const one of row.querySelectorAll("button")) one.disabled = off || !known;
+    put(row.children[1], known ? told.position_um.toFixed(2) + " \u00b5m" : "not homed");
+    for (const press of row.querySelectorAll("button")) press.disabled = off || !known;
   }
 }
 
@@ -310,14 +298,14 @@ for (const [id, send] of [
   ["exposure", (ms) => act("exposure", { seconds: typeof ms === "number" ? ms / 1e3 : ms })],
   ["gain", (factor) => act("gain", { factor })],
 ]) {
-  const one = $(id);
+  const field = $(id);
   for (const change of ["input", "change"])
-    one.addEventListener(change, () => { one.dataset.typed = "yes"; });
-  one.form.addEventListener("submit", (event) => {
+    field.addEventListener(change, () => { field.dataset.typed = "yes"; });
+  field.form.addEventListener("submit", (event) => {
     event.preventDefault();
-    send(number(one));
-    delete one.dataset.typed;
-    one.blur();
+    send(number(field));
+    delete field.dataset.typed;
+    field.blur();
   });
 }
 $("take").addEventListener("click", () => act("reference", { taken: !state.reference }));

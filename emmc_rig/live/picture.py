@@ -1,7 +1,7 @@
 """A frame as a browser shows it: a part of it, as the mosaic or in colour, encoded.
 
-A large frame is averaged over whole colour tiles before anything else is done with it: each pixel
-shown is the mean of its tiles, so that nothing needs to be demosaiced.
+A large frame is first averaged over whole colour tiles: each pixel shown is the mean of its tiles,
+which needs no demosaicing.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def _mixing(cfa: str) -> NDArray[np.float32]:
     """Return what turns the four means of a tile into BGR, (4, 3); grey for an unknown tile."""
     if cfa not in BAYER:
         return np.full((4, 3), 0.25, np.float32)
-    mixing = np.array([[letter == one for one in "bgr"] for letter in cfa], np.float32)
+    mixing = np.array([[letter == own for own in "bgr"] for letter in cfa], np.float32)
     return mixing / mixing.sum(axis=0)
 
 
@@ -151,11 +151,11 @@ def _averaged(mosaic, step, white, mixing, gain, offset, table, marked):
             for column in range(columns):
                 at = 2 * step * column
                 for pair in range(step):
-                    one, other = line[at + 2 * pair], line[at + 2 * pair + 1]
-                    sums[column, first] += one
-                    sums[column, first + 1] += other
-                    most[column] = max(most[column], one, other)
-                    least[column] = min(least[column], one, other)
+                    left, right = line[at + 2 * pair], line[at + 2 * pair + 1]
+                    sums[column, first] += left
+                    sums[column, first + 1] += right
+                    most[column] = max(most[column], left, right)
+                    least[column] = min(least[column], left, right)
         for column in range(columns):
             for c in range(3):
                 seen = 0.0

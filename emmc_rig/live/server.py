@@ -1,4 +1,4 @@
-"""A page over HTTP: a secret in its address, nothing done by GET, nothing of others.
+"""A page over HTTP with a secret in its address; GET requests change nothing.
 
 Every path begins with a random token, and the host must be one of this computer's names for
 itself, so that no other page in the browser can reach it (cross-site requests, DNS rebinding).
@@ -83,8 +83,8 @@ class Page(Protocol):
     """What is served; every member may be used by any thread.
 
     files: of the package `emmc_rig.live` or templates; the first is the page itself. pictures: by
-    name; each takes a query, and returns None while there is none. actions: by name, what POST
-    does; a mapping returned is part of the answer. urgent: the actions that wait for no other.
+    name; each takes a query, and returns None while there is no picture. actions: of POST requests,
+    by name; a mapping returned is part of the answer. urgent: actions with a thread of their own.
     """
 
     files: tuple[str, ...]
@@ -118,7 +118,7 @@ def address(host: str, port: int, token: str) -> str:
 
 
 def names_of(host: str) -> tuple[str, ...]:
-    """Return under which names a page served there may be asked for, see `application`."""
+    """Return the valid names of a server there, see `application`."""
     if host in ("127.0.0.1", "::1", "localhost"):
         return LOCAL_HOSTS
     return ("*",) if host in EVERYWHERE else (*LOCAL_HOSTS, f"[{host}]" if ":" in host else host)
@@ -131,9 +131,10 @@ def application(
     hosts: tuple[str, ...] = LOCAL_HOSTS,
     to_act: str = "start a page that may act",
 ) -> Starlette:
-    """Return the ASGI application; hosts: names under which it may be asked for ("*": any).
+    """Return the ASGI application.
 
-    to_act: what somebody has to do who wants to act on a page that is read-only.
+    hosts: names of this server in valid requests ("*": any). to_act: advice in the refusal of an
+    action on a read-only page.
     """
     ending, known = asyncio.Event(), (-1, b"")
     made: dict[Hashable, tuple[int, bytes]] = {}

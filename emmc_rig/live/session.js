@@ -17,7 +17,7 @@ function draw(before) {
   write("wish", here ? "Paused by hand: \u201cgo on\u201d takes the next frame." : state.wish);
   $("waiting").hidden = !state.paused || here || state.by_hand;
   write("waiting", !state.paused ? "" : state.held ? "Paused by hand." : `Waiting: ${state.paused.reason}`);
-  for (const one of document.querySelectorAll(".steers")) one.hidden = state.read_only || state.ended;
+  each(".steers", (part) => { part.hidden = state.read_only || state.ended; });
   write("pause", state.held ? "go on" : "pause");
   $("pause").hidden = state.paused !== null && !state.held;
   drawAsk();
@@ -48,11 +48,11 @@ function drawEnd() {
   const { end, verdict } = state;
   $("end").hidden = !state.ended;
   $("capture-section").hidden = state.ended;
-  const reasons = (verdict?.reasons || []).map((one) => `${one.level}: ${one.what}; ${one.remedy}`);
-  const folder = end && (/[^\w./:\\-]/.test(end.session) ? JSON.stringify(end.session) : end.session);
+  const reasons = (verdict?.reasons || []).map((reason) => `${reason.level}: ${reason.what}; ${reason.remedy}`);
+  const next = end?.complete ? "reconstruct the light field of session" : "go on with this capture; its session is";
   writeWithCode("end", !end ? `The capture has ended: ${state.why || "see the terminal"}`
     : [end.complete ? "Complete: every frame verified." : `Stopped: ${end.missing} frames are still to be taken.`,
-      ...reasons, `Next: \`emmc-rig ${end.complete ? "reconstruct" : "capture"} ${folder}\``].join("\n"));
+      ...reasons, `Next: ${next} \`${end.session}\``].join("\n"));
   $("end").classList.toggle("good", Boolean(end?.complete) && reasons.length === 0);
   $("end").classList.toggle("bad", !end);
 }
@@ -79,7 +79,7 @@ function drawAsk() {
   $("done").disabled = !asked || performance.now() - wishedAt < UNREAD_MS;
   const left = $("left").textContent;
   const how = !asked ? "" : state.read_only ? "Press Enter at the computer when it is done."
-    : "Done is also the space bar or Enter, or a foot switch that sends one of them.";
+    : "Done is also the space bar or Enter, or a foot switch that sends either.";
   write("ask-note", `${left && `A${left.slice(1)}. `}${how}`);
 }
 
@@ -89,7 +89,7 @@ function drawPlate(hole) {
   $("plate").toggleAttribute("hidden", !plate);
   if (!plate || key === drawnPlate) return;
   drawnPlate = key;
-  const [rows, columns] = plate, one = (name, facts, text = "") => {
+  const [rows, columns] = plate, shape = (name, facts, text = "") => {
     const made = document.createElementNS("http://www.w3.org/2000/svg", name);
     for (const [fact, value] of Object.entries(facts)) made.setAttribute(fact, value);
     made.textContent = text;
@@ -99,9 +99,9 @@ function drawPlate(hole) {
   const drawn = [];
   for (let v = 0; v < rows; v++) for (let u = 0; u < columns; u++) {
     const x = 10 * u + 5, y = 10 * v + 5, is = (place) => place && place[0] === v && place[1] === u;
-    drawn.push(one("circle", { cx: x, cy: y, r: 4.2, class: is(hole) ? "wanted" : "hole" }));
-    drawn.push(one("text", { x, y: y + 1.3, class: is(hole) ? "wanted" : "hole" }, number([v, u])));
-    if (is(state.last_hole)) drawn.push(one("path", { d: `M${x - 4} ${y - 4}l8 8m0-8l-8 8`, class: "last" }));
+    drawn.push(shape("circle", { cx: x, cy: y, r: 4.2, class: is(hole) ? "wanted" : "hole" }));
+    drawn.push(shape("text", { x, y: y + 1.3, class: is(hole) ? "wanted" : "hole" }, number([v, u])));
+    if (is(state.last_hole)) drawn.push(shape("path", { d: `M${x - 4} ${y - 4}l8 8m0-8l-8 8`, class: "last" }));
   }
   $("plate").setAttribute("viewBox", `0 0 ${10 * columns} ${10 * rows}`);
   $("plate").setAttribute("aria-label", `plate of ${rows} by ${columns} holes: `
@@ -110,7 +110,7 @@ function drawPlate(hole) {
 }
 
 // A tile is made once for each frame, and its picture is asked for when that is taken (again). Like
-// tiles stand in one group; the newest is open, of the others a line says what is in them.
+// tiles stand in a group; the newest group is open, and the others have a summary.
 const groups = new Map();
 const FEW = 24;
 function groupOf(kind) {
@@ -129,29 +129,29 @@ function groupOf(kind) {
 }
 
 function drawFrames() {
-  const parent = $("frames"), shown = new Set(state.frames.map((one) => one.id)), made = new Set();
+  const parent = $("frames"), shown = new Set(state.frames.map((frame) => frame.id)), made = new Set();
   for (const [id, row] of rows) if (!shown.has(id)) { row.remove(); rows.delete(id); }
-  for (const one of state.frames) {
-    let tile = rows.get(one.id);
+  for (const frame of state.frames) {
+    let tile = rows.get(frame.id);
     if (!tile) {
       tile = document.createElement("button");
       tile.className = "tile";
-      tile.append(document.createElement("img"), cell("span", one.id), cell("span", "", "figure"));
+      tile.append(document.createElement("img"), cell("span", frame.id), cell("span", "", "figure"));
       tile.firstChild.alt = "";
       tile.firstChild.loading = "lazy";
-      tile.addEventListener("click", () => choose_frame(one.id));
+      tile.addEventListener("click", () => choose_frame(frame.id));
       tile.setAttribute("aria-pressed", "false");
-      rows.set(one.id, tile);
-      groupOf(one.kind).tiles.prepend(tile);
-      made.add(one.kind);
+      rows.set(frame.id, tile);
+      groupOf(frame.kind).tiles.prepend(tile);
+      made.add(frame.kind);
     }
-    const key = `frame.jpg?id=${encodeURIComponent(one.id)}&n=${one.number}`;
+    const key = `frame.jpg?id=${encodeURIComponent(frame.id)}&n=${frame.number}`;
     if (tile.firstChild.getAttribute("src") !== key) tile.firstChild.src = key;
-    const saturated = one.saturated > 0 ? `, ${(100 * one.saturated).toFixed(2)} % saturated` : "";
-    const words = `${Math.round(100 * one.level)}\u00a0%\u00a0of\u00a0white${saturated}, ${Number(one.exposure_s.toPrecision(3))}\u00a0s`;
-    if (tile.lastChild.textContent !== words) tile.lastChild.textContent = words;
-    tile.lastChild.classList.toggle("bad", one.saturated > 0.001);
-    tile.classList.toggle("due", !one.stored);
+    const saturated = frame.saturated > 0 ? `, ${(100 * frame.saturated).toFixed(2)} % saturated` : "";
+    const words = `${Math.round(100 * frame.level)}\u00a0%\u00a0of\u00a0white${saturated}, ${Number(frame.exposure_s.toPrecision(3))}\u00a0s`;
+    put(tile.lastChild, words);
+    tile.lastChild.classList.toggle("bad", frame.saturated > 0.001);
+    tile.classList.toggle("due", !frame.stored);
     tile.disabled = state.read_only || state.ended;
   }
   for (const kind of made) {
@@ -161,7 +161,7 @@ function drawFrames() {
     parent.prepend(all);
     all.open = true;
   }
-  for (const [kind, group] of groups) drawGroup(group, state.frames.filter((one) => one.kind === kind));
+  for (const [kind, group] of groups) drawGroup(group, state.frames.filter((frame) => frame.kind === kind));
   const hidden = state.taken - state.frames.length;
   write("chosen", chosen.size ? `${chosen.size} chosen` : state.frames.length === 0 ? "none yet" : hidden > 0 ? `the last ${state.frames.length} of ${state.taken}` : "");
   $("retake").disabled = chosen.size === 0;
@@ -169,11 +169,11 @@ function drawFrames() {
 }
 
 function drawGroup(group, frames) {
-  const levels = frames.map((one) => Math.round(100 * one.level)), most = Math.max(...levels), least = Math.min(...levels);
-  const due = frames.filter((one) => !one.stored).length, bad = frames.filter((one) => one.saturated > 0.001).length;
+  const levels = frames.map((frame) => Math.round(100 * frame.level)), most = Math.max(...levels), least = Math.min(...levels);
+  const due = frames.filter((frame) => !frame.stored).length, bad = frames.filter((frame) => frame.saturated > 0.001).length;
   const words = [`${frames.length}`, `${least === most ? "" : `${least} to `}${most}\u00a0% of white`,
     due && `${due} not on the disk yet`, bad && `${bad} saturated`].filter(Boolean).join(", ");
-  if (group.words.textContent !== words) group.words.textContent = words;
+  put(group.words, words);
   group.words.classList.toggle("bad", bad > 0);
   group.more.textContent = `all ${frames.length}`;
   group.more.hidden = frames.length <= FEW || group.tiles.classList.contains("all");
@@ -186,28 +186,15 @@ function choose_frame(id) {
 }
 
 function drawNewest() {
-  const one = state.frame ? state.frames.at(-1) : null;
+  const frame = state.frame ? state.frames.at(-1) : null;
   write("none-yet", state.asked ? "no frame yet: it is taken when that is done" : "waiting for the first frame");
-  write("newest", one ? `${one.id}: its brightest readings reach ${Math.round(100 * one.level)}\u00a0% of white` : "");
-  write("why", !one || one.level > DIM ? "" : one.kind === "dark" ? "Black, as it should be: the lamp is off while darks are taken."
-    : `Almost black: ${one.kind === "whiteboard" ? "little light comes through one pinhole" : "little light comes at this exposure"}.`);
+  write("newest", frame ? `${frame.id}: its brightest readings reach ${Math.round(100 * frame.level)}\u00a0% of white` : "");
+  write("why", !frame || frame.level > DIM ? "" : frame.kind === "dark" ? "Black, as it should be: the lamp is off while darks are taken."
+    : `Almost black: ${frame.kind === "whiteboard" ? "little light comes through frame pinhole" : "little light comes at this exposure"}.`);
 }
 
-let loading = false, wanted = false;
-async function show() {
-  if (onField() || !state.frame) return;
-  if (loading) { wanted = true; return; }
-  loading = true;
-  try {
-    const blob = await (await ask("newest.jpg?n=" + state.frame)).blob();
-    const before = $("picture").src;
-    $("picture").src = URL.createObjectURL(blob);
-    $("picture").hidden = false;
-    $("none-yet").hidden = true;
-    if (before) URL.revokeObjectURL(before);
-  } catch (fault) { /* the next frame is shown */ }
-  loading = false;
-  if (wanted) { wanted = false; show(); }
+function show() {
+  if (!onField() && state.frame) load("newest.jpg?n=" + state.frame, show);
 }
 
 $("pause").addEventListener("click", () => act(state.held ? "resume" : "pause"));

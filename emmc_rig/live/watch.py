@@ -1,8 +1,8 @@
-"""The camera behind the page, and all that is worked out of its frames: always of the newest.
+"""The page to set up by: camera and stage behind it, and figures of the newest frame.
 
 The camera's thread takes frame after frame while somebody looks; wishes (exposure, gain) are
 carried out between two frames. Levels, mask and light field have a thread each, which takes the
-newest frame and skips frames that came meanwhile: a slow thread delays no quick one.
+newest frame and skips older ones: a slow thread does not delay a quick one.
 """
 
 from __future__ import annotations
@@ -28,18 +28,21 @@ from emmc_rig.bench.registration import LEAST_LIKENESS, registered
 from emmc_rig.errors import AppError
 from emmc_rig.live.alignment import MaskGauge
 from emmc_rig.live.driving import Driving
-from emmc_rig.live.light_field import LiveLightField
+from emmc_rig.live.light_field import LiveLightField, field_pictures
+from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.save import Files, Found
+from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query, finite
 from emmc_rig.live.steps import (
     AWAY_UM,
     LONGEST_UNASKED_S,
     NO_FOCUS,
-    Saving,
     exposure_hint,
+    hint_of,
     steps,
 )
 from emmc_rig.model.camera import Camera as Design
 from emmc_rig.model.errors import CameraError
+from emmc_rig.model.settings import validated
 from emmc_rig.pages.frame_view import brightest, histogram
 from emmc_rig.session.brightness import (
     GOOD_LEVELS,
@@ -54,7 +57,7 @@ from emmc_rig.session.brightness import (
 )
 
 IDLE_S = 10.0
-"""Without anybody who asks for this long, no frame is taken."""
+"""No frame is taken when nobody has looked at the page for so long."""
 RETRY_S = 1.0
 FASTEST_S = 0.04
 """Frames are not taken faster than this: a page cannot show more."""
@@ -77,10 +80,10 @@ EXPOSURE_TRIES = 8
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A frame with its number, and when it came (monotonic clock).
+    """A frame with its number, and the time of its arrival (monotonic clock).
 
-    moves: how many moves the stage had made; None: it moved since this frame was asked for, or
-    since the one before where a camera streams, and one may be on its way meanwhile.
+    moves: number of moves that the stage had made; None for a frame that a move may blur: the stage
+    moved during its exposure, or, of a camera that streams, since the frame before.
     """
 
     number: int
@@ -90,14 +93,17 @@ class Shown:
 
 
 class Watch:
-    """What the page shows and asks for; every method may be called by any thread.
+    """The page, a `emmc_rig.live.server.Page`; every method may be called by any thread.
 
-    stage: None where there is none. look: changes what a simulated bench shows, None otherwise;
-    targets: what it takes. centre_um: where each axis centres the mask and opens the aperture.
-    design: the camera whose mask is in, for what needs to know it. light_field: reconstructs what
-    the camera sees. files: that what is found may be written into. Raises nothing of the devices:
-    their errors become `state`'s "trouble".
+    stage: None for a bench without. look: changes the target of a simulated bench; targets: the
+    names that it takes. centre_um: place of each axis that centres the mask and opens the aperture.
+    design: the camera whose mask is in. light_field: reconstructs while the camera watches. saved:
+    files into which the page may write. following: the command to go on with once a plan was
+    saved; "": none is known. Errors of the devices are not raised: they are "trouble" of `state`.
     """
+
+    files: tuple[str, ...] = ("page.html", "page.js", *COMMON_FILES)
+    urgent: frozenset[str] = frozenset({"stop", "cancel"})
 
     def __init__(
         self,
@@ -108,14 +114,15 @@ class Watch:
         centre_um: Mapping[str, float] | None = None,
         design: Design | None = None,
         light_field: LiveLightField | None = None,
-        files: Files | None = None,
+        saved: Files | None = None,
+        following: str = "",
     ) -> None:
         self._camera, self._look, self.targets = camera, look, targets
         axes = () if stage is None else stage.axes
         self._centre_um = {a: um for a, um in (centre_um or {}).items() if a in axes}
         self._design = design
         self.light_field = light_field
-        self._files = files or Files()
+        self._saved, self._following = saved or Files(), following
         self._found = Found()
         self._written: list[str] = []
         self._news = threading.Condition()
@@ -145,7 +152,29 @@ class Watch:
             "light_field": None,
             "hint": None,
             "steps": [],
-            "takes": self._files.takes,
+            "takes": self._saved.takes,
+            "next": following,
+        }
+        self.pictures: Mapping[str, Pictured] = {
+            "picture.jpg": self._picture,
+            **field_pictures(lambda: light_field and light_field.pictures()),
+        }
+        self.actions: Mapping[str, Action] = {
+            "exposure": lambda seconds: self.set_exposure_s(finite(seconds)),
+            "gain": lambda factor: self.set_gain(finite(factor)),
+            "autoexpose": lambda longest_s=LONGEST_UNASKED_S: self.auto_expose(finite(longest_s)),
+            "cancel": self.cancel,
+            "jog": lambda axis, distance_um: self.jog(str(axis), finite(distance_um)),
+            "go": lambda axis, place_um: self.go(str(axis), finite(place_um)),
+            "home": lambda: self.home(),
+            "centre": self.centre,
+            "stop": self.stop,
+            "look": self.look_at,
+            "reference": lambda taken: self.take_reference(taken),
+            "refocus": self._focus.forget,
+            "autofocus": lambda span_um: self.autofocus(finite(span_um)),
+            "preview": self.preview,
+            "save": self.save,
         }
         self._asked_s = time.monotonic()
         self._ending = threading.Event()
@@ -196,19 +225,33 @@ class Watch:
         newest = self.newest()
         return None if newest is None else newest.frame
 
-    def state(self, after: int = 0, patience_s: float = 0.0) -> dict[str, Any]:
-        """Return what is known, when it is newer than version `after` or patience ends."""
+    def touch(self) -> None:
+        """Let frames be taken."""
+        self.newest()
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of the page, plain data."""
         with self._news:
             self._asked_s = time.monotonic()
-            self._news.wait_for(
-                lambda: self._state["version"] > after or self._ending.is_set(), patience_s
-            )
             return {**self._state, "trouble": dict(self._state["trouble"])}
 
     @property
     def version(self) -> int:
         """Grows with every change of the state."""
         return self._state["version"]
+
+    def _picture(self, query: Query) -> Picture | None:
+        view = validated(View, dict(query), "the picture", AppError)
+        newest = self.newest()
+        if newest is None:
+            return None
+
+        def make() -> bytes:
+            frame = self.frame()
+            assert frame is not None
+            return encoded(picture(frame, view))
+
+        return Picture(view.model_dump_json(), newest.number, make)
 
     def set_exposure_s(self, exposure_s: float) -> None:
         """Let the frames that follow be exposed for so long."""
@@ -281,10 +324,6 @@ class Watch:
         look = self._look
         self._wishes.put(lambda: look(target))
         self._start_anew()
-
-    def forget_focus(self) -> None:
-        """Compare the sharpness with nothing seen so far."""
-        self._focus.forget()
 
     def take_reference(self, taken: bool = True) -> None:
         """Measure shifts from the present frame on; or no more."""
@@ -364,13 +403,13 @@ class Watch:
             axes = zip(("mask_x", "mask_y"), place.offset_um, strict=True)
             zero_um = {a: self._centre_um[a] - um for a, um in axes if a in self._centre_um}
         self._found = replace(self._found, exposure_s=exposure_s, zero_um=zero_um)
-        return {"diff": self._files.preview(self._found, what)}
+        return {"diff": self._saved.preview(self._found, what)}
 
-    def save(self) -> dict[str, list[str]]:
-        """Write what was previewed; raises AppError."""
-        self._written = self._files.save()
+    def save(self) -> dict[str, Any]:
+        """Write what was previewed, and return the files and the next command; raises AppError."""
+        self._written = self._saved.save()
         self._publish()
-        return {"written": self._written}
+        return {"written": self._written, "next": self._following}
 
     def stop(self) -> None:
         """Stop all axes now, in the middle of a move too."""
@@ -423,9 +462,9 @@ class Watch:
         ]
 
     def _hint(self) -> dict[str, Any] | None:
-        """Return what to do next, in words, and the action that does it ("": a person's).
+        """Return the hint for the newest picture; None where it is well exposed.
 
-        None: nothing, or the picture is from before the present place of the stage.
+        None also for a picture that was taken before the last move of the stage.
         """
         figures = self._state["figures"]
         if figures is None or figures["moves"] is None or figures["moves"] != self._moved():
@@ -433,17 +472,12 @@ class Watch:
         away = self._away()
         level = figures["level"]
         if figures["dark"] and away:
-            return {
-                "text": f"The picture is dark: {', '.join(away)} away from the centre.",
-                "action": "centre",
-            }
+            names = ", ".join(away)
+            return hint_of(f"The picture is dark: {names} away from the centre.", "centre")
         if figures["dark"]:
-            return {
-                "text": "The picture is dark: switch the lamp on, open the aperture.",
-                "action": "",
-            }
+            return hint_of("The picture is dark: switch the lamp on, open the aperture.")
         if figures["saturated"] > OVEREXPOSED:
-            return {"text": "Part of the picture is saturated.", "action": "autoexpose"}
+            return hint_of("Part of the picture is saturated.", "autoexpose")
         if level < UNDEREXPOSED:
             exposure_s = figures["exposure_s"] or self._exposure_s
             longest_s = self._state["settings"]["exposure_limits_s"][1]
@@ -452,19 +486,17 @@ class Watch:
 
     def _steps(self, hint: Mapping[str, Any] | None) -> list[dict[str, Any]]:
         """Return the steps from an unpacked box to a plan: see `emmc_rig.live.steps`."""
-        figures, mask = self._state["figures"], self._state["mask"]
-        places = (
-            {}
-            if self._driving is None
-            else {axis: self._driving.position_um(axis) for axis in self._driving.stage.axes}
-        )
-        off_um = {
-            axis: None if at is None else at - self._centre_um[axis]
-            for axis, at in places.items()
-            if axis in self._centre_um
-        }
-        saving = Saving(self._files.takes, self._written)
-        return steps(figures, mask, off_um, tuple(places), self._found, saving, hint)
+        axes: tuple[str, ...] = ()
+        off_um: dict[str, float | None] = {}
+        if self._driving is not None:
+            axes = self._driving.stage.axes
+            for axis in (axis for axis in axes if axis in self._centre_um):
+                at_um = self._driving.position_um(axis)
+                off_um[axis] = None if at_um is None else at_um - self._centre_um[axis]
+        return steps(
+            self._state["figures"], self._state["mask"], off_um, axes, self._found,
+            self._saved.takes, self._written, hint,
+        )  # fmt: skip
 
     def _read_settings(self) -> dict[str, Any]:
         camera = self._camera

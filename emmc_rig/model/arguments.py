@@ -1,4 +1,4 @@
-"""Arguments of public functions: of a type that they take, or refused in one line."""
+"""Checks of the arguments of public functions; another type raises an error of one line."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from numba import get_num_threads
 from emmc_rig.model.compiling import njit
 
 _inside = threading.local()
-"""Set in a thread that works on a band: what it calls runs in that thread alone."""
+"""Set in a thread that works on a band: calls within it use no further threads."""
 
 
 @cache
@@ -39,7 +39,7 @@ def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None
     count = min(rows, threads if bands is None else bands)
     edges = np.linspace(0, rows, count + 1).round().astype(int)
 
-    def one(band: int) -> None:
+    def work_on(band: int) -> None:
         outer, _inside.band = getattr(_inside, "band", False), True
         try:
             work(band, int(edges[band]), int(edges[band + 1]))
@@ -48,13 +48,13 @@ def in_bands(work: Callable[[int, int, int], None], rows: int, bands: int | None
 
     if threads == 1 or count == 1 or getattr(_inside, "band", False):
         for band in range(count):
-            one(band)
+            work_on(band)
         return
     ahead = iter(range(count))
 
     def several() -> None:
         for band in ahead:  # threads share it: who is free takes the next
-            one(band)
+            work_on(band)
 
     # A task a thread, not a band: to hand one over takes as long as a short band.
     at_work = [_pool(threads).submit(several) for _ in range(min(threads, count))]
@@ -76,8 +76,8 @@ def in_views(work: Callable[[tuple[int, int]], None], views: tuple[int, ...]) ->
 def summed_in_bands(work: Callable[[int, int, int], None], rows: int, reach_rows: float) -> None:
     """Call work(sums, first, last + 1) for bands of rows that add to one of two sums, 0 or 1.
 
-    A row adds at most reach_rows away, so that bands of the same sum never meet. What is added, and
-    in which order, depends on no number of threads, as rounding otherwise would.
+    A row adds at most reach_rows away, so that bands of the same sum never meet. The terms and
+    their order, and so the rounding, are the same for any number of threads.
     """
     apart = ceil(2 * reach_rows) + 1
     bands = max(2, rows // apart // 2 * 2)

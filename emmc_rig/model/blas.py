@@ -1,6 +1,6 @@
-"""One thread for NumPy's and SciPy's linear algebra, so that its rounding is the same everywhere.
+"""Linear algebra of NumPy and SciPy in one thread, for equal rounding on all computers.
 
-OpenBLAS splits sums by its number of threads, which is that of the machine's cores.
+OpenBLAS splits sums among its threads, of which there are as many as processor cores.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from threadpoolctl import threadpool_limits
 
 _lock = threading.Lock()
 _inside: list[threadpool_limits] = []
-"""A limit for each call that is at work; the first one's is lifted when the last call ends."""
+"""A limit for each call at work, all the same; it is lifted when the last call ends."""
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Compute with one thread of BLAS in this process, until all calls that ask for it have ended.
+    """Limit BLAS in this process to one thread, until the last of overlapping calls ends.
 
     Also a decorator.
     """

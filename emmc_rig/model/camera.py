@@ -317,7 +317,7 @@ def camera_of(psi: ImagingMatrix) -> Camera:
 def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
     """Return the camera with some of its shots alone, as `ImagingMatrix.camera_json`.
 
-    "" where no camera is made of them: where a mask shows another pattern in every shot.
+    "" for cameras whose mask shows another pattern in every shot: no subset is a camera.
     """
     count = len(camera.shots)
     if any(mask.pattern.frame_count(count) > 1 for mask in camera.masks.values()):
@@ -551,12 +551,12 @@ def seen_of_white(
 ) -> NDArray[np.float64]:
     """Return the sum over the views of Psi's weights, (shot, y, stored colour, x), without Psi.
 
-    Takes and raises what `build_imaging_matrix` does, but for shots that no light reaches.
+    Arguments and errors: see `build_imaging_matrix`, which alone refuses shots without light.
     """
-    shares, colour = _shares(camera, size)
-    stored = 3 if colour is None else 1
-    seen = np.empty((len(camera.shots), size[0], stored, size[1]))
-    for shot, share in enumerate(shares):
+    layout = psi_layout(camera, size)
+    colour = layout.colour
+    seen = np.empty((layout.shots, *layout.weights_shape[3:]))
+    for shot, share in enumerate(_shares(camera, size)):
         passed = _passed_to_all(camera, size, plates, shot) * share
         if colour is not None:
             index = colour[shot][..., None].astype(np.intp)
@@ -597,20 +597,14 @@ def _weights_of_views(
             raise CameraError(f"mask '{name}', shot {shot}: {fault}") from fault
 
 
-def _shares(
-    camera: Camera, size: tuple[int, int]
-) -> tuple[list[NDArray[np.float32]], NDArray[np.uint8] | None]:
-    """Return what an open camera's Psi has of each colour, (y, x, colour) of each shot, and the
-    colour that a sample's pixel sees, (shot, y, x); None where some see several."""
+def _shares(camera: Camera, size: tuple[int, int]) -> list[NDArray[np.float32]]:
+    """Return the share of each colour in an open camera's Psi, (y, x, colour) of each shot."""
     response = sensor_response(camera, size)
-    colours_seen = response.sum(axis=-1)
     scale = camera.views[0] * camera.views[1] * camera.sensor.binning**2
-    shares = [
-        (one / np.maximum(seen, 1)[..., None] / scale).astype(np.float32)
-        for one, seen in zip(response, colours_seen, strict=True)
+    return [
+        (colours / np.maximum(seen, 1)[..., None] / scale).astype(np.float32)
+        for colours, seen in zip(response, response.sum(axis=-1), strict=True)
     ]
-    single = bool((colours_seen <= 1).all())
-    return shares, response.argmax(axis=-1).astype(np.uint8) if single else None
 
 
 def build_imaging_matrix(
@@ -625,10 +619,9 @@ def build_imaging_matrix(
     divide the light field, and for a shot that no light reaches.
     """
     plates = draw_plates(camera, size) if plates is None else plates
-    shares, colour = _shares(camera, size)
-    shape = (len(camera.shots), *camera.views, size[0], 3 if colour is None else 1, size[1])
-    weights = np.empty(shape, dtype=np.float32)
-    for shot, share in enumerate(shares):
+    layout = psi_layout(camera, size)
+    colour, weights = layout.colour, np.empty(layout.weights_shape, dtype=np.float32)
+    for shot, share in enumerate(_shares(camera, size)):
         for v, u, passed in _transmittances(camera, size, plates, shot):
             passed *= share
             if colour is not None:
@@ -640,5 +633,4 @@ def build_imaging_matrix(
             raise CameraError(
                 f"no light reaches the sensor in shot {shot}: open its masks or change its filter"
             )
-    k = camera.sensor.binning
-    return ImagingMatrix(weights, colour, k, camera.model_dump_json(), camera.view_axes)
+    return layout.psi(weights)

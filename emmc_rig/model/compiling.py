@@ -1,15 +1,15 @@
 """Compiled kernels whose machine code is kept on the disk for as long as its sources are the same.
 
-Numba keeps machine code until the kernel's own file changes. But helpers and constants of other
-files are part of that code, so it is kept here per state of all files that the kernel's file
-imports from its own package and from this project, directly or through others.
+Numba keeps machine code until the kernel's own file changes. But helpers and constants of imported
+files are part of that code. It is therefore kept by a hash of all files of this project and of the
+kernel's own package that the kernel's file imports, directly or indirectly.
 
 A helper that a kernel calls must be compiled into the kernel (`forceinline=True`, and no cache of
 its own). If a call remains, the kernel's machine code brings its own copy of the helper, optimised
 again, and a process calls the copy that it met first: after compiling, the helper's own copy; after
 loading from the disk, the copy of the first kernel. The two copies may round differently.
 
-Of several processes that need a kernel, one compiles it: the others wait, and load what it wrote.
+Of several processes that need a kernel, the first compiles it; the others wait and load its code.
 The clock `running_s` stands still meanwhile: the seconds of a method are those of its work.
 """
 
@@ -200,7 +200,7 @@ def _user_folder() -> str:
 
 @cache
 def _folder(file: Path, user_folder: str) -> Path | None:
-    """Return the folder of a file's kernels as its sources are now; None where none can be made."""
+    """Return the folder for kernels of a file in its present state; None where no disk takes it."""
     try:
         name, state = _state(file)
     except OSError:  # no source at hand, as in a zip archive

@@ -1,4 +1,4 @@
-"""Errors of the camera model: each message says what is wrong and what to do, in one line."""
+"""Errors of the camera model; a message is one line, with the fault and its remedy."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,13 +7,13 @@ from emmc_rig.model.advice import AdvisedError
 
 
 def nearest_of(name: str, known: Iterable[str]) -> str:
-    """Return a hint for a name that is not known: the nearest one, if any is near, and all."""
+    """Return a hint for an unknown name: the nearest known name, if any is near, and all names."""
     known = list(known)
     return f"{did_you_mean(name, known, 0.6)}known are {', '.join(known)}"
 
 
 def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.5) -> str:
-    """Return a question that names the nearest of what is known, "" where none is that near."""
+    """Return "did you mean", with the known name that is nearest; "" where no name is near."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=likeness)
     return f"did you mean '{near[0]}'? " if near else ""
 

@@ -45,7 +45,7 @@ class Disk:
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
     def make_folder(self, path: Path) -> None:
-        """Make a folder and those above it, where they are missing."""
+        """Make a folder, with its missing parents."""
         path.mkdir(parents=True, exist_ok=True)
 
     def sync(self, path: Path) -> None:
@@ -198,7 +198,7 @@ def make_folder_whole(disk: Disk, folder: Path, files: Mapping[str, bytes]) -> N
 
 
 def _make_synced(disk: Disk, folder: Path) -> None:
-    """Make a folder and those above it, with their names on the disk."""
+    """Make a folder with its missing parents, and sync their names."""
     try:
         disk.sizes(folder)
     except FileNotFoundError:

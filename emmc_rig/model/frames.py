@@ -35,7 +35,7 @@ class Frames:
     readings: 1 is the reading of the fully open camera and a white light field. Saturated pixels
     have the reading of their white level, a lower bound; other unusable pixels have 0. deviation:
     standard deviation of each reading. usable: pixels that are neither saturated nor bad.
-    exposures: of each shot, where they are known. NumPy takes frames as their readings.
+    exposures: of each shot; (): unknown. NumPy takes frames as their readings.
     """
 
     readings: NDArray[np.floating]

@@ -104,12 +104,12 @@ class CellWeights:
     @classmethod
     def summed(cls, matrices: Sequence[CellWeights]) -> CellWeights:
         """Return the sum of matrices of one shape, as those of neighbouring views."""
-        first = np.min([one.first for one in matrices], axis=0)
-        ends = [one.first + one.values.shape[1] for one in matrices]
+        first = np.min([matrix.first for matrix in matrices], axis=0)
+        ends = [matrix.first + matrix.values.shape[1] for matrix in matrices]
         values = np.zeros((len(first), int((np.max(ends, axis=0) - first).max())))
-        for one in matrices:
-            columns = (one.first - first)[:, None] + np.arange(one.values.shape[1])
-            np.add.at(values, (np.arange(len(first))[:, None], columns), one.values)
+        for matrix in matrices:
+            columns = (matrix.first - first)[:, None] + np.arange(matrix.values.shape[1])
+            np.add.at(values, (np.arange(len(first))[:, None], columns), matrix.values)
         return cls(first, values, matrices[0].cells)
 
     def toarray(self) -> NDArray[np.float64]:

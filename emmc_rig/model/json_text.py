@@ -19,7 +19,7 @@ def parse_json(data: bytes | str, source: str, error: type[Exception]) -> Any:
 
 def shown_path(path: Path | str) -> str:
     """Return a path on one line: control characters escaped, no longer than a name can be."""
-    text = "".join(one if one.isprintable() else repr(one)[1:-1] for one in str(path))
+    text = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in str(path))
     return text if len(text) <= 300 else f"{text[:300]}..."
 
 

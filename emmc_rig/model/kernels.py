@@ -1,7 +1,7 @@
 """Fused loops of the imaging matrix, over rows of pixels in parallel: see `row_kernel`.
 
 Axes: weights (shot, v, u, y, stored colour, x); frames (shot, pixel_y, pixel_x); light fields as
-said at each. With one stored colour, `colour` (shot, y, x) says which it is. A pixel sums
+stated for each. `colour` (shot, y, x): number of the only stored colour. A pixel sums
 binning x binning samples; samples belong to one pixel only, so Psi Psi^T is one small block
 (shot x shot) per pixel. Solvers keep the colours of a row apart, (v, u, y, colour, x): their
 loops then run along x.
@@ -160,10 +160,10 @@ def gram(begin, end, weights, colour, binning, blocks):
                     for v in range(views_v):
                         for u in range(views_u):
                             for c in range(stored):
-                                one, other = weights[a, v, u, y, c], weights[b, v, u, y, c]
+                                first, second = weights[a, v, u, y, c], weights[b, v, u, y, c]
                                 for x in range(width):
                                     if stored == 3 or colour[a, y, x] == colour[b, y, x]:
-                                        total[x] += np.float64(one[x]) * np.float64(other[x])
+                                        total[x] += np.float64(first[x]) * np.float64(second[x])
                 for x in range(blocks.shape[3]):
                     value = 0.0
                     for sample in range(x * binning, (x + 1) * binning):

@@ -32,7 +32,7 @@ _VIEW_NAME = re.compile(r"view_(\d+)_(\d+)\.(png|tiff?|exr)", re.IGNORECASE)
 _LIKE_A_VIEW = re.compile(r"view|[^.].*\d\D+\d+\.(png|tiff?|exr|jpe?g|bmp|webp)$", re.IGNORECASE)
 """Begins as a view's name, or is a picture's with two numbers."""
 _MOST_VIEWS = 10_000
-"""In a grid of which most are missing; what asks for more is another number, such as a time."""
+"""In a grid with most views missing; names with larger numbers hold a time or the like."""
 _SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
@@ -77,8 +77,8 @@ def load_views(folder: str | os.PathLike) -> np.ndarray:
         (v, u, y, x, 3), code values divided by the full scale; floating values as they are.
 
     Raises:
-        SceneError: no such folder, no views in it, views missing or not named as the others, a
-            file that is no whole picture, or pictures of different sizes.
+        SceneError: no such folder; no views, missing views or views with other names; files that
+            are damaged or no pictures; pictures of different sizes.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -2,7 +2,7 @@
 
 Positions are in view steps: (v, u) = (1.5, 2) lies halfway between two views of column 2. Samples
 between pixels are bilinear, and beyond an edge its last pixel continues. The viewer's shader is
-the twin of `between`: what is changed here is changed in `viewer.js` too.
+the twin of `between`: change both together.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ STEPS = 3
 TOLERANCE_PX = 0.25
 """Disparities this far apart are of two surfaces; below the least step that occlusion shows."""
 LEAST_WEIGHT = 1e-3
-"""Of a view that no other confirms: what no view sees is shown as the views have it."""
+"""Of a view that no other view confirms: so that surfaces seen by a single view are shown."""
 CANDIDATES, WINDOW_PX = 33, 7
 """Disparities tried, and the side of the square over which views are compared."""
 UNSEEN = np.finfo(np.float32).max
@@ -95,7 +95,7 @@ def view_disparities(centre: Array, views: tuple[int, int]) -> NDArray[np.float3
         hole = view == UNSEEN
         cracks = hole & (cv2.blur(hole.astype(np.float32), (3, 3)) < CRACK_SHARE)
         view[cracks] = cv2.erode(view, np.ones((3, 3), np.uint8))[cracks]
-        # What a near thing uncovers is as wide as it moved against what lies behind it.
+        # A near surface uncovers a strip as wide as its shift against the background.
         steps = max(abs(v - views[0] // 2), abs(u - views[1] // 2))
         wide = 2 * int(np.ceil(steps * (depth[-1] - depth[0]))) + 3
         while (hole := view == UNSEEN).any():
@@ -107,8 +107,8 @@ def view_disparities(centre: Array, views: tuple[int, int]) -> NDArray[np.float3
 def between(light_field: Array, disparities: Array, v: float, u: float) -> Array:
     """Return the picture (y, x, c) at a position between the views.
 
-    Each ray takes its colour from the four views around it, where its surface is in them. Views
-    whose disparity does not confirm the surface, and surfaces behind a nearer one, count little.
+    The colour of a ray is a mean of the four nearest views, each sampled at the ray's surface.
+    Views whose disparity contradicts the surface, and occluded surfaces, have small weights.
 
     Args:
         light_field: (v, u, y, x, c).

@@ -33,7 +33,7 @@ _DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
 _FILTERS = frozenset((_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF))
 """Filters of HDF5 whose memory a chunk's size bounds; others allocate what the file says."""
 _BLANK = ("_FillValue", "missing_value")
-"""Attributes by which NetCDF and others name the value of what is not valid."""
+"""Attributes for the value of invalid samples, in NetCDF and other formats."""
 FAULTS = (
     *(OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError),
     MemoryError,
@@ -120,11 +120,11 @@ def _unfolded(content: object) -> float:
             continue
         children = list(value.values()) if isinstance(value, dict) else value
         if left:
-            counted[id(value)] = 1 + sum(counted.get(id(one), 1) for one in children)
+            counted[id(value)] = 1 + sum(counted.get(id(child), 1) for child in children)
         elif id(value) not in counted:
-            counted[id(value)] = np.inf  # of one inside itself
+            counted[id(value)] = np.inf  # of a list inside itself
             pending.append((value, True))
-            pending.extend((one, False) for one in children)
+            pending.extend((child, False) for child in children)
     return counted.get(id(content), 1)
 
 
@@ -205,7 +205,7 @@ def _check_written(name: str, found: h5py.Dataset) -> None:
 def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[StoredArrays]:
     """Yield the data sets of an HDF5 file; whatever fails in reading them raises `error`.
 
-    remedy: what to do about a file that is damaged or not what was expected.
+    remedy: advice for a damaged file, or a file with other content.
     """
     size = check_regular(path, error)
     try:
@@ -221,12 +221,10 @@ def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[S
         raise error(f"{shown_path(path)}: {why}; {remedy}") from fault
 
 
-def holds_array(path: Path, name: str, form: str | None = None) -> bool:
-    """Return whether a path is HDF5 with a data set of that name, its `format` as given."""
+def holds_array(path: Path, name: str) -> bool:
+    """Return whether a path is HDF5 with a data set of that name."""
     try:
         with stored_arrays(path, ValueError, "") as stored:
-            return stored.dataset(name) is not None and (
-                form is None or stored.attributes.get("format") == form
-            )
+            return stored.dataset(name) is not None
     except ValueError:
         return False

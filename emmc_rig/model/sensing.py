@@ -223,24 +223,17 @@ class ImagingMatrix(PsiLayout):
                 raise SensingError(
                     f"a window from {first} to {last} cuts pixels of {self.binning} samples"
                 )
-        return ImagingMatrix(
-            np.ascontiguousarray(self.weights[:, :, :, rows, :, columns]),
-            None if self.colour is None else np.ascontiguousarray(self.colour[:, rows, columns]),
-            self.binning,
-            self.camera_json,
-            self.view_axes,
-        )
+        weights = np.ascontiguousarray(self.weights[:, :, :, rows, :, columns])
+        colour = self.colour
+        if colour is not None:
+            colour = np.ascontiguousarray(colour[:, rows, columns])
+        return replace(self, weights=weights, colour=colour)
 
     def of_shots(self, shots: Sequence[int], camera_json: str = "") -> ImagingMatrix:
         """Return Psi of some shots, in the order given; camera_json: of a camera with these."""
         chosen = list(shots)
-        return ImagingMatrix(
-            self.weights[chosen],
-            None if self.colour is None else self.colour[chosen],
-            self.binning,
-            camera_json,
-            self.view_axes,
-        )
+        colour = None if self.colour is None else self.colour[chosen]
+        return replace(self, weights=self.weights[chosen], colour=colour, camera_json=camera_json)
 
     def forward(self, light_field: Array) -> Array:
         """Return the frames (shot, pixel_y, pixel_x) of a light field (v, u, y, x, c)."""
@@ -379,8 +372,8 @@ class ImagingMatrix(PsiLayout):
             view_axes: what rows and columns of views are, each "angle", "band" or "time".
 
         Raises:
-            SensingError: a shape that does not fit, entries that are no finite numbers, a reading
-                of samples that do not lie at its own pixel.
+            SensingError: a wrong shape, entries that are not finite, or a reading that depends on
+                samples of another pixel.
             ArgumentError: an argument of another type.
 
         >>> from scipy import sparse
@@ -444,9 +437,9 @@ class ImagingMatrix(PsiLayout):
             weights: (shot, v, u, y, x), of the light that the pixel sees; or (shot, v, u, y, x, 3),
                 of linear red, green and blue. The views are what a code multiplies: angles, bands
                 or times, any number, and bands are views (1, count).
-            cfa: the colour filters, where the weights have no colours. None: the light has none
-                either, as a monochrome sensor sees it. It is held as red, which is faster and surer
-                than three unknown colours, and `reconstruct` returns three that are alike.
+            cfa: the colour filters, for weights without colours. None: the light has no colours
+                either, as for a monochrome sensor. It is stored as red, since one unknown colour is
+                faster and surer than three; `reconstruct` returns three equal colours.
             binning: k; a pixel sums k x k samples, y and x count the samples.
             view_axes: what v and u are: `angle`, `band` or `time`.
 

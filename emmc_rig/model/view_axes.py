@@ -14,7 +14,7 @@ ViewAxis = Literal["angle", "band", "time"]
 ViewAxes = tuple[str, str]
 ANGLES: ViewAxes = ("angle", "angle")
 PICTURES = {"angle": "view", "band": "band", "time": "time"}
-"""By the name of an axis, what one picture along it is called."""
+"""Name of a picture by the name of the axis along which pictures differ."""
 VIEW_AXES = tuple(product(PICTURES, PICTURES))
 ATTRIBUTE = "view_axes"
 """Of files; without it, views are at angles."""
@@ -51,7 +51,7 @@ def picture_name(axes: ViewAxes) -> str:
 
 
 def grid_name(axes: ViewAxes, views: tuple[int, int]) -> str:
-    """Return rows, columns and what they are of: `5x5 views`, `1x24 bands`."""
+    """Return a grid of pictures in words, such as `5x5 views` or `1x24 bands`."""
     return f"{views[0]}x{views[1]} {picture_name(axes)}s"
 
 

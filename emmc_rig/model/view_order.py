@@ -1,4 +1,4 @@
-"""In which order the views of a light field lie, told from its own parallax.
+"""Order of the views of a light field, by its own parallax.
 
 By convention a point moves by one disparity d along +x from column to column of views, and along
 +y from row to row. Files of others name views column by column, or count rows from the bottom; then
@@ -7,9 +7,9 @@ that from row to row, and (L_x, L_y) the slopes of the centre view,
 
     L_u = -d L_x,  L_v = -d L_y
 
-hold with one d about a point if the order is right, and for no other order but that with both axes
-reversed, whose d is negative. The share of the squared changes that the best d of every place
-explains is compared among the orders, at several blurs since disparities may exceed a pixel.
+hold with one d about a point if the order is right. Both axes reversed change the sign of d; all
+other orders contradict the equations. The share of the squared changes that the best d of every
+place explains is compared among the orders, at several blurs since disparities may exceed a pixel.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ViewOrder(StrEnum):
 
 
 def others(views: tuple[int, int]) -> tuple[ViewOrder, ...]:
-    """Return the orders that rows and columns of views may be in but for that named."""
+    """Return the possible orders of rows and columns of views, other than the named order."""
     square = ViewOrder.TRANSPOSED, ViewOrder.MIRRORED, ViewOrder.TURNED
     return square if views[0] == views[1] else (ViewOrder.MIRRORED,)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +25,7 @@ from emmc_rig.pages.page import (
     data_address,
     fragment,
     framed,
+    part,
     provenance_section,
     typed,
 )
@@ -41,6 +42,10 @@ GOOD_CHI2 = 1.5
 """Validation residual, in variances of the noise, above which something is not modelled."""
 GOOD_BAD_PIXELS = 0.02
 """Share of pixels, from which on a reconstruction is doubted (`reconstruction.verdict.rules`)."""
+PSI_SHOWN = (
+    "How much of the light that an open camera gathers each pixel gets from each view, first shot: "
+    "one tile for each view. An open camera gets 1 / number of views from each."
+)
 SURE = 2.0
 """Deviations by which a parameter differs from the design before the page says so."""
 
@@ -48,8 +53,8 @@ SURE = 2.0
 class _Parameter(NamedTuple):
     """How a fitted parameter is written: in units of `unit`, each `per_unit` of the fit's.
 
-    design: its value as designed, in the fit's units; None where the mask's file has another for
-    every mask. of: whose property it is, where it differs.
+    design: its value as designed, in the fit's units; None where it differs from mask to mask. of:
+    the part of the camera to blame for a difference.
     """
 
     words: str
@@ -89,7 +94,7 @@ def write_calibration_report(
 
     metrics: as `emmc_rig.calibrate` makes them.
     """
-    unwatched = [one.removeprefix("not measured: ") for one in outcome.unwatched]
+    unwatched = [text.removeprefix("not measured: ") for text in outcome.unwatched]
     psi, relative_deviation = _psi(outcome)
     chosen = outcome.judged[outcome.chosen]
     sections = [
@@ -106,7 +111,7 @@ def write_calibration_report(
         ),
     ]  # fmt: skip
     if outcome.parametric is not None:
-        about = "Where it sits and how it was made, each figure with its standard deviation."
+        about = "Placement and shape of the mask, each figure with its standard deviation."
         sections.append(Section("fit", "Mask as fitted", _fit(metrics), about=about))
     if sensor is not None:
         about = "Gain, noise and linearity after EMVA 1288."
@@ -115,7 +120,7 @@ def write_calibration_report(
     title = f"Calibration of {metrics['camera']}"
     text = framed(
         title, (), (), sections, ["calibration.css"], head=_head(outcome, metrics),
-        lead=fragment("cards.html", cards=_cards(outcome, metrics, relative_deviation)),
+        lead=part("cards", _cards(outcome, metrics, relative_deviation)),
     )  # fmt: skip
     write_text(path, text)
 
@@ -161,23 +166,22 @@ def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> lis
 
 
 def _methods(outcome: Outcome) -> str:
+    heads = (
+        "Calibration method", "Frames", "Validation residual, x noise",
+        f"Good (below {GOOD_CHI2:g})", "Residual, of the signal",
+    )  # fmt: skip
     rows = [
-        (
-            name,
-            outcome.frames[name],
-            f"{one.chi2:.2f}",
-            "yes" if one.chi2 < GOOD_CHI2 else "no",
-            f"{one.relative_error:.3%}",
-        )
-        for name, one in outcome.judged.items()
-    ]
+        (name, outcome.frames[name], f"{judged.chi2:.2f}",
+         "yes" if judged.chi2 < GOOD_CHI2 else "no", f"{judged.relative_error:.3%}")
+        for name, judged in outcome.judged.items()
+    ]  # fmt: skip
     chosen = list(outcome.judged).index(outcome.chosen)
-    return fragment("calibration_choice.html", rows=rows, chosen=chosen)
+    return part("table", heads, rows, numbers=True, chosen=chosen)
 
 
 def _listed(name: str, title: str, lines: Sequence[str]) -> list[Section]:
     """Return the section of some lines; none without any."""
-    return [Section(name, title, fragment("advice.html", lines=lines))] if lines else []
+    return [Section(name, title, part("bullets", lines))] if lines else []
 
 
 def _kinds(judged: HeldOut) -> str:
@@ -185,7 +189,7 @@ def _kinds(judged: HeldOut) -> str:
     order = sorted(judged.groups.items(), key=lambda item: -item[1])
     rows = [(name, f"{value:.2f}") for name, value in order]
     heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
-    return fragment("figures.html", heads=heads, rows=rows)
+    return part("table", heads, rows, numbers=True)
 
 
 def _fit(metrics: Mapping) -> str:
@@ -197,39 +201,39 @@ def _fit(metrics: Mapping) -> str:
     return fragment("calibration_fit.html", fit=metrics["fit"], rows=rows, good_chi2=GOOD_CHI2)
 
 
-def _fitted(one: _Parameter, found: Mapping[str, float], undecided: bool) -> tuple[str, str, str]:
-    """Return a parameter as a row: its name, value and deviation, and what that says."""
-    value, deviation = found["value"] / one.per_unit, found["deviation"] / one.per_unit
+def _fitted(parameter: _Parameter, found: Mapping[str, float], undecided: bool) -> tuple[str, ...]:
+    """Return a parameter as a row: name, value with deviation, and their meaning."""
+    value, deviation = found["value"] / parameter.per_unit, found["deviation"] / parameter.per_unit
     digits = max(0, 1 - math.floor(math.log10(deviation))) if deviation > 0 else 2
-    written = f"{value:.{digits}f} ± {deviation:.{digits}f} {one.unit}"
+    written = f"{value:.{digits}f} ± {deviation:.{digits}f} {parameter.unit}"
     if undecided:
-        return one.words, written, "not known from these whiteboards: taken as designed"
-    if one.design is None:
-        return one.words, written, "measured; Psi has it"
-    away = abs(value - one.design / one.per_unit)
+        return parameter.words, written, "not known from these whiteboards: taken as designed"
+    if parameter.design is None:
+        return parameter.words, written, "measured; Psi has it"
+    away = abs(value - parameter.design / parameter.per_unit)
     if away <= SURE * deviation:
-        return one.words, written, "as designed, within its deviation"
-    return one.words, written, f"{one.of}, not an error: Psi has it"
+        return parameter.words, written, "as designed, within its deviation"
+    return parameter.words, written, f"{parameter.of}, not an error: Psi has it"
 
 
 def _residuals(judged: Sequence[HeldOut]) -> str:
     """Return maps (pixel_y, pixel_x) of what predictions miss, with axes and a scale."""
     figure, panels = sheet(len(judged), 7.0, 4.6, label="pixel y")
-    for axes, one in zip(panels, judged, strict=True):
-        height, width = one.residual.shape
-        small = _shrunk(one.residual, MAP_PX)
+    for axes, board in zip(panels, judged, strict=True):
+        height, width = board.residual.shape
+        small = _shrunk(board.residual, MAP_PX)
         scale = (-0.5, width - 0.5, height - 0.5, -0.5)
         drawn_map(
             axes, small, (-RESIDUAL_SCALE, RESIDUAL_SCALE), "validation whiteboard less "
             "prediction,\nstandard deviations of the noise", "RdBu_r", extent=scale,
         )  # fmt: skip
-        titled(axes, one.route, "pixel x")
-    return _pictures({"Residual map": figure})
+        titled(axes, board.route, "pixel x")
+    return _drawn({"Residual map": figure})
 
 
-def _pictures(figures: Mapping[str, Figure]) -> str:
-    addresses = {name: data_address(svg_of(one), ".svg") for name, one in figures.items()}
-    return fragment("calibration_pictures.html", pictures=addresses)
+def _drawn(figures: Mapping[str, Figure]) -> str:
+    addresses = {name: data_address(svg_of(figure), ".svg") for name, figure in figures.items()}
+    return part("drawings", addresses)
 
 
 def _psi(outcome: Outcome) -> tuple[str, float]:
@@ -246,8 +250,8 @@ def _psi(outcome: Outcome) -> tuple[str, float]:
         squares += [np.square(plane, dtype=np.float64).sum() for plane in planes]
         weights, spread = (plane.sum(axis=1) for plane in planes)
         shown = _shrunk(weights, THUMBNAIL_PX), _centre(weights), _centre(spread)
-        for found, one in zip(slices, shown, strict=True):
-            found.append(one)
+        for found, tile in zip(slices, shown, strict=True):
+            found.append(tile)
     titles = (
         "Weights, whole field",
         f"Weights, the middle {slices[1][0].shape[1]} x {slices[1][0].shape[0]} pixels",
@@ -270,7 +274,7 @@ def _psi(outcome: Outcome) -> tuple[str, float]:
         )
         titled(axes, title, "view u")
     relative_deviation = float(np.sqrt(squares[1] / max(squares[0], 1e-30)))
-    return fragment("calibration_psi.html") + _pictures({"Psi": figure}), relative_deviation
+    return part("lead", PSI_SHOWN) + _drawn({"Psi": figure}), relative_deviation
 
 
 def _centre(view: Array) -> Array:
@@ -302,16 +306,12 @@ def _sensor(sheet_: SensorSheet) -> str:
     linearity.axhline(0, color=INK, linewidth=0.8)
     titled(linearity, "Linearity", "exposure, s")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
-    table = fragment("figures.html", heads=heads, rows=_figures(sheet_.rows()))
-    return table + _pictures({"Photon transfer curve": first, "Linearity": second})
-
-
-def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> list[tuple[str, ...]]:
-    """Return quantities with their deviations as rows of a table."""
-    return [
+    rows = [
         (name, f"{value:.5g}", "" if deviation is None else f"{deviation:.2g}", unit)
-        for name, value, deviation, unit in rows
+        for name, value, deviation, unit in sheet_.rows()
     ]
+    table = part("table", heads, rows, numbers=True)
+    return table + _drawn({"Photon transfer curve": first, "Linearity": second})
 
 
 def _provenance(metrics: Mapping) -> dict[str, str]:

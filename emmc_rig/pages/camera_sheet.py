@@ -84,7 +84,7 @@ def _sensor_name(camera: Camera) -> str:
 def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> dict[str, Any]:
     """Return what a camera measures, on a light field of `size` (rows, columns) samples.
 
-    views: rows and columns, and what they are.
+    views: rows and columns of views, in words.
     sampling_rate: measurements per light-field value (rows over columns of Psi).
     light_efficiency: reading from a white light field, 1 for the open camera behind its filters.
     dark_share: share of the measurements that no light reaches.

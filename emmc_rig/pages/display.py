@@ -136,7 +136,7 @@ def reduced(views: Array, most_pixels: int = SPRITE_PIXELS) -> Array:
 
 
 def three_colours(views: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return pictures of one colour as pictures of three equal ones, others as they are."""
+    """Return pictures (..., c) with three colours; grey is repeated."""
     return np.repeat(views, 3, axis=-1) if views.shape[-1] == 1 else views
 
 

@@ -41,14 +41,14 @@ def sheet(
     rows = -(-panels // columns)
     figure = Figure(figsize=(wide * columns, high * rows), layout="constrained")
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(panels)]
-    for one in axes:
-        one.spines[["top", "right"]].set_visible(False)
-        one.spines[["left", "bottom"]].set_color(LINE)
-        one.tick_params(colors=FAINT, labelsize=9)
-        one.grid(axis="y", color=LINE, linewidth=0.7)
-        one.set_axisbelow(True)
-    for one in axes[::columns]:
-        one.set_ylabel(label, color=FAINT, fontsize=9)
+    for panel in axes:
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.spines[["left", "bottom"]].set_color(LINE)
+        panel.tick_params(colors=FAINT, labelsize=9)
+        panel.grid(axis="y", color=LINE, linewidth=0.7)
+        panel.set_axisbelow(True)
+    for panel in axes[::columns]:
+        panel.set_ylabel(label, color=FAINT, fontsize=9)
     return figure, axes
 
 
@@ -67,7 +67,7 @@ def drawn_map(
     colours: str,
     **more: Any,
 ) -> None:
-    """Draw a map (y, x) with a bar of its colours; label: what they are, with the unit."""
+    """Draw a map (y, x) with a colour bar; label: of the bar, with the unit."""
     axes.grid(False)
     image = axes.imshow(
         values, cmap=colours, vmin=scale[0], vmax=scale[1], interpolation="none", **more

@@ -70,7 +70,7 @@ def white_balance(whiteboard: RawFrame) -> Balance:
         for name in planes
     }
     blue, red = (
-        float(light["green"] / light[one]) if light[one] > 0 else 1.0 for one in ("blue", "red")
+        float(light["green"] / light[name]) if light[name] > 0 else 1.0 for name in ("blue", "red")
     )
     return blue, 1.0, red
 

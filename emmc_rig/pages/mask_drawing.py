@@ -43,7 +43,7 @@ def write_mask(
         "blur_cells": mask.blur_cells,
         "clear": mask.clear,
         "light_sigma": mask.light_sigma,
-        "defects": [asdict(one) for one in mask.defects],
+        "defects": [asdict(defect) for defect in mask.defects],
         "sigma": np.round(mask.sigma.astype(float), 5).tolist(),
         **provenance(),
     }
@@ -80,7 +80,7 @@ def draw_mask(photo: NDArray[np.floating], mask: MaskReading) -> Figure:
             seen.plot(at[:, 0], at[:, 1], color=ACCENT, linewidth=0.6)
     cells.imshow(_shown(mask.cells), cmap="gray", vmin=0, vmax=1)
     if mask.defects:
-        at = np.array([(one.column, one.row) for one in mask.defects])
+        at = np.array([(defect.column, defect.row) for defect in mask.defects])
         ring = {"s": 60, "facecolors": "none", "edgecolors": MARK, "linewidths": 1.2}
         cells.scatter(at[:, 0], at[:, 1], **ring)
         seen.scatter(*mask.grid.place(at[:, 0] + 0.5, at[:, 1] + 0.5).T, **ring)

@@ -38,8 +38,7 @@ VERDICTS = {
 class Section:
     """key: its anchor. title: its heading. body: HTML. short: in the navigation, if not title.
 
-    about: one sentence on what it shows; with it the section is folded, and this stands beside the
-    title.
+    about: a sentence on its content, beside the title; a section with it is folded.
     """
 
     key: str
@@ -102,7 +101,7 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
     return Head(
         words,
         "; ".join(why),
-        [one for one in remedies if one] or _uses(metrics, source, viewer),
+        [remedy for remedy in remedies if remedy] or _uses(metrics, source, viewer),
         tone,
     )
 
@@ -140,9 +139,9 @@ def _uses(metrics: Mapping[str, object], source: str, viewer: bool) -> list[str]
     named = shlex.quote(source)
     return [
         look,
-        "hand it on: this page is one file"
+        "share this page: it is a single file"
         if viewer
-        else f"hand it on as one page to turn: `emmc-rig export {named}`",
+        else f"share it as a page to turn: `emmc-rig export {named}`",
         f"open it in other programs: `emmc-rig export {named} --format tiff`; "
         "`emmc-rig export --list` names all formats",
         f"draw it for a paper: `emmc-rig figure {named}`",
@@ -187,6 +186,12 @@ def fragment(template: str, **values: object) -> Markup:
     return Markup(ENVIRONMENT.get_template(template).render(**values).lstrip())
 
 
+def part(name: str, *given: object, **values: object) -> Markup:
+    """Return a part of all pages (a macro of parts.html), such as a table; text is escaped."""
+    parts = ENVIRONMENT.get_template("parts.html").module
+    return Markup(getattr(parts, name)(*given, **values).lstrip())
+
+
 def framed(
     title: str,
     about: Sequence[str],
@@ -210,7 +215,7 @@ def framed(
 
 def provenance_section(provenance: Mapping[str, object]) -> Section:
     """Return where everything came from."""
-    body = fragment("provenance.html", rows=provenance)
+    body = part("facts", provenance.items(), code=True)
     return Section("provenance", "Provenance", body, about="Versions, command and settings.")
 
 

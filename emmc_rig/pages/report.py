@@ -108,7 +108,7 @@ def render(content: ReportContent) -> str:
 
 
 def _frames(frames: Array) -> dict[str, Any]:
-    """Return frames (shot, y, x) as pictures on one scale, so that shots compare, and its ends."""
+    """Return frames (shot, y, x) as pictures on a common scale, and the ends of the scale."""
     frames = finite(frames)
     curve = DisplayCurve.fitted_to(frames)
     small = reduced(frames[None, ..., None], FRAME_PIXELS)[0, ..., 0]
@@ -161,7 +161,7 @@ FIGURES = {
     "design_relative_error": Figure("Relative error of the design", ".2e", "",
         "|designed - exact| / |exact|: what Psi would be off by without calibration"),
     "psi_mean_deviation": Figure("Mean standard deviation of Psi", ".2e", "",
-        "of one coefficient, as calibration states it"),
+        "of a coefficient, as stated by the calibration"),
     "noise_sigma": Figure("Noise of the readings", ".2e", "",
         "their standard deviation, as the reconstruction assumed it; 1 is white"),
     "saturated_share": Figure("Saturated readings", ".2%", "", "share excluded as clipped"),
@@ -208,8 +208,8 @@ FIGURES = {
     "parameters.stated_within_db": Figure("Half of the interval", ".2f", "dB",
         "of the estimated accuracy, which holds the true PSNR in 9 of 10 captures"),
 }  # fmt: skip
-"""By the name in metrics.json; a figure without a row here is listed under its own name. In braces:
-what pictures are called, the one in the middle, what it is to fall short of it."""
+"""By the name in metrics.json; a figure without a row here is listed under its own name. Braces:
+words of the view axes, {picture} and {middle}, and {lost}, the meaning of a negative margin."""
 PROVENANCE = {
     "command": "Command line",
     "commit": "Commit",

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -28,7 +29,6 @@ from emmc_rig.model.lightfield import epi_horizontal, psnr_db, ssim
 from emmc_rig.model.view_axes import picture_name, place_name, shows_parallax
 from emmc_rig.pages.display import DisplayCurve, ends, finite, round_up, three_colours
 from emmc_rig.pages.drawing import FAINT, INK, save_publication
-from emmc_rig.pages.pictures import Piece, detailed_pieces, epipolar_lines
 from emmc_rig.version import __version__
 
 Array = NDArray[np.floating]
@@ -51,10 +51,23 @@ SCALE_SHARE = 0.25
 
 
 @dataclass(frozen=True)
+class Piece:
+    """A square of a picture to enlarge."""
+
+    y: int
+    x: int
+    side: int
+
+    def of(self, picture: NDArray) -> NDArray:
+        """Cut it out of (y, x, c)."""
+        return picture[self.y : self.y + self.side, self.x : self.x + self.side]
+
+
+@dataclass(frozen=True)
 class FigureSettings:
     """What is shown of each result.
 
-    view: its row and column (default: the centre one). at: centres (y, x) of the close-ups, pixels
+    view: its row and column (default: the centre). at: centres (y, x) of the close-ups, pixels
     (default: two with many edges). side_px: of a close-up. width_in: of the figure.
     """
 
@@ -82,7 +95,7 @@ class PaperFigure:
 
 @dataclass(frozen=True)
 class _Maps:
-    """One map (y, x) of every result, None where it has none, and their common scale."""
+    """A map (y, x) of every result, None for a result without, and their common scale."""
 
     label: str
     values: Sequence[Array | None]
@@ -107,13 +120,13 @@ def draw_results(
     true = [] if truth is None else [Export("true", "", truth, view_axes=axes)]
     columns = [*true, *results]
     reference = columns[0].light_field
-    for one in results:
-        if one.light_field.shape != reference.shape:
+    for result in results:
+        if result.light_field.shape != reference.shape:
             raise AppError(
-                f"{one.title} has shape {one.light_field.shape}, {results[0].title} has "
+                f"{result.title} has shape {result.light_field.shape}, {results[0].title} has "
                 f"{reference.shape}: name results of one capture"
             )
-    if any(one.view_axes != axes for one in results):
+    if any(result.view_axes != axes for result in results):
         raise AppError("views are angles of one result, bands or times of another")
     parallax, (rows_of_views, columns_of_views) = shows_parallax(axes), reference.shape[:2]
     view = _view(reference, settings.view)
@@ -121,8 +134,8 @@ def draw_results(
     curve = DisplayCurve.fitted_to(reference)
     names = _names(columns)
     measured = {} if truth is None else {
-        name: {"psnr_db": psnr_db(one.light_field, truth), "ssim": ssim(one.light_field, truth)}
-        for name, one in zip(names[1:], results, strict=True)
+        name: {"psnr_db": psnr_db(shown.light_field, truth), "ssim": ssim(shown.light_field, truth)}
+        for name, shown in zip(names[1:], results, strict=True)
     }  # fmt: skip
     titles = [
         f"{name}\n{measured[name]['psnr_db']:.2f} dB, SSIM\u00a0{measured[name]['ssim']:.3f}"
@@ -133,35 +146,36 @@ def draw_results(
     line, _ = epipolar_lines(reference)
     maps, flat_px = _maps(results, view, truth)
     beside = maps if len(columns) == 1 else []
-    titles += [one.label for one in beside]
+    titles += [drawn.label for drawn in beside]
     rows, bars = (0, len(maps)) if beside else (len(maps), 1 if maps and truth is None else 0)
     sheet = _Sheet(
         figure or Figure(), settings.width_in, titles, len(pieces), rows, bars, reference.shape,
         bool(beside),
     )  # fmt: skip
-    for at, one in enumerate(columns):
+    for at, column in enumerate(columns):
+        shown = column.light_field
         codes, strip = (
             three_colours(curve.encode(picture))
-            for picture in (one.light_field[view], epi_horizontal(one.light_field, view[0], line))
+            for picture in (shown[view], epi_horizontal(shown, view[0], line))
         )
         sheet.picture(at, codes, pieces, line)
         sheet.strip(at, strip, line, parallax)
     sheet.scale_bar(reference.shape[3])
-    for at, one in enumerate(beside, 1):
-        sheet.map(at, 0, one.values[0], one)
-        sheet.bar(at, 0, one)
-    for row, one in enumerate(maps if not beside else [], 1):
-        for at, values in enumerate(one.values, len(columns) - len(results)):
-            sheet.map(at, row, values, one)
+    for at, drawn in enumerate(beside, 1):
+        sheet.map(at, 0, drawn.values[0], drawn)
+        sheet.bar(at, 0, drawn)
+    for row, drawn in enumerate(maps if not beside else [], 1):
+        for at, values in enumerate(drawn.values, len(columns) - len(results)):
+            sheet.map(at, row, values, drawn)
         if truth is None:
-            sheet.label(row, one.label)
-            sheet.bar(len(columns) - 1, row, one)
+            sheet.label(row, drawn.label)
+            sheet.bar(len(columns) - 1, row, drawn)
         else:
-            sheet.key(row, one)
+            sheet.key(row, drawn)
     sources = [
-        f"{name}: {_source(one)}."
-        for name, one in zip(names, columns, strict=True)
-        if one.title != "true"
+        f"{name}: {_source(column)}."
+        for name, column in zip(names, columns, strict=True)
+        if column.title != "true"
     ]
     name, picture = place_name(axes, (rows_of_views, columns_of_views), view), picture_name(axes)
     caption = " ".join([
@@ -175,7 +189,7 @@ def draw_results(
         *([f"Error: root mean square over colours, of this {picture}. PSNR and SSIM are of all "
            f"{picture}s, peak 1."] if measured else []),
         f"Close-ups of {pieces[0].side}x{pieces[0].side} pixels around (y, x) = "
-        + ", ".join(f"({one.y + one.side // 2}, {one.x + one.side // 2})" for one in pieces) + ".",
+        + ", ".join(f"({p.y + p.side // 2}, {p.x + p.side // 2})" for p in pieces) + ".",
         f"Linear values x are shown as {_shown_as(curve)}, cut at 1.",
         *sources,
         f"Drawn by emmc-rig {__version__}.",
@@ -210,7 +224,7 @@ class _Sheet:
         self.side = (self.wide - GAP_IN * (close_ups - 1)) / close_ups
         letters = max(8, int(self.wide * 72 / LETTER_PT))
         wrapped = [
-            "\n".join(line for one in title.split("\n") for line in textwrap.wrap(one, letters))
+            "\n".join(line for text in title.split("\n") for line in textwrap.wrap(text, letters))
             for title in titles
         ]
         self.top = GAP_IN + LINE_IN * (1 + max(title.count("\n") for title in wrapped))
@@ -370,11 +384,13 @@ def _maps(
     """
     errors = [
         None if truth is None
-        else np.sqrt(np.mean((finite(one.light_field[view]) - truth[view]) ** 2, axis=-1))
-        for one in results
+        else np.sqrt(np.mean((finite(result.light_field[view]) - truth[view]) ** 2, axis=-1))
+        for result in results
     ]  # fmt: skip
-    deviations = [None if one.sigma is None else one.sigma[view] for one in results]
-    disparities = [one.disparity if shows_parallax(one.view_axes) else None for one in results]
+    deviations = [None if result.sigma is None else result.sigma[view] for result in results]
+    disparities = [
+        result.disparity if shows_parallax(result.view_axes) else None for result in results
+    ]
     top = round_up(ends([*errors, *deviations])[1])
     low, high = ends(disparities)
     every = [
@@ -383,8 +399,8 @@ def _maps(
         _Maps("disparity, px per view", disparities, low, high, "viridis"),
     ]
     known = [
-        one for one in every
-        if 2 * sum(values is not None for values in one.values) >= len(results)
+        drawn for drawn in every
+        if 2 * sum(values is not None for values in drawn.values) >= len(results)
     ]  # fmt: skip
     if known and known[-1].values is disparities and high - low < LEAST_RANGE_PX:
         return known[:-1], (low + high) / 2
@@ -393,16 +409,16 @@ def _maps(
 
 def _names(columns: Sequence[Export]) -> list[str]:
     """Return the methods' names, with the folder's where two are of one method."""
-    methods = [str(one.metrics.get("method", one.title)) for one in columns]
+    methods = [str(column.metrics.get("method", column.title)) for column in columns]
     return [
-        method if methods.count(method) == 1 else f"{method} ({one.title})"
-        for method, one in zip(methods, columns, strict=True)
+        method if methods.count(method) == 1 else f"{method} ({column.title})"
+        for method, column in zip(methods, columns, strict=True)
     ]
 
 
-def _source(one: Export) -> str:
+def _source(column: Export) -> str:
     """Return where a result came from: what metrics.json says of it."""
-    known = one.metrics
+    known = column.metrics
     said = [str(known[key]) for key in ("scene", "camera") if known.get(key)]
     if known.get("psi_sha256"):
         said.append(f"Psi {str(known['psi_sha256'])[:12]}")
@@ -411,10 +427,51 @@ def _source(one: Export) -> str:
         said.append(f"verdict: {verdict.get('level')}")
     if known.get("command"):
         said.append(f"by: {known['command']}")
-    return "; ".join(said) or one.caption or one.title
+    return "; ".join(said) or column.caption or column.title
 
 
 def _shown_as(curve: DisplayCurve) -> str:
     """Return the screen's curve as a formula of x."""
     shown = f"{curve.gain:.3g} x"
     return shown if abs(curve.gamma - 1) < 0.005 else f"({shown})^(1/{curve.gamma:.3g})"
+
+
+def epipolar_lines(truth: Array) -> tuple[int, int]:
+    """Return the row and the column (y, x) along which the outer views differ most.
+
+    Epipolar images through them show slopes. They lie in the middle three fifths of the picture.
+    """
+    across = np.abs(truth[truth.shape[0] // 2, -1] - truth[truth.shape[0] // 2, 0])
+    down = np.abs(truth[-1, truth.shape[1] // 2] - truth[0, truth.shape[1] // 2])
+    found = []
+    for difference, axis in ((across, 0), (down, 1)):
+        inner = difference[tuple(slice(n // 5, n - n // 5) for n in difference.shape[:2])].mean(
+            axis=(1 - axis, 2)
+        )
+        found.append(int(inner.argmax()) + difference.shape[axis] // 5)
+    return found[0], found[1]
+
+
+def detailed_pieces(picture: Array, side: int, count: int = 1) -> list[Piece]:
+    """Return the squares of a picture (y, x, c) with most edges and colour, away from each other.
+
+    The border of the picture, which other views do not show, is excluded.
+    """
+    height, width = picture.shape[:2]
+    side = min(side, height, width)
+    grey = picture.mean(axis=-1, dtype=np.float32)
+    slope_y, slope_x = np.gradient(grey)
+    spread = np.abs(picture - grey[..., None]).mean(axis=-1)
+    interest = np.minimum(np.hypot(slope_y, slope_x), 0.2) + 0.5 * np.abs(np.gradient(spread)[0])
+    sums = cv2.boxFilter(interest.astype(np.float32), -1, (side, side), anchor=(0, 0))
+    sums = sums[: height - side + 1, : width - side + 1].copy()
+    border = [min((length - side) // 2, length // 12) for length in (height, width)]
+    inside = np.zeros(sums.shape, dtype=bool)
+    inside[border[0] : height - side + 1 - border[0], border[1] : width - side + 1 - border[1]] = 1
+    sums[~inside] = -1
+    found = []
+    for _ in range(count):
+        y, x = np.unravel_index(int(sums.argmax()), sums.shape)
+        found.append(Piece(int(y), int(x), side))
+        sums[max(0, y - side) : y + side, max(0, x - side) : x + side] = -1
+    return found

@@ -26,6 +26,7 @@ from emmc_rig.pages.page import (
     data_address,
     fragment,
     framed,
+    part,
     provenance_section,
     typed,
 )
@@ -83,7 +84,7 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
         about = f"The accuracy estimated after each of {len(taken)} shots, and which came next."
         sections.append(Section("decisions", "Choice of shots", body, about=about))
     happened = list(events(session))
-    body = fragment("session_events.html", events=happened)
+    body = part("facts", happened)
     sections += [
         *_frames(session, pictures),
         Section(
@@ -96,7 +97,7 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
         **{f"SHA-256 of {name}": digest for name, digest in session.digests.items()},
     }
     sections.append(provenance_section(sources))
-    lead = fragment("cards.html", cards=_cards(session))
+    lead = part("cards", _cards(session))
     about = [_about(session)]
     return framed(
         session.header["title"],
@@ -188,11 +189,11 @@ def session_metrics(session: Session) -> dict[str, object]:
         "title": session.header["title"],
         "frames": len(needed),
         "spared": len(session.frames) - len(needed),
-        "decided": [one.model_dump(mode="json") for one in of_kind(entries, DecidedEntry)],
+        "decided": [entry.model_dump(mode="json") for entry in of_kind(entries, DecidedEntry)],
         "stored": len(session.stored),
         "complete": session.is_complete,
         "bytes": sum(entry.bytes for entry in session.stored.values()),
-        "exposures": [asdict(one) for one in shot_exposures(session)],
+        "exposures": [asdict(shot) for shot in shot_exposures(session)],
         "retries": len(of_kind(entries, RetryEntry)),
         "runs": run_times(session),
         "command": session.header["command"],
@@ -205,7 +206,7 @@ def _exposure_cards(session: Session) -> list[Card]:
     shots = shot_exposures(session)
     if not shots:
         return []
-    levels = [one.level for one in shots]
+    levels = [shot.level for shot in shots]
     reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
     note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVELS[0]:.0%}"
     tone = "watch" if exposure_reasons(shots) else "good"
@@ -247,7 +248,7 @@ def _count(session: Session, frames: Sequence[PlannedFrame]) -> str:
 
 
 def _place_in_plan(frame: PlannedFrame) -> tuple:
-    """Return what frames are shown in the order of: they were taken in another one."""
+    """Return the sort key of frames on the page, which differs from the order of capture."""
     return frame.bench.shot, frame.view or (), frame.exposure_s or 0.0, frame.repeat
 
 
@@ -259,7 +260,7 @@ def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
 
 
 def _balance(session: Session) -> Balance:
-    """Return the white balance of the first whiteboard under white light; none without one."""
+    """Return the white balance of the first whiteboard under white light; AS_READ without any."""
     for planned in session.needed:
         entry = session.stored.get(planned.id)
         if entry and planned.kind in BOARDS and planned.bench.lamp == "white":
@@ -269,7 +270,7 @@ def _balance(session: Session) -> Balance:
 
 
 def _picture(session: Session, planned: PlannedFrame, balance: Balance) -> dict[str, object]:
-    """Return what the page shows of a frame: its picture, or why there is none."""
+    """Return a frame as the page shows it: its picture, or the reason for its absence."""
     entry = session.stored.get(planned.id)
     if entry is None:
         return {"id": planned.id, "why": "not captured"}

@@ -172,12 +172,12 @@ def viewer_data(
             "atlas": map_of(tiled(codes[..., None])[..., 0]), "low": low, "high": low + span,
         },
         "focus": {"low": back - 0.25 * span, "high": front + 0.25 * span, "at": middle},
-        "overlays": [_overlay(one, shown, map_of) for one in overlays_of(content, like)],
+        "overlays": [_overlay(overlay, shown, map_of) for overlay in overlays_of(content, like)],
     }  # fmt: skip
 
 
 def curve_of(content: Export) -> DisplayCurve:
-    """Return how a light field is shown: as bright as the truth is, where there is one."""
+    """Return the display curve of a light field, fitted to its truth if known."""
     return DisplayCurve.fitted_to(content.light_field if content.truth is None else content.truth)
 
 
@@ -197,8 +197,8 @@ def overlays_of(content: Export, like: Export | None = None) -> list[Overlay]:
     if content.misfit is not None:
         found.append(Overlay("doubt", "unexplained residual", "x noise", content.misfit, 1.0, 5.0))
     scales = overlays_of(like) if like else []
-    ends_of = {one.key: {"low": one.low, "high": one.high} for one in scales}
-    return [replace(one, **ends_of.get(one.key, {})) for one in found]
+    ends_of = {overlay.key: {"low": overlay.low, "high": overlay.high} for overlay in scales}
+    return [replace(overlay, **ends_of.get(overlay.key, {})) for overlay in found]
 
 
 def _resized(values: NDArray, shown: Array) -> NDArray:
@@ -208,15 +208,17 @@ def _resized(values: NDArray, shown: Array) -> NDArray:
     )
 
 
-def _overlay(one: Overlay, shown: Array, encode: Callable[[NDArray], str]) -> dict[str, object]:
-    levels = np.clip((_resized(one.values, shown) - one.low) / (one.high - one.low), 0, 1)
+def _overlay(overlay: Overlay, shown: Array, encode: Callable[[NDArray], str]) -> dict[str, object]:
+    levels = np.clip(
+        (_resized(overlay.values, shown) - overlay.low) / (overlay.high - overlay.low), 0, 1
+    )
     picture = np.rint(levels * 255).astype(np.uint8)
-    if np.isnan(one.values).any():  # clear where nothing is known
-        known = _resized(~np.isnan(one.values), shown)
+    if np.isnan(overlay.values).any():  # clear where nothing is known
+        known = _resized(~np.isnan(overlay.values), shown)
         picture = np.dstack([picture, picture, picture, np.rint(known * 255).astype(np.uint8)])
     return {
-        "key": one.key, "label": one.label, "unit": one.unit, "low": one.low, "high": one.high,
-        "colours": one.colours, "picture": encode(picture),
+        "key": overlay.key, "label": overlay.label, "unit": overlay.unit, "low": overlay.low,
+        "high": overlay.high, "colours": overlay.colours, "picture": encode(picture),
     }  # fmt: skip
 
 
@@ -243,10 +245,10 @@ def render_film(film: Film) -> str:
         metrics[place] = export.metrics
         centre = reduced(centre_view(export.light_field)[None, None], SPRITE_PIXELS // count)
         centres[divmod(place, columns)] = three_colours(curve.encode(centre))[0, 0]
-    focus = [one["focus"] for one in frames if one]
+    focus = [frame["focus"] for frame in frames if frame]
     ends_of_slider = {"low": min(f["low"] for f in focus), "high": max(f["high"] for f in focus)}
-    for one in focus:
-        one.update(ends_of_slider)
+    for slider in focus:
+        slider.update(ends_of_slider)
     data = {
         "rate": film.rate,
         "times_s": film.times_s,
@@ -281,7 +283,7 @@ def _level(metrics: Mapping[str, object]) -> str:
 
 
 def _film_head(film: Film, metrics: Mapping[int, Mapping[str, object]]) -> Head:
-    """Return what to think of a film: of its worst frames, and how many they are."""
+    """Return the head of a film's page: that of its worst frames, with their number."""
     order = ["trust", "", *list(VERDICTS)[1:]]
     worst = max(metrics, key=lambda place: order.index(_level(metrics[place])))
     head = light_field_head(metrics[worst], str(film.folder), viewer=True)

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.films import FRAMES
+from emmc_rig.files.exports import FRAMES
 from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.result_files import read_metrics
 from emmc_rig.files.results import PSI_ASSUMED, write_metrics

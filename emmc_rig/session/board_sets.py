@@ -59,7 +59,7 @@ def board_sets(session: Session, channels: NDArray[np.uint8]) -> SessionBoards:
         replace(every, frames=tuple(frames), checks=checks) if frames else None
         for frames in (few, found["whiteboard"], found[VALIDATION])
     )
-    own_um = next((one.stage_um for one in found["open"]), (0.0, 0.0))
+    own_um = next((board.stage_um for board in found["open"]), (0.0, 0.0))
     boards = {
         turn_deg: BoardSet(
             every.darks,

@@ -1,8 +1,8 @@
 """A frame as a file that decodes to it again, on any machine, without the camera's driver.
 
 That is the camera's own bytes where they are of a format known here; of any other camera, such as
-a plug-in's, a DNG of the mosaic with the camera's own bytes in it. Which of both is found by
-decoding what would be stored and comparing it with the frame.
+a plug-in's, a DNG of the mosaic with the camera's own bytes in it. The choice depends on a trial:
+the camera's bytes are decoded and compared with the frame.
 """
 
 from __future__ import annotations
@@ -99,8 +99,10 @@ def decode_frame(data: bytes, entry: FrameEntry) -> RawFrame:
             sha256=entry.camera_sha256,
         )
     elif Path(entry.file).suffix == STREAMED:
-        protocols = (one for one in CAMERAS.values() if one.frame_prefix)
-        driver = next((one for one in protocols if data.startswith(one.frame_prefix)), None)
+        protocols = (driver for driver in CAMERAS.values() if driver.frame_prefix)
+        driver = next(
+            (driver for driver in protocols if data.startswith(driver.frame_prefix)), None
+        )
         if driver is None:
             raise RawFrameError(
                 f"{entry.file} is in a format that only the plug-in of its camera knows: "
@@ -114,7 +116,7 @@ def decode_frame(data: bytes, entry: FrameEntry) -> RawFrame:
 
 
 def _suffix_of(frame: RawFrame) -> str:
-    """Return the kind of file that the camera's bytes are, if they are of a known one."""
+    """Return the suffix for the camera's bytes; STREAMED for an unknown format."""
     suffix = Path(frame.metadata.get("name", "")).suffix.lower()
     if suffix in RAW_SUFFIXES:
         return suffix

@@ -132,8 +132,8 @@ def _taken_s(session: Session, entry: FrameEntry) -> float:
     The clock of a run may begin anew with it: then the run follows the one before.
     """
     times: dict[int, list[float]] = defaultdict(list)
-    for one in session.stored.values():
-        times[one.run].append(one.host_time_s or 0.0)
+    for other in session.stored.values():
+        times[other.run].append(other.host_time_s or 0.0)
     offset = latest = 0.0
     for run in sorted(times):
         offset = max(0.0, latest - min(times[run])) if run != min(times) else 0.0
@@ -150,7 +150,7 @@ def alike_frames(session: Session, frames: list[PlannedFrame]) -> list[PlannedFr
     """
     exposures_s = [exposure_of(session, frame) for frame in frames]
     (exposure_s, _), *_ = Counter(exposures_s).most_common()
-    return [one for one, own_s in zip(frames, exposures_s, strict=True) if own_s == exposure_s]
+    return [frame for frame, own_s in zip(frames, exposures_s, strict=True) if own_s == exposure_s]
 
 
 def mean_of(session: Session, frames: list[PlannedFrame]) -> MeanFrame:

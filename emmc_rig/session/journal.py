@@ -3,9 +3,9 @@
 A line is on the disk when `append` returns. A line that a crash tore, or whose checksum is wrong,
 counts as never written: its step is done again.
 
-This module alone knows what lines hold, a class for each kind, and what they mean together. What
-came after version 0.2 has a default, so that its journals are read. After an amendment of the plan
-metering and shots are decided anew.
+This module alone knows the content of lines, a class for each kind, and their joint meaning. Fields
+that are newer than version 0.2 have defaults, for journals of that version. After an amendment of
+the plan metering and shots are decided anew.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class RunEntry(TimedEntry):
 class ImportedEntry(TimedEntry):
     """The frames are of files that another program wrote.
 
-    files: by path, the SHA-256 of their bytes. notes: what was assumed that no file states.
+    files: by path, the SHA-256 of their bytes. notes: assumptions for values that no file states.
     """
 
     kind: Literal["imported"] = "imported"
@@ -116,8 +116,8 @@ class FrameEntry(Entry):
     """A frame is stored.
 
     run: counted from 1. plan: number of the amendment that it was taken by. camera_sha256: of the
-    camera's own bytes, where `file` is a DNG of the mosaic that holds them. read_um: where the axes
-    read to stand; of one that a hand moved, where the frame shows it, to `deviation_um`. wall,
+    camera's own bytes, where `file` is a DNG of the mosaic that holds them. read_um: readings of
+    the axes; of an axis moved by hand its place in the frame, with `deviation_um`. wall,
     monotonic_s: when its exposure was asked for, by the time of day and on the clock of the rig.
     stands_um: where axes of the stage read to stand that no plan moves. temperatures_c: of stage
     and camera, environment: of other sources, whose units the run's line has. segment: of a film's
@@ -272,7 +272,7 @@ class RetryEntry(Entry):
 
 
 class ComparedEntry(Entry):
-    """A frame was taken again before going on: the bench is as it was, or that is refused."""
+    """A frame was taken again before going on: the bench is unchanged, or capture is refused."""
 
     kind: Literal["registered", "refused"]
     id: str
@@ -344,8 +344,8 @@ class SourceEntry(TimedEntry):
 class FilmEntry(TimedEntry):
     """A segment of a film begins, from frame `id` on: time goes on within it without a break.
 
-    segment: counted from 0. One begins with the film, and another wherever it was interrupted: the
-    scene may be another one by then.
+    segment: counted from 0. The first begins with the film, the next after each interruption, in
+    which the scene may have changed.
     """
 
     kind: Literal["film"] = "film"
@@ -380,9 +380,9 @@ class CompleteEntry(TimedEntry):
 
 
 _KINDS = {
-    kind: one
-    for one in (*Entry.__subclasses__(), *TimedEntry.__subclasses__())
-    for kind in get_args(one.model_fields["kind"].annotation)
+    kind: entry
+    for entry in (*Entry.__subclasses__(), *TimedEntry.__subclasses__())
+    for kind in get_args(entry.model_fields["kind"].annotation)
 }
 _CHECK = ',"crc32":"'
 _TAIL_CHARACTERS = len(_CHECK) + len('01234567"}')
@@ -399,7 +399,7 @@ def encode_line(entry: Entry) -> bytes:
 
 
 def decode_line(line: bytes) -> Entry | None:
-    """Return the entry in a line without its newline; None for one that is torn or damaged."""
+    """Return the entry in a line without its newline; None for a torn or damaged line."""
     cut = len(line) - _TAIL_CHARACTERS
     body, tail = line[:cut], line[cut:]
     if cut <= 0 or tail != b'%s%08x"}' % (_CHECK.encode(), zlib.crc32(body)):
@@ -458,7 +458,7 @@ def found_complete(entries: Sequence[Entry]) -> bool:
 
 
 def ended(entries: Sequence[Entry]) -> DecidedEntry | None:
-    """Return the decision that no more shots are needed; None while there is none, or no longer."""
+    """Return the decision that no more shots are needed; None without it or after an amendment."""
     last = _last_of(entries, DecidedEntry, UntilEntry, AmendedEntry)
     return last if isinstance(last, DecidedEntry) and last.next is None else None
 

@@ -20,8 +20,8 @@ from emmc_rig.store.folders import SESSION_RECONSTRUCTION, is_session, refuse_mi
 class Summary:
     """What a session says of itself; planned: frames, but those that the scene did not need.
 
-    camera: as its plan names it. verdict, stated_db: of the light field that lies in it, "" and
-    None without one, or where the method states no PSNR. folder: where it lies.
+    camera: as its plan names it. verdict, stated_db: of its light field; "" and None for a session
+    that is not reconstructed, and None for a method without a stated PSNR. folder: of the session.
     """
 
     name: str
@@ -69,7 +69,7 @@ def reconstructed(session: Path) -> tuple[str, float | None]:
 
 
 def sessions_in(folder: Path) -> Iterator[Summary]:
-    """Yield the sessions in a folder and below it by name, itself too where it is one.
+    """Yield the sessions in a folder, at any depth, by name; the folder itself may be a session.
 
     Hidden folders, and what lies in sessions, are passed over. Raises AppError.
     """
@@ -80,11 +80,11 @@ def sessions_in(folder: Path) -> Iterator[Summary]:
         raise AppError(f"{folder}: cannot be read ({fault.strerror})") from fault
     for place, below, _ in os.walk(folder):
         below[:] = sorted(name for name in below if not name.startswith("."))
-        one = Path(place)
-        if not is_session(one):
+        found = Path(place)
+        if not is_session(found):
             continue
         below.clear()
         try:
-            yield summary(Session(one))
+            yield summary(Session(found))
         except AppError as fault:
-            yield Summary(one.resolve().name, str(fault), "", "damaged", 0, 0, 0, folder=one)
+            yield Summary(found.resolve().name, str(fault), "", "damaged", 0, 0, 0, folder=found)

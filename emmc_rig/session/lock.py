@@ -1,7 +1,7 @@
 """The lock of a session: one program writes at a time, and the error of a second names the first.
 
-A session is locked by `session.lock` in it, a session that is not made yet by `.NAME.lock` beside
-its folder. The file names the holder and is removed at the end. The file of a killed program blocks
+The lock of a session is `session.lock` in its folder; before the folder exists it is `.NAME.lock`
+beside it. The file names the holder and is removed at the end. The file of a killed program blocks
 nobody, except on disks that cannot lock files (see `emmc_rig.store.locks`).
 """
 

@@ -55,9 +55,9 @@ class PlannedFrame:
 
     exposure_s: None where it is metered, by the frame `metered_by`: then it is exposed `light`
     times as long as that frame asks for, a whiteboard because so much less light comes to the
-    sensor. view: (v, u) of a whiteboard's pinhole. Frames of one shot that differ in exposure
-    alone are its bracket; `repeat` counts equal ones. part: frames of one come before those of
-    the next, in whatever order else. window: by how many aperture cells the plate's window is
+    sensor. view: (v, u) of a whiteboard's pinhole. A bracket is the frames of a shot with
+    different exposures; `repeat` counts equal frames. part: parts are captured in this order,
+    frames of a part in any. window: by how many aperture cells the plate's window is
     moved, x and y. film: its place in time, from 0, of a frame of a film.
     """
 
@@ -112,7 +112,7 @@ class PlannedFrame:
 
         Keys that came after version 0.2 may be missing.
         """
-        bench = {one.name for one in fields(Bench)}
+        bench = {own.name for own in fields(Bench)}
         own = {key: value for key, value in data.items() if key not in bench}
         for name in ("view", "window"):
             own[name] = tuple(own[name]) if own.get(name) is not None else getattr(cls, name)

@@ -81,7 +81,7 @@ def film_places(session: Session) -> list[FilmPlace]:
     if faults := list(_film_faults(film)):
         shown = "; ".join(faults[:SHOWN_FAULTS]) + ("; ..." if len(faults) > SHOWN_FAULTS else "")
         raise AppError(f"{session.folder}: no film to reconstruct: {shown}")
-    rates = {one.segment: one.rate_hz for one in of_kind(session.journal.entries, FilmEntry)}
+    rates = {begun.segment: begun.rate_hz for begun in of_kind(session.journal.entries, FilmEntry)}
     places: list[FilmPlace] = []
     segment, began_s, time_s, place = -1, 0.0, 0.0, 0
     for frame, entry in film:

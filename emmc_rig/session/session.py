@@ -18,11 +18,10 @@ Where a capture ends when the scene needs no more shots, the journal says which 
 count as not planned (see `journal`).
 
 The first journal line holds the SHA-256 of the frozen files, an `amended` line that of the files
-of an amendment: a frame that is taken stays what it was planned to be, and its line says by which
-plan it was taken. A frame counts when its journal line
-is readable and its file has the bytes that the line states; a frame that was taken twice counts
-by its last line. A file without a line is what a crash left between the two: it is taken again,
-under the same name. So nothing is lost that was counted, and nothing is there twice.
+of an amendment: a captured frame keeps its plan, whose number is in its line. A frame counts when
+its journal line is readable and its file has the bytes that the line states; a frame that was
+captured twice counts by its last line. A crash between the two leaves a file without a line: that
+frame is captured again, under the same name. No counted frame is lost, and none is stored twice.
 
 No file is ever changed in place, and nothing that the session did not make is touched.
 """
@@ -162,8 +161,8 @@ class Session:
     def amend(self, frozen: Frozen, changes: Sequence[str]) -> Session:
         """Let another plan hold from now on, and return the session opened again.
 
-        frozen: all that follows from it, frames that are taken as they are. changes: to the plan,
-        for people. Raises `OSError`; the earlier plan holds then.
+        frozen: plan, camera, rig and frames; captured frames are unchanged. changes: of the plan,
+        in words. Raises `OSError`; the earlier plan holds then.
         """
         number = self.amendments + 1
         files = {amended_name(name, number): data for name, data in _planned_files(frozen).items()}
@@ -279,7 +278,7 @@ class Session:
         """Every frame to be taken, in the order of the capture."""
         name = amended_name(ORDER, self.amendments)
         try:
-            return tuple(PlannedFrame.from_dict(one) for one in self._data(name))
+            return tuple(PlannedFrame.from_dict(frame) for frame in self._data(name))
         except (AttributeError, KeyError, TypeError) as fault:
             raise AppError(
                 f"{self.folder / name}: is no list of frames; restore it from a copy"
@@ -320,8 +319,8 @@ class Session:
     def needed(self) -> tuple[PlannedFrame, ...]:
         """Every frame to be taken.
 
-        Without those of shots that the scene was found not to need, longer ones of brackets
-        that metering does not ask for, and frames of a film that were dropped.
+        Excluded are frames of spared shots, longer frames of brackets that metering does not ask
+        for, and dropped frames of a film.
         """
         decided, exposed = ended(self.journal.entries), metered(self.journal.entries)
         spared = () if decided is None else decided.spared
@@ -452,7 +451,7 @@ class Session:
     def _ids(self) -> set[str]:
         """The names of all frames ever planned."""
         earlier = [amended_name(ORDER, number) for number in range(self.amendments)]
-        return {one["id"] for name in earlier for one in self._data(name)}.union(self._places)
+        return {frame["id"] for name in earlier for frame in self._data(name)}.union(self._places)
 
 
 def amended_name(name: str, number: int) -> str:

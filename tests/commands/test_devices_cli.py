@@ -21,8 +21,8 @@ from drivers.clock import SYSTEM_CLOCK
 from drivers.stage import StageSettings
 from drivers.transport import SerialTransport
 from drivers.zaber import ZaberStage
+from emmc_rig.bench.device_config import parse_stage
 from emmc_rig.bench.hardware import SIMULATED_SCALES, open_stage, probe_port
-from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from simulators.apt import Z825, AptController
 from simulators.grbl import BENCH_AXES, GrblController

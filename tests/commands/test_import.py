@@ -383,7 +383,7 @@ MISTAKES = {
     "a shot left out": (changed(1, shot=2), "shot 1 has no file, of shots 0 to 2"),
     "a negative shot": (changed(1, shot=-1), "shot: input should be greater than or equal to 0"),
     "half a shot": (changed(1, shot=0.5), "shot: input should be a whole number"),
-    "shots without and with a number": (changed(1, shot=""), "other shots have a number"),
+    "shots without and with a number": (changed(1, shot=""), "kind shot without a shot number"),
     "a dark of no shot": (changed(2, shot=7), "there is no shot 7, only 0 to 1"),
     "no shots": (lambda folder, rows: rows.__delitem__(slice(0, 2)), "no file is a shot"),
     "no rows": (table_bytes(b"file,kind\n"), "no row below the names"),
@@ -626,7 +626,7 @@ def test_a_disk_that_is_full_leaves_nothing(where, tmp_path, run, monkeypatch):
     if where == "session":
         monkeypatch.setattr(Session, "store", fault)
     else:
-        monkeypatch.setattr("emmc_rig.importing.session._reader", fault)
+        monkeypatch.setattr("emmc_rig.importing.session._spooled", fault)
     code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
     assert code == 1
     assert "No space left on device; nothing was imported" in one_line(err)

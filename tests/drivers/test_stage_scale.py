@@ -10,8 +10,8 @@ from drivers.errors import ScaleError, SpeedLimitError
 from drivers.grbl import FACTORY_STEPS_PER_MM, GrblStage
 from drivers.stage import StageSettings
 from drivers.zaber import ZaberStage
+from emmc_rig.bench.device_config import parse_stage
 from emmc_rig.bench.hardware import open_stage
-from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from simulators.clock import ManualClock
 from simulators.grbl import BENCH_AXES, GrblController

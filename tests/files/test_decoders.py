@@ -20,9 +20,8 @@ from hypothesis import strategies as st
 from drivers.dng import encode_dng
 from drivers.errors import RawFrameError
 from drivers.raw import decode_raw
-from emmc_rig.bench.camera_config import parse_camera
+from emmc_rig.bench.device_config import parse_camera, parse_stage
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
-from emmc_rig.bench.stage_config import parse_stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import StoredPsi, save_shards
@@ -48,7 +47,7 @@ GUARDED = {
     "OpenEXR": (CHILD,),
     "zarr": ("emmc_rig/files/shards.py",),
     # What a study and a film keep for themselves.
-    "numpy.load": ("emmc_rig/pages/pictures.py", "emmc_rig/processing/filming.py", CHILD),
+    "numpy.load": ("emmc_rig/processing/filming.py", CHILD),
     "torch.load": (),
     "pickle.load": (),
     "imagecodecs": (),  # which tifffile calls

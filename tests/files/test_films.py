@@ -12,7 +12,7 @@ from programs import one_line, program
 from watching import Recorder
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.films import film_of, open_film
+from emmc_rig.files.exports import film_of, open_film
 from emmc_rig.files.formats.displays import in_time
 from emmc_rig.files.formats.registry import FORMATS
 from emmc_rig.files.scenes import open_scene
@@ -130,7 +130,7 @@ def test_ome_zarr_has_time_in_seconds_and_views_along_z(tmp_path, film):
     assert attributes["views"] == [3, 3]
     assert attributes["film"] == {"times_s": list(film.times_s), "missing": [3]}
     assert done == 5
-    with pytest.raises(AppError, match="holds a film; open one frame"):
+    with pytest.raises(AppError, match="holds a film; open a frame"):
         open_scene(str(folder / "film.ome.zarr"))
 
 

@@ -31,13 +31,11 @@ from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
-from emmc_rig.live import setup_page as page_module
 from emmc_rig.live import watch as watch_module
 from emmc_rig.live.driving import Driving
 from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window
 from emmc_rig.live.server import application
 from emmc_rig.live.server import served as serving
-from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 
 PATIENCE_S = 60.0
@@ -147,12 +145,13 @@ def watching(*arguments):
 
 def until(watch, holds):
     """Return the first state of which that holds."""
-    version, end_s = 0, time.monotonic() + PATIENCE_S
+    end_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < end_s:
-        state = watch.state(version, 1.0)
-        version = state["version"]
+        state = watch.state()
         if holds(state):
             return state
+        while watch.version == state["version"] and time.monotonic() < end_s:
+            time.sleep(0.005)
     raise AssertionError(f"never came: {state}")
 
 
@@ -573,7 +572,7 @@ def served(watch, **options):
         link.close()
         return answer.status, answer.headers, data
 
-    with serving(application(SetupPage(watch), TOKEN, **options)) as port:
+    with serving(application(watch, TOKEN, **options)) as port:
         ask.port = port
         yield ask
 
@@ -586,7 +585,7 @@ def test_the_page_its_state_and_its_pictures_are_served():
         assert b"emmc-rig live" in page
         assert b"http://" not in page
         assert b"https://" not in page
-        for name in SetupPage.files[1:]:
+        for name in Watch.files[1:]:
             assert ask("GET", f"/{TOKEN}/{name}")[0] == 200
         status, headers, data = ask("GET", f"/{TOKEN}/picture.jpg?kind=mosaic&part=0.5&px=64")
         assert (status, headers["Content-Type"]) == (200, "image/jpeg")
@@ -718,7 +717,7 @@ def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
         made.append(view)
         return picture(frame, view)
 
-    monkeypatch.setattr(page_module, "picture", counted)
+    monkeypatch.setattr(watch_module, "picture", counted)
     camera = FakeCamera()
     with watching(camera) as watch, served(watch) as ask:
         until(watch, lambda state: state["frame"])

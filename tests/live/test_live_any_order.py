@@ -18,7 +18,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.save import Files
-from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.steps import LONGEST_UNASKED_S
 from simulators.clock import ManualClock
 
@@ -52,7 +51,7 @@ class HeldClock(ManualClock):
 
 @pytest.fixture
 def bench(tmp_path, monkeypatch):
-    """Return a clock, the page of a dark rig, its Watch, the exposures it asked for, a plan."""
+    """Return a clock, the page of a dark rig, the exposures it asked for, a plan."""
     camera, clock = find_camera(DESIGN), HeldClock()
     fine = fine_scene("near-planar", 2, 2, size=SIZE, views=camera.views)
     rig, _ = simulated_rig(camera, fine.samples, SIZE, 0, clock, focus_um=FOCUS_UM)
@@ -72,7 +71,7 @@ def bench(tmp_path, monkeypatch):
     look, targets = rig.attendant.place, ("scene", "whiteboard")
     arguments = (rig.camera, rig.stage, look, targets, centre_um, camera, None, Files(plan))
     with watching(*arguments) as watch:
-        yield clock, SetupPage(watch), watch, exposures_s, plan
+        yield clock, watch, exposures_s, plan
 
 
 def click(page, name, values):
@@ -118,15 +117,15 @@ def offered(state, looked):
 def test_whoever_clicks_in_any_order_and_interrupts_comes_to_a_plan_by_what_is_offered(
     bench, order
 ):
-    clock, page, watch, exposures_s, plan = bench
+    clock, watch, exposures_s, plan = bench
     settled(watch)
     for name in order:
         (does, values), (interrupts, more) = CLICKS[name]
         clock.waits.clear()
         clock.free.clear()
-        click(page, does, values)
+        click(watch, does, values)
         assert clock.waits.wait(PATIENCE_S)
-        interrupting = Thread(target=click, args=(page, interrupts, more))
+        interrupting = Thread(target=click, args=(watch, interrupts, more))
         interrupting.start()
         clock.free.set()
         interrupting.join(PATIENCE_S)
@@ -137,8 +136,8 @@ def test_whoever_clicks_in_any_order_and_interrupts_comes_to_a_plan_by_what_is_o
             break
         looked |= next_click[0] == "look"
         if next_click[0] == "autofocus":
-            click(page, "look", {"target": "scene"})
-        click(page, *next_click)
+            click(watch, "look", {"target": "scene"})
+        click(watch, *next_click)
         state = settled(watch)
     left = {step["name"] for step in state["steps"] if not step["done"]} - {"align"}
     assert left == {"save"}, state
@@ -146,7 +145,7 @@ def test_whoever_clicks_in_any_order_and_interrupts_comes_to_a_plan_by_what_is_o
     said = json.dumps([state["hint"], state["trouble"], state["steps"]])
     assert "dark" not in said
     assert "lamp" not in said
-    click(page, "preview", {"what": ["exposure"]})
-    click(page, "save", {})
+    click(watch, "preview", {"what": ["exposure"]})
+    click(watch, "save", {})
     (shot,) = yaml.safe_load(plan.read_text())["shots"]
     assert shot["exposure_s"] == pytest.approx(state["settings"]["exposure_s"])

@@ -15,7 +15,6 @@ from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
-from emmc_rig.live.setup_page import SetupPage
 from emmc_rig.live.watch import Watch
 from emmc_rig.pages.page import source
 from simulators.bench import MountingErrors
@@ -52,7 +51,7 @@ def address(rig):
     targets = ("scene", "whiteboard")
     watch = Watch(rig.camera, rig.stage, rig.attendant.place, targets, centre_um, design, field)
     watch.start()
-    with served(application(SetupPage(watch), TOKEN)) as port:
+    with served(application(watch, TOKEN)) as port:
         yield f"http://127.0.0.1:{port}/{TOKEN}/"
     watch.close()
 
@@ -293,7 +292,7 @@ def test_a_long_exposure_is_counted_down_where_the_picture_is_and_cancelled(brow
     watch = Watch(PatientCamera())
     watch.start()
     try:
-        with served(application(SetupPage(watch), TOKEN)) as port:
+        with served(application(watch, TOKEN)) as port:
             browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
             wait(browser, lambda: frame_number(browser) > 0)
             before = frame_number(browser)
@@ -364,7 +363,7 @@ def test_no_camera_and_no_stage_are_explained_where_the_picture_would_be(browser
     watch = Watch(camera)
     watch.start()
     try:
-        with served(application(SetupPage(watch), TOKEN)) as port:
+        with served(application(watch, TOKEN)) as port:
             browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
             said = "No picture: no camera answers: switch it on. Trying again every second."
             wait(browser, lambda: text(browser, "why") == said)

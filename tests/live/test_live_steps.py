@@ -104,7 +104,7 @@ def test_the_mask_is_centred_by_what_was_measured_and_written(tmp_path):
         assert "-zero_um" in shown
         assert path.read_text().startswith("# the bench in room 12\n")
         assert not watch.state()["steps"][-1]["done"]
-        assert watch.save() == {"written": [str(path)]}
+        assert watch.save() == {"written": [str(path)], "next": ""}
         last = watch.state()["steps"][-1]
         assert (last["done"], last["text"]) == (True, "wrote rig.yaml")
     written = yaml.safe_load(path.read_text())

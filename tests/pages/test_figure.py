@@ -12,8 +12,12 @@ from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.formats.format import Export
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.pages.pictures import detailed_pieces, epipolar_lines
-from emmc_rig.pages.result_figure import FigureSettings, draw_results
+from emmc_rig.pages.result_figure import (
+    FigureSettings,
+    detailed_pieces,
+    draw_results,
+    epipolar_lines,
+)
 
 SIZE = (36, 48)
 

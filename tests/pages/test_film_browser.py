@@ -9,7 +9,7 @@ import pytest
 from browsers import MARKS, at_width, complaints, nameless
 from filmed import SIZE, light_field_at, write_film
 
-from emmc_rig.files.films import open_film
+from emmc_rig.files.exports import open_film
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.pages.viewer import curve_of, render_film
 

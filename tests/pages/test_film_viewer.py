@@ -7,7 +7,7 @@ import pytest
 from filmed import SIZE, write_film
 from pages import Page
 
-from emmc_rig.files.films import open_film
+from emmc_rig.files.exports import open_film
 from emmc_rig.pages import viewer
 from emmc_rig.pages.viewer import render_film
 

@@ -21,7 +21,7 @@ from watching import Recorder
 
 import emmc_rig as emmc
 from emmc_rig.errors import AppError, StoppedError
-from emmc_rig.files.films import open_film
+from emmc_rig.files.exports import open_film
 from emmc_rig.model.arguments import ArgumentError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import load_hdf5

@@ -13,8 +13,7 @@ import pytest
 import emmc_rig as emmc
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
-from emmc_rig.files.exports import open_export
-from emmc_rig.files.films import open_film
+from emmc_rig.files.exports import open_export, open_film
 from emmc_rig.files.results import write_metrics
 from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.reconstructing import reconstruct_undrawn

@@ -1,1 +1,1 @@
-"""Formats of light fields: `format` says what one is, `registry` knows all."""
+"""Formats of light fields: `format` defines the class, `registry` lists all."""

@@ -82,9 +82,9 @@ def _centre(export: Export) -> Codes:
 
 
 def in_time(film: Film, picture_of: Callable[[Export], Codes]) -> Iterator[Codes]:
-    """Yield the picture (y, x, rgb) of every place in time; a missing one repeats the one before.
+    """Yield the picture (y, x, rgb) of every place in time; a missing frame repeats the last one.
 
-    Before the first frame that there is, it is that one.
+    Places before the first frame have the picture of the first frame.
     """
     begins = [0, *list(film.frames)[1:], len(film.times_s)]
     for (_, export), (begin, end) in zip(film.each(), pairwise(begins), strict=True):

@@ -1,4 +1,4 @@
-"""What a format of light fields is: one object that writes, reads and says what it keeps."""
+"""A format of light fields: how it is written and read, and how much of a light field it keeps."""
 
 from __future__ import annotations
 
@@ -84,11 +84,11 @@ class Film:
 class Format:
     """One format that others read.
 
-    name: as typed after --format. title: what it is. keeps: what survives. write: an export into
-    an existing folder. parallax: whether it shows views from where none was, or depth, which bands
-    and times do not have. holds: whether a path is of this format, and read: that path as a light
-    field; None where it cannot be a scene. write_film: a film into an existing folder; None where
-    the format has nothing in time.
+    name: as typed after --format. title: what it is. keeps: what survives. write: an export into an
+    existing folder. parallax: whether it shows depth or views between the views, which need views
+    at angles, not bands or times. holds: whether a path is of this format, and read: that path as a
+    light field; None where it cannot be a scene. write_film: a film into an existing folder; None
+    where the format has nothing in time.
     """
 
     name: str

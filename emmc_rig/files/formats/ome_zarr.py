@@ -37,7 +37,7 @@ def _write(folder: Path, export: Export) -> None:
 
 
 def _write_film(folder: Path, film: Film) -> None:
-    """Write frame after frame: what is in memory is what ngff-zarr works on at once."""
+    """Write frame after frame; memory holds the frames that ngff-zarr works on at once."""
     dask, array = extra_module("dask", "OME-Zarr"), extra_module("dask.array", "OME-Zarr")
     first = film.first
     shape = 1, *_planes(first.light_field).shape
@@ -104,7 +104,7 @@ def _read(path: Path) -> Array:
         rows, columns = attributes["emmc_rig"]["views"]
         image = extra_module("ngff_zarr", "OME-Zarr").from_ngff_zarr(str(path)).images[0]
         if len(image.dims) == 5:
-            raise AppError(f"{path}: holds a film; open one frame of what it was exported from")
+            raise AppError(f"{path}: holds a film; open a frame of the result that was exported")
         check_fits(image.data.nbytes, path)
         data = np.asarray(image.data, dtype=np.float32)
         data = data if "t" in image.dims else data.swapaxes(0, 1)

@@ -1,7 +1,7 @@
 """Every view as a picture of its own: PNG of 8 or 16 bits, TIFF and EXR of floating values.
 
-Values are linear. PNG files say so by the chunk gAMA = 1, so that viewers that heed it show the
-scene as it looked; EXR files are linear by definition. Source: PNG 1.2, section 4.2.2.1.
+Values are linear. PNG files have the chunk gAMA = 1, by which viewers show the scene in its own
+brightness; EXR files are linear by definition. Source: PNG 1.2, section 4.2.2.1.
 """
 
 from __future__ import annotations

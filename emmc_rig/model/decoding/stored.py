@@ -1,7 +1,7 @@
-"""What a file holds, by the format that its bytes say: the one reader of every door for files.
+"""Content of a file, read in the format that its first bytes state; all readers of files call this.
 
-A TIFF or another picture is read as a viewer shows it: upright, with its palette's colours, and
-with all of its pages. Zarr and RAW files, whose packages are above the model, join in
+A TIFF or another picture is read as a viewer shows it: upright, in the colours of its palette, all
+pages of the file. Zarr and RAW files, whose packages are above the model, join in
 `emmc_rig.files.own_arrays`.
 """
 

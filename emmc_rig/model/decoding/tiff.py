@@ -354,7 +354,7 @@ class _Series:
             taken.append(_Page(_whole(pages[number]), *stated.get(place, (_UNKNOWN, _UNKNOWN))))
             members.append(file)
         if not taken:
-            raise ValueError("its OME-XML names no page of it")
+            raise ValueError("its OME-XML lists no page of this file")
         return taken, [str(self._beside(file)) if file else str(self._path) for file in {*members}]
 
     def _beside(self, file: str) -> Path:

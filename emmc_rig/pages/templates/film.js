@@ -6,7 +6,7 @@ const film = JSON.parse(byId("data").textContent);
 const count = film.times_s.length, rows = film.rows;
 const viewer = document.getElementById("viewer"), picture = document.getElementById("viewer-picture");
 const first = film.frames.findIndex(Boolean);
-const neighbour = (k) => film.frames[Math.max(film.frames.findLastIndex((one, i) => one && i <= k), first)];
+const neighbour = (k) => film.frames[Math.max(film.frames.findLastIndex((frame, i) => frame && i <= k), first)];
 let place = first, loading = false, playing = 0, centres = null;
 
 // The newest place that was asked for is shown, however many were asked for while one was decoded.

@@ -354,12 +354,12 @@ function reading() {
   const middle = [Math.floor(columns / 2), Math.floor(rows / 2)];
   const x = clamp(Math.round(state.x + d * (middle[0] - state.u)), 0, width - 1);
   const y = clamp(Math.round(state.y + d * (middle[1] - state.v)), 0, height - 1);
-  data.overlays.forEach((one, k) => {
-    if (one.key === "disparity" || !overlayLevels[k]) return;
+  data.overlays.forEach((map, k) => {
+    if (map.key === "disparity" || !overlayLevels[k]) return;
     const at = 4 * (y * width + x), level = overlayLevels[k].data[at] / 255;
-    if (!overlayLevels[k].data[at + 3]) { here.push(`${one.label} unknown`); return; }
-    const value = one.low + level * (one.high - one.low);
-    here.push(`${one.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${one.unit}`.trimEnd());
+    if (!overlayLevels[k].data[at + 3]) { here.push(`${map.label} unknown`); return; }
+    const value = map.low + level * (map.high - map.low);
+    here.push(`${map.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${map.unit}`.trimEnd());
   });
   return here.join(", ");
 }
@@ -369,11 +369,11 @@ function drawEpi() {
   const v = Math.round(state.v), u = Math.round(state.u);
   const across = byId("epi-h"), down = byId("epi-v");
   across.width = width; across.height = columns;
-  const one = across.getContext("2d");
+  const drawn = across.getContext("2d");
   for (let k = 0; k < columns; k++)
-    one.drawImage(source, k * tileWidth, v * tileHeight + state.y, width, 1, 0, k, width, 1);
-  one.fillStyle = "#fff9";
-  one.fillRect(state.x, 0, 1, columns);
+    drawn.drawImage(source, k * tileWidth, v * tileHeight + state.y, width, 1, 0, k, width, 1);
+  drawn.fillStyle = "#fff9";
+  drawn.fillRect(state.x, 0, 1, columns);
   down.width = height; down.height = rows;
   const other = down.getContext("2d");
   other.setTransform(0, 1, 1, 0, 0, 0); // y along the strip, v down it
@@ -393,12 +393,12 @@ function choose(overlay) {
   state.overlay = overlay < data.overlays.length ? overlay : -1;
   if (!overlayLevels[state.overlay]) state.overlay = -1; // until they are decoded
   for (const input of byId("overlays").querySelectorAll("input")) input.checked = +input.value === state.overlay;
-  const legend = byId("legend"), one = data.overlays[state.overlay];
-  legend.hidden = !one;
+  const legend = byId("legend"), map = data.overlays[state.overlay];
+  legend.hidden = !map;
   legend.replaceChildren();
-  if (one) {
+  if (map) {
     const levels = overlayLevels[state.overlay], coloured = new ImageData(width, height);
-    const table = Array.from({ length: 256 }, (_, i) => colourOf(one.colours, i / 255));
+    const table = Array.from({ length: 256 }, (_, i) => colourOf(map.colours, i / 255));
     for (let i = 0; i < coloured.data.length; i += 4) {
       const [r, g, b] = table[levels.data[i]];
       coloured.data.set([r, g, b, levels.data[i + 3]], i);
@@ -409,10 +409,10 @@ function choose(overlay) {
       made.textContent = text;
       return made;
     };
-    add(legend, "i", "").style.background = `linear-gradient(90deg,${one.colours.map((c) => `rgb(${c})`)})`;
+    add(legend, "i", "").style.background = `linear-gradient(90deg,${map.colours.map((c) => `rgb(${c})`)})`;
     const ends = add(legend, "div", "");
-    add(ends, "span", one.low.toPrecision(2));
-    add(ends, "span", `${one.high.toPrecision(2)} ${one.unit}`);
+    add(ends, "span", map.low.toPrecision(2));
+    add(ends, "span", `${map.high.toPrecision(2)} ${map.unit}`);
   }
   changed();
 }
@@ -571,9 +571,9 @@ function prepareControls() {
   for (const element of document.querySelectorAll(".viewer-with-truth")) element.hidden = !data.truth;
   for (const element of document.querySelectorAll(".viewer-angles")) element.hidden = Boolean(data.axes);
   if (data.axes) nameAxes(data.axes);
-  const choices = ["nothing", ...data.overlays.map((one) => one.label)];
+  const choices = ["nothing", ...data.overlays.map((map) => map.label)];
   const there = [...byId("overlays").querySelectorAll("label")];
-  if (choices.join() === there.map((row) => row.textContent).join()) return; // one of them may have the focus
+  if (choices.join() === there.map((row) => row.textContent).join()) return; // a choice may have the focus
   for (const row of there) row.remove();
   choices.forEach((label, k) => {
     const row = byId("overlays").appendChild(document.createElement("label"));
@@ -612,7 +612,7 @@ function adopt(next) {
   state.x = clamp(Math.round(state.x * grown), 0, width - 1);
   state.y = clamp(Math.round(state.y * grown), 0, height - 1);
   state.focus = clamp(state.focus * grown, data.focus.low, data.focus.high);
-  state.overlay = data.overlays.findIndex((one) => one.key === overlay);
+  state.overlay = data.overlays.findIndex((map) => map.key === overlay);
   picture.style.aspectRatio = `${width} / ${height}`;
   byId("stage").style.maxWidth = `calc(80vh * ${width} / ${height})`;
 }
@@ -643,8 +643,8 @@ async function take(next) {
 }
 
 async function levelsOf(next) {
-  const laid = await Promise.all(next.overlays.map((one) => decoded(one.picture)));
-  return laid.map((one) => one.getContext("2d").getImageData(0, 0, one.width, one.height));
+  const laid = await Promise.all(next.overlays.map((map) => decoded(map.picture)));
+  return laid.map((canvas) => canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height));
 }
 
 // What is laid over the estimate and compared with it.

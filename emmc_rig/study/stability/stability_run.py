@@ -29,7 +29,15 @@ from emmc_rig.pages.drawing import (
     sheet,
     titled,
 )
-from emmc_rig.pages.page import Head, Section, embedded, fragment, framed, provenance_section
+from emmc_rig.pages.page import (
+    Head,
+    Section,
+    embedded,
+    fragment,
+    framed,
+    part,
+    provenance_section,
+)
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import result_folder
@@ -328,5 +336,5 @@ def breaking_section(scene: str, curves: Sequence[Curve]) -> Section:
 def curves_section(scene: str, kind: str, svg: Path, answers: Sequence[str]) -> Section:
     """Return the small multiples of one kind of fault, below what they say."""
     title = f"{kind}, {scene}"
-    body = fragment("drawing.html", drawing=embedded(svg), title=title, answers=answers)
+    body = part("bullets", answers) + part("drawings", {title: embedded(svg)})
     return Section(title.lower().replace(", ", "-").replace(" ", "-"), title, body)

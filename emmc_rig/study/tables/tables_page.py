@@ -11,7 +11,7 @@ import numpy as np
 
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.page import Head, Section, fragment, framed, number, provenance_section
+from emmc_rig.pages.page import Head, Section, framed, number, part, provenance_section
 from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import result_folder
 from emmc_rig.study.points import study_folder
@@ -89,7 +89,8 @@ def tables_page(
     """Return the page. about: sentences under the title."""
     sections = []
     for index, grid in enumerate(grids):
-        body = fragment("tables_grid.html", heads=grid.heads, rows=grid.rows)
+        body = part("lead", "PSNR in dB, the paper's after the bar.")
+        body += part("wide_table", grid.heads, grid.rows)
         sections.append(Section(f"table-{index}", grid.title, body, grid.title.partition(":")[0]))
     sections.append(provenance_section(provenance))
     title = "The paper's tables, reproduced"
@@ -183,9 +184,9 @@ def _about(study: TablesStudy) -> list[str]:
 def cells_csv(study: TablesStudy) -> str:
     """Return tables.csv: one row per cell, in the order of the tables."""
     parts: dict[Cell, list[str]] = {}
-    for part in study.parts:
-        for cell in cells_of(part, list(study.scenes)):
-            parts.setdefault(cell, []).append(part.name)
+    for table in study.parts:
+        for cell in cells_of(table, list(study.scenes)):
+            parts.setdefault(cell, []).append(table.name)
     rows = [
         {
             **study.results[cell],

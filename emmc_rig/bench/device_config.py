@@ -1,15 +1,18 @@
-"""The configuration of a stage: a short `PROTOCOL:PORT`, or a YAML file that wires names to axes.
+"""Configuration of stage and camera: a short `NAME:ADDRESS`, or a YAML file with more settings.
 
-Single settings may follow the port: `zaber:/dev/ttyUSB0,microstep_um=0.49609375`.
+A stage is `PROTOCOL:PORT`; single settings may follow,
+`zaber:/dev/ttyUSB0,microstep_um=0.49609375`; its file wires names to axes. A camera is
+`DRIVER:ADDRESS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError, create_model
 
 from drivers.apt import ACTUATORS
 from drivers.stage import StageSettings
@@ -34,14 +37,7 @@ class _Common(Settings):
 
     def stage_settings(self) -> StageSettings:
         """Return the part that concerns how carefully the stage moves."""
-        return StageSettings(
-            approach_um=self.approach_um,
-            tolerance_um=self.tolerance_um,
-            settle_s=self.settle_s,
-            soft_limits_um=self.soft_limits_um,
-            speeds_um_s=self.speeds_um_s,
-            top_speeds_um_s=self.top_speeds_um_s,
-        )
+        return StageSettings(**{name: getattr(self, name) for name in _Common.model_fields})
 
 
 class ZaberConfig(_Common):
@@ -58,7 +54,7 @@ class ZaberConfig(_Common):
 
 
 class GrblConfig(_Common):
-    """A Grbl controller, axes by letter; steps_per_mm: what its `$100` and following must be."""
+    """A Grbl controller, axes by letter; steps_per_mm: values that its `$100`, ... must have."""
 
     protocol: Literal["grbl"] = "grbl"
     port: str
@@ -107,7 +103,7 @@ class MicroManagerConfig(_Common):
 
 
 class PluginConfig(_Common):
-    """A stage of a plug-in: `options` go to its factory as they are."""
+    """A stage of a plug-in; its factory gets `options` unchanged."""
 
     protocol: str
     port: str = ""
@@ -141,7 +137,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
     chosen: dict[str, Any] = {}
     if protocol in PROTOCOLS:
         port, *options = port.split(",")
-        chosen = dict(_option(shown, one) for one in options)
+        chosen = dict(_option(shown, option) for option in options)
     if colon and protocol in known and (port or known[protocol] is PluginConfig):
         data: dict[str, Any] = {"protocol": protocol, "port": port} | chosen
         if protocol == "apt":
@@ -163,8 +159,8 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
 def _require_actuators(axes: Any, source: str) -> None:
     """Raise AppError for an axis without an actuator: no controller reports what is plugged in."""
     known = ", ".join(ACTUATORS)
-    for axis, one in axes.items() if isinstance(axes, dict) else ():
-        if isinstance(one, dict) and "actuator" not in one:
+    for axis, channel in axes.items() if isinstance(axes, dict) else ():
+        if isinstance(channel, dict) and "actuator" not in channel:
             raise AppError(
                 f"{source}: {axis} must not move, its actuator is not stated: write "
                 f"actuator: with one of {known} into the stage's YAML file, or "
@@ -194,8 +190,55 @@ def stage_of(data: dict[str, Any], source: str) -> StageConfig:
     except ValidationError as fault:
         raise AppError(" ".join(f"{source}: {explain(fault, cls)}".split())) from fault
     if isinstance(config, AptConfig):
-        for axis, one in config.axes.items():
-            if one.actuator not in ACTUATORS:
+        for axis, channel in config.axes.items():
+            if channel.actuator not in ACTUATORS:
                 known = ", ".join(ACTUATORS)
                 raise AppError(f"{source}: axes.{axis}.actuator: use one of {known}")
     return config
+
+
+DRIVER_KEYS = ("driver", "kind")
+"""Of a camera's YAML file: the name of its driver, now and in earlier versions."""
+
+
+@dataclass(frozen=True)
+class CameraChoice:
+    """A driver, the address of its camera, other settings (options); `source` is for messages."""
+
+    driver: str
+    address: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+    source: str = ""
+
+
+def settings_of(kind: type[Any]) -> type[Settings]:
+    """Return the model that reads a driver's dataclass of options, and refuses unknown keys."""
+    hints = get_type_hints(kind, include_extras=True)
+    found: dict[str, Any] = {
+        option.name: (
+            hints[option.name],
+            option.default
+            if option.default_factory is MISSING
+            else Field(default_factory=option.default_factory),
+        )
+        for option in fields(kind)
+    }
+    return create_model(kind.__name__, __base__=Settings, **found)
+
+
+def parse_camera(spec: str) -> CameraChoice:
+    """Return the camera that `DRIVER:ADDRESS` or the name of a YAML file describes.
+
+    The file holds `driver` (in earlier versions `kind`), `address` and what that driver takes.
+    Raises AppError with one line.
+    """
+    if not spec.endswith((".yaml", ".yml")) or ":" in spec:
+        driver, _, address = spec.partition(":")
+        return CameraChoice(driver, address, source=f"camera {shown_path(spec)}")
+    read = read_yaml(Path(spec), AppError)
+    options = {str(key): value for key, value in read.items()} if isinstance(read, dict) else {}
+    named = next((key for key in DRIVER_KEYS if isinstance(options.get(key), str)), None)
+    if named is None:
+        raise AppError(f"{shown_path(spec)}: name the camera's driver, such as driver: mm")
+    driver, address = options.pop(named), str(options.pop("address", ""))
+    return CameraChoice(driver, address, options, shown_path(spec))
