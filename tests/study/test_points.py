@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 
 from emmc_rig.errors import AppError, StoppedError
-from emmc_rig.pages.page import Head, Section, fragment, framed, number
+from emmc_rig.pages.page import Head, Section, framed, number, part
 from emmc_rig.progress import Watcher
 from emmc_rig.study.points import Journal, NotApplicableError, Study, study_folder
 from emmc_rig.study.rows import csv_text, plain
@@ -184,7 +184,7 @@ def test_a_result_is_kept_as_json_gives_it_back():
 
 
 def test_text_on_a_page_is_escaped():
-    body = fragment("figures.html", heads=["<b>"], rows=[["</td>", "&"]], pictures={})
+    body = part("wide_table", ["<b>"], [["</td>", "&"]])
     head = Head("<trust>", "<u>", ["look at `<s>`"])
     sections = [Section("one", "One", body)]
     page = framed("<i>", ["&"], ["'"], sections, head=head)
