@@ -27,12 +27,12 @@ from reconstruction.inputs import checked_inputs
 from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
+from reconstruction.tv import few_steps
 from reconstruction.verdict.evidence import FittedFrames, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import MOTION, Verdict, verdict_from
 from reconstruction.verdict.shadow import relief
 from reconstruction.verdict.shots import Motion, motion
-from reconstruction.wave import few_steps
 
 FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""
