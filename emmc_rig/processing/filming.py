@@ -71,7 +71,7 @@ from emmc_rig.store.folders import (
 )
 from emmc_rig.version import __version__
 from reconstruction.adaptive.film import Film
-from reconstruction.adaptive.parts import put_together, taken_apart
+from reconstruction.adaptive.parts import from_arrays, to_arrays
 from reconstruction.errors import ReconstructionError
 from reconstruction.methods import DEFAULT_METHOD, MethodSettings, film_methods, find_method
 from reconstruction.result import Progress
@@ -261,14 +261,14 @@ class FilmJob:
         psi.save(self.kept / PSI)
         (self.kept / FRAMES).mkdir()
         arrays: dict[str, NDArray] = {}
-        plain = taken_apart(scale, arrays)
+        plain = to_arrays(scale, arrays)
         _save(path, {"fingerprint": fingerprint, "scale": plain}, arrays)
 
     def scale(self) -> Scale:
         """Return what turns frames into readings, with the Psi that all are reconstructed by."""
         psi = StoredPsi(self.kept / PSI).load()
         about, arrays = _open(self.kept / SCALE)
-        return put_together(about["scale"], arrays, (Scale, MeanFrame, SensorGain), lambda: psi)
+        return from_arrays(about["scale"], arrays, (Scale, MeanFrame, SensorGain), lambda: psi)
 
 
 @dataclass(frozen=True)
