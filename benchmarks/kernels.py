@@ -9,12 +9,11 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import lab
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import njit, prange
 
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model import kernels
@@ -23,7 +22,6 @@ from emmc_rig.model.sensing import rows_of_colours
 from reconstruction import kernels as tv_kernels
 from reconstruction.differences import stencils
 from reconstruction.problem import colour_metric
-from reconstruction.tv import row_bands
 
 TRIAD_VALUES = 40_000_000
 
@@ -57,8 +55,6 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
     dual = np.zeros((*planar.shape[:3], 4, *planar.shape[3:]), dtype=np.float32)
     taps, room = stencils(1, psi.light_field_shape, planar.dtype), np.empty_like(planar)
     moved = np.zeros((psi.frames_shape[1], 2))
-    bands = row_bands(psi.frames_shape[1], get_num_threads())
-    pool = ThreadPoolExecutor(len(bands))
     one, operator = np.float32(1), (psi.weights, psi.colour_map)
     data = tv_kernels.FrameFit(*operator, inverse, frames, psi.binning)
     steps = tv_kernels.Steps(one, one / 64, one, one, colour_metric(2.0).astype(np.float32))
@@ -71,7 +67,7 @@ def cases(camera: str, size: tuple[int, int]) -> dict[str, tuple[Callable[[], ob
             lambda: kernels.back_project(*operator, frames, psi.binning, light_field), once,
         ),
         "TV step": (
-            lambda: tv_kernels.sweep(data, steps, taps, planar, dual, room, bands, moved, pool.map),
+            lambda: tv_kernels.sweep(data, steps, taps, planar, dual, room, moved),
             once + light_field.nbytes + 2 * dual.nbytes,
         ),
     }  # fmt: skip

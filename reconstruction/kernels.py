@@ -12,13 +12,12 @@ need the next band's first and are done after all bands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.bands import row_kernel
+from emmc_rig.model.bands import in_bands, row_kernel
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.kernels import correct_row, gather_row, spread_row
 
@@ -267,25 +266,22 @@ def sweep(
     light_field: NDArray[np.floating],
     dual: NDArray[np.floating],
     ahead: NDArray[np.floating],
-    bands: NDArray[np.int64],
     moved: NDArray[np.float64],
-    run: Callable[..., Iterable[object]] = map,
 ) -> None:
     """Do one over-relaxed primal-dual iteration in place (Condat 2013, algorithm 3.1).
 
     dual: (v, u, y, index, colour, x), 0 where no stencil fits. ahead: room for another light field.
-    bands: (band, 2) first and last + 1 row of pixels. moved: (pixel_y, 2), set to the squared
-    change and the squared size of the light field per row of pixels. run: `map`, or that of a
-    thread pool: the bands are independent (numba's own parallel loop takes 15 s more to compile).
+    moved: (pixel_y, 2), set to the squared change and the squared size of the light field per row
+    of pixels.
     """
     dual = dual.reshape(*dual.shape[:4], -1)
     for last_rows in (False, True):
 
-        def work(band: NDArray[np.int64], last_rows: bool = last_rows) -> None:
+        def work(_: int, begin: int, end: int, last_rows: bool = last_rows) -> None:
+            band = begin, end
             _sweep_band(data, steps, stencils, light_field, dual, ahead, band, last_rows, moved)
 
-        for _ in run(work, bands):
-            pass
+        in_bands(work, len(moved))
 
 
 @row_kernel("light_field", 2, fastmath=True)

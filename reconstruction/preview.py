@@ -13,17 +13,14 @@ several frames.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames, even_frames
-from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
-from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
+from emmc_rig.model.sensing import ImagingMatrix
+from reconstruction.choices import choose_mu
 from reconstruction.inputs import checked_inputs
-from reconstruction.problem import Problem, colour_metric
-from reconstruction.tv import TVSettings, sweeping
+from reconstruction.tv import Sweeps
 
 Array = NDArray[np.floating]
 PICTURE_NOISE, COARSE_NOISE = 0.1, 0.06
@@ -62,31 +59,17 @@ def _grouped(frames: NDArray, part: int, high: int, wide: int) -> NDArray:
 
 
 class _Following:
-    """Total variation of frame after frame by one Psi: `planar` is (v, u, y, colour, x)."""
+    """Total variation of frame after frame by one Psi."""
 
     def __init__(self, psi: ImagingMatrix, frames: Frames) -> None:
-        settings, usable = TVSettings(), frames.usable
-        self._data, self._usable = checked_inputs(psi, frames).readings, usable
-        mu = choose_mu(psi, self._data[usable], frames.noise_sigma)
-        guess = smooth_guess(psi, self._data, usable)
-        gamma = choose_primal_step(contrast(guess), mu, settings.chroma_weight)
-        dtype = psi.weights.dtype.type
-        metric = colour_metric(settings.chroma_weight).astype(dtype)
-        problem = Problem(psi, self._data, usable, mu, 1, metric)
-        begin = np.broadcast_to(guess, psi.light_field_shape)
-        self.planar = np.ascontiguousarray(rows_of_colours(begin), dtype=dtype)
-        self._sweep, self._bands = sweeping(
-            problem, dtype(gamma), dtype(settings.relaxation), self.planar
-        )
-        self._moved = np.zeros((psi.frames_shape[1], 2))
+        self._data, self._usable = checked_inputs(psi, frames).readings, frames.usable
+        mu = choose_mu(psi, self._data[self._usable], frames.noise_sigma)
+        self.sweeps = Sweeps.usual(psi, self._data, self._usable, mu)
 
     def follow(self, frames: Array, steps: int) -> float:
         """Take these frames instead, do some steps; return the last one's relative change."""
         self._data[:] = np.where(self._usable, frames, 0)
-        with ThreadPoolExecutor(len(self._bands)) as pool:
-            for _ in range(steps):
-                self._sweep(self._bands, self._moved, pool.map)
-        return float(np.sqrt(self._moved[:, 0].sum() / max(self._moved[:, 1].sum(), 1e-300)))
+        return self.sweeps.advance(steps)
 
 
 class Preview:
@@ -121,7 +104,7 @@ class Preview:
         Returns the relative change of the light field in the last step.
         """
         self._picture.follow(frames, steps)
-        texture = self._picture.planar.copy()
+        texture = self._picture.sweeps.planar.copy()
         high, wide = (count * self._factor for count in self.size)
         blocks = texture[0, 0, :high, :, :wide].reshape(
             self.size[0], self._factor, 3, self.size[1], self._factor
@@ -133,7 +116,6 @@ class Preview:
     @property
     def light_field(self) -> NDArray[np.float32]:
         """The estimate so far, (v, u, y, x, c) in [0, 1], a copy."""
-        found = np.ascontiguousarray(np.moveaxis(self._coarse.planar, -2, -1), dtype=np.float32)
-        np.clip(found, 0, 1, out=found)
+        found = self._coarse.sweeps.light_field
         self._seen_by.even_unseen_colours(found)
         return found

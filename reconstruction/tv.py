@@ -22,11 +22,8 @@ per value.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import numpy as np
-from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -80,10 +77,77 @@ def method_name(order: int, with_patches: bool) -> str:
     return ("tv" if order == 1 else f"dv{order}") + ("-patch" if with_patches else "")
 
 
-def row_bands(pixel_rows: int, bands: int) -> NDArray[np.int64]:
-    """Return the first and last + 1 row of at most `bands` bands of pixel rows: (band, 2)."""
-    edges = np.unique(np.linspace(0, pixel_rows, bands + 1).round().astype(np.int64))
-    return np.stack([edges[:-1], edges[1:]], axis=1)
+class Sweeps:
+    """Steps of the solver on a light field, in place; `planar` is it, (v, u, y, colour, x).
+
+    begin: the light field to begin with, (v, u, y, x, c). gamma: the primal step, of Psi's type.
+    The frames of the problem may change between steps.
+    """
+
+    def __init__(
+        self, problem: Problem, gamma: np.floating, relaxation: np.floating, begin: Array
+    ) -> None:
+        psi, dtype = problem.psi, problem.psi.weights.dtype
+        spread = float(np.linalg.norm(problem.metric, 2)) ** 2
+        norm_squared = spread * norm_squared_of(problem.order, (*psi.views, None, None))
+        pull = problem.pixel_weight()
+        total = 1 / gamma + pull
+        inverse = psi.inverted_blocks(np.where(problem.usable, total, np.inf))
+        fit = kernels.FrameFit(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
+        if problem.patch_term is not None:
+            share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
+            pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]
+            fit = fit._replace(share=share, pulled=np.ascontiguousarray(pulled, dtype=dtype))
+        dual_step = dtype.type(1 / (norm_squared * gamma))
+        steps = kernels.Steps(gamma, dual_step, dtype.type(problem.mu), relaxation, problem.metric)
+        self.planar = np.empty((*begin.shape[:3], 3, begin.shape[3]), dtype)
+        self.planar[:] = rows_of_colours(begin)
+        taps = stencils(problem.order, begin.shape, dtype)
+        dual = np.zeros((*begin.shape[:3], len(taps.reach), 3, begin.shape[3]), dtype)
+        self._moved = np.zeros((psi.frames_shape[1], 2))
+        ahead = np.empty_like(self.planar)
+        self._state = fit, steps, taps, self.planar, dual, ahead, self._moved
+
+    @classmethod
+    def usual(
+        cls, psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], mu: float
+    ) -> Sweeps:
+        """Return steps of total variation with the usual settings, begun with a smooth picture.
+
+        frames, usable: (shot, pixel_y, pixel_x), checked, the frames in Psi's type and finite. mu:
+        the weight of total variation.
+        """
+        settings, dtype = TVSettings(), psi.weights.dtype.type
+        guess = smooth_guess(psi, frames, usable)
+        gamma = choose_primal_step(contrast(guess), mu, settings.chroma_weight)
+        metric = colour_metric(settings.chroma_weight).astype(dtype)
+        problem = Problem(psi, frames, usable, mu, 1, metric)
+        begin = np.broadcast_to(guess, psi.light_field_shape)
+        return cls(problem, dtype(gamma), dtype(settings.relaxation), begin)
+
+    def advance(self, steps: int = 1) -> float:
+        """Do some steps; return the relative change of the light field in the last one."""
+        for _ in range(steps):
+            kernels.sweep(*self._state)
+        return float(np.sqrt(self._moved[:, 0].sum() / max(self._moved[:, 1].sum(), 1e-300)))
+
+    @property
+    def light_field(self) -> NDArray[np.float32]:
+        """The estimate so far, (v, u, y, x, c) in [0, 1], a copy."""
+        found = np.ascontiguousarray(np.moveaxis(self.planar, -2, -1), dtype=np.float32)
+        return np.clip(found, 0, 1, out=found)
+
+
+def few_steps(
+    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], mu: float, count: int
+) -> NDArray[np.float32]:
+    """Return the light field (v, u, y, x, c) of `count` steps of total variation.
+
+    Arguments: see `Sweeps.usual`.
+    """
+    sweeps = Sweeps.usual(psi, frames, usable, mu)
+    sweeps.advance(count)
+    return sweeps.light_field
 
 
 def reconstruct_tv(
@@ -114,28 +178,23 @@ def reconstruct_tv(
     rtol = settings.rtol * min(1.0, gamma / usual)
     metric = colour_metric(settings.chroma_weight).astype(dtype)
     problem = Problem(psi, data, usable, mu, settings.order, metric, patch_term, settings.rho)
-    light_field = np.empty((*psi.light_field_shape[:3], 3, psi.size[1]), dtype=dtype)
-    light_field[:] = rows_of_colours(first_light_field(psi, guess, patch_term))
-    sweep, bands = sweeping(problem, dtype(gamma), dtype(settings.relaxation), light_field)
-    moved = np.zeros((psi.frames_shape[1], 2))
+    begin = first_light_field(psi, guess, patch_term)
+    sweeps = Sweeps(problem, dtype(gamma), dtype(settings.relaxation), begin)
     history: list[tuple[int, float]] = []
     change, step = np.inf, 0
-    with ThreadPoolExecutor(len(bands)) as pool:
-        while step < settings.max_steps and change > rtol:
-            sweep(bands, moved, pool.map)
-            step += 1
-            change = float(np.sqrt(moved[:, 0].sum() / max(moved[:, 1].sum(), 1e-300)))
-            value = None
-            if step % settings.objective_every == 0:
-                value = problem.value(np.moveaxis(light_field, -2, -1))
-                history.append((step, value))
-            if on_step is not None:
-                on_step(Progress(step, change, value))
+    while step < settings.max_steps and change > rtol:
+        change = sweeps.advance()
+        step += 1
+        value = None
+        if step % settings.objective_every == 0:
+            value = problem.value(np.moveaxis(sweeps.planar, -2, -1))
+            history.append((step, value))
+        if on_step is not None:
+            on_step(Progress(step, change, value))
     converged = change <= rtol
-    result = np.ascontiguousarray(np.moveaxis(light_field, -2, -1), dtype=np.float32)
     return Reconstruction(
         method=method_name(settings.order, patch_term is not None),
-        light_field=np.clip(result, 0, 1, out=result),
+        light_field=sweeps.light_field,
         status=Status.CONVERGED if converged else Status.STEP_LIMIT,
         advice="" if converged else "raise max_steps or loosen rtol",
         steps=step,
@@ -150,38 +209,3 @@ def reconstruct_tv(
             "rho": settings.rho,
         },
     )
-
-
-def prepared(
-    problem: Problem, gamma: np.floating, relaxation: np.floating
-) -> tuple[kernels.FrameFit, kernels.Steps]:
-    """Return what steps of the solver fit and how far they go, gamma the primal one.
-
-    The steps do not depend on the size of the picture, so that its tiles take the same ones.
-    """
-    psi, dtype = problem.psi, problem.psi.weights.dtype
-    spread = float(np.linalg.norm(problem.metric, 2)) ** 2
-    norm_squared = spread * norm_squared_of(problem.order, (*psi.views, None, None))
-    pull = problem.pixel_weight()
-    total = 1 / gamma + pull
-    inverse = psi.inverted_blocks(np.where(problem.usable, total, np.inf))
-    fit = kernels.FrameFit(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
-    if problem.patch_term is not None:
-        share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
-        pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]
-        fit = fit._replace(share=share, pulled=np.ascontiguousarray(pulled, dtype=dtype))
-    dual_step = dtype.type(1 / (norm_squared * gamma))
-    return fit, kernels.Steps(gamma, dual_step, dtype.type(problem.mu), relaxation, problem.metric)
-
-
-def sweeping(
-    problem: Problem, gamma: np.floating, relaxation: np.floating, light_field: Array
-) -> tuple[Callable[..., None], NDArray[np.int64]]:
-    """Return a step of the solver on light_field (v, u, y, c, x), in place, and bands of rows."""
-    psi, order, dtype = problem.psi, problem.order, light_field.dtype
-    fit, steps = prepared(problem, gamma, relaxation)
-    bands = row_bands(psi.frames_shape[1], get_num_threads())
-    taps = stencils(order, (*light_field.shape[:3], light_field.shape[4]), dtype)
-    dual = np.zeros((*light_field.shape[:3], len(taps.reach), *light_field.shape[3:]), dtype)
-    ahead = np.empty_like(light_field)
-    return partial(kernels.sweep, fit, steps, taps, light_field, dual, ahead), bands

@@ -97,7 +97,7 @@ def helped_to_compile(method: str, camera: str, shots: int | None) -> Iterator[N
 def compile_for(part: str, camera: str, shots: int | None) -> None:
     """Reconstruct a small light field, or do that part of it: its kernels are compiled and kept."""
     import emmc_rig as emmc
-    from reconstruction.wave import few_steps
+    from reconstruction.tv import few_steps
 
     described = emmc.camera(camera, shots)
     psi = described.psi(SIZE)

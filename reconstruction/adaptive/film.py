@@ -40,7 +40,7 @@ from reconstruction.adaptive.joint import (
     solve,
     surfaces_of,
 )
-from reconstruction.adaptive.parts import put_together, taken_apart
+from reconstruction.adaptive.parts import from_arrays, to_arrays
 from reconstruction.adaptive.rays import Surfaces
 from reconstruction.adaptive.settings import AdaptiveSettings
 from reconstruction.adaptive.survey import Plain, checked, plain_of, unseen_by
@@ -159,7 +159,7 @@ class Film:
     def arrays(self) -> dict[str, NDArray]:
         """Return all but Psi as arrays by name, to be stored: `restored` makes a film of them."""
         arrays: dict[str, NDArray] = {}
-        about = json.dumps(taken_apart(self, arrays))
+        about = json.dumps(to_arrays(self, arrays))
         return {"about": np.array(about), **arrays}
 
     @classmethod
@@ -171,7 +171,7 @@ class Film:
         fitted = (checked(psi, even_frames(np.zeros(psi.frames_shape), 1.0)).psi for psi in psis)
         kinds = (cls, FilmSettings, Known, Rest, OtherTime, Readings, search.Volume)
         about = parse_json(str(arrays["about"]), "a stored film", ReconstructionError)
-        return put_together(about, arrays, kinds, lambda: next(fitted))
+        return from_arrays(about, arrays, kinds, lambda: next(fitted))
 
     def after(
         self,
@@ -347,7 +347,7 @@ def followed(
     residuals: list[Array] = [given.frames - psi.forward(mixture.values(one)) for one in models]
     models.append(plain.plain)
     residuals.append(plain.plain_residual)
-    fits = Fits(models, residuals, scene, patched=False, understated=UNDERSTATED)
+    fits = Fits(models, residuals, scene, with_patches=False, understated=UNDERSTATED)
     moved = float(np.median(np.linalg.norm(there, axis=-1)))
     parameters = {"flow_px": moved, "new_share": new, "still_share": float(still.mean())}
     moving = used & (np.linalg.norm(back[::k, ::k], axis=-1) > RESTING_PX)

@@ -33,14 +33,14 @@ class Fits:
 
     light_fields: (v, u, y, x, c) of each, as `mixture.stored`; residuals: frames less what each
     predicts, (shot, pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's
-    scale. patched: whether the last are patches. understated: by how much the spread of these
+    scale. with_patches: whether the last are patches. understated: by how much the spread of these
     models understates the variance of their mean, beside that of a capture's.
     """
 
     light_fields: list[NDArray[np.uint16]]
     residuals: list[Array]
     scene: FittedScene
-    patched: bool
+    with_patches: bool
     understated: float = 1.0
 
 
@@ -112,7 +112,7 @@ def fitted_models(
         seen = scene.surfaces.light_field(scale * scene.texture)
         light_fields.append(mixture.stored(np.clip(seen, 0, 1, out=seen)))
     assert scene is not None
-    enough = settings.patched(given.psi.shots)
+    enough = settings.uses_patches(given.psi.shots)
     patched = patches is not None and (enough or surfaces_fail(survey, residuals))
     if patches is not None and patched:
         seen = patches(given.usable & ~held)
@@ -147,7 +147,7 @@ def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
     """
     given, held = survey.given, survey.held
     if held.any():
-        rule = mixture.beside_patches if fits.patched else mixture.shares_of
+        rule = mixture.beside_patches if fits.with_patches else mixture.shares_of
         shares = rule(fits.residuals, given.noise, held)
     else:
         shares = np.zeros((len(fits.residuals), *held.shape[1:]), dtype=np.float32)

@@ -96,7 +96,7 @@ def reconstruct_adaptive(
         total = 2 * settings.texture.steps + 3
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second)
     believed = survey.volume if second is None else second
-    result = _put_together(survey, fits, survey.volume, believed, edges, whole, total, started)
+    result = _result_of(survey, fits, survey.volume, believed, edges, whole, total, started)
     report(total)
     return replace(
         result,
@@ -123,7 +123,7 @@ def reconstruct_next(
     started = running_s()
     whole = checked(psi, frames)
     if shown := film.shown(whole.psi):
-        return _among(whole, shown, settings, on_step, film)
+        return _with_other_times(whole, shown, settings, on_step, film)
     given, edges = _without_edges(whole, settings)
     total = film.settings.texture.steps + 1
 
@@ -136,7 +136,7 @@ def reconstruct_next(
     if found is None or known is None:
         return Film(film.settings)
     beliefs = found.beliefs
-    result = _put_together(found.plain, found.fits, beliefs, beliefs, edges, whole, total, started)
+    result = _result_of(found.plain, found.fits, beliefs, beliefs, edges, whole, total, started)
     if found.worse(known, result.light_field):
         return film
     report(total)
@@ -164,10 +164,10 @@ def reconstruct_moving(
     )
     nothing, steps = np.zeros(psi.size), settings.start_steps
     shown = [(one, plain_of(one, 1.0, nothing, steps).picture) for one in others]
-    return _among(present, shown, settings, on_step, patches=patches)
+    return _with_other_times(present, shown, settings, on_step, patches=patches)
 
 
-def _among(
+def _with_other_times(
     whole: Readings,
     shown: Sequence[tuple[Readings, Array]],
     settings: AdaptiveSettings,
@@ -189,7 +189,7 @@ def _among(
     survey = of_present(together, given)
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second, others)
     beliefs, scene = survey.volume if second is None else second, fits.scene
-    result = _put_together(survey, fits, survey.volume, beliefs, edges, whole, total, started)
+    result = _result_of(survey, fits, survey.volume, beliefs, edges, whole, total, started)
     report(total)
     left = result.parameters["misfit"]
     return replace(
@@ -209,7 +209,7 @@ def _without_edges(
     return replace(whole, usable=whole.usable & ~edges.within), edges
 
 
-def _put_together(
+def _result_of(
     survey: Plain,
     fits: Fits,
     searched: search.Volume,

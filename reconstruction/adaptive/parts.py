@@ -1,4 +1,4 @@
-"""Dataclasses taken apart into plain data and arrays, to be stored, and put together again."""
+"""Dataclasses to plain data and arrays, which can be stored, and back."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KIND = "class"
 PLAIN = bool, int, float, str, type(None)
 
 
-def taken_apart(value: Any, arrays: dict[str, NDArray]) -> Any:
+def to_arrays(value: Any, arrays: dict[str, NDArray]) -> Any:
     """Return a value as JSON has it; its arrays, in rows, are added to `arrays` under numbers.
 
     value: dataclasses, settings, tuples, arrays, numbers of Python and NumPy, and Psi, of which
@@ -25,7 +25,7 @@ def taken_apart(value: Any, arrays: dict[str, NDArray]) -> Any:
     if type(value) in PLAIN:
         return value
     if isinstance(value, tuple):
-        return [taken_apart(one, arrays) for one in value]
+        return [to_arrays(one, arrays) for one in value]
     if isinstance(value, (np.ndarray, np.generic)):
         name = str(len(arrays))
         arrays[name] = np.asarray(value, order="C")
@@ -35,16 +35,16 @@ def taken_apart(value: Any, arrays: dict[str, NDArray]) -> Any:
         return kind
     if isinstance(value, Settings):
         return kind | {"settings": value.model_dump(mode="json")}
-    return kind | {one.name: taken_apart(getattr(value, one.name), arrays) for one in fields(value)}
+    return kind | {one.name: to_arrays(getattr(value, one.name), arrays) for one in fields(value)}
 
 
-def put_together(
+def from_arrays(
     plain: Any,
     arrays: Mapping[str, NDArray],
     kinds: Iterable[type],
     next_psi: Callable[[], ImagingMatrix],
 ) -> Any:
-    """Return the value that `taken_apart` was given.
+    """Return the value that `to_arrays` was given.
 
     kinds: classes of the dataclasses and settings in it. next_psi: returns its Psi, one after the
     other in the order of the fields.

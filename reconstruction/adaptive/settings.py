@@ -71,7 +71,7 @@ class AdaptiveSettings(Settings):
         description="deviation of the values of the scene that this is a part of; None: its own",
     )
 
-    def patched(self, shots: int) -> bool:
+    def uses_patches(self, shots: int) -> bool:
         """Return whether sparse patches are in the mean of so many shots, whatever the scene."""
         return self.patches is not None and shots >= self.patches
 

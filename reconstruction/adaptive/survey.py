@@ -24,7 +24,7 @@ from reconstruction.choices import choose_mu, contrast, smooth_guess
 from reconstruction.colour import unseen_colour
 from reconstruction.errors import ReconstructionError
 from reconstruction.inputs import Readings
-from reconstruction.wave import few_steps
+from reconstruction.tv import few_steps
 
 Array = NDArray[np.floating]
 COARSE_PX = 8.0, 2.0

@@ -38,7 +38,7 @@ def sparse_patches(settings: SparseSettings, binning: int) -> SparseSettings:
     return settings.model_copy(update={"stride": stride, "solver": solver})
 
 
-def may_take_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
+def patches_fit(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
     """Return whether `adaptive` may average with sparse patches: if one fits."""
     return settings.patches is not None and min(psi.size) >= max(usual_patch(psi.binning))
 
@@ -46,7 +46,7 @@ def may_take_patches(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
 def _patches(psi: ImagingMatrix, settings: ShippedSettings) -> SparseSettings | None:
     """Return the patches that `adaptive` averages with whatever the scene: from so many shots."""
     adaptive = settings.adaptive
-    if not (may_take_patches(psi, adaptive) and adaptive.patched(psi.shots)):
+    if not (patches_fit(psi, adaptive) and adaptive.uses_patches(psi.shots)):
         return None
     return sparse_patches(settings.sparse, psi.binning)
 
@@ -74,7 +74,7 @@ def _solve(
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
         return solve_tv_dict(fitted, quick).light_field
 
-    result, taken = given.film, patches if may_take_patches(present.psi, adaptive) else None
+    result, taken = given.film, patches if patches_fit(present.psi, adaptive) else None
     if given.moving:
         result = reconstruct_moving(psi, given.frames, adaptive, given.on_step, taken)
     elif result is not None and result.known is not None:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
 from reconstruction.choices import choose_mu
+from reconstruction.tv import few_steps
 from reconstruction.verdict.pixels import neighbours
 from reconstruction.verdict.shadow import Relief
-from reconstruction.wave import few_steps
 
 Array = NDArray[np.floating]
 FEWEST = 30

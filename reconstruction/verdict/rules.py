@@ -307,7 +307,7 @@ def _coding(e: Evidence) -> Iterator[Reason]:
         )
         return
     deviation = max(error for error in e.strength_errors if error is not None)
-    if 4 * deviation > STRENGTH_LOST.doubt * _patience(e, 0.85):
+    if 4 * deviation > STRENGTH_LOST.doubt * _psi_tolerance(e, 0.85):
         yield Reason(
             f"the masks' contrast is known to {deviation:.1%} only: a wrong Psi may go unnoticed",
             deviation,
@@ -327,7 +327,7 @@ def _colour(e: Evidence) -> Iterator[Reason]:
         )
 
 
-def _patience(e: Evidence, power: float) -> float:
+def _psi_tolerance(e: Evidence, power: float) -> float:
     """Return by how much errors of Psi weigh less than on one shot reconstructed by tv.
 
     They set several shots against one another, and mislead methods that assume more than tv.
@@ -346,9 +346,9 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     causes = _causes(e)
     cause, value, deviation = _likeliest(causes)
     # A wrong black level does several shots no more harm than one.
-    patience = _patience(e, 0.0 if cause == "offset" else 0.85)
-    weak = STRENGTH_LOST.times(patience).level(lost)
-    displaced = DISPLACED_PX.times(_patience(e, 0.85)).level(moved)
+    tolerance = _psi_tolerance(e, 0.0 if cause == "offset" else 0.85)
+    weak = STRENGTH_LOST.times(tolerance).level(lost)
+    displaced = DISPLACED_PX.times(_psi_tolerance(e, 0.85)).level(moved)
     shift = f"the masks' shadow is about {moved:.2f} pixels from its place in Psi"
     sure = abs(value) - 2 * deviation
     what, remedy = _named(cause, value, weakest[0])
@@ -359,29 +359,29 @@ def _masks(e: Evidence) -> Iterator[Reason]:
         yield Reason(what, weakest[0], remedy, weak)
     elif cause == "gamma" and GAMMA.level(sure) != "trust":
         yield Reason(what, value, remedy, GAMMA.level(sure))
-    elif _does_harm(e, cause) or (_is_harmful(e, lost, moved) and lost > SLIGHT_LOSS):
+    elif _harms_modulation(e, cause) or (_harms_surfaces(e, lost, moved) and lost > SLIGHT_LOSS):
         yield Reason(what, weakest[0], remedy, "doubt")
-    elif _is_harmful(e, lost, moved):
+    elif _harms_surfaces(e, lost, moved):
         yield Reason(shift, moved, DRIFT, "doubt")
     elif "vignetting" in causes:
         darker, deviation, gain = causes["vignetting"]
         if gain > AS_LIKELY * max(each[2] for each in causes.values()):
-            level = VIGNETTING.times(_patience(e, 0.5)).level(darker - 2 * deviation)
+            level = VIGNETTING.times(_psi_tolerance(e, 0.5)).level(darker - 2 * deviation)
             what, remedy = _named("vignetting", darker, weakest[0])
             yield Reason(what, darker, remedy, level)
 
 
-def _is_harmful(e: Evidence, lost: float, moved: float) -> bool:
+def _harms_surfaces(e: Evidence, lost: float, moved: float) -> bool:
     """Return whether a slight error of Psi leaves surfaces hardly better than total variation."""
     over_plain = e.parameters.get("over_plain", 0.0)
     return over_plain > UNLIKE_SURFACES and (lost > SLIGHT_LOSS or moved > SLIGHT_PX)
 
 
-def _does_harm(e: Evidence, cause: str) -> bool:
+def _harms_modulation(e: Evidence, cause: str) -> bool:
     """Return whether a cause changes the masks' modulation by more than the light field allows."""
     value, deviation, _ = _causes(e).get("contrast", (0.0, 0.0, 0.0))
     sure = abs(value) - 2 * deviation
-    if cause in ("blur", "distance") and sure > NAMED_LOST * _patience(e, 0.85):
+    if cause in ("blur", "distance") and sure > NAMED_LOST * _psi_tolerance(e, 0.85):
         return True
     if not e.noise_share:
         return False

@@ -27,12 +27,12 @@ from reconstruction.inputs import checked_inputs
 from reconstruction.methods import MethodSettings, find_method, reconstruct
 from reconstruction.result import Progress, Reconstruction
 from reconstruction.screening import screened
+from reconstruction.tv import few_steps
 from reconstruction.verdict.evidence import FittedFrames, gathered
 from reconstruction.verdict.kept import kept_readings
 from reconstruction.verdict.rules import MOTION, Verdict, verdict_from
 from reconstruction.verdict.shadow import relief
 from reconstruction.verdict.shots import Motion, motion
-from reconstruction.wave import few_steps
 
 FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""
@@ -62,86 +62,136 @@ def reconstruct_judged(
     """
     settings, compiling = settings or MethodSettings(), compiling_s()
     read, notes = _as_fitted(psi, frames.of_one_deviation(), settings.screening)
-    typical = read.frames.noise_sigma
     unscreened = settings.model_copy(update={"screening": False})
 
-    def solved(frames: Frames, before: float = 0.0, moving: bool = False) -> Reconstruction:
-        result = reconstruct(
+    def solve(frames: Frames, moving: bool) -> Reconstruction:
+        return reconstruct(
             name, psi, frames, dictionary, unscreened, on_step, film=film, moving=moving
         )
-        return dataclasses.replace(result, seconds=result.seconds + before)
 
-    fitted = dataclasses.replace(read.frames, usable=read.frames.usable & ~read.kept)
-    shown = read.shown
-    seen = relief(psi, shown, typical, read.frames.usable)
-
-    def differing(light_field: NDArray[np.floating]) -> Motion | None:
-        return motion(seen, shown - psi.forward(light_field), typical)
-
-    can_carry, moving = _can_carry(name, psi, fitted.usable), False
-    if can_carry:
-        mu = choose_mu(psi, fitted.readings[fitted.usable], typical)
-        coarse = few_steps(psi, fitted.readings, fitted.usable, mu, COARSE_STEPS)
-        moving = _moved(differing(coarse), CLEARLY_MOVED)
-    result = solved(fitted, moving=moving)
-    short = _short(psi, read, result)
-    if short is not None:
-        took = result.seconds
-        del result
-        bounded = np.where(short, read.excluded, fitted.readings)
-        fitted = dataclasses.replace(fitted, readings=bounded, usable=fitted.usable | short)
-        result = solved(fitted, took, moving)
-        read = dataclasses.replace(read, short=float(short.mean()))
-        notes = (
-            *notes,
-            f"{read.short:.1%} of the readings are saturated, and taken as lower bounds",
-        )
-    found = None
-    if psi.shots > 1 and not moving:
-        found = differing(result.light_field)
-        if can_carry and _moved(found, MOTION.doubt):
-            took, moving = result.seconds, True
-            del result
-            result = solved(fitted, took, moving)
-    if moving:
-        moved_px, share = (result.parameters[key] for key in ("moved_px", "seen_share"))
-        notes = (
-            *notes,
-            f"the scene moved by up to {moved_px:.1f} pixels between the shots: the light field is "
-            f"that of shot 1, to whose time {share:.0%} of the other shots are carried",
-        )
-        psi, read, shown, found = psi.of_shots([0]), read.of_first_shot(), shown[:1], None
-        seen = relief(psi, shown, typical, read.frames.usable)
-    elif found is not None and found.moved.any():
-        took = result.seconds
-        del result
-        at_rest = dataclasses.replace(fitted, usable=fitted.usable & ~found.moved)
-        result = solved(at_rest, took)
-        read = dataclasses.replace(read, kept=read.kept & ~found.moved)
-        notes = (
-            *notes,
-            f"excluded {found.moved.mean():.1%} of the readings, where one shot saw another scene "
-            "than the others",
-        )
+    capture = _Fitting(name, psi, read, notes, solve)
+    capture.fit()
+    capture.fit_bounds()
+    differing = capture.fit_motion()
+    psi = capture.psi
     result = dataclasses.replace(
-        result, screening=notes, maps=named_maps(result.maps, psi),
-        compiling_seconds=compiling_s() - compiling,
+        capture.result, screening=capture.notes, maps=named_maps(capture.result.maps, psi),
+        seconds=capture.seconds, compiling_seconds=compiling_s() - compiling,
     )  # fmt: skip
-    verdict = verdict_from(gathered(psi, read, result, seen, found))
+    verdict = verdict_from(gathered(psi, capture.read, result, capture.relief, differing))
     psi.even_unseen_colours(result.light_field)
     # A mean of values in [0, 1] may round to just above 1.
     np.clip(result.light_field, 0, 1, out=result.light_field)
     return result, verdict
 
 
-def _can_carry(name: str, psi: ImagingMatrix, fitted: NDArray[np.bool_]) -> bool:
-    """Return whether a method can carry shots to the time of the first one, which sees all."""
-    colours = psi.colour is None or len(np.unique(psi.colour[0])) == COLOURS
-    return psi.shots > 1 and find_method(name).films and colours and bool(fitted[0].any())
+class _Fitting:
+    """A capture that is fitted, and fitted again with other readings where the first fit asks so.
+
+    fitted: the readings of the next fit. result: of the latest fit; seconds: of all fits. relief:
+    of all usable readings. moving: whether all shots are carried to the first one's time. psi,
+    read: of all shots, of the first one where the scene moved.
+    """
+
+    result: Reconstruction
+
+    def __init__(
+        self,
+        name: str,
+        psi: ImagingMatrix,
+        read: FittedFrames,
+        notes: tuple[str, ...],
+        solve: Callable[[Frames, bool], Reconstruction],
+    ) -> None:
+        self.psi, self.read, self.notes, self._solve, self.seconds = psi, read, notes, solve, 0.0
+        self.fitted = dataclasses.replace(read.frames, usable=read.frames.usable & ~read.kept)
+        self.relief = relief(psi, read.shown, read.frames.noise_sigma, read.frames.usable)
+        colours = psi.colour is None or len(np.unique(psi.colour[0])) == COLOURS
+        # Shots are carried to the time of the first one, which must see all colours.
+        self.can_carry = psi.shots > 1 and find_method(name).films and colours
+        self.can_carry &= bool(self.fitted.usable[0].any())
+        self.moving = self.can_carry and _moved(self._motion(self._coarse()), CLEARLY_MOVED)
+
+    def _coarse(self) -> NDArray[np.float32]:
+        """Return the light field of a few steps of total variation."""
+        readings, usable = self.fitted.readings, self.fitted.usable
+        mu = choose_mu(self.psi, readings[usable], self.read.frames.noise_sigma)
+        return few_steps(self.psi, readings, usable, mu, COARSE_STEPS)
+
+    def _motion(self, light_field: NDArray[np.floating]) -> Motion | None:
+        """Return the place where shots differ most, given a light field of all of them."""
+        residual = self.read.shown - self.psi.forward(light_field)
+        return motion(self.relief, residual, self.read.frames.noise_sigma)
+
+    def fit(self) -> None:
+        """Fit the readings."""
+        self.result = self._solve(self.fitted, self.moving)
+        self.seconds += self.result.seconds
+
+    def _refit(self) -> None:
+        del self.result  # It is large.
+        self.fit()
+
+    def fit_bounds(self) -> None:
+        """Fit again with the saturated readings that the light field falls short of."""
+        clipped = self.read.clipped
+        if clipped.mean() <= FEWEST_SHORT:
+            return
+        short = clipped & (self.psi.forward(self.result.light_field) < self.read.excluded)
+        if short.mean() <= FEWEST_SHORT:
+            return
+        bounded = np.where(short, self.read.excluded, self.fitted.readings)
+        usable = self.fitted.usable | short
+        self.fitted = dataclasses.replace(self.fitted, readings=bounded, usable=usable)
+        self._refit()
+        self.read = dataclasses.replace(self.read, short=float(short.mean()))
+        self._note(
+            f"{self.read.short:.1%} of the readings are saturated, and taken as lower bounds"
+        )
+
+    def fit_motion(self) -> Motion | None:
+        """Fit again where shots saw different scenes; return where they differ.
+
+        Readings of a shot that differs from the others are left out. Where no single shot does, all
+        are carried to the time of the first, and no difference is left to return.
+        """
+        differing = None
+        if self.psi.shots > 1 and not self.moving:
+            differing = self._motion(self.result.light_field)
+            if self.can_carry and _moved(differing, MOTION.doubt):
+                self.moving = True
+                self._refit()
+        if self.moving:
+            self._keep_first_shot()
+            return None
+        if differing is not None and differing.moved.any():
+            usable = self.fitted.usable & ~differing.moved
+            self.fitted = dataclasses.replace(self.fitted, usable=usable)
+            self._refit()
+            self.read = dataclasses.replace(self.read, kept=self.read.kept & ~differing.moved)
+            self._note(
+                f"excluded {differing.moved.mean():.1%} of the readings, where one shot saw "
+                "another scene than the others"
+            )
+        return differing
+
+    def _keep_first_shot(self) -> None:
+        """Reduce Psi and readings to the shot whose time the light field is of."""
+        moved_px, share = (self.result.parameters[key] for key in ("moved_px", "seen_share"))
+        self._note(
+            f"the scene moved by up to {moved_px:.1f} pixels between the shots: the light field is "
+            f"that of shot 1, to whose time {share:.0%} of the other shots are carried"
+        )
+        typical = self.read.frames.noise_sigma
+        self.psi, self.read = self.psi.of_shots([0]), self.read.of_first_shot()
+        self.relief = relief(self.psi, self.read.shown, typical, self.read.frames.usable)
+
+    def _note(self, words: str) -> None:
+        self.notes = (*self.notes, words)
 
 
 def _moved(found: Motion | None, least: float) -> bool:
-    """Return whether a scene moved in nobody knows which shots."""
+    """Return whether a scene moved, and no single shot differs from the others."""
     return found is not None and found.shot is None and found.ratio > least
 
 
@@ -150,17 +200,6 @@ def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDA
     if shows_parallax(psi.view_axes):
         return dict(maps)
     return {name.replace("disparity", "shift"): values for name, values in maps.items()}
-
-
-def _short(
-    psi: ImagingMatrix, read: FittedFrames, result: Reconstruction
-) -> NDArray[np.bool_] | None:
-    """Return which saturated readings a light field falls short of; None where hardly any."""
-    clipped = read.clipped
-    if clipped.mean() <= FEWEST_SHORT:
-        return None
-    short = clipped & (psi.forward(result.light_field) < read.excluded)
-    return short if short.mean() > FEWEST_SHORT else None
 
 
 def _as_fitted(

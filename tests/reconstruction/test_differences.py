@@ -1,13 +1,16 @@
 """DV_K: derivatives against an explicit matrix, norms, and the sweep against plain NumPy."""
 
+from functools import partial
 from itertools import product
 from math import comb, factorial
+from unittest.mock import patch
 
 import numba
 import numpy as np
 import pytest
 from variation import AXIS, adjoint, gradient, variation
 
+from emmc_rig.model.bands import in_bands
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from reconstruction import kernels
 from reconstruction.differences import (
@@ -18,7 +21,6 @@ from reconstruction.differences import (
 )
 from reconstruction.errors import ReconstructionError
 from reconstruction.problem import colour_metric
-from reconstruction.tv import row_bands
 
 EPS = float(np.finfo(np.float32).eps)
 SHAPES = [(2, 3, 4, 5, 3), (1, 1, 4, 6, 3), (3, 1, 2, 4, 3), (1, 4, 1, 5, 3)]
@@ -196,9 +198,9 @@ def swept(psi, usable, frames, light_field, dual, order, bands, pull=None, count
     dual_state = np.ascontiguousarray(dual.transpose(1, 2, 3, 0, 5, 4), dtype=kind)
     moved = np.zeros((psi.frames_shape[1], 2))
     taps = stencils(order, psi.light_field_shape, np.dtype(kind))
-    shares = row_bands(psi.frames_shape[1], bands)
-    for _ in range(count):
-        kernels.sweep(data, steps, taps, state, dual_state, room, shares, moved)
+    with patch("reconstruction.kernels.in_bands", partial(in_bands, bands=bands)):
+        for _ in range(count):
+            kernels.sweep(data, steps, taps, state, dual_state, room, moved)
     return np.swapaxes(state, -1, -2), dual_state.transpose(3, 0, 1, 2, 5, 4), moved
 
 

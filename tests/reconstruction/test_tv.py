@@ -11,7 +11,7 @@ from emmc_rig.model.lightfield import psnr_db
 from reconstruction.choices import choose_mu
 from reconstruction.errors import ReconstructionError
 from reconstruction.problem import colour_metric
-from reconstruction.tv import TVSettings, reconstruct_tv, row_bands
+from reconstruction.tv import TVSettings, reconstruct_tv
 from simulators.scenes import render
 
 SIZE = (6, 8)
@@ -44,14 +44,6 @@ def test_the_colour_metric_turns_to_luminance_and_two_chrominances_and_weighs_th
     np.testing.assert_allclose(colour_metric(2.0) @ [1, 1, 1], [np.sqrt(3), 0, 0], atol=1e-12)
     lengths = np.linalg.norm(colour_metric(2.0), axis=1)
     np.testing.assert_allclose(lengths, [1, 2, 2])
-
-
-@pytest.mark.parametrize("bands", [1, 2, 3, 7, 100])
-@pytest.mark.parametrize("rows", [1, 2, 7, 64])
-def test_bands_cover_every_row_of_pixels_once(rows, bands):
-    found = row_bands(rows, bands)
-    assert len(found) <= min(rows, bands)
-    np.testing.assert_array_equal(np.concatenate([np.arange(*band) for band in found]), range(rows))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2, 3])
