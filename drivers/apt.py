@@ -101,9 +101,7 @@ class AptStage(HostStage):
         self._homing_since_s: dict[str, float] = {}
         self._start_up()
 
-    def identity(self, axis: str) -> StageIdentity:
-        """As `HostStage.identity`."""
-        self._require_axis(axis)
+    def _identity(self, axis: str) -> StageIdentity:
         reply = self._channels[axis].query(Id.HW_REQ_INFO, Id.HW_GET_INFO, with_channel=False)
         info = codec.decode_info(reply)
         return StageIdentity("Thorlabs", info.model, str(info.serial_number), info.firmware)
@@ -216,12 +214,9 @@ class AptStage(HostStage):
 
     def _status_without_fault(self, axis: str) -> codec.MotorStatus:
         """Return the status; a fault counts when two in a row show it, for nothing checks them."""
-        status = self._status(axis)
-        if _fault(axis, status) is None:
+        if _fault(axis, status := self._status(axis)) is None:
             return status
-        status = self._status(axis)
-        fault = _fault(axis, status)
-        if fault is not None:
+        if fault := _fault(axis, status := self._status(axis)):
             raise fault
         return status
 

@@ -11,7 +11,7 @@ class Clock(Protocol):
         """Return the time in seconds."""
         ...
 
-    def sleep(self, duration_s: float) -> None:
+    def sleep(self, duration_s: float, /) -> None:
         """Return `duration_s` seconds later."""
 
 

@@ -103,9 +103,8 @@ class GrblStage(HostStage):
         self._require_axis(axis)
         return self._positive(codec.STEPS_PER_MM, axis)
 
-    def identity(self, axis: str) -> StageIdentity:
-        """As `HostStage.identity`; the serial is what somebody wrote into it by `$I=`."""
-        self._require_axis(axis)
+    def _identity(self, axis: str) -> StageIdentity:
+        """Return the identity, with the text that a user wrote by `$I=` as the serial number."""
         firmware, _, written = self._build.get("VER", "").partition(":")
         return StageIdentity("", "Grbl", written, firmware)
 

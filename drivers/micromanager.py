@@ -252,12 +252,11 @@ class MicroManagerCamera:
 
     def temperatures_c(self) -> dict[str, float]:
         """Return the properties of the camera that are called temperatures and are numbers."""
-        core, found = self._loaded.core, {}
-        with calling("read the temperatures"):
-            for name in core.getDevicePropertyNames(self.label):
-                if "temperature" in name.lower():
-                    with suppress(ValueError):
-                        found[name] = float(core.getProperty(self.label, name))
+        found = {}
+        for name, shown in self.details().items():
+            if "temperature" in name.lower():
+                with suppress(ValueError):
+                    found[name] = float(shown)
         return found
 
     def set_exposure_s(self, exposure_s: float) -> None:
@@ -379,16 +378,9 @@ class MicroManagerCamera:
         mosaic = np.asarray(image, dtype=np.uint16)
         if mosaic.shape != self.shape:
             raise CaptureError(f"it has {mosaic.shape} pixels instead of {self.shape}")
-        return frame_of_array(
-            mosaic,
-            self.cfa,
-            self._setup.black_level_dn,
-            self.white_level_dn,
-            self.exposure_s,
-            self.identity,
-            self._clock.now_s(),
-            metadata,
-        )
+        levels_dn = self._setup.black_level_dn, self.white_level_dn
+        about = self.exposure_s, self.identity, self._clock.now_s(), metadata
+        return frame_of_array(mosaic, self.cfa, *levels_dn, *about)
 
 
 def _shifted(cfa: str, top: int, left: int) -> str:
@@ -463,8 +455,8 @@ class MicroManagerStage(HostStage):
             self._closed = True
             super().close()
 
-    def identity(self, axis: str) -> StageIdentity:
-        """As `HostStage.identity`: adapter and device, and a property that is a serial number."""
+    def _identity(self, axis: str) -> StageIdentity:
+        """Return adapter and device, and the property that holds a serial number, if any."""
         (label, _), core, serial = self._place(axis), self._loaded.core, ""
         with calling("describe the stage"):
             for name in core.getDevicePropertyNames(label):

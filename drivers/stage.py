@@ -309,6 +309,9 @@ class HostStage(Stage, ABC):
     def identity(self, axis: str) -> StageIdentity:
         """Return who made the controller of an axis, as far as it says; it is asked now."""
         self._require_axis(axis)
+        return self._identity(axis)
+
+    def _identity(self, axis: str) -> StageIdentity:
         return StageIdentity()
 
     def temperatures_c(self) -> dict[str, float]:

@@ -40,6 +40,8 @@ Kind = tuple[int, int, int]
 TRANSFER_BYTES = 1 << 22
 """Largest single transfer: the kernel's default memory for USB is 16 MiB for all devices."""
 
+SILENCE_S = 0.05
+
 BULK, INTERRUPT = usb.util.ENDPOINT_TYPE_BULK, usb.util.ENDPOINT_TYPE_INTR
 
 _DESKTOP_ADVICE = (
@@ -317,7 +319,7 @@ class UsbPipe:
         with self._device._faults(self.address):
             self._device._device.clear_halt(self.address)
 
-    def drain(self, timeout_s: float = 0.05, most: int = 1 << 24) -> int:
+    def drain(self, most: int = 1 << 24) -> int:
         """Read and forget what is still under way, until silence; return how many bytes it was.
 
         Raises `UsbTransferError` when the device never falls silent.
@@ -326,7 +328,7 @@ class UsbPipe:
         lost = 0
         for _ in range(1 + most // len(buffer)):
             try:
-                lost += self.read_into(buffer, timeout_s)
+                lost += self.read_into(buffer, SILENCE_S)
             except UsbTimeoutError:
                 return lost
         raise UsbTransferError(self._device.name, "it never falls silent", CHECK_CABLE)

@@ -109,9 +109,7 @@ class ZaberStage(HostStage):
             self._require_axis(axis)
         self._start_up()
 
-    def identity(self, axis: str) -> StageIdentity:
-        """As `HostStage.identity`; the model by name where its ids are known."""
-        self._require_axis(axis)
+    def _identity(self, axis: str) -> StageIdentity:
         device, _ = self._addresses[axis]
         settings = ("deviceid", "system.serial", "version")
         device_id, serial, firmware = (self._chain.text(device, name) for name in settings)
@@ -130,8 +128,11 @@ class ZaberStage(HostStage):
 
     def _configure(self) -> None:
         self._chain.checksummed = frozenset()
+        # Old firmware cannot put checksums on its replies.
         self._chain.checksummed = frozenset(
-            device for device, _ in self._addresses.values() if self._enable_checksum(device)
+            device
+            for device, _ in self._addresses.values()
+            if self._chain.optional(device, 0, "set comm.checksum 1", f"device {device}")
         )
         axes = self._axes
         self._resolutions = {axis: self._optional(axis, "resolution") for axis in axes}
@@ -241,11 +242,9 @@ class ZaberStage(HostStage):
     def _optional(self, axis: str, setting: str, whole_device: bool = False) -> int | None:
         """Return a setting that not every device has; None where it says so."""
         device, number = self._addresses[axis]
-        try:
-            reply = self._chain.query(device, 0 if whole_device else number, f"get {setting}", axis)
-        except CommandRefusedError:
-            return None
-        return int(self._number(axis, reply))
+        number = 0 if whole_device else number
+        reply = self._chain.optional(device, number, f"get {setting}", axis)
+        return None if reply is None else int(self._number(axis, reply))
 
     def _warnings(self, axis: str) -> list[str]:
         """Return the flags raised, the most severe first; the device's reply counts them too."""
@@ -287,14 +286,6 @@ class ZaberStage(HostStage):
             raise GarbledReplyError(raw, f"not a number for {axis}").about(axis=axis)
         return float(reply.data)
 
-    def _enable_checksum(self, device: int) -> bool:
-        """Return whether the device will put a checksum on its replies; old firmware cannot."""
-        try:
-            self._chain.query(device, 0, "set comm.checksum 1", f"device {device}")
-        except CommandRefusedError:
-            return False
-        return True
-
     def _query(self, axis: str, data: str) -> codec.Reply:
         device, number = self._addresses[axis]
         return self._chain.query(device, number, data, axis)
@@ -322,10 +313,15 @@ class _Chain:
 
     def text(self, device: int, setting: str) -> str:
         """Return a setting of a device, "" where it has none of that name."""
+        reply = self.optional(device, 0, f"get {setting}", f"device {device}")
+        return "" if reply is None else reply.data
+
+    def optional(self, device: int, number: int, data: str, name: str) -> codec.Reply | None:
+        """As `query`; None where the device refuses the command."""
         try:
-            return self.query(device, 0, f"get {setting}", f"device {device}").data
+            return self.query(device, number, data, name)
         except CommandRefusedError:
-            return ""
+            return None
 
     def ask(self, device: int, number: int, data: str, name: str) -> codec.Reply:
         """Exchange a command once; an error carries the command and the axis."""

@@ -327,14 +327,10 @@ class AptController(SimulatedController):
         else:
             bay.motor.seek(0.0, speed_um_s, acceleration_um_s2)
 
-    def _move_absolute(self, address: int, bay: _Bay, message: Message) -> None:
+    def _move(self, address: int, bay: _Bay, message: Message) -> None:
+        start = self._counts(bay) if message.id == Id.MOT_MOVE_RELATIVE else 0
         if message.data is not None and len(message.data) == 6:
-            self._go(address, bay, struct.unpack("<Hi", message.data)[1], message.id)
-
-    def _move_relative(self, address: int, bay: _Bay, message: Message) -> None:
-        if message.data is not None and len(message.data) == 6:
-            step = struct.unpack("<Hi", message.data)[1]
-            self._go(address, bay, self._counts(bay) + step, message.id)
+            self._go(address, bay, start + struct.unpack("<Hi", message.data)[1], message.id)
 
     def _move_for_ever(self, address: int, bay: _Bay, message: Message) -> None:
         far = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
@@ -390,8 +386,8 @@ class AptController(SimulatedController):
         Id.MOT_SET_GENMOVEPARAMS: _set_backlash,
         Id.MOT_SET_HOMEPARAMS: _set_home,
         Id.MOT_MOVE_HOME: _home,
-        Id.MOT_MOVE_ABSOLUTE: _move_absolute,
-        Id.MOT_MOVE_RELATIVE: _move_relative,
+        Id.MOT_MOVE_ABSOLUTE: _move,
+        Id.MOT_MOVE_RELATIVE: _move,
         Id.MOT_MOVE_VELOCITY: _move_for_ever,
         Id.MOT_MOVE_STOP: _stop,
     }

@@ -40,8 +40,8 @@ class SimulatedController(ABC):
     sends it twice, `unplug` pulls the cable at the next byte from the host. `stall` blocks the
     next move half way, `drift` shifts the axis by `drift_um` unnoticed at the end of the next
     move, after `busy_forever` an axis says for ever that it moves, `slow_start` lets the next move
-    begin `slow_by_s` after its command. `fed` counts the writes of the host, `plugs` how often the
-    cable was plugged in: a port opened before the last time is dead.
+    begin `slow_by_s` after its command. `plugs` counts how often the cable was plugged in: a port
+    opened before the last time is dead.
     """
 
     def __init__(self, clock: Clock, faults: Iterable[str] = ()) -> None:
@@ -57,7 +57,6 @@ class SimulatedController(ABC):
         self._outbox: list[tuple[float, int, bytes]] = []
         self._sent = 0
         self._garbled = 0
-        self.fed = 0
 
     def _stalls(self, motor: Motor) -> bool:
         """Arm on the motor the faults that strike its next move; return whether it stalls."""
@@ -113,7 +112,6 @@ class SimulatedController(ABC):
                 return b""
             if self.faults.strikes("lose_command_byte", Occasion(data)):
                 data = _without_middle(data)
-            self.fed += 1
             self._advance()
             self._receive(data)
             return self._due()

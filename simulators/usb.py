@@ -179,9 +179,6 @@ class SimulatedUsb(usb.backend.IBackend):
         """Return the devices plugged in."""
         return iter(tuple(self._plugs))
 
-    def get_parent(self, dev: Plug) -> None:
-        """Say that no device hangs behind a hub."""
-
     def get_device_descriptor(self, dev: Plug) -> SimpleNamespace:
         """Return the fields of the device descriptor."""
         spec = dev.function.spec
@@ -276,18 +273,10 @@ class SimulatedUsb(usb.backend.IBackend):
         for number in [n for n, holder in claims.items() if holder is dev_handle]:
             del claims[number]
 
-    def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
-        """Choose the only configuration."""
-        _plug(dev_handle)
-
     def get_configuration(self, dev_handle: Handle) -> int:
         """Return the only configuration's value."""
         _plug(dev_handle)
         return 1
-
-    def set_interface_altsetting(self, dev_handle: Handle, intf: int, altsetting: int) -> None:
-        """Choose the only alternate setting."""
-        _plug(dev_handle)
 
     def claim_interface(self, dev_handle: Handle, intf: int) -> None:
         """Claim an interface that neither a program nor the kernel holds."""
@@ -321,14 +310,6 @@ class SimulatedUsb(usb.backend.IBackend):
         plug.pending.pop(ep, None)
         plug.ends.discard(ep)
         plug.function.cleared(ep)
-
-    def reset_device(self, dev_handle: Handle) -> None:
-        """Let the device start anew at the same address."""
-        plug = _plug(dev_handle)
-        plug.halted.clear()
-        plug.pending.clear()
-        plug.ends.clear()
-        plug.function.plugged()
 
     def ctrl_transfer(
         self,
