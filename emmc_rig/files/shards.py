@@ -154,7 +154,7 @@ def stored_shards(folder: Path, error: type[Exception], remedy: str) -> Iterator
 def stored_in(
     path: Path, error: type[Exception], remedy: str
 ) -> AbstractContextManager[StoredGroup | StoredArrays]:
-    """Return the arrays of a Zarr group, or of an HDF5 file: see `stored_shards`, `stored_arrays`."""
+    """Return the arrays of a Zarr group or an HDF5 file: `stored_shards` or `stored_arrays`."""
     return (stored_shards if path.is_dir() else stored_arrays)(path, error, remedy)
 
 

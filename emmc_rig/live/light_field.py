@@ -175,9 +175,12 @@ class LiveLightField:
                 self._unsettled -= 1
             begins = self._film is not None or self._still()
             if self._run is None and self._done != self._held and begins:
+                scale, held = self._scale_of_held(), dict(self._held)
+                places = {shot: place for place, shot in enumerate(self._scale.shots)}
+                frames = scale.frames(lambda shot: [held[places[shot]]])
                 self._run = _Refinement(
-                    *self._problem(), self._method, self._solve, self._film, dict(self._held),
-                    self._clock(), number,
+                    scale.psi, frames, self._method, self._solve, self._film, held, self._clock(),
+                    number,
                 )  # fmt: skip
         except (SensingError, ReconstructionError, CalibrationError) as fault:
             return self._report(str(fault))
@@ -259,12 +262,6 @@ class LiveLightField:
             )
         ]
         return float(np.sqrt(np.mean(variances)))
-
-    def _problem(self) -> tuple[ImagingMatrix, Frames]:
-        """Return Psi and the frames held, as `emmc-rig reconstruct` takes them of a session."""
-        scale = self._scale_of_held()
-        places = {shot: place for place, shot in enumerate(self._scale.shots)}
-        return scale.psi, scale.frames(lambda shot: [self._held[places[shot]]])
 
     def _draw(self, export: Export, block: int = 1) -> None:
         self._numbers += 1

@@ -146,11 +146,17 @@ def _cards(session: Session) -> list[Card]:
     retries = len(of_kind(session.journal.entries, RetryEntry))
     note = f"{shown_bytes(size)}; good: all" + (f"; {retries} taken again" if retries else "")
     tone = "good" if session.is_complete else "watch"
-    cards = [
-        Card("Frames", f"{stored} of {planned}", note, tone),
-        *_exposure_cards(session),
-        *_light_field_cards(session),
-    ]
+    cards = [Card("Frames", f"{stored} of {planned}", note, tone)]
+    if shots := shot_exposures(session):
+        levels = [shot.level for shot in shots]
+        reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
+        note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVELS[0]:.0%}"
+        tone = "watch" if exposure_reasons(shots) else "good"
+        cards.append(Card("Exposure", reached, note, tone))
+    verdict, stated_db = reconstructed(session.folder)
+    if verdict:
+        note = "" if stated_db is None else f"estimated accuracy {stated_db:.1f} dB"
+        cards.append(Card("Light field", verdict, note, TONES.get(verdict, "")))
     if runs := run_times(session):
         last = runs[-1]
         note = f"the last run; {last['moving_s']:.1f} s moving, {last['exposing_s']:.1f} s exposing"
@@ -199,25 +205,6 @@ def session_metrics(session: Session) -> dict[str, object]:
         "command": session.header["command"],
         "versions": session.header["versions"],
     }
-
-
-def _exposure_cards(session: Session) -> list[Card]:
-    """Return what the brightest readings of the shots reach."""
-    shots = shot_exposures(session)
-    if not shots:
-        return []
-    levels = [shot.level for shot in shots]
-    reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
-    note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVELS[0]:.0%}"
-    tone = "watch" if exposure_reasons(shots) else "good"
-    return [Card("Exposure", reached, note, tone)]
-
-
-def _light_field_cards(session: Session) -> list[Card]:
-    """Return the verdict of the light field, once the session is reconstructed."""
-    verdict, stated_db = reconstructed(session.folder)
-    stated = "" if stated_db is None else f"estimated accuracy {stated_db:.1f} dB"
-    return [Card("Light field", verdict, stated, TONES.get(verdict, ""))] if verdict else []
 
 
 def _frames(session: Session, pictures: int) -> Iterator[Section]:

@@ -72,7 +72,7 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
         tiff = files.enter_context(tifffile.TiffFile(path))
         members, described, notes = [path], tiff.ome_metadata, []
         if described is None:
-            pages = [_whole(page) for page in _all_pages(tiff)]
+            pages = [page.aspage() for top in tiff.pages for page in (top, *(top.pages or ()))]
             kept = [page for page in pages if not _is_copy(page)] or pages
             if len(kept) < len(pages):
                 notes = [f"{len(pages) - len(kept)} page(s) that are smaller copies are not taken"]
@@ -89,7 +89,11 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
             shown = _shown(codes, taken[0].page, tiff.is_shaped)
         else:
             shown = _stack([part.page for part in taken], tiff.is_shaped)
-            _check_stated_count(tiff, len(shown.frames))
+            stated = (tiff.imagej_metadata or {}).get("images") if tiff.is_imagej else None
+            if stated is not None and int(stated) > len(shown.frames):
+                raise ValueError(
+                    f"it states {stated} images and holds {len(shown.frames)}: cut short"
+                )
         complaints.check()
         facts = {
             "full_scale": _full_scale(taken[0].page, shown.frames.dtype),
@@ -138,17 +142,6 @@ class _Complaints(logging.Handler):
                 raise ValueError(f"cut short: {said.rpartition('>')[2].strip()}")
 
 
-def _all_pages(tiff: tifffile.TiffFile) -> Iterator[Any]:
-    """Yield the pages of a file, each followed by those within it."""
-    for page in tiff.pages:
-        yield page
-        yield from page.pages or ()
-
-
-def _whole(page: Any) -> Any:
-    return page.aspage()
-
-
 def _is_copy(page: Any) -> bool:
     return bool(page.subfiletype & (_REDUCED | _MASK))
 
@@ -182,12 +175,6 @@ def _planes_of_one_page(tiff: tifffile.TiffFile, page: Any) -> NDArray:
         _check_strips(page)
         return series[0].asarray().reshape(-1, *page.shape)
     return _codes(page)
-
-
-def _check_stated_count(tiff: tifffile.TiffFile, count: int) -> None:
-    stated = (tiff.imagej_metadata or {}).get("images") if tiff.is_imagej else None
-    if stated is not None and int(stated) > count:
-        raise ValueError(f"it states {stated} images and holds {count}: cut short")
 
 
 def _check_strips(page: Any) -> None:
@@ -351,7 +338,7 @@ class _Series:
                     f"its OME-XML names page {number + 1} of {file or self._path.name}, which has "
                     f"{len(pages)}: cut short"
                 )
-            taken.append(_Page(_whole(pages[number]), *stated.get(place, (_UNKNOWN, _UNKNOWN))))
+            taken.append(_Page(pages[number].aspage(), *stated.get(place, (_UNKNOWN, _UNKNOWN))))
             members.append(file)
         if not taken:
             raise ValueError("its OME-XML lists no page of this file")
@@ -397,7 +384,7 @@ class _Series:
     def _check_unlisted(self, listed: set[int]) -> None:
         own = list(self._own.pages)
         others = (k for k in range(len(own)) if k not in listed)
-        unlisted = [k for k in others if not _is_copy(_whole(own[k]))]
+        unlisted = [k for k in others if not _is_copy(own[k].aspage())]
         if unlisted:
             raise ValueError(
                 f"{len(unlisted)} of its {len(own)} pages are no planes in its OME-XML, the first "
