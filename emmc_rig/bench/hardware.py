@@ -395,7 +395,12 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
             STAGES, config.protocol, config.port, care, SYSTEM_CLOCK, **config.options
         )
     if isinstance(config, MicroManagerConfig):
-        return _open_micromanager_stage(config)
+        from drivers.micromanager import MicroManagerStage, StageSetup, load_core
+
+        names = (field.name for field in fields(StageSetup))
+        setup = StageSetup(**{name: getattr(config, name) for name in names})
+        core = load_core(config.port)
+        return MicroManagerStage(core, setup, SYSTEM_CLOCK, config.stage_settings())
     transports: dict[str, Transport] = {}
     with ExitStack() as opened:
 
@@ -409,13 +414,6 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
         stage = _stage(config, transport, SYSTEM_CLOCK)
         opened.pop_all()
     return stage
-
-
-def _open_micromanager_stage(config: MicroManagerConfig) -> Stage:
-    from drivers.micromanager import MicroManagerStage, StageSetup, load_core
-
-    setup = StageSetup(**{field.name: getattr(config, field.name) for field in fields(StageSetup)})
-    return MicroManagerStage(load_core(config.port), setup, SYSTEM_CLOCK, config.stage_settings())
 
 
 def open_simulated(

@@ -132,14 +132,11 @@ def _head(outcome: Outcome, metrics: Mapping) -> Head:
     if agrees:
         words = "You can use this calibration"
         words += ", and make it better" if outcome.advice else ""
-    good = agrees and not outcome.advice
-    return Head(words, outcome.why, outcome.advice or [_use(metrics)], "good" if good else "watch")
-
-
-def _use(metrics: Mapping) -> str:
-    if not metrics["session"]:
-        return "get the light field with this Psi: `emmc_rig.reconstruct(psi, report.frames(dn))`"
-    return f"get the light field with this Psi: `emmc-rig reconstruct {typed(metrics['session'])}`"
+    good, use = agrees and not outcome.advice, "emmc_rig.reconstruct(psi, report.frames(dn))"
+    if metrics["session"]:
+        use = f"emmc-rig reconstruct {typed(metrics['session'])}"
+    advice = outcome.advice or [f"get the light field with this Psi: `{use}`"]
+    return Head(words, outcome.why, advice, "good" if good else "watch")
 
 
 def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> list[Card]:

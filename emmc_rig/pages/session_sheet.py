@@ -211,9 +211,11 @@ def _frames(session: Session, pictures: int) -> Iterator[Section]:
     """Yield a section for each kind of frame; all but the shots of the scene are folded."""
     left, balance = pictures, _balance(session)
     for kind in reversed(KINDS):
-        frames = sorted((f for f in session.needed if f.kind == kind), key=_place_in_plan)
+        frames = [frame for frame in session.needed if frame.kind == kind]
         if not frames:
             continue
+        # The order of capture is another one.
+        frames.sort(key=lambda f: (f.bench.shot, f.view or (), f.exposure_s or 0.0, f.repeat))
         shown = _chosen(frames, left)
         left -= len(shown)
         body = fragment(
@@ -232,11 +234,6 @@ def _count(session: Session, frames: Sequence[PlannedFrame]) -> str:
     missing = sum(frame.id not in session.stored for frame in frames)
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
     return f"{count}, {missing} of them missing" if missing else count
-
-
-def _place_in_plan(frame: PlannedFrame) -> tuple:
-    """Return the sort key of frames on the page, which differs from the order of capture."""
-    return frame.bench.shot, frame.view or (), frame.exposure_s or 0.0, frame.repeat
 
 
 def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:
