@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,15 +48,6 @@ class _Page:
     page: Any
     exposure_s: float = _UNKNOWN
     time_s: float = _UNKNOWN
-
-
-class _Block(NamedTuple):
-    """Consecutive pages of a file that are consecutive planes."""
-
-    file: str
-    first_page: int
-    first_plane: int
-    count: int | None
 
 
 def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any]]:
@@ -311,12 +302,15 @@ class _Series:
             sizes["C"] = max(sizes["C"] // max(samples, default=1), 1)
             total = math.prod(sizes.values())
             expected += total
-            for block in self._blocks(pixels, order, sizes):
-                count = block.count
-                if count is None:
-                    count = len(self._pages_of(block.file))
-                for k in range(min(count, total - block.first_plane)):
-                    found[number, block.first_plane + k] = block.file, block.first_page + k
+            listed = [part for part in pixels if _tag(part) == "TiffData"]
+            for entry in listed or [ElementTree.Element("TiffData")]:
+                file, first = self._file_of(entry), int(entry.get("IFD", 0))
+                plane = _plane_number(entry, "First", order, sizes)
+                default = "1" if "IFD" in entry.attrib else None
+                stated_count = entry.get("PlaneCount", entry.get("NumPlanes", default))
+                count = int(stated_count or len(self._pages_of(file)))
+                for k in range(min(count, total - plane)):
+                    found[number, plane + k] = file, first + k
             for plane in pixels:
                 if _tag(plane) == "Plane" and all(f"The{axis}" in plane.attrib for axis in order):
                     times = _duration(plane, "ExposureTime"), _duration(plane, "DeltaT")
@@ -326,7 +320,15 @@ class _Series:
                 f"its OME-XML states {expected} planes and lists pages of {len(found)}: save it "
                 "again, or as a TIFF without OME-XML"
             )
-        self._check_files({file for file, _ in found.values()})
+        missing = sorted(
+            file for file in {file for file, _ in found.values()} - {""}
+            if not self._beside(file).exists()
+        )  # fmt: skip
+        if missing:
+            rest = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+            raise ValueError(
+                f"{', '.join(missing[:3])}{rest} of its series is missing: put it beside this file"
+            )
         self._check_unlisted({page for file, page in found.values() if not file})
         taken, members = [], [""]
         for place, (file, number) in sorted(found.items()):
@@ -347,39 +349,14 @@ class _Series:
     def _beside(self, file: str) -> Path:
         return self._path.with_name(Path(file).name)
 
-    def _blocks(
-        self, pixels: ElementTree.Element, order: str, sizes: Mapping[str, int]
-    ) -> Iterator[_Block]:
-        entries = [part for part in pixels if _tag(part) == "TiffData"]
-        if not entries:
-            yield _Block("", 0, 0, None)
-        for entry in entries:
-            count = entry.get("PlaneCount", entry.get("NumPlanes"))
-            if count is None and "IFD" in entry.attrib:
-                count = "1"
-            uuid = next((part for part in entry if _tag(part) == "UUID"), None)
-            yield _Block(
-                self._file_of(uuid),
-                int(entry.get("IFD", 0)),
-                _plane_number(entry, "First", order, sizes),
-                None if count is None else int(count),
-            )
-
-    def _file_of(self, uuid: ElementTree.Element | None) -> str:
-        """Return the name of the file that holds a plane, "" for the file that is read."""
+    def _file_of(self, entry: ElementTree.Element) -> str:
+        """Return the file that holds the planes of an entry, "" for the file that is read."""
+        uuid = next((part for part in entry if _tag(part) == "UUID"), None)
         if uuid is None:
             return ""
         name, own = uuid.get("FileName", ""), self._path.name
         is_own = not name or name == own or (uuid.text is not None and uuid.text == self._uuid)
         return "" if is_own else name
-
-    def _check_files(self, names: set[str]) -> None:
-        missing = sorted(name for name in names if name and not self._beside(name).exists())
-        if missing:
-            rest = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-            raise ValueError(
-                f"{', '.join(missing[:3])}{rest} of its series is missing: put it beside this file"
-            )
 
     def _check_unlisted(self, listed: set[int]) -> None:
         own = list(self._own.pages)
