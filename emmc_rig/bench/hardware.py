@@ -17,7 +17,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.apt import ACTUATORS, Actuator, AptAxis, AptStage
+from drivers.apt import ACTUATORS, AptAxis, AptStage
 from drivers.apt import identify as identify_apt
 from drivers.camera import Camera as CameraDevice
 from drivers.cameras import CAMERA_HELP, CAMERAS
@@ -35,7 +35,6 @@ from drivers.u3v import open_camera as open_u3v
 from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
 from emmc_rig.bench.device_config import (
-    AptAxisConfig,
     AptConfig,
     CameraChoice,
     GrblConfig,
@@ -396,7 +395,12 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
             STAGES, config.protocol, config.port, care, SYSTEM_CLOCK, **config.options
         )
     if isinstance(config, MicroManagerConfig):
-        return _open_micromanager_stage(config)
+        from drivers.micromanager import MicroManagerStage, StageSetup, load_core
+
+        names = (field.name for field in fields(StageSetup))
+        setup = StageSetup(**{name: getattr(config, name) for name in names})
+        core = load_core(config.port)
+        return MicroManagerStage(core, setup, SYSTEM_CLOCK, config.stage_settings())
     transports: dict[str, Transport] = {}
     with ExitStack() as opened:
 
@@ -410,13 +414,6 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
         stage = _stage(config, transport, SYSTEM_CLOCK)
         opened.pop_all()
     return stage
-
-
-def _open_micromanager_stage(config: MicroManagerConfig) -> Stage:
-    from drivers.micromanager import MicroManagerStage, StageSetup, load_core
-
-    setup = StageSetup(**{field.name: getattr(config, field.name) for field in fields(StageSetup)})
-    return MicroManagerStage(load_core(config.port), setup, SYSTEM_CLOCK, config.stage_settings())
 
 
 def open_simulated(
@@ -487,12 +484,6 @@ _PROBES = {"apt": _probe_apt, "zaber": _probe_zaber, "grbl": identify_grbl}
 """In this order: half a line of text would leave an APT controller in the middle of a message."""
 
 
-def _actuator(axis: AptAxisConfig) -> Actuator:
-    """Return an axis's actuator, with its counts as stated."""
-    known = ACTUATORS[axis.actuator]
-    return replace(known, counts_per_um=axis.counts_per_um or known.counts_per_um)
-
-
 def _stage(config: SerialConfig, transport: Callable[[str], Transport], clock: Clock) -> HostStage:
     """Return the stage of a configuration over transports opened by port."""
     try:
@@ -509,10 +500,12 @@ def _stage(config: SerialConfig, transport: Callable[[str], Transport], clock: C
                 settings,
                 steps_per_mm=config.steps_per_mm,
             )
-        channels = {
-            name: AptAxis(transport(axis.port), _actuator(axis), axis.destination, axis.channel)
-            for name, axis in config.axes.items()
-        }
+        channels = {}
+        for name, axis in config.axes.items():
+            known = ACTUATORS[axis.actuator]
+            actuator = replace(known, counts_per_um=axis.counts_per_um or known.counts_per_um)
+            wire = transport(axis.port)
+            channels[name] = AptAxis(wire, actuator, axis.destination, axis.channel)
         return AptStage(channels, clock, settings)
     except ValueError as error:
         raise AppError(f"stage {config.protocol}: {error}") from error

@@ -60,7 +60,12 @@ def read_own(path: Path, name: str = "", apart: Collection[Path] = ()) -> OwnFra
     else:
         data = file_bytes(path, AppError)
         if path.suffix.lower() in RAW_SUFFIXES:
-            return _of_raw(data, shown)
+            try:
+                raw = decode_raw(data)
+            except RawFrameError as fault:
+                raise AppError(f"{shown}: {fault}") from fault
+            exposures_s = np.array([raw.exposure_s or np.nan])
+            return OwnFrames(raw.mosaic[None], data, exposures_s, np.array([np.nan]), raw)
         stored = read_stored(path, AppError, name, apart)
     frames, facts = _stacked(stored.array, shown), stored.facts
     unknown = [None] * len(frames)
@@ -72,15 +77,6 @@ def read_own(path: Path, name: str = "", apart: Collection[Path] = ()) -> OwnFra
         members=tuple(map(Path, facts.get("members", ()))),
         notes=tuple(f"{shown}: {note}" for note in facts.get("notes", ())),
     )
-
-
-def _of_raw(data: bytes, shown: str) -> OwnFrames:
-    try:
-        raw = decode_raw(data)
-    except RawFrameError as fault:
-        raise AppError(f"{shown}: {fault}") from fault
-    exposures_s = np.array([raw.exposure_s or np.nan])
-    return OwnFrames(raw.mosaic[None], data, exposures_s, np.array([np.nan]), raw)
 
 
 def _stacked(array: NDArray, shown: str) -> NDArray:

@@ -8,20 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.shards import (
-    CHUNK,
-    SHARD,
-    created_group,
-    missing_value,
-    stored_shards,
-    whole,
-)
+from emmc_rig.files.shards import CHUNK, SHARD, created_group, missing_value, stored_in
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiLayout, checksum_of
 from emmc_rig.model.view_axes import ATTRIBUTE, axes_from, stored_as
 from emmc_rig.store.folders import refuse_missing
@@ -43,7 +34,7 @@ class StoredPsi(PsiLayout):
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._sharded = path, path.is_dir()
+        self._path = path
         with self._opened() as stored:
             shape = stored.dataset("weights").shape
             binning = int(np.asarray(stored.attributes["binning"]))
@@ -56,17 +47,16 @@ class StoredPsi(PsiLayout):
     def verify(self) -> None:
         """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
         with self._opened() as stored:
-            weights = stored.dataset("weights")
-            planes = (self._whole(weights[place]) for place in np.ndindex(self.weights_shape[:3]))
+            places = np.ndindex(self.weights_shape[:3])
+            planes = (stored.part("weights", place) for place in places)
             colour = stored.array("colour") if "colour" in stored else NO_COLOUR_MAP
-            colour = self._whole(colour)
             checksum = checksum_of(self.binning, self.camera_json, planes, colour, self.view_axes)
         if checksum != self.checksum:
             raise SensingError(f"{self._path}: damaged (its checksum differs); {AGAIN}")
 
     def load(self) -> ImagingMatrix:
         """Return all of it, verified."""
-        if not self._sharded:
+        if self._path.is_file():
             return ImagingMatrix.load(self._path)
         self.verify()
         return self.window(*(slice(0, length) for length in self.size))
@@ -74,20 +64,14 @@ class StoredPsi(PsiLayout):
     def window(self, rows: slice, columns: slice) -> ImagingMatrix:
         """Return the imaging matrix of some samples; the slices are multiples of k."""
         with self._opened() as stored:
-            weights = self._whole(stored.dataset("weights")[:, :, :, rows, :, columns])
-            colour = None
-            if "colour" in stored:
-                colour = self._whole(stored.dataset("colour")[:, rows, columns])
+            weights = stored.part("weights", np.s_[:, :, :, rows, :, columns])
+            has_colour = "colour" in stored
+            colour = stored.part("colour", np.s_[:, rows, columns]) if has_colour else None
         return ImagingMatrix(weights, colour, self.binning, self.camera_json, self.view_axes)
-
-    def _whole(self, values: NDArray) -> NDArray:
-        """Return the values; raises SensingError where a shard is missing."""
-        return whole(values, self._path, SensingError, AGAIN) if self._sharded else values
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        opened = stored_shards if self._sharded else stored_arrays
-        with opened(self._path, SensingError, AGAIN) as stored:
+        with stored_in(self._path, SensingError, AGAIN) as stored:
             if stored.attributes.get("format") != FORMAT or "weights" not in stored:
                 raise SensingError(f"{self._path}: not an imaging matrix of this program")
             yield stored
@@ -128,17 +112,9 @@ def holds_frames(folder: Path) -> bool:
 def read_frames(folder: Path) -> Frames:
     """Read the frames of a folder; raises AppError when they are missing, damaged or incomplete."""
     refuse_missing(folder, WRITTEN_BY)
-    path = folder / FRAMES
-    sharded = (folder / FRAMES_GROUP).is_dir()
-    if sharded:
-        path = folder / FRAMES_GROUP
-    elif not path.is_file():
+    if not holds_frames(folder):
         raise AppError(f"{folder}: holds no {FRAMES}; {WRITTEN_BY}")
-    with (stored_shards if sharded else stored_arrays)(path, AppError, FRAMES_AGAIN) as stored:
-        names = ("readings", "deviation", "usable")
-        arrays = [stored.array(name) for name in names]
-    if sharded:
-        arrays = [whole(values, path, AppError, FRAMES_AGAIN) for values in arrays]
-    readings, deviation, usable = arrays
-    usable = usable.astype(bool)
-    return Frames(readings, deviation, usable)
+    path = folder / (FRAMES_GROUP if (folder / FRAMES_GROUP).is_dir() else FRAMES)
+    with stored_in(path, AppError, FRAMES_AGAIN) as stored:
+        readings, deviation, usable = map(stored.array, ("readings", "deviation", "usable"))
+    return Frames(readings, deviation, usable.astype(bool))

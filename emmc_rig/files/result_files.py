@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import holds_frames
 from emmc_rig.files.results import METRICS
-from emmc_rig.files.shards import load_light_field, stored_shards, whole
+from emmc_rig.files.shards import load_light_field, stored_shards
 from emmc_rig.model.json_text import one_line, parse_json
 from emmc_rig.model.lightfield import load_hdf5, load_view_axes, save_hdf5
 from emmc_rig.model.reading import stored_arrays
@@ -84,8 +84,7 @@ def read_result(folder: Path) -> SavedResult:
         light_field = load_light_field(group)
         with stored_shards(group, AppError, AGAIN) as stored:
             axes = axes_from(stored.attributes.get(ATTRIBUTE), group, AppError)
-            names = [name for name in stored.names() if name != "light_field"]
-            maps = {name: whole(stored.array(name), group, AppError, AGAIN) for name in names}
+            maps = {name: stored.array(name) for name in stored.names() if name != "light_field"}
     return SavedResult(folder, light_field, maps, metrics, axes)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from math import ceil, prod
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,13 @@ from emmc_rig.model.decoding.child import only_array
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.json_text import one_line, shown_path
 from emmc_rig.model.lightfield import check_light_field, scaled
-from emmc_rig.model.reading import FAULTS, FREE_BYTES, MOST_COMPRESSED
+from emmc_rig.model.reading import (
+    FAULTS,
+    FREE_BYTES,
+    MOST_COMPRESSED,
+    StoredArrays,
+    stored_arrays,
+)
 
 ENDING = ".zarr"
 MISSING_BYTE = 255
@@ -44,23 +50,13 @@ def missing_value(dtype: np.dtype) -> float:
     return np.nan if dtype.kind == "f" else MISSING_BYTE if dtype == np.uint8 else 0
 
 
-def whole(values: NDArray, folder: Path, error: type[Exception], remedy: str) -> NDArray:
-    """Return values that were read from floats or bytes; raises `error` where some are missing."""
-    gone = np.isnan(values) if values.dtype.kind == "f" else values == MISSING_BYTE
-    if gone.any():
-        raise error(
-            f"{shown_path(folder)}: a file of it is missing; copy the folder again, or {remedy}"
-        )
-    return values
-
-
 def create_array(
     group: Any, name: str, shape: tuple[int, ...], dtype: np.dtype, axes: int
 ) -> list[Place]:
     """Create an array with `axes` axes before (y, x); return the places of its shards.
 
     A shard holds all views of SHARD x SHARD samples, a chunk one view of CHUNK x CHUNK. Where the
-    file of a shard is missing, values are as `whole` expects.
+    file of a shard is missing, values are `missing_value`.
     """
     after = shape[axes + 2 :]
     group.create_array(
@@ -94,8 +90,15 @@ def save_arrays(folder: Path, arrays: Mapping[str, NDArray]) -> None:
             group.attrs[name] = values.tolist()
 
 
+class MissingShardError(Exception):
+    """The file of a shard is missing."""
+
+
 class StoredGroup:
-    """The arrays of a Zarr group, read as `emmc_rig.model.reading.StoredArrays` are."""
+    """The arrays of a Zarr group, read as `emmc_rig.model.reading.StoredArrays` are.
+
+    Values of a missing shard raise MissingShardError.
+    """
 
     def __init__(self, group: Any, folder: Path) -> None:
         self._group, self._folder, self.attributes = group, folder, group.attrs
@@ -113,9 +116,16 @@ class StoredGroup:
 
     def array(self, name: str) -> NDArray:
         """Return an array, all of it; raises ValueError where its files cannot hold so much."""
-        stored = self._group[name]
-        check_fits(stored.nbytes, self._folder)
-        return np.asarray(stored[...])
+        check_fits(self._group[name].nbytes, self._folder)
+        return self.part(name, ...)
+
+    def part(self, name: str, index: Any) -> NDArray:
+        """Return a part of an array of floats or bytes; raises MissingShardError."""
+        values = np.asarray(self._group[name][index])
+        gone = np.isnan(values) if values.dtype.kind == "f" else values == MISSING_BYTE
+        if gone.any():
+            raise MissingShardError
+        return values
 
 
 def check_fits(unpacked_bytes: int, folder: Path) -> None:
@@ -133,9 +143,19 @@ def stored_shards(folder: Path, error: type[Exception], remedy: str) -> Iterator
         yield StoredGroup(zarr.open_group(folder, mode="r"), folder)
     except error:
         raise
+    except MissingShardError as fault:
+        why = "a file of it is missing; copy the folder again, or"
+        raise error(f"{shown_path(folder)}: {why} {remedy}") from fault
     except FAULTS as fault:
         why = f"no Zarr group, or one that cannot be read ({one_line(fault)})"
         raise error(f"{shown_path(folder)}: {why}; {remedy}") from fault
+
+
+def stored_in(
+    path: Path, error: type[Exception], remedy: str
+) -> AbstractContextManager[StoredGroup | StoredArrays]:
+    """Return the arrays of a Zarr group or an HDF5 file: `stored_shards` or `stored_arrays`."""
+    return (stored_shards if path.is_dir() else stored_arrays)(path, error, remedy)
 
 
 def is_zarr(folder: Path) -> bool:

@@ -119,7 +119,9 @@ class Driving:
                     break
 
     def _carry_out(self) -> None:
-        self._read_limits()
+        for axis in self.stage.axes:
+            with suppress(DriverError):
+                self._limits_um[axis] = self.stage.limits_um(axis)
         with self._reading:
             self._publish(stage=self._read_positions(), axes=self._axes())
         while not self._ending.is_set():
@@ -153,11 +155,6 @@ class Driving:
                             self._positions_um[axis] = self.stage.position_um(axis)
                     self._publish(axes=self._axes())
             self._ending.wait(POLL_S)
-
-    def _read_limits(self) -> None:
-        for axis in self.stage.axes:
-            with suppress(DriverError):
-                self._limits_um[axis] = self.stage.limits_um(axis)
 
     def _read_positions(self) -> str:
         """Read where every axis is; returns why one cannot be read, "" where none or not homed."""

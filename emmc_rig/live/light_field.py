@@ -16,7 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +128,7 @@ class LiveLightField:
     def close(self) -> None:
         """Give up a reconstruction under way."""
         if self._run is not None:
-            self._run.give_up()
+            self._run.given_up.set()
 
     def pictures(self) -> Pictures | None:
         """Return what was drawn last; None before the first."""
@@ -175,9 +175,12 @@ class LiveLightField:
                 self._unsettled -= 1
             begins = self._film is not None or self._still()
             if self._run is None and self._done != self._held and begins:
+                scale, held = self._scale_of_held(), dict(self._held)
+                places = {shot: place for place, shot in enumerate(self._scale.shots)}
+                frames = scale.frames(lambda shot: [held[places[shot]]])
                 self._run = _Refinement(
-                    *self._problem(), self._method, self._solve, self._film, dict(self._held),
-                    self._clock(), number,
+                    scale.psi, frames, self._method, self._solve, self._film, held, self._clock(),
+                    number,
                 )  # fmt: skip
         except (SensingError, ReconstructionError, CalibrationError) as fault:
             return self._report(str(fault))
@@ -260,12 +263,6 @@ class LiveLightField:
         ]
         return float(np.sqrt(np.mean(variances)))
 
-    def _problem(self) -> tuple[ImagingMatrix, Frames]:
-        """Return Psi and the frames held, as `emmc-rig reconstruct` takes them of a session."""
-        scale = self._scale_of_held()
-        places = {shot: place for place, shot in enumerate(self._scale.shots)}
-        return scale.psi, scale.frames(lambda shot: [self._held[places[shot]]])
-
     def _draw(self, export: Export, block: int = 1) -> None:
         self._numbers += 1
         self._pictures = Pictures(self._numbers, export, block)
@@ -300,30 +297,28 @@ class LiveLightField:
         }
 
 
+@dataclass(eq=False)
 class _Refinement:
     """A reconstruction in a thread of its own, which can be given up between two steps.
 
-    film: that the frames are the next one of, None: of none. of: the frames by shot. begun_s,
-    number: when it begins, and the number of the newest frame then.
+    film: that the frames are the next of, None: of none. of: the frames by shot. begun_s, number:
+    time of the begin, and the number of the newest frame then.
     """
 
-    def __init__(
-        self,
-        psi: ImagingMatrix,
-        frames: Frames,
-        method: str,
-        solve: Solve,
-        film: Film | None,
-        of: dict[int, RawFrame],
-        begun_s: float,
-        number: int,
-    ) -> None:
-        self.result: tuple[Reconstruction, Verdict] | None = None
-        self.fault = ""
-        self.step = 0
-        self._given_up = threading.Event()
-        self.psi, self.frames, self._method, self._solve = psi, frames, method, solve
-        self._film, self.of, self.begun_s, self.number = film, of, begun_s, number
+    psi: ImagingMatrix
+    frames: Frames
+    method: str
+    solve: Solve
+    film: Film | None
+    of: dict[int, RawFrame]
+    begun_s: float
+    number: int
+    result: tuple[Reconstruction, Verdict] | None = None
+    fault: str = ""
+    step: int = 0
+    given_up: threading.Event = field(default_factory=threading.Event)
+
+    def __post_init__(self) -> None:
         threading.Thread(target=self._run, name="live reconstruction", daemon=True).start()
 
     @property
@@ -331,14 +326,10 @@ class _Refinement:
         """Whether there is a result, or a fault."""
         return self.result is not None or self.fault != ""
 
-    def give_up(self) -> None:
-        """End at the next step."""
-        self._given_up.set()
-
     def _run(self) -> None:
         try:
-            self.result = self._solve(
-                self._method, self.psi, self.frames, None, None, self._on_step, self._film
+            self.result = self.solve(
+                self.method, self.psi, self.frames, None, None, self._on_step, self.film
             )
         except _ChangedError:
             return
@@ -346,7 +337,7 @@ class _Refinement:
             self.fault = str(fault)
 
     def _on_step(self, progress: Progress) -> None:
-        if self._given_up.is_set():
+        if self.given_up.is_set():
             raise _ChangedError
         self.step = progress.step
 

@@ -86,35 +86,16 @@ def picture(frame: RawFrame, view: View) -> NDArray[np.uint8]:
         seen = cv2.cvtColor(np.ascontiguousarray(mosaic), code)
     else:
         seen = np.repeat(mosaic[..., None], 3, axis=2)
-    return _shown(
-        seen.astype(np.float32),
-        black,
-        span,
-        view,
-        mosaic >= frame.white_level_dn,
-        mosaic == 0,
-    )
-
-
-def _shown(
-    seen: NDArray[np.float32],
-    black: float,
-    span: float,
-    view: View,
-    saturated: NDArray[np.bool_],
-    clipped: NDArray[np.bool_],
-) -> NDArray[np.uint8]:
-    """Return a picture (y, x, BGR) in DN as it is shown; marks are of the same or a finer grid."""
-    linear = np.clip((seen - np.float32(black)) / np.float32(span), 0, 1)
+    linear = np.clip((seen.astype(np.float32) - np.float32(black)) / np.float32(span), 0, 1)
     if view.bright:
         linear = np.clip(linear / max(1 / span, float(np.quantile(linear, BRIGHTEST))), 0, 1)
-    resized = _resized(linear, view.px / max(linear.shape[:2]))
-    shown = _srgb_table()[(resized * np.float32(CODES - 1)).astype(np.uint16)]
+    scale = view.px / max(mosaic.shape)
+    shown = _srgb_table()[(_resized(linear, scale) * np.float32(CODES - 1)).astype(np.uint16)]
     if view.marked:
-        # The most of each spot, not the mean: one saturated pixel in a large frame is seen.
+        saturated, clipped = mosaic >= frame.white_level_dn, mosaic == 0
         for where, colour in ((saturated, SATURATED_BGR), (clipped, CLIPPED_BGR)):
-            if where.any():
-                shown[_any(where, shown.shape[:2])] = colour
+            # Any pixel of a spot, not their mean: a single saturated pixel in a frame is seen.
+            shown[_resized(where.astype(np.float32), scale) > 0] = colour
     return shown
 
 
@@ -184,14 +165,3 @@ def _resized(linear: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
         return np.asarray(smaller, np.float32)
     whole = max(1, int(scale))
     return linear.repeat(whole, axis=0).repeat(whole, axis=1) if whole > 1 else linear
-
-
-def _any(where: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the mask at a picture's size: true where any of the pixels there is."""
-    if where.shape == shape:
-        return where
-    if shape[0] > where.shape[0]:
-        factors = shape[0] // where.shape[0], shape[1] // where.shape[1]
-        return where.repeat(factors[0], axis=0).repeat(factors[1], axis=1)
-    area = cv2.resize(where.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
-    return area > 0

@@ -165,12 +165,11 @@ class Watch:
             "autoexpose": lambda longest_s=LONGEST_UNASKED_S: self.auto_expose(finite(longest_s)),
             "cancel": self.cancel,
             "jog": lambda axis, distance_um: self.jog(str(axis), finite(distance_um)),
-            "go": lambda axis, place_um: self.go(str(axis), finite(place_um)),
-            "home": lambda: self.home(),
+            "home": self.home,
             "centre": self.centre,
             "stop": self.stop,
             "look": self.look_at,
-            "reference": lambda taken: self.take_reference(taken),
+            "reference": self.take_reference,
             "refocus": self._focus.forget,
             "autofocus": lambda span_um: self.autofocus(finite(span_um)),
             "preview": self.preview,
@@ -325,29 +324,24 @@ class Watch:
         self._wishes.put(lambda: look(target))
         self._start_anew()
 
-    def take_reference(self, taken: bool = True) -> None:
+    def take_reference(self, taken: bool) -> None:
         """Measure shifts from the present frame on; or no more."""
         with self._news:
             self._reference = self._shown.frame if taken and self._shown is not None else None
         self._publish(reference=self._reference is not None)
 
-    def home(self, axes: list[str] | None = None) -> None:
-        """Home axes, all by default; raises AppError as `jog`."""
-        self._move("homing", lambda stage: stage.home(axes))
+    def home(self) -> None:
+        """Home all axes; raises AppError as `jog`."""
+        self._move("homing", lambda stage: stage.home())
 
     def jog(self, axis: str, distance_um: float) -> None:
         """Move an axis by a distance; raises AppError without a stage, or while it moves."""
-        self._require_axis(axis)
+        if self._driving is not None and axis not in self._driving.stage.axes:
+            names = ", ".join(self._driving.stage.axes)
+            raise AppError(f"no axis {axis!r}: the stage has {names}")
         self._move(
             f"moving {axis} by {distance_um:g} um",
             lambda stage: stage.move_by_um({axis: distance_um}),
-        )
-
-    def go(self, axis: str, place_um: float) -> None:
-        """Move an axis to a place; raises AppError as `jog`."""
-        self._require_axis(axis)
-        self._move(
-            f"moving {axis} to {place_um:g} um", lambda stage: stage.move_to_um({axis: place_um})
         )
 
     def centre(self) -> None:
@@ -415,11 +409,6 @@ class Watch:
         """Stop all axes now, in the middle of a move too."""
         if self._driving is not None:
             self._driving.stop()
-
-    def _require_axis(self, axis: str) -> None:
-        if self._driving is not None and axis not in self._driving.stage.axes:
-            names = ", ".join(self._driving.stage.axes)
-            raise AppError(f"no axis {axis!r}: the stage has {names}")
 
     def _move(self, what: str, *steps: Callable[[Stage], object]) -> None:
         if self._driving is None:

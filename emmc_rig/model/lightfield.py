@@ -205,7 +205,10 @@ def save_hdf5(
     if not (lf.min() >= 0 and lf.max() <= 1):
         lf = np.clip(lf, 0, 1)
     lf = check_light_field(lf, str(path))
-    _make_folder(path.parent)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SceneError(f"{path.parent}: cannot be made a folder ({error.strerror})") from error
     try:
         with whole_file(path) as partial, h5py.File(partial, "w") as file:
             dataset = file.create_dataset(_DATASET, data=lf)
@@ -246,7 +249,9 @@ def shear(lf: np.ndarray, disparity_px: float) -> np.ndarray:
     """
     sheared = np.empty(lf.shape, np.float32)
     for v, u in np.ndindex(lf.shape[:2]):
-        sheared[v, u] = _aligned_view(lf, v, u, disparity_px)
+        steps_v, steps_u = v - lf.shape[0] // 2, u - lf.shape[1] // 2
+        view = np.ascontiguousarray(lf[v, u], dtype=np.float32)
+        sheared[v, u] = shifted(view, disparity_px * steps_v, disparity_px * steps_u)
     return sheared
 
 
@@ -378,7 +383,9 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     means = np.empty(truth.shape[:2])
 
     def work(place: tuple[int, int]) -> None:
-        means[place] = _view_ssim(estimate[place], truth[place])
+        found, true = estimate[place], truth[place]  # a colour at a time: a third of the memory
+        colours = range(true.shape[-1])
+        means[place] = np.mean([_plane_ssim(found[..., c], true[..., c]) for c in colours])
 
     in_views(work, means.shape)
     return float(means.mean())
@@ -387,23 +394,6 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
 def read_picture(path: Path) -> np.ndarray:
     """Return the picture of a file as float32 (y, x, 3), 1 for white; raises SceneError."""
     return light_of(*read_codes(path, SceneError, opaque=True))
-
-
-def _make_folder(folder: str | os.PathLike) -> Path:
-    """Create the folder where missing."""
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SceneError(f"{folder}: cannot be made a folder ({error.strerror})") from error
-    return folder
-
-
-def _aligned_view(lf: np.ndarray, v: int, u: int, disparity_px: float) -> np.ndarray:
-    """View (v, u) moved onto the centre view for points of this disparity: (y, x, c)."""
-    steps_v, steps_u = v - lf.shape[0] // 2, u - lf.shape[1] // 2
-    view = np.ascontiguousarray(lf[v, u], dtype=np.float32)
-    return shifted(view, disparity_px * steps_v, disparity_px * steps_u)
 
 
 def _catmull_rom(fraction: float) -> np.ndarray:
@@ -427,12 +417,6 @@ def disagreement(lf: np.ndarray, disparity_px: float, window_px: int) -> np.ndar
 def _check_same_shape(estimate: np.ndarray, truth: np.ndarray) -> None:
     if estimate.shape != truth.shape:
         raise SceneError(f"estimate has shape {estimate.shape}, the truth {truth.shape}")
-
-
-def _view_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
-    """SSIM of one (y, x, c) view, a colour at a time, which takes a third of the memory."""
-    colours = range(truth.shape[-1])
-    return float(np.mean([_plane_ssim(estimate[..., c], truth[..., c]) for c in colours]))
 
 
 def _plane_ssim(estimate: np.ndarray, truth: np.ndarray) -> float:

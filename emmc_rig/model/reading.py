@@ -182,6 +182,10 @@ class StoredArrays:
                 raise ValueError(f"'{name}' has {invalid} value(s) that its {key} calls not valid")
         return values
 
+    def part(self, name: str, index: Any) -> NDArray:
+        """Return a part of a data set of numbers; raises KeyError or ValueError."""
+        return self.dataset(name)[index]
+
     def text(self, name: str) -> str:
         """Return a data set that is one text; raises KeyError or ValueError."""
         found = self.dataset(name)

@@ -106,7 +106,9 @@ def explain(error: ValidationError, cls: type[BaseModel]) -> str:
         valid = _keys_beside(cls, first["loc"])
         hint = did_you_mean(key, valid).strip() or f"valid keys: {', '.join(valid)}"
         return f"unknown key '{where}': {hint}"
-    message = _in_words(first["msg"].replace("\n", " "))
+    message = first["msg"].replace("\n", " ")
+    for pattern, words in _WORDS:
+        message = re.sub(pattern, words, message)
     if first["type"] == "value_error":
         return f"{where}: {message.removeprefix('Value error, ')}"
     return f"{where}: {message[:1].lower()}{message[1:]}"
@@ -121,13 +123,7 @@ _WORDS = (
     (r"a valid boolean", "true or false"),
     (r"\bNone\b|NoneType", "nothing"),
 )
-
-
-def _in_words(message: str) -> str:
-    """Return a message of the validator in words of the file's format instead of Python's."""
-    for pattern, words in _WORDS:
-        message = re.sub(pattern, words, message)
-    return message
+"""Words of the file's format in place of Python's in messages of the validator."""
 
 
 def _kind(data: object) -> str:

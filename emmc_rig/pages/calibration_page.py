@@ -102,7 +102,7 @@ def write_calibration_report(
         *_listed("unwatched", "Not measured", unwatched),
         Section("psi", "Psi", psi),
         Section(
-            "residuals", "Residuals", _residuals([chosen]) + _kinds(chosen),
+            "residuals", "Residuals", _residuals(chosen),
             about="Whiteboards kept from the fit, less what this calibration predicts of them.",
         ),
         Section(
@@ -132,14 +132,11 @@ def _head(outcome: Outcome, metrics: Mapping) -> Head:
     if agrees:
         words = "You can use this calibration"
         words += ", and make it better" if outcome.advice else ""
-    good = agrees and not outcome.advice
-    return Head(words, outcome.why, outcome.advice or [_use(metrics)], "good" if good else "watch")
-
-
-def _use(metrics: Mapping) -> str:
-    if not metrics["session"]:
-        return "get the light field with this Psi: `emmc_rig.reconstruct(psi, report.frames(dn))`"
-    return f"get the light field with this Psi: `emmc-rig reconstruct {typed(metrics['session'])}`"
+    good, use = agrees and not outcome.advice, "emmc_rig.reconstruct(psi, report.frames(dn))"
+    if metrics["session"]:
+        use = f"emmc-rig reconstruct {typed(metrics['session'])}"
+    advice = outcome.advice or [f"get the light field with this Psi: `{use}`"]
+    return Head(words, outcome.why, advice, "good" if good else "watch")
 
 
 def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> list[Card]:
@@ -184,14 +181,6 @@ def _listed(name: str, title: str, lines: Sequence[str]) -> list[Section]:
     return [Section(name, title, part("bullets", lines))] if lines else []
 
 
-def _kinds(judged: HeldOut) -> str:
-    """Return how every kind of whiteboard is predicted, the worst first."""
-    order = sorted(judged.groups.items(), key=lambda item: -item[1])
-    rows = [(name, f"{value:.2f}") for name, value in order]
-    heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
-    return part("table", heads, rows, numbers=True)
-
-
 def _fit(metrics: Mapping) -> str:
     undecided = metrics["fit"]["undecided"]
     rows = [
@@ -216,19 +205,23 @@ def _fitted(parameter: _Parameter, found: Mapping[str, float], undecided: bool) 
     return parameter.words, written, f"{parameter.of}, not an error: Psi has it"
 
 
-def _residuals(judged: Sequence[HeldOut]) -> str:
-    """Return maps (pixel_y, pixel_x) of what predictions miss, with axes and a scale."""
-    figure, panels = sheet(len(judged), 7.0, 4.6, label="pixel y")
-    for axes, board in zip(panels, judged, strict=True):
-        height, width = board.residual.shape
-        small = _shrunk(board.residual, MAP_PX)
-        scale = (-0.5, width - 0.5, height - 0.5, -0.5)
-        drawn_map(
-            axes, small, (-RESIDUAL_SCALE, RESIDUAL_SCALE), "validation whiteboard less "
-            "prediction,\nstandard deviations of the noise", "RdBu_r", extent=scale,
-        )  # fmt: skip
-        titled(axes, board.route, "pixel x")
-    return _drawn({"Residual map": figure})
+def _residuals(judged: HeldOut) -> str:
+    """Return the residuals of a prediction: a map (pixel_y, pixel_x), and kinds of whiteboards.
+
+    The kinds are in a table, the worst first.
+    """
+    figure, (axes,) = sheet(1, 7.0, 4.6, label="pixel y")
+    height, width = judged.residual.shape
+    drawn_map(
+        axes, _shrunk(judged.residual, MAP_PX), (-RESIDUAL_SCALE, RESIDUAL_SCALE),
+        "validation whiteboard less prediction,\nstandard deviations of the noise", "RdBu_r",
+        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+    )  # fmt: skip
+    titled(axes, judged.route, "pixel x")
+    order = sorted(judged.groups.items(), key=lambda item: -item[1])
+    rows = [(name, f"{value:.2f}") for name, value in order]
+    heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
+    return _drawn({"Residual map": figure}) + part("table", heads, rows, numbers=True)
 
 
 def _drawn(figures: Mapping[str, Figure]) -> str:

@@ -52,20 +52,13 @@ class CameraRow:
 
 def camera_rows() -> list[CameraRow]:
     """Return the shipped cameras' lines of the listing, by name."""
-    return [_row(name, camera) for name, camera in shipped_cameras().items()]
-
-
-def _row(name: str, camera: Camera) -> CameraRow:
-    psi = build_imaging_matrix(camera, _square(camera, LISTING_SAMPLES))
-    return CameraRow(
-        name=name,
-        title=camera.title,
-        sensor=_sensor_name(camera),
-        shots=psi.shots,
-        masks=len(camera.masks),
-        sampling_rate=str(Fraction(*psi.shape)),
-        light_percent=100 * psi.light_efficiency(),
-    )
+    rows = []
+    for name, camera in shipped_cameras().items():
+        psi = build_imaging_matrix(camera, _square(camera, LISTING_SAMPLES))
+        sampling_rate, light_percent = str(Fraction(*psi.shape)), 100 * psi.light_efficiency()
+        names = name, camera.title, _sensor_name(camera)
+        rows.append(CameraRow(*names, psi.shots, len(camera.masks), sampling_rate, light_percent))
+    return rows
 
 
 def _square(camera: Camera, samples: int) -> tuple[int, int]:

@@ -70,6 +70,7 @@ def render(content: ReportContent) -> str:
     rows, columns, height, width, _ = content.estimate.shape
     disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
     axes, listed = axes_of(content.metrics), _figures(content.metrics)
+    total_s, longest_s = (max(of(content.stage_s.values() or [0]), 1e-12) for of in (sum, max))
     frames = content.frames
     shots = content.metrics.get("shots", 0 if frames is None else len(frames))
     export = Export(
@@ -96,7 +97,10 @@ def render(content: ReportContent) -> str:
         views={"rows": rows, "columns": columns, "height": height, "width": width},
         error=None if content.truth is None else _error(content.estimate, content.truth),
         shots="1 shot" if shots == 1 else f"{shots} shots",
-        timings=_timings(content.stage_s),
+        timings=[
+            (name, f"{s / longest_s:.1%}", f"{s:.2f} s ({s / total_s:.0%})")
+            for name, s in content.stage_s.items()
+        ],
         total_s=sum(content.stage_s.values()),
         figures=[row for row in listed if not row["of_method"]],
         of_method=[row for row in listed if row["of_method"]],
@@ -291,15 +295,6 @@ def _warnings(content: ReportContent) -> list[str]:
     broken = int(content.estimate.size - np.count_nonzero(np.isfinite(content.estimate)))
     more = f"The estimate holds {broken} values that are not finite; drawn black."
     return [*warnings, *estimated(content.metrics), *([more] if broken else [])]
-
-
-def _timings(stage_s: Mapping[str, float]) -> list[tuple[str, str, str]]:
-    """Return name, width of its bar and words of each stage."""
-    total_s, longest_s = sum(stage_s.values()), max(stage_s.values(), default=0.0)
-    return [
-        (name, f"{s / max(longest_s, 1e-12):.1%}", f"{s:.2f} s ({s / max(total_s, 1e-12):.0%})")
-        for name, s in stage_s.items()
-    ]
 
 
 def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, object]]:

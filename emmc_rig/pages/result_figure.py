@@ -177,6 +177,9 @@ def draw_results(
         for name, column in zip(names, columns, strict=True)
         if column.title != "true"
     ]
+    formula = f"{curve.gain:.3g} x"
+    if abs(curve.gamma - 1) >= 0.005:
+        formula = f"({formula})^(1/{curve.gamma:.3g})"
     name, picture = place_name(axes, (rows_of_views, columns_of_views), view), picture_name(axes)
     caption = " ".join([
         f"{name[0].upper()}{name[1:]} of {rows_of_views}x{columns_of_views}, "
@@ -190,7 +193,7 @@ def draw_results(
            f"{picture}s, peak 1."] if measured else []),
         f"Close-ups of {pieces[0].side}x{pieces[0].side} pixels around (y, x) = "
         + ", ".join(f"({p.y + p.side // 2}, {p.x + p.side // 2})" for p in pieces) + ".",
-        f"Linear values x are shown as {_shown_as(curve)}, cut at 1.",
+        f"Linear values x are shown as {formula}, cut at 1.",
         *sources,
         f"Drawn by emmc-rig {__version__}.",
     ])  # fmt: skip
@@ -428,12 +431,6 @@ def _source(column: Export) -> str:
     if known.get("command"):
         said.append(f"by: {known['command']}")
     return "; ".join(said) or column.caption or column.title
-
-
-def _shown_as(curve: DisplayCurve) -> str:
-    """Return the screen's curve as a formula of x."""
-    shown = f"{curve.gain:.3g} x"
-    return shown if abs(curve.gamma - 1) < 0.005 else f"({shown})^(1/{curve.gamma:.3g})"
 
 
 def epipolar_lines(truth: Array) -> tuple[int, int]:

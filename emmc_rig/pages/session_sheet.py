@@ -146,11 +146,17 @@ def _cards(session: Session) -> list[Card]:
     retries = len(of_kind(session.journal.entries, RetryEntry))
     note = f"{shown_bytes(size)}; good: all" + (f"; {retries} taken again" if retries else "")
     tone = "good" if session.is_complete else "watch"
-    cards = [
-        Card("Frames", f"{stored} of {planned}", note, tone),
-        *_exposure_cards(session),
-        *_light_field_cards(session),
-    ]
+    cards = [Card("Frames", f"{stored} of {planned}", note, tone)]
+    if shots := shot_exposures(session):
+        levels = [shot.level for shot in shots]
+        reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
+        note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVELS[0]:.0%}"
+        tone = "watch" if exposure_reasons(shots) else "good"
+        cards.append(Card("Exposure", reached, note, tone))
+    verdict, stated_db = reconstructed(session.folder)
+    if verdict:
+        note = "" if stated_db is None else f"estimated accuracy {stated_db:.1f} dB"
+        cards.append(Card("Light field", verdict, note, TONES.get(verdict, "")))
     if runs := run_times(session):
         last = runs[-1]
         note = f"the last run; {last['moving_s']:.1f} s moving, {last['exposing_s']:.1f} s exposing"
@@ -201,32 +207,15 @@ def session_metrics(session: Session) -> dict[str, object]:
     }
 
 
-def _exposure_cards(session: Session) -> list[Card]:
-    """Return what the brightest readings of the shots reach."""
-    shots = shot_exposures(session)
-    if not shots:
-        return []
-    levels = [shot.level for shot in shots]
-    reached = f"{min(levels):.0%}" + (f" to {max(levels):.0%}" if len(shots) > 1 else "")
-    note = f"of white, the brightest readings of the shots; good: about {GOOD_LEVELS[0]:.0%}"
-    tone = "watch" if exposure_reasons(shots) else "good"
-    return [Card("Exposure", reached, note, tone)]
-
-
-def _light_field_cards(session: Session) -> list[Card]:
-    """Return the verdict of the light field, once the session is reconstructed."""
-    verdict, stated_db = reconstructed(session.folder)
-    stated = "" if stated_db is None else f"estimated accuracy {stated_db:.1f} dB"
-    return [Card("Light field", verdict, stated, TONES.get(verdict, ""))] if verdict else []
-
-
 def _frames(session: Session, pictures: int) -> Iterator[Section]:
     """Yield a section for each kind of frame; all but the shots of the scene are folded."""
     left, balance = pictures, _balance(session)
     for kind in reversed(KINDS):
-        frames = sorted((f for f in session.needed if f.kind == kind), key=_place_in_plan)
+        frames = [frame for frame in session.needed if frame.kind == kind]
         if not frames:
             continue
+        # The order of capture is another one.
+        frames.sort(key=lambda f: (f.bench.shot, f.view or (), f.exposure_s or 0.0, f.repeat))
         shown = _chosen(frames, left)
         left -= len(shown)
         body = fragment(
@@ -245,11 +234,6 @@ def _count(session: Session, frames: Sequence[PlannedFrame]) -> str:
     missing = sum(frame.id not in session.stored for frame in frames)
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
     return f"{count}, {missing} of them missing" if missing else count
-
-
-def _place_in_plan(frame: PlannedFrame) -> tuple:
-    """Return the sort key of frames on the page, which differs from the order of capture."""
-    return frame.bench.shot, frame.view or (), frame.exposure_s or 0.0, frame.repeat
 
 
 def _chosen(frames: Sequence[PlannedFrame], most: int) -> list[PlannedFrame]:

@@ -125,11 +125,13 @@ def _checks(session: Session, boards: BoardSet, channels: NDArray[np.uint8]) -> 
 def sensor_pairs(session: Session) -> tuple[list[Pair], Iterator[Pair]]:
     """Return pairs of darks, and of white references without masks, of every exposure that has two.
 
+    References are those of the first shot, and the checks without masks.
+
     Raises AppError where that is fewer than two dark and four lit exposures.
     """
-    darks, flats = (
-        _by_exposure(session, frames) for frames in (darks_of(session), _flats(session))
-    )
+    again = (f for f in session.frames if f.kind == "check" and not f.bench.masks_in)
+    whites = [*references_of(session).get((0, "white"), ()), *again]
+    darks, flats = (_by_exposure(session, frames) for frames in (darks_of(session), whites))
     if len(darks) < 2 or len(flats) < 4:
         raise AppError(
             f"{session.folder}: calibrating the sensor needs two darks at each of two exposures "
@@ -143,12 +145,6 @@ def sensor_pairs(session: Session) -> tuple[list[Pair], Iterator[Pair]]:
             yield Pair(exposure_s, first, second)
 
     return list(pairs(darks)), pairs(flats)
-
-
-def _flats(session: Session) -> list[PlannedFrame]:
-    """Return the white references of the first shot, and those seen again without masks."""
-    again = (f for f in session.frames if f.kind == "check" and not f.bench.masks_in)
-    return [*references_of(session).get((0, "white"), ()), *again]
 
 
 def _by_exposure(

@@ -18,7 +18,7 @@ from drivers.camera import CameraIdentity
 from drivers.cameras import CAMERAS
 from drivers.dng import LARGEST_TILE, Facts, encode_dng, private_data
 from drivers.errors import DriverError, RawFrameError
-from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, Array, RawFrame, decode_raw
+from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Figures, FrameEntry
 
@@ -39,11 +39,19 @@ class FrameFile:
 
 
 def frame_facts(frame: RawFrame) -> dict[str, Any]:
-    """Return what is kept of a frame beside its bytes: plain data, for JSON."""
+    """Return what is kept of a frame beside its bytes: plain data, for JSON.
+
+    A large tile of black levels is kept as the means of a 2x2 tile: the file alone has room for it.
+    """
+    black_dn = frame.black_level_dn
+    if black_dn.size > LARGEST_TILE:
+        black_dn = np.array(
+            [[black_dn[row::2, column::2].mean() for column in (0, 1)] for row in (0, 1)]
+        )
     return {
         "shape": list(frame.mosaic.shape),
         "cfa": frame.cfa,
-        "black_level_dn": _journal_levels(frame.black_level_dn).tolist(),
+        "black_level_dn": black_dn.tolist(),
         "white_level_dn": frame.white_level_dn,
         "exposure_s": frame.exposure_s,
         "gain": frame.gain,
@@ -51,13 +59,6 @@ def frame_facts(frame: RawFrame) -> dict[str, Any]:
         "host_time_s": frame.host_time_s,
         "metadata": dict(frame.metadata),
     }
-
-
-def _journal_levels(black_dn: Array) -> Array:
-    """Return black levels, or the means of a 2x2 tile where the file alone has room for them."""
-    if black_dn.size <= LARGEST_TILE:
-        return black_dn
-    return np.array([[black_dn[row::2, column::2].mean() for column in (0, 1)] for row in (0, 1)])
 
 
 def frame_entry(frame: RawFrame, exposure_s: float, gain: float, **about: Any) -> FrameEntry:
@@ -74,7 +75,10 @@ def frame_file(frame: RawFrame) -> FrameFile:
 
     Raises AppError for a frame that no file can hold.
     """
-    own = FrameFile(_suffix_of(frame), frame.original, frame.sha256)
+    suffix = Path(frame.metadata.get("name", "")).suffix.lower()
+    if suffix not in RAW_SUFFIXES:
+        suffix = ".dng" if frame.original[:4] in TIFF_MAGICS else STREAMED
+    own = FrameFile(suffix, frame.original, frame.sha256)
     if _decodes_to(own, frame):
         return own
     identity = CameraIdentity(frame.metadata.get("maker", ""), frame.metadata.get("model", ""))
@@ -113,14 +117,6 @@ def decode_frame(data: bytes, entry: FrameEntry) -> RawFrame:
     else:
         frame = decode_raw(data)
     return replace(frame, exposure_s=entry.exposure_s, gain=entry.gain)
-
-
-def _suffix_of(frame: RawFrame) -> str:
-    """Return the suffix for the camera's bytes; STREAMED for an unknown format."""
-    suffix = Path(frame.metadata.get("name", "")).suffix.lower()
-    if suffix in RAW_SUFFIXES:
-        return suffix
-    return ".dng" if frame.original[:4] in TIFF_MAGICS else STREAMED
 
 
 def _decodes_to(file: FrameFile, frame: RawFrame) -> bool:

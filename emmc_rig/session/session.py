@@ -469,11 +469,16 @@ def _digests(files: Mapping[str, bytes]) -> dict[str, str]:
 
 
 def _planned_files(frozen: Frozen) -> dict[str, bytes]:
+    """Return the files of a plan; frames.json has a frame in each line."""
+    frames = (frame.as_dict() for frame in frozen.frames)
+    lines = ",\n".join(
+        json.dumps(frame, separators=(",", ":"), allow_nan=False) for frame in frames
+    )
     return {
         PLAN: frozen.plan_yaml.encode(),
         CAMERA: _json(frozen.camera),
         RIG: _json(frozen.rig),
-        ORDER: _json_lines([frame.as_dict() for frame in frozen.frames]),
+        ORDER: f"[\n{lines}\n]\n".encode(),
     }
 
 
@@ -484,9 +489,3 @@ def _certain(frames: Iterable[PlannedFrame]) -> int:
 
 def _json(data: Mapping[str, Any]) -> bytes:
     return (json.dumps(data, indent=2, allow_nan=False) + "\n").encode()
-
-
-def _json_lines(items: Iterable[Mapping[str, Any]]) -> bytes:
-    """Return a JSON list, one item a line."""
-    lines = ",\n".join(json.dumps(item, separators=(",", ":"), allow_nan=False) for item in items)
-    return f"[\n{lines}\n]\n".encode()

@@ -188,7 +188,7 @@ def test_a_frame_of_a_film_opens_with_the_psi_of_its_shot(result, tmp_path):
     same(opened, one)
     np.testing.assert_array_equal(opened.frames.readings, taken.readings)
     assert np.array_equal(open_film(film).opened(3).light_field, one.light_field)
-    with pytest.raises(AppError, match=r"a film; open one of its frames"):
+    with pytest.raises(AppError, match=r"a film; open a frame of it"):
         emmc.open_result(film)
 
 

@@ -22,7 +22,7 @@ from emmc_rig.model.decoding.child import only_array, read_in_child
 from emmc_rig.model.decoding.pictures import decode_picture
 from emmc_rig.model.decoding.regular import file_bytes, not_read
 from emmc_rig.model.json_text import one_line, shown_path
-from emmc_rig.model.reading import FAULTS, StoredArrays, stored_arrays
+from emmc_rig.model.reading import FAULTS, stored_arrays
 
 TIFF_STARTS = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 _EXR_START = b"\x76\x2f\x31\x01"
@@ -154,11 +154,7 @@ def _of_npy(data: bytes) -> NDArray:
 def _of_hdf5(path: Path, error: type[Exception], name: str) -> NDArray:
     """Read a data set; MATLAB's files of version 7.3 have their axes in the other order."""
     with stored_arrays(path, error, "write it again") as stored:
-        array = stored.array(_name_in(stored, name))
+        shapes: dict[str, tuple[int, ...]] = {}
+        stored.file.visititems(lambda at, item: shapes.update({at: getattr(item, "shape", ())}))
+        array = stored.array(only_array(shapes, name))
     return array.T if path.suffix.lower() == ".mat" else array
-
-
-def _name_in(stored: StoredArrays, name: str) -> str:
-    shapes: dict[str, tuple[int, ...]] = {}
-    stored.file.visititems(lambda found, item: shapes.update({found: getattr(item, "shape", ())}))
-    return only_array(shapes, name)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,15 +50,6 @@ class _Page:
     time_s: float = _UNKNOWN
 
 
-class _Block(NamedTuple):
-    """Consecutive pages of a file that are consecutive planes."""
-
-    file: str
-    first_page: int
-    first_plane: int
-    count: int | None
-
-
 def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any]]:
     """Return frames (frame, y, x) or (frame, y, x, 3), and the facts of the file.
 
@@ -72,7 +63,7 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
         tiff = files.enter_context(tifffile.TiffFile(path))
         members, described, notes = [path], tiff.ome_metadata, []
         if described is None:
-            pages = [_whole(page) for page in _all_pages(tiff)]
+            pages = [page.aspage() for top in tiff.pages for page in (top, *(top.pages or ()))]
             kept = [page for page in pages if not _is_copy(page)] or pages
             if len(kept) < len(pages):
                 notes = [f"{len(pages) - len(kept)} page(s) that are smaller copies are not taken"]
@@ -89,7 +80,11 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
             shown = _shown(codes, taken[0].page, tiff.is_shaped)
         else:
             shown = _stack([part.page for part in taken], tiff.is_shaped)
-            _check_stated_count(tiff, len(shown.frames))
+            stated = (tiff.imagej_metadata or {}).get("images") if tiff.is_imagej else None
+            if stated is not None and int(stated) > len(shown.frames):
+                raise ValueError(
+                    f"it states {stated} images and holds {len(shown.frames)}: cut short"
+                )
         complaints.check()
         facts = {
             "full_scale": _full_scale(taken[0].page, shown.frames.dtype),
@@ -138,17 +133,6 @@ class _Complaints(logging.Handler):
                 raise ValueError(f"cut short: {said.rpartition('>')[2].strip()}")
 
 
-def _all_pages(tiff: tifffile.TiffFile) -> Iterator[Any]:
-    """Yield the pages of a file, each followed by those within it."""
-    for page in tiff.pages:
-        yield page
-        yield from page.pages or ()
-
-
-def _whole(page: Any) -> Any:
-    return page.aspage()
-
-
 def _is_copy(page: Any) -> bool:
     return bool(page.subfiletype & (_REDUCED | _MASK))
 
@@ -182,12 +166,6 @@ def _planes_of_one_page(tiff: tifffile.TiffFile, page: Any) -> NDArray:
         _check_strips(page)
         return series[0].asarray().reshape(-1, *page.shape)
     return _codes(page)
-
-
-def _check_stated_count(tiff: tifffile.TiffFile, count: int) -> None:
-    stated = (tiff.imagej_metadata or {}).get("images") if tiff.is_imagej else None
-    if stated is not None and int(stated) > count:
-        raise ValueError(f"it states {stated} images and holds {count}: cut short")
 
 
 def _check_strips(page: Any) -> None:
@@ -324,12 +302,15 @@ class _Series:
             sizes["C"] = max(sizes["C"] // max(samples, default=1), 1)
             total = math.prod(sizes.values())
             expected += total
-            for block in self._blocks(pixels, order, sizes):
-                count = block.count
-                if count is None:
-                    count = len(self._pages_of(block.file))
-                for k in range(min(count, total - block.first_plane)):
-                    found[number, block.first_plane + k] = block.file, block.first_page + k
+            listed = [part for part in pixels if _tag(part) == "TiffData"]
+            for entry in listed or [ElementTree.Element("TiffData")]:
+                file, first = self._file_of(entry), int(entry.get("IFD", 0))
+                plane = _plane_number(entry, "First", order, sizes)
+                default = "1" if "IFD" in entry.attrib else None
+                stated_count = entry.get("PlaneCount", entry.get("NumPlanes", default))
+                count = int(stated_count or len(self._pages_of(file)))
+                for k in range(min(count, total - plane)):
+                    found[number, plane + k] = file, first + k
             for plane in pixels:
                 if _tag(plane) == "Plane" and all(f"The{axis}" in plane.attrib for axis in order):
                     times = _duration(plane, "ExposureTime"), _duration(plane, "DeltaT")
@@ -339,7 +320,15 @@ class _Series:
                 f"its OME-XML states {expected} planes and lists pages of {len(found)}: save it "
                 "again, or as a TIFF without OME-XML"
             )
-        self._check_files({file for file, _ in found.values()})
+        missing = sorted(
+            file for file in {file for file, _ in found.values()} - {""}
+            if not self._beside(file).exists()
+        )  # fmt: skip
+        if missing:
+            rest = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+            raise ValueError(
+                f"{', '.join(missing[:3])}{rest} of its series is missing: put it beside this file"
+            )
         self._check_unlisted({page for file, page in found.values() if not file})
         taken, members = [], [""]
         for place, (file, number) in sorted(found.items()):
@@ -351,7 +340,7 @@ class _Series:
                     f"its OME-XML names page {number + 1} of {file or self._path.name}, which has "
                     f"{len(pages)}: cut short"
                 )
-            taken.append(_Page(_whole(pages[number]), *stated.get(place, (_UNKNOWN, _UNKNOWN))))
+            taken.append(_Page(pages[number].aspage(), *stated.get(place, (_UNKNOWN, _UNKNOWN))))
             members.append(file)
         if not taken:
             raise ValueError("its OME-XML lists no page of this file")
@@ -360,44 +349,19 @@ class _Series:
     def _beside(self, file: str) -> Path:
         return self._path.with_name(Path(file).name)
 
-    def _blocks(
-        self, pixels: ElementTree.Element, order: str, sizes: Mapping[str, int]
-    ) -> Iterator[_Block]:
-        entries = [part for part in pixels if _tag(part) == "TiffData"]
-        if not entries:
-            yield _Block("", 0, 0, None)
-        for entry in entries:
-            count = entry.get("PlaneCount", entry.get("NumPlanes"))
-            if count is None and "IFD" in entry.attrib:
-                count = "1"
-            uuid = next((part for part in entry if _tag(part) == "UUID"), None)
-            yield _Block(
-                self._file_of(uuid),
-                int(entry.get("IFD", 0)),
-                _plane_number(entry, "First", order, sizes),
-                None if count is None else int(count),
-            )
-
-    def _file_of(self, uuid: ElementTree.Element | None) -> str:
-        """Return the name of the file that holds a plane, "" for the file that is read."""
+    def _file_of(self, entry: ElementTree.Element) -> str:
+        """Return the file that holds the planes of an entry, "" for the file that is read."""
+        uuid = next((part for part in entry if _tag(part) == "UUID"), None)
         if uuid is None:
             return ""
         name, own = uuid.get("FileName", ""), self._path.name
         is_own = not name or name == own or (uuid.text is not None and uuid.text == self._uuid)
         return "" if is_own else name
 
-    def _check_files(self, names: set[str]) -> None:
-        missing = sorted(name for name in names if name and not self._beside(name).exists())
-        if missing:
-            rest = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-            raise ValueError(
-                f"{', '.join(missing[:3])}{rest} of its series is missing: put it beside this file"
-            )
-
     def _check_unlisted(self, listed: set[int]) -> None:
         own = list(self._own.pages)
         others = (k for k in range(len(own)) if k not in listed)
-        unlisted = [k for k in others if not _is_copy(_whole(own[k]))]
+        unlisted = [k for k in others if not _is_copy(own[k].aspage())]
         if unlisted:
             raise ValueError(
                 f"{len(unlisted)} of its {len(own)} pages are no planes in its OME-XML, the first "
