@@ -27,7 +27,7 @@ from emmc_rig.version import __version__
 
 P = TypeVar("P", bound=Hashable)
 Results = Generator[dict, None, None]
-LEFT_OUT = "left out"
+LEFT_OUT = "excluded"
 """Key of why a point has no result."""
 
 
