@@ -127,7 +127,7 @@ def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:
     """Return whether whiteboards show every view of every shot, as the method free takes them."""
     if pinholes is None:
         return False
-    opened = {(one.shot, one.pinhole) for one in pinholes.frames}
+    opened = {(frame.shot, frame.pinhole) for frame in pinholes.frames}
     shots = range(len(camera.shots))
     return opened >= {(shot, view) for shot in shots for view in np.ndindex(camera.views)}
 

@@ -104,7 +104,7 @@ class QuietAttendant:
 
     @property
     def lamp(self):
-        return [one[1] for one in self.asked if one[0] == "lamp"][-1]
+        return [asked[1] for asked in self.asked if asked[0] == "lamp"][-1]
 
 
 def stops_after(frame_id, control):

@@ -146,9 +146,9 @@ def _head(chart: Chart | None) -> Head:
         f"{best.configuration.label} is the most accurate",
         f"{chart.title}: {_accuracy(chart, best)}",
         [
-            f"in {one.seconds:.3g} s: {one.configuration.label}, "
-            f"{best.psnr_db - one.psnr_db:.2f} dB less"
-            for one in reversed(quicker)
+            f"in {mark.seconds:.3g} s: {mark.configuration.label}, "
+            f"{best.psnr_db - mark.psnr_db:.2f} dB less"
+            for mark in reversed(quicker)
         ]
         + [f"use it: `emmc-rig reconstruct FRAMES --method {best.configuration.method}`"],
     )

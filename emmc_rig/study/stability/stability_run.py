@@ -201,8 +201,8 @@ def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) ->
     faults = list(dict.fromkeys(curve.fault.name for curve in curves))
     panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
     figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(COLUMNS, len(panels)))
-    for one, some in zip(axes, panels, strict=True):
-        _panel(one, some, colours)
+    for axis, some in zip(axes, panels, strict=True):
+        _panel(axis, some, colours)
     _legend(figure, curves, colours)
     return save_drawing(figure, path)
 
@@ -306,7 +306,7 @@ def answers(curves: Sequence[Curve]) -> list[str]:
         some = [(curve.below_best(), curve) for curve in curves if curve.fault is fault]
         never = [curve.method for place, curve in some if place is None]
         breaking = sorted(
-            ((place, curve) for place, curve in some if place is not None), key=lambda one: one[0]
+            ((place, curve) for place, curve in some if place is not None), key=lambda pair: pair[0]
         )
         if not breaking:
             sentences.append(f"{fault.title}: no method loses {LOST_DB:g} dB in this sweep.")
