@@ -146,7 +146,7 @@ def _write(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) 
 
 
 def _read(path: Path, digest: str) -> dict[str, Any] | None:
-    """Return the figures of a block's file; None where it is missing, damaged or of another job."""
+    """Return the figures of a block's file; None for a missing or damaged file, or another job."""
     try:
         with stored_arrays(path, AppError, REMEDY) as stored:
             for name in map(str, stored.file):

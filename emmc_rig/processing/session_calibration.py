@@ -105,8 +105,8 @@ class SessionCalibration:
         """Return the readings of raw frames by these whiteboards, with deviations.
 
         dn: (shot, pixel_y, pixel_x), of the shots of Psi. exposures_s: of all, or of each, in the
-        unit of the whiteboards' exposures. Raises ReconstructionError for another shape, and
-        ArgumentError for what are no numbers.
+        unit of the whiteboards' exposures. Raises ReconstructionError for another shape,
+        ArgumentError for values other than numbers.
         """
         taken = numbers_of(dn, "dn", "raw values, an array (shot, pixel_y, pixel_x)")
         check_frames(self.psi.frames_shape, taken)

@@ -160,8 +160,8 @@ def psi_inputs(session: Session) -> dict[str, Any]:
 def stored_calibration(session: Session) -> tuple[Product | None, str]:
     """Return what the calibration stored in a session follows from, and a sentence that names it.
 
-    Returns None for a session without a calibration, with an empty sentence; and for a calibration
-    of other frames, another plan or another version of the program, with the reason.
+    Returns None for a session without a calibration, with an empty sentence, and for a stale
+    calibration, with the reason: frames, plan or program version have changed.
     """
     folder = session.folder / CALIBRATION
     if not (folder / PSI).is_file():

@@ -1,4 +1,4 @@
-"""The sequencer: what it takes, retries, refuses, and how it leaves the bench."""
+"""The sequencer: frames taken, retries, refusals, and the bench at the end."""
 
 import errno
 import os
@@ -242,7 +242,7 @@ def test_a_resume_refuses_another_stage_unless_it_is_meant():
     with pytest.raises(AppError, match=r"begun with mask_y on .*, now it is on .* 999") as refused:
         refuse_other_devices(session, of_serial("999"))
     assert refused.value.advice == "other-devices"
-    # Meant, it goes on, and later runs are compared with that one.
+    # Other devices that are meant go on, and later runs are compared with these devices.
     refuse_other_devices(session, of_serial("999"), meant=True)
     again = Session(session.folder, session.disk)
     again.discard(next(iter(again.stored)), "wanted once more")

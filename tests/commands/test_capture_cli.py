@@ -441,7 +441,7 @@ def test_files_of_any_name_are_taken_in_order_where_all_exposures_agree(
 
 
 def started_capture(folder):
-    """Start a capture that takes its time, and return it when it has taken some frames."""
+    """Start a long capture; return its process after a few frames."""
     plan_file(folder, darks={"repeats": 300})
     command = [*PROGRAM, "capture", "plan.yaml", *RIG, "--real-time"]
     process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)

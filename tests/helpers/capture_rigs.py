@@ -1,6 +1,6 @@
 """A rig without time or light: what crash tests run by the hundred.
 
-Every frame is made from its own name, so that two runs of one plan differ in nothing.
+Every frame is made from its own name, so that two runs of a plan are equal.
 """
 
 import hashlib
@@ -82,7 +82,7 @@ class PreparedCamera:
 
 
 class QuietAttendant:
-    """Does what it is asked, and keeps it."""
+    """Keeps every request."""
 
     def __init__(self):
         self.asked = []

@@ -1,4 +1,4 @@
-"""The page of a running capture, and what it does to it: pause, retake, finish."""
+"""The page of a running capture, and its actions: pause, retake, finish."""
 
 import http.client
 import json
@@ -195,7 +195,7 @@ def test_the_first_state_is_not_pushed_again_and_again(tmp_path):
 
 
 class Answering(SessionPage):
-    """A page on which somebody answers each wish, but for a last one at which the capture stops."""
+    """A page on which somebody answers each request, and stops the capture at the last."""
 
     def __init__(self, folder, stop_at=None):
         self.control = Control()

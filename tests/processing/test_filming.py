@@ -109,7 +109,7 @@ def film_metrics(out):
 
 
 def changed_frames(monkeypatch, change):
-    """Let a film's frames be those that `change` makes of them; None leaves one out."""
+    """Let `change` replace the frames of a film; None leaves a frame out."""
     real = filming.film_frames
 
     def frames(*given):

@@ -58,7 +58,7 @@ def frames(tmp_path_factory):
 
 
 def same(result, other):
-    """Assert that two results are equal in all that they say."""
+    """Assert that two results are equal in arrays, figures and words."""
     np.testing.assert_array_equal(result.light_field, other.light_field)
     assert result.maps.keys() == other.maps.keys()
     for name, values in result.maps.items():

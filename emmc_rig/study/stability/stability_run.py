@@ -67,7 +67,7 @@ BREAK_COLUMNS = (
     "scene", "fault", "unit", "repairable", "method", "best_db", "below_best_to", "below_best",
     "below_view_to", "below_view",
 )  # fmt: skip
-"""`..._to`: the strength from which on it is broken; empty: not within the sweep. Then in words."""
+"""`..._to`: the lowest strength that breaks a method; empty: beyond the sweep. Then in words."""
 PANEL_INCHES, COLUMNS = (3.9, 2.75), 3
 FLOOR_DB = 6.0
 """Below the least of the baseline: further down, a curve says nothing more."""
@@ -85,7 +85,7 @@ CAVEATS = (
 
 @dataclass(frozen=True)
 class StabilityOutcome:
-    """What was measured, and the page that shows it. left_out: in words, what is missing, why."""
+    """The measured curves, and their page. left_out: in words, what is missing, why."""
 
     curves: list[Curve]
     left_out: list[str]
@@ -106,7 +106,7 @@ def run_stability(
     scheduler whose workers share them, on a disk shared with them.
 
     Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
-    and the errors of the layers below; what is done is kept in each case.
+    and the errors of the layers below; measured points are kept in each case.
     """
     started = time.perf_counter()
     points = planned(settings)

@@ -124,7 +124,7 @@ class StabilityStudy(Study[Point]):
         }
 
     def group(self, point: Point) -> Hashable:
-        """Return what all methods of one trial have in common."""
+        """Return the trial of a point, which all methods share."""
         return replace(point, method="")
 
     def measured(self, points: Sequence[Point]) -> Results:
