@@ -215,10 +215,10 @@ def calibrate_simulated(
         **found.metrics,
         "camera": settings.camera_name,
         "psi_relative_error": {
-            name: true_error(one.psi, true, good) for name, one in known.items()
+            name: true_error(found.psi, true, good) for name, found in known.items()
         },
-        "psi_stated_error": {name: stated_error(one, good) for name, one in known.items()},
-        "psi_coverage": {name: coverage(one, true, good) for name, one in known.items()},
+        "psi_stated_error": {name: stated_error(found, good) for name, found in known.items()},
+        "psi_coverage": {name: coverage(found, true, good) for name, found in known.items()},
         "design_relative_error": true_error(design, true, good),
         "held_out_frames": held_out,
         "capture_seconds": captured_s,

@@ -10,7 +10,7 @@ Up to `BlockSettings.whole` samples a light field is one block: the method itsel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -55,6 +55,8 @@ SURE_PX, COVERED = 0.25, 99.0
 covers. Fewer readings of a block show surfaces beyond; there it is averaged with its neighbour."""
 
 Array = NDArray[np.floating]
+ArrayType = tuple[tuple[int, ...], np.dtype]
+"""Shape and type of an array."""
 Place = tuple[slice, slice]
 
 
@@ -252,6 +254,13 @@ def samples(size: tuple[int, int], multiple: int) -> list[Place]:
     return [(rows, columns) for rows, columns in product(*along)]
 
 
+def grid_of(
+    psi: PsiLayout, dictionary: Dictionary | None, settings: MethodSettings, halo: int = 0
+) -> Grid:
+    """Return the grid of blocks of a capture; halo: see `Grid`."""
+    return Grid(psi.size, multiple_of(psi.binning, dictionary, settings), halo, settings.blocks)
+
+
 def multiple_of(binning: int, dictionary: Dictionary | None, settings: MethodSettings) -> int:
     """Return of what blocks' edges are multiples: pixels, and the strides of patches.
 
@@ -435,12 +444,35 @@ def summed_up(
     )
 
 
-def judged_block(verdict: Verdict, block: Block, binning: int) -> JudgedBlock:
-    """Return a block's verdict with its place, in pixels of k x k samples."""
-    rows, columns = block.inner
-    samples = (rows.stop - rows.start) * (columns.stop - columns.start)
-    row, column = (part.start // binning for part in block.outer)
-    return JudgedBlock(verdict, row, column, samples // binning**2)
+def verdict_on(grid: Grid, verdicts: Iterable[Verdict | None], binning: int) -> Verdict:
+    """Return the verdict on the whole from the verdicts on its blocks, in the order of the grid.
+
+    verdicts: None for a block without usable pixels. binning: samples along a pixel's side. Raises
+    ReconstructionError where every verdict is None.
+    """
+    judged = []
+    for block, verdict in zip(grid, verdicts, strict=True):
+        if verdict is not None:
+            rows, columns = block.inner
+            samples = (rows.stop - rows.start) * (columns.stop - columns.start)
+            row, column = (part.start // binning for part in block.outer)
+            judged.append(JudgedBlock(verdict, row, column, samples // binning**2))
+    if not judged:
+        raise ReconstructionError("no usable pixel: every one is saturated or excluded")
+    return judged_together(judged)
+
+
+def whole_shapes(grid: Grid, parts: Sequence[Mapping[str, ArrayType]]) -> dict[str, ArrayType]:
+    """Return shape and type of the arrays of the whole that every block has a part of, by name.
+
+    parts: shape and type of the arrays of each block.
+    """
+    shapes = {}
+    for name, (shape, dtype) in parts[0].items():
+        if all(name in part for part in parts):
+            axes = AXES.get(name, 0)
+            shapes[name] = (*shape[:axes], *grid.size, *shape[axes + 2 :]), dtype
+    return shapes
 
 
 def reconstruct_in_blocks(
@@ -460,37 +492,30 @@ def reconstruct_in_blocks(
     if not frames.usable.any():
         raise ReconstructionError("no usable pixel: every one is saturated or excluded")
     survey = surveyed(name, psi, frames, dictionary, settings)
-    multiple = multiple_of(psi.binning, dictionary, settings)
-    grid = Grid(psi.size, multiple, survey.halo, settings.blocks)
-    parts, results, verdicts = {}, [], []
+    grid = grid_of(psi, dictionary, settings, survey.halo)
     frames = survey.applied(frames.of_one_deviation())
+    blocks: dict[str, SolvedBlock] = {}
     for done, block in enumerate(grid, 1):
         seen = pixels_of(block.outer, psi.binning)
-        solved = solve_block(
+        blocks[block.name] = solve_block(
             name, psi.window(*block.outer), frames.cut(seen), block, survey.settings, dictionary
         )
-        parts[block.name] = solved.arrays
-        results.append(solved.result)
-        if solved.verdict is not None:
-            verdicts.append(judged_block(solved.verdict, block, psi.binning))
         if on_step is not None:
             on_step(Progress(done, None, None, len(grid)))
-    arrays = _whole(grid, parts)
-    whole = summed_up(name, results, survey, running_s() - started)
+    solved = list(blocks.values())
+    parts = [
+        {key: (values.shape, values.dtype) for key, values in block.arrays.items()}
+        for block in solved
+    ]
+    everywhere = slice(0, grid.size[0]), slice(0, grid.size[1])
+    arrays: dict[str, Array] = {}
+    for key, (_, dtype) in whole_shapes(grid, parts).items():
+
+        def part(block: Block, at: tuple, key: str = key) -> Array:
+            return blocks[block.name].arrays[key][at]
+
+        arrays[key] = assembled(grid, everywhere, AXES.get(key, 0), dtype, part)
+    whole = summed_up(name, [block.result for block in solved], survey, running_s() - started)
     light_field = arrays.pop("light_field")
-    return replace(whole, light_field=light_field, maps=arrays), judged_together(verdicts)
-
-
-def _whole(grid: Grid, parts: Mapping[str, Mapping[str, Array]]) -> dict[str, Array]:
-    """Return the arrays that all blocks have, by name. parts: by block and name."""
-    first = next(iter(parts.values()))
-    out: dict[str, Array] = {}
-    for name in (key for key in first if all(key in one for one in parts.values())):
-        axes, like = AXES.get(name, 0), first[name]
-
-        def part(block: Block, at: tuple, name: str = name) -> Array:
-            return parts[block.name][name][at]
-
-        everywhere = slice(0, grid.size[0]), slice(0, grid.size[1])
-        out[name] = assembled(grid, everywhere, axes, like.dtype, part)
-    return out
+    verdict = verdict_on(grid, [block.verdict for block in solved], psi.binning)
+    return replace(whole, light_field=light_field, maps=arrays), verdict

@@ -65,7 +65,7 @@ def ask_at_prompt(what: str) -> None:
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """What to capture and where to; rig: see `emmc_rig.bench.rig_config`, None on resuming alike.
+    """A capture as it was asked for. rig: see `emmc_rig.bench.rig_config`; None: the session's.
 
     until_db: the PSNR at which no further shot is taken; None: what the session has, if any.
     other_devices: the session may go on with a camera and stages of other serial numbers.
@@ -118,7 +118,7 @@ def request_from_plan(
 def request_from_session(
     folder: Path, rig: Mapping[str, Any] | None, until_db: float | None, out: Path
 ) -> CaptureRequest:
-    """Return what a session was begun for; out: itself, or for another like it. Raises AppError."""
+    """Return the request that began a session; out: the folder to write. Raises AppError."""
     session = Session(folder)
     plan = validated(Plan, session.plan_data(), str(folder), AppError)
     camera = validated(Camera, session.camera, str(folder), CameraError)
@@ -140,7 +140,7 @@ def still_possible(request: CaptureRequest, session: Session) -> tuple[PlannedFr
 
 
 def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session | None:
-    """Return the session that the request goes on with; None where it is to be begun.
+    """Return the session that the request goes on with; None for a new session.
 
     Raises AppError when the folder is in the way, or frames were taken by another rig.
     """
@@ -356,8 +356,8 @@ def asked_for(
 ) -> CaptureRequest:
     """Return what a plan file asks for, or what a session was begun for; raises AppError.
 
-    folder: of the session. rig: see `rig_description`; a session has its own, and an edited plan
-    for a session that is there keeps it.
+    folder: of the session. rig: see `rig_description`; a session keeps its own rig, also under an
+    edited plan.
     """
     if is_session(plan):
         return request_from_session(plan, rig, until_db, folder)
@@ -426,13 +426,13 @@ def capture(
 
     Args:
         plan: a plan (YAML), or the folder of a session to go on with.
-        rig: what `emmc_rig.rig` returns, or what it takes; a session has its own.
+        rig: of `emmc_rig.rig`, or its argument; a session has its own rig.
         out: folder of the session (default: PLAN-session beside the plan).
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
         other_devices: a session may go on with a camera or stage of another serial number.
         watcher: observes the capture.
         on_event: is called with each event of `emmc_rig.acquisition.events`, as `frame.written` or
-            `shot.done`; one that raises is not called again.
+            `shot.done`; a function that raises is not called again.
         ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
 
     Raises:
@@ -458,6 +458,6 @@ def capture(
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a new file; raises AppError when one of that name is there, or it cannot be."""
+    """Write a new file; raises AppError when the name is taken, or nothing can be written."""
     with new_file(path) as partial:
         partial.write_text(text, encoding="utf-8")

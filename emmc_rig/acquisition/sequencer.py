@@ -139,7 +139,7 @@ class Sequencer:
         """Take what is missing.
 
         Raises AppError with one line, a `DriverError` that mending cannot cure, `OSError` of the
-        disk, or `KeyboardInterrupt`; what was stored until then is kept.
+        disk, or `KeyboardInterrupt`; stored frames are kept in each case.
         """
         self._began_s = time.perf_counter()
         with self._writer, self._bench_left_safe():
@@ -296,7 +296,7 @@ class Sequencer:
         self._watcher.tell(f"taken once more: {', '.join(ids)}")
 
     def _missing_of_shots(self) -> dict[int, set[str]]:
-        """Return by shot which frames of it are still to be taken."""
+        """Return the frames that are missing, by shot."""
         found: dict[int, set[str]] = {}
         for frame in self._session.missing():
             if frame.is_still_shot:
@@ -473,7 +473,7 @@ class Sequencer:
         """Take a film's frames, each at its time; returns False when asked to stop.
 
         A pause, or a fault that is mended, ends a segment: the film goes on at its next place in
-        another one. What is missing before the last frame stored cannot be made up for.
+        a new segment. Frames missing before the last stored frame stay missing.
         """
         self._writer.flush()
         session = self._session
@@ -787,7 +787,7 @@ class Sequencer:
             self._budget.spend(name, DriverError(fault), 1)
 
     def _discard_damaged(self, ids: set[str]) -> dict[str, str]:
-        """Read files again; returns, by id, what is wrong with those that no longer count."""
+        """Read files again; return the faults of damaged files, which no longer count, by id."""
         session = self._session
         planned = {frame.id for frame in session.frames} & ids
         entries = [entry for name, entry in session.stored.items() if name in planned]

@@ -2,8 +2,8 @@
 
 Everything but the shots comes first, so that Psi of every planned shot is known: measured, or by
 the parametric fit. Then shots are taken one by one, in the order of the plan. After each the light
-field so far is reconstructed; its own deviation says what PSNR to expect, and what is decided is
-journalled before it is acted on, so that a resume goes on with it.
+field so far is reconstructed; its estimated deviation gives the expected PSNR. Each decision is
+journalled before the next frame, so that a resumed capture follows it.
 """
 
 from __future__ import annotations

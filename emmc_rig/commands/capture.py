@@ -239,7 +239,7 @@ def _page(
 ) -> Iterator[Watcher]:
     """Serve the page of a capture, and say where, until the block ends; yield its watcher.
 
-    other: another watcher of the capture, which that watcher passes all on to.
+    other: gets every event before the page.
     """
     from emmc_rig.acquisition.events import DISPLAYED, Listener
     from emmc_rig.live.server import (

@@ -258,7 +258,7 @@ class SessionPage(Watcher):
         self._publish(wish=words, held=self._control.paused)
 
     def _answer(self, number: int) -> None:
-        """Go on; not where another wish than the one with that number stands by now."""
+        """Go on, unless the page asks for another work by now; number: of the work answered."""
         with self._changed:
             asked = self._state["asked"]
             if asked is not None and asked["number"] == number:

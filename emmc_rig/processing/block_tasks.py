@@ -42,21 +42,22 @@ from reconstruction.methods import MethodSettings, find_method
 from reconstruction.result import Reconstruction, Status, stated_figures
 from reconstruction.tiles import (
     AXES,
+    ArrayType,
     Block,
     CaptureSurvey,
     Grid,
     Place,
     SolvedBlock,
     assembled,
-    judged_block,
-    multiple_of,
+    grid_of,
     pixels_of,
     solve_block,
     summed_up,
     surveyed,
+    verdict_on,
+    whole_shapes,
     within,
 )
-from reconstruction.verdict.blocks import judged_together
 from reconstruction.verdict.evidence import Evidence
 from reconstruction.verdict.rules import Verdict, verdict_from
 
@@ -146,7 +147,7 @@ def _write(path: Path, arrays: Mapping[str, NDArray], about: Mapping[str, Any]) 
 
 
 def _read(path: Path, digest: str) -> dict[str, Any] | None:
-    """Return the figures of a block's file; None where it is missing, damaged or of another job."""
+    """Return the figures of a block's file; None for a missing or damaged file, or another job."""
     try:
         with stored_arrays(path, AppError, REMEDY) as stored:
             for name in map(str, stored.file):
@@ -327,30 +328,19 @@ class Blocks:
         return summed_up(self.job.method, results, self.survey, self.seconds)
 
     def verdict(self) -> Verdict:
-        """Return the verdict on all blocks; raises AppError where none could be judged."""
-        judged = [
-            judged_block(done.verdict, block, self.job.psi.binning)
-            for block, done in zip(self.grid, self.done, strict=True)
-            if done.verdict is not None
-        ]
-        if not judged:
-            raise AppError("no usable pixel: every one is saturated or excluded")
-        return judged_together(judged)
+        """Return the verdict on all blocks; raises ReconstructionError without usable pixels."""
+        verdicts = [done.verdict for done in self.done]
+        return verdict_on(self.grid, verdicts, self.job.psi.binning)
 
-    def shapes(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    def shapes(self) -> dict[str, ArrayType]:
         """Return shape and type of the arrays of the whole, by name, which all blocks have."""
-        every: list[dict[str, tuple[tuple[int, ...], np.dtype]]] = []
+        every: list[dict[str, ArrayType]] = []
         for block in self.grid:
             with stored_arrays(self.job.kept / f"{block.name}.h5", AppError, REMEDY) as stored:
                 names = (str(name) for name in stored.file if name != ABOUT)
                 parts = {name: stored.dataset(name) for name in names}
                 every.append({name: (part.shape, part.dtype) for name, part in parts.items()})
-        whole = {}
-        for name, (shape, dtype) in every[0].items():
-            if all(name in arrays for arrays in every):
-                axes = AXES.get(name, 0)
-                whole[name] = (*shape[:axes], *self.grid.size, *shape[axes + 2 :]), dtype
-        return whole
+        return whole_shapes(self.grid, every)
 
     def write(self, name: str, out: Any) -> None:
         """Write an array of the whole into an array or dataset, blocks in a fixed order."""
@@ -395,21 +385,14 @@ def shard_task(task: ShardTask, out: Any = None) -> None:
     array[(slice(None),) * axes + task.place] = values
 
 
-def compute_blocks(
-    job: BlockJob,
-    frames: Frames,
-    pool: Pool,
-    watcher: Watcher,
-) -> Blocks:
+def compute_blocks(job: BlockJob, frames: Frames, pool: Pool, watcher: Watcher) -> Blocks:
     """Return the blocks of a capture, computed by a pool, those done before left as they are.
 
-    watcher: gets the blocks done. Raises WorkersError, AppError, and what
-    a block raises.
+    watcher: gets the blocks done. Raises WorkersError, AppError, and what a block raises.
     """
     started = running_s()
     psi, dictionary = job.psi, job.opened_dictionary()
-    multiple = multiple_of(psi.binning, dictionary, job.settings)
-    grid = Grid(psi.size, multiple, 0, job.settings.blocks)
+    grid = grid_of(psi, dictionary, job.settings)
     pool.fit(task_bytes(psi, grid))
     survey = _surveyed(job, frames, pool, len(grid) == 1, watcher)
     grid = replace(grid, halo=survey.halo)

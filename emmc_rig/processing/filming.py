@@ -78,14 +78,14 @@ from reconstruction.verdict.run import reconstruct_judged
 
 ABOUT = "plain"
 DONE = "[0-9]*"
-"""The folders of frames that are done; others are of frames that are being written, or were."""
+"""Names of frames that are done; partial folders have other names."""
 DAMAGED = (
     OSError, ValueError, LookupError, TypeError, EOFError, MemoryError, zlib.error, BadZipFile,
     ReconstructionError, SensingError,
 )  # fmt: skip
-"""What reading a damaged file of an earlier run raises, or one that is not there."""
+"""Errors of reading a damaged or missing file of an earlier run."""
 FOLLOWS = {"new_share", "moved_px"}
-"""Parameters of frames that go on from those before, by masks that rest and that step."""
+"""Parameters of frames that follow an earlier frame, with masks at rest and stepping masks."""
 FILM_TAKES = "an array (t, pixel_y, pixel_x), or an iterable of Frames of one shot each"
 
 
@@ -145,7 +145,7 @@ def _save(path: Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray]) -
 
 
 def _open(path: Path) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Return plain data and arrays; raises one of DAMAGED, also where there are none."""
+    """Return plain data and arrays; raises one of DAMAGED, also for a missing file."""
     with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
     return parse_json(str(arrays[ABOUT]), str(path), ValueError), arrays
@@ -160,7 +160,7 @@ def reconstruct_film(
     settings: MethodSettings | Mapping[str, Any] | None = None,
     on_step: OnStep | None = None,
 ) -> Iterator[Result]:
-    """Return the light fields of a film's frames, one by one as they are asked for.
+    """Yield the light field of each frame of a film, computed when the caller asks for it.
 
     Each goes on from what the frames before it showed. After a cut or a pause call it again.
 
@@ -266,7 +266,7 @@ class FilmJob:
 
 @dataclass(frozen=True)
 class SegmentTask:
-    """A segment of a film: its number, and its places in time, also of frames that are missing."""
+    """A segment of a film. places: in time, of dropped frames too."""
 
     job: FilmJob
     number: int
@@ -418,7 +418,7 @@ def _workers(
     memory: int | None,
     watcher: Watcher,
 ) -> Iterator[Pool | None]:
-    """Yield the workers that share segments; None where this process does them all."""
+    """Yield the workers that share segments; None: this process computes every segment."""
     if segments == 1 and (cluster is not None or (workers or 1) > 1):
         watcher.tell(
             "one segment, which workers cannot share: the setting film: {segment: 50} makes "
@@ -436,7 +436,7 @@ def _workers(
 
 
 def _linked(path: str | Path, place: str | Path) -> None:
-    """Give a file another name, which stays when the first goes; it moves where it can have one."""
+    """Link a file to a second name; move the file where the disk has no links."""
     try:
         os.link(path, place)
     except OSError:  # a file system without links, as on a memory stick

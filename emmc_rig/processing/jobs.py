@@ -35,7 +35,7 @@ class Store(Generic[Result, Kept]):
     """What is kept of a job, by name."""
 
     def get(self, name: str) -> Kept | None:
-        """Return what is kept under a name; None where nothing is, or it is damaged."""
+        """Return the kept result of a name; None for a missing or damaged result."""
         raise NotImplementedError
 
     def add(self, name: str, result: Result) -> Kept:
@@ -59,7 +59,7 @@ def run_job(
     stage: str = "",
     words: Callable[[str, Kept], str] = lambda name, kept: "",
 ) -> dict[str, Kept]:
-    """Do what the store does not have; return what is kept of all, by name.
+    """Compute the results that the store lacks; return all results as the store keeps them.
 
     Args:
         names: of all results, each once.
@@ -140,8 +140,8 @@ def _repeated(call: Callable[[], None]) -> Iterator[None]:
 def kept_words(out: Path, what: Callable[[], str]) -> Iterator[None]:
     """Word Ctrl-C and a full disk within the block: raise StoppedError or AppError.
 
-    out: the folder to name. what: what is kept there, with its verb; "": nothing is yet, and
-    Ctrl-C stays a KeyboardInterrupt.
+    out: the folder to name. what: returns the kept results and a verb; "": nothing is kept yet,
+    and Ctrl-C stays a KeyboardInterrupt.
     """
     try:
         yield

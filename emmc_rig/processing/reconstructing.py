@@ -66,7 +66,7 @@ LARGEST_READING = 8.0
 CODES, FEW_CODES = 255, 32
 """Of pictures of 8 bits; fewer different ones may be a drawing in readings."""
 Place = tuple[Capture, Path]
-"""A capture, and the folder to write: in a session only the one it has for this."""
+"""A capture, and the folder of its result; a session has a single folder for results."""
 
 
 def reconstruct(
@@ -84,7 +84,7 @@ def reconstruct(
 
     Args:
         psi: the imaging matrix of the camera that took the frames.
-        frames: what `Camera.expose`, `open_frames` or `frames` return, or an array (shot, pixel_y,
+        frames: of `Camera.expose`, `open_frames` or `frames`, or an array (shot, pixel_y,
             pixel_x) of readings, such as `psi @ scene`.
         method: a name that `emmc-rig reconstruct --list` lists.
         noise_sigma: standard deviation of the readings, all alike. By default that of the frames;
@@ -178,7 +178,7 @@ def as_frames(
     if not (isinstance(usable, np.ndarray) and usable.dtype.kind == "b"):
         raise refusal(usable, "usable", "a boolean array (shot, pixel_y, pixel_x)")
     if usable.shape == taken.shape:
-        # Why they are not to be used is not known: not that there was at least so much light.
+        # Unknown reason: the readings are no lower bound of the light, unlike saturated readings.
         taken = replace(taken, readings=np.where(usable, taken.readings, 0))
     return replace(taken, usable=usable)
 
@@ -240,8 +240,8 @@ def reconstruct_undrawn(
 ) -> tuple[dict, Callable[..., None] | None]:
     """Reconstruct a capture's frames into an existing folder `out`, all but the page.
 
-    Returns the metrics, and what writes the page, given its folder: None of a light field that is
-    too large for one.
+    Returns the metrics, and what writes the page, given its folder: None for a light
+    field too large for a page.
 
     A light field of more than one block, see `reconstruction.tiles`, is computed by the pool, from
     what an earlier run left of it. dictionary_spec: see `open_dictionary`. truth: the scene that
@@ -373,9 +373,9 @@ def reconstruct_captures(
     watcher: Watcher,
     **given: Any,
 ) -> Iterator[tuple[Place, dict | Exception]]:
-    """Yield each capture with its metrics, or with what it failed by, in the order they are done.
+    """Yield each capture with its metrics, or with its error, in the order of completion.
 
-    workers: processes; None and one capture that is one block: this process and its threads.
+    workers: processes; None, for a single capture of a single block: threads of this process.
     memory: bytes of all processes together, kept by computing less at a time. watcher: gets the
     steps of a single capture, or the captures done. given: see `reconstruct_undrawn`.
     Raises WorkersError, and AppError for a ceiling that is too low.
@@ -443,7 +443,7 @@ def open_frames(
     """Return Psi and the frames of a folder: a session, a result, or what `simulate` wrote.
 
     psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, its
-    calibration, which is measured and stored there first where there is none). frame: of a
+    calibration, measured and stored first if need be). frame: of a
     session's film, by its place in time from 0. Raises AppError, SensingError, CalibrationError, or
     ArgumentError for what is no path.
     """
@@ -466,7 +466,7 @@ def open_frames(
 def _without(frames: Frames, shots: Sequence[int]) -> Frames:
     """Return frames of which some shots, counted from 1, are not used.
 
-    Raises AppError where there is no such shot, or none would be left.
+    Raises AppError for unknown shots, and where every shot would be left out.
     """
     count = len(frames.readings)
     wrong = [shot for shot in shots if not 1 <= shot <= count]

@@ -105,8 +105,8 @@ class SessionCalibration:
         """Return the readings of raw frames by these whiteboards, with deviations.
 
         dn: (shot, pixel_y, pixel_x), of the shots of Psi. exposures_s: of all, or of each, in the
-        unit of the whiteboards' exposures. Raises ReconstructionError for another shape, and
-        ArgumentError for what are no numbers.
+        unit of the whiteboards' exposures. Raises ReconstructionError for another shape,
+        ArgumentError for values other than numbers.
         """
         taken = numbers_of(dn, "dn", "raw values, an array (shot, pixel_y, pixel_x)")
         check_frames(self.psi.frames_shape, taken)
@@ -270,11 +270,11 @@ def outcome_figures(outcome: Outcome) -> dict:
         "unwatched": list(outcome.unwatched),
         "held_out": {
             name: {
-                "chi2": one.chi2,
-                "relative_error": one.relative_error,
-                "chi2_by_kind": dict(one.groups),
+                "chi2": judged.chi2,
+                "relative_error": judged.relative_error,
+                "chi2_by_kind": dict(judged.groups),
             }
-            for name, one in outcome.judged.items()
+            for name, judged in outcome.judged.items()
         },
         "frames": dict(outcome.frames),
         "bad_pixels": float(1 - outcome.good.mean()),
@@ -314,7 +314,7 @@ def _fit_figures(outcome: Outcome) -> dict[str, object]:
         "steps": fit.steps,
         "status": fit.status,
         "undecided": list(fit.undecided),
-        "boards": [asdict(one) for one in fit.boards],
+        "boards": [asdict(board) for board in fit.boards],
     }
 
 

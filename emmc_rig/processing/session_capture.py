@@ -78,8 +78,8 @@ class SessionCapture:
     def scale(self, psi: Path | None, watcher: Watcher | None = None) -> Scale:
         """Return what makes readings of the frames.
 
-        psi: of another calibration, whose whiteboards then scale the readings; darks are those of
-        this session, if it has darks. Raises AppError for a calibration of other frames.
+        psi: of another calibration, whose whiteboards then scale the readings, with the darks of
+        this session, if any. Raises AppError for a calibration of other frames.
         """
         if psi is None or not (psi.parent / CALIBRATION_FILE).is_file():
             return calibrated_scale(self.session, watcher)

@@ -147,7 +147,11 @@ def _groups(
     version = session.header["versions"]["emmc-rig"]
     noted = session.notes
     beside = [line.temperatures_c | line.environment for line in lines]
-    read = {name: [one.get(name, np.nan) for one in beside] for one in beside for name in one}
+    read = {
+        name: [values.get(name, np.nan) for values in beside]
+        for values in beside
+        for name in values
+    }
     detector = {
         "count_time": [line.exposure_s for line in lines],
         "gain": [line.gain for line in lines],

@@ -39,8 +39,8 @@ class NotApplicableError(AppError):
 def study_folder(out: Path, journal: str, command: str) -> Iterator[Path]:
     """Yield the folder of a study, created where missing; it outlives interruptions of the block.
 
-    command: as typed, such as "chart". What is drawn and written of the points is replaced later by
-    `result_folder`; what that would refuse is refused here, before anything is measured.
+    command: as typed, such as "chart". Charts and tables of the points are replaced later by
+    `result_folder`; files that it would refuse are refused before the first point is measured.
 
     Raises AppError when the folder holds something else, or results that were edited, where a
     session is, and where nothing can be written; StoppedError at Ctrl-C.

@@ -26,7 +26,7 @@ def plain(result: Mapping[str, object]) -> dict:
 
 
 def described(point: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as plain data; of its capture what identifies it."""
+    """Return the fields of a dataclass as plain data; a capture as its identity."""
     values = {each.name: getattr(point, each.name) for each in fields(point)}
     if "capture" in values:
         values["capture"] = values["capture"].identity()

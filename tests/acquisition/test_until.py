@@ -165,9 +165,9 @@ def test_it_is_calibrated_reconstructed_and_exported_with_the_shots_it_has(enoug
 
 def test_shots_follow_in_the_order_of_the_plan_while_the_target_is_not_stated(every):
     taken = decided(Session(every))
-    assert [one.shots for one in taken] == [[0], [0, 1], [0, 1, 2]]
-    assert [one.next for one in taken] == [1, 2, None]
-    assert all(one.stated_db < one.target_db for one in taken)
+    assert [entry.shots for entry in taken] == [[0], [0, 1], [0, 1, 2]]
+    assert [entry.next for entry in taken] == [1, 2, None]
+    assert all(entry.stated_db < entry.target_db for entry in taken)
 
 
 def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, tmp_path):
@@ -262,7 +262,7 @@ def test_a_capture_that_cannot_spare_shots_says_why_and_makes_nothing(
     code, _, err = program("capture", path, *RIG, "--until", until, "--out", tmp_path / "s")
     assert code == (2 if "write a PSNR" in line else 1)
     assert line in one_line(err)
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["camera.yaml", "plan.yaml"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["camera.yaml", "plan.yaml"]
 
 
 def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cost():

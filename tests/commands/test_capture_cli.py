@@ -68,8 +68,8 @@ def test_two_captures_of_one_plan_are_the_same_byte_for_byte(captured):
     assert "62 frames to take, about" in err
     assert "saturated" not in err  # progress is for a terminal
     assert "\x1b" not in err
-    one, other = (contents(captured / name) for name in ("plan-session", "again"))
-    assert one == other
+    first, other = (contents(captured / name) for name in ("plan-session", "again"))
+    assert first == other
 
 
 def contents(folder):
@@ -175,7 +175,7 @@ def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured,
     with h5py.File("x.h5") as file:
         entry: Any = file[file.attrs["default"]]
         kinds = {}
-        entry.visititems(lambda name, one: kinds.update({name: one.attrs.get("NX_class")}))
+        entry.visititems(lambda name, group: kinds.update({name: group.attrs.get("NX_class")}))
         assert entry.attrs["NX_class"] == "NXentry"
         assert kinds["instrument/detector"] == "NXdetector"
         assert kinds["instrument/mask"] == "NXpositioner"
@@ -441,7 +441,7 @@ def test_files_of_any_name_are_taken_in_order_where_all_exposures_agree(
 
 
 def started_capture(folder):
-    """Start a capture that takes its time, and return it when it has taken some frames."""
+    """Start a long capture; return its process after a few frames."""
     plan_file(folder, darks={"repeats": 300})
     command = [*PROGRAM, "capture", "plan.yaml", *RIG, "--real-time"]
     process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
@@ -482,10 +482,10 @@ def test_sessions_are_listed_with_verdict_and_psnr_below_a_folder(captured, run,
     reported = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
     (results / "metrics.json").write_text(json.dumps(reported))
     _, out, _ = run("session", "list", tmp_path, "--json")
-    one, two = json.loads(out.splitlines()[-1])["sessions"]
-    assert (one["name"], one["verdict"], one["stated_db"]) == ("one", "doubt", 27.5)
+    first, two = json.loads(out.splitlines()[-1])["sessions"]
+    assert (first["name"], first["verdict"], first["stated_db"]) == ("one", "doubt", 27.5)
     assert (two["name"], two["verdict"], two["stated_db"]) == ("two", "", None)
-    assert one["camera"] == PLAN["camera"]
+    assert first["camera"] == PLAN["camera"]
     _, out, _ = run("session", "list", tmp_path)
     assert "a/one" in out
     assert "27.5" in out

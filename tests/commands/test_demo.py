@@ -1,4 +1,4 @@
-"""The whole loop, end to end: no step of it inverts the operator that made its data."""
+"""The whole loop, end to end, without inverting the operator that made the data."""
 
 import json
 import os

@@ -79,10 +79,12 @@ def test_psi_in_shards_gives_the_bytes_of_psi_in_a_file(frames, tmp_path, monkey
     ]  # fmt: skip
     weights = zarr.open_group(sharded / "psi.zarr", mode="r")["weights"]
     assert weights.shards == (1, 5, 5, 32, 1, 32)
-    results = [reconstructed(one, tmp_path / f"from-{one.name}") for one in (frames, sharded)]
+    results = [
+        reconstructed(folder, tmp_path / f"from-{folder.name}") for folder in (frames, sharded)
+    ]
     assert results[0]["psi_sha256"] == results[1]["psi_sha256"]
-    one, two = (tmp_path / f"from-{name}/light_field.h5" for name in ("frames", "sharded"))
-    assert one.read_bytes() == two.read_bytes()
+    from_frames, two = (tmp_path / f"from-{name}/light_field.h5" for name in ("frames", "sharded"))
+    assert from_frames.read_bytes() == two.read_bytes()
     whole, _ = open_frames(sharded)
     np.testing.assert_array_equal(whole.weights, open_frames(frames)[0].weights)
 

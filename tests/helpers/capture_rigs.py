@@ -1,6 +1,6 @@
 """A rig without time or light: what crash tests run by the hundred.
 
-Every frame is made from its own name, so that two runs of one plan differ in nothing.
+Every frame is made from its own name, so that two runs of a plan are equal.
 """
 
 import hashlib
@@ -82,7 +82,7 @@ class PreparedCamera:
 
 
 class QuietAttendant:
-    """Does what it is asked, and keeps it."""
+    """Keeps every request."""
 
     def __init__(self):
         self.asked = []
@@ -104,7 +104,7 @@ class QuietAttendant:
 
     @property
     def lamp(self):
-        return [one[1] for one in self.asked if one[0] == "lamp"][-1]
+        return [asked[1] for asked in self.asked if asked[0] == "lamp"][-1]
 
 
 def stops_after(frame_id, control):

@@ -1,4 +1,4 @@
-"""A Dask cluster computes the blocks: the same bytes as here, and one line where it cannot."""
+"""A Dask cluster computes the blocks: the same bytes as a local run, and faults in a line."""
 
 import errno
 import json

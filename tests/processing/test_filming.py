@@ -101,7 +101,7 @@ def content(out):
 def without_times(part):
     if isinstance(part, dict):
         return {name: without_times(value) for name, value in part.items() if name not in TIMES}
-    return [without_times(one) for one in part] if isinstance(part, list) else part
+    return [without_times(value) for value in part] if isinstance(part, list) else part
 
 
 def film_metrics(out):
@@ -109,7 +109,7 @@ def film_metrics(out):
 
 
 def changed_frames(monkeypatch, change):
-    """Let a film's frames be those that `change` makes of them; None leaves one out."""
+    """Let `change` replace the frames of a film; None leaves a frame out."""
     real = filming.film_frames
 
     def frames(*given):
@@ -135,7 +135,9 @@ def test_every_frame_has_its_result_at_its_time(session, whole):
         assert metrics["frame"] == place
         assert frame.light_field.shape == (5, 5, 40, 48, 3)
         assert ("new_share" in metrics["parameters"]) == (place not in {0, *about["begun_anew"]})
-    assert about["verdicts"] == about["verdicts"] | {one: verdicts.count(one) for one in verdicts}
+    assert about["verdicts"] == about["verdicts"] | {
+        level: verdicts.count(level) for level in verdicts
+    }
     assert about["trusted_share"] == verdicts.count("trust") / FRAMES
     assert sum(about["verdicts"].values()) == FRAMES
     assert about["missing"] == []
@@ -328,14 +330,14 @@ def shared(session, out, pool, monkeypatch, **more):
 
 
 def test_a_segment_begins_as_a_first_frame_does(session, whole, in_two, tmp_path, run):
-    anew = [film_metrics(one)["begun_anew"] for one in (in_two, whole)]
+    anew = [film_metrics(out)["begun_anew"] for out in (in_two, whole)]
     assert [place for place in anew[0] if place < 4] == [place for place in anew[1] if place < 4]
     code, _, err = run("reconstruct", session, "--frame", 4, "--method", METHOD, "--out", tmp_path)
     assert code == 0, err
     names = [f"frames/{place:06d}/light_field.h5" for place in (3, 4, 5)]
     alone = load_hdf5(tmp_path / "light_field.h5")
     np.testing.assert_array_equal(load_hdf5(in_two / names[1]), alone)
-    before, _, last = ((in_two / one, whole / one) for one in names)
+    before, _, last = ((in_two / name, whole / name) for name in names)
     assert before[0].read_bytes() == before[1].read_bytes()
     assert last[0].read_bytes() != last[1].read_bytes()
 
@@ -463,11 +465,11 @@ def test_without_a_deviation_it_is_the_sensors_at_the_exposure_of_each_shot(psi)
 
 
 def test_frames_with_deviations_are_taken_one_by_one(psi):
-    one = (of_readings(part) for part in readings(psi, 3))
-    asked = emmc.reconstruct_film(psi, one, METHOD)
+    film = (of_readings(part) for part in readings(psi, 3))
+    asked = emmc.reconstruct_film(psi, film, METHOD)
     first = next(asked)
     assert first.light_field.shape == (5, 5, 24, 32, 3)
-    assert len(list(one)) == 2, "no frame is read before it is asked for"
+    assert len(list(film)) == 2, "no frame is read before it is asked for"
 
 
 @pytest.mark.parametrize("wrong", [3, Frames(*(np.ones((2, 24, 32), dtype=t) for t in "ff?"))])
@@ -493,8 +495,8 @@ def test_settings_of_films_reach_the_frames_after_the_first(psi, steps, changed)
     given = masks, readings(masks, 3, step=0), METHOD
     usual, other = (
         [
-            one.light_field
-            for one in emmc.reconstruct_film(*given, noise_sigma=0.003, settings=settings)
+            result.light_field
+            for result in emmc.reconstruct_film(*given, noise_sigma=0.003, settings=settings)
         ]
         for settings in ({"film": {"earlier": 2}}, {"film": changed})
     )
@@ -533,11 +535,11 @@ def test_settings_of_films_that_cannot_be_are_refused_in_a_line(psi, wrong, what
 
 def test_memory_does_not_grow_with_the_number_of_frames(psi):
     """Results that were kept would grow it by ten light fields, frames by five times the film."""
-    one, latest, settings = psi.of_shots([0]), filming.Latest(), MethodSettings()
+    of_shot, latest, settings = psi.of_shots([0]), filming.Latest(), MethodSettings()
     carried, held, light_field = [], [], 5 * 5 * 24 * 32 * 3 * 4
     tracemalloc.start()
-    for part in readings(one, 12):
-        _, latest = latest.next(one, 0, of_readings(part), METHOD, settings)
+    for part in readings(of_shot, 12):
+        _, latest = latest.next(of_shot, 0, of_readings(part), METHOD, settings)
         carried.append(sum(array.nbytes for array in latest.film.arrays().values()))
         gc.collect()
         held.append(tracemalloc.get_traced_memory()[0])

@@ -57,19 +57,19 @@ def frames(tmp_path_factory):
     return folder
 
 
-def same(one, other):
-    """Assert that two results are equal in all that they say."""
-    np.testing.assert_array_equal(one.light_field, other.light_field)
-    assert one.maps.keys() == other.maps.keys()
-    for name, values in one.maps.items():
+def same(result, other):
+    """Assert that two results are equal in arrays, figures and words."""
+    np.testing.assert_array_equal(result.light_field, other.light_field)
+    assert result.maps.keys() == other.maps.keys()
+    for name, values in result.maps.items():
         np.testing.assert_array_equal(values, other.maps[name])
-    np.testing.assert_array_equal(one.misfit, other.misfit)
+    np.testing.assert_array_equal(result.misfit, other.misfit)
     for name in ("method", "status", "advice", "seconds", "stated_db", "stated_interval_db",
                  "dictionary", "view_axes"):  # fmt: skip
-        assert getattr(one, name) == getattr(other, name), name
-    assert one.verdict.words == other.verdict.words
-    assert json.dumps(one.verdict.as_dict()) == json.dumps(other.verdict.as_dict())
-    assert repr(one) == repr(other)
+        assert getattr(result, name) == getattr(other, name), name
+    assert result.verdict.words == other.verdict.words
+    assert json.dumps(result.verdict.as_dict()) == json.dumps(other.verdict.as_dict())
+    assert repr(result) == repr(other)
 
 
 def test_a_saved_result_opens_as_it_was(result, saved, tmp_path):
@@ -179,15 +179,15 @@ def test_a_frame_of_a_film_opens_with_the_psi_of_its_shot(result, tmp_path):
     second = result.psi.of_shots([1], "")
     taken = emmc.Frames(*(getattr(result.frames, name)[1:] for name in
                           ("readings", "deviation", "usable")))  # fmt: skip
-    one = emmc.reconstruct(second, taken, "adaptive-fast")
+    result = emmc.reconstruct(second, taken, "adaptive-fast")
     of_film = {"frame": 3, "time_s": 0.5, "segment": 0, "shot": 2}
-    one.write(place, {**one.metrics(), **of_film})
+    result.write(place, {**result.metrics(), **of_film})
     times_s = [0.0, 0.2, 0.4, 0.5]
     write_metrics(film, {"film": {"frames": 4, "rate": 5.0, "times_s": times_s}})
     opened = emmc.open_result(place)
-    same(opened, one)
+    same(opened, result)
     np.testing.assert_array_equal(opened.frames.readings, taken.readings)
-    assert np.array_equal(open_film(film).opened(3).light_field, one.light_field)
+    assert np.array_equal(open_film(film).opened(3).light_field, result.light_field)
     with pytest.raises(AppError, match=r"a film; open a frame of it"):
         emmc.open_result(film)
 

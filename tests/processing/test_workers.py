@@ -126,8 +126,8 @@ def test_a_capture_of_one_block_comes_out_as_without_workers(place):
         settings = load_settings(place / "none.yaml")
         capture = opened_capture(place / "frames")
         reconstruct_undrawn(capture, new, "adaptive-fast", settings=settings)
-    one, shared = (load_hdf5(place / out / "light_field.h5") for out in ("one", "shared"))
-    np.testing.assert_array_equal(one, shared)
+    alone, shared = (load_hdf5(place / out / "light_field.h5") for out in ("one", "shared"))
+    np.testing.assert_array_equal(alone, shared)
 
 
 def command(place, out, *more):

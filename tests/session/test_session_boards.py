@@ -104,8 +104,8 @@ def test_every_whiteboard_goes_to_what_takes_it(session):
     assert names(session, boards.pinholes) == pinholes
     assert names(session, boards.held_out) == ["held-out-2"]
     assert names(session, whiteboards(session)) == pinholes
-    assert [one.stage_um for one in boards.fit.frames[:2]] == [(0, 0), (24, -12)]
-    assert [one.pinhole for one in boards.fit.frames] == [None, None, (2, 2), (0, 1)]
+    assert [frame.stage_um for frame in boards.fit.frames[:2]] == [(0, 0), (24, -12)]
+    assert [frame.pinhole for frame in boards.fit.frames] == [None, None, (2, 2), (0, 1)]
     (turned,) = boards.turned.items()
     assert turned[0] == 90
     (seen,) = turned[1].frames
@@ -128,10 +128,10 @@ def test_checks_are_the_references_and_what_is_seen_again_above_its_dark(session
     assert boards.fit is not None
     checks = boards.fit.checks
     # Two references, two of each response, two of the lamp, two references at the end.
-    assert [one.masks_in for one in checks].count(True) == 2
+    assert [check.masks_in for check in checks].count(True) == 2
     assert len(checks) == 2 + 3 * 2 + 2 + 2
     # At 0.02 s a third of the way from the dark of 0.01 s to that of 0.04 s.
-    darks = {one.exposure_s: float(one.mean_dn[0, 0]) for one in session_darks(session)}
+    darks = {dark.exposure_s: float(dark.mean_dn[0, 0]) for dark in session_darks(session)}
     dark = darks[0.01] + (darks[0.04] - darks[0.01]) / 3
     above = levels(session)["reference-s0-white-r0"] - dark
     assert checks[0].above_dn == pytest.approx((np.nan,) * 3 + (above,), abs=1e-3, nan_ok=True)
@@ -148,7 +148,10 @@ def test_a_plan_with_turned_boards_alone_has_no_others_and_one_with_none_is_refu
 
 
 def test_darks_are_means_of_one_exposure_each_the_shortest_first(session):
-    assert [(one.exposure_s, one.count) for one in session_darks(session)] == [(0.01, 2), (0.04, 2)]
+    assert [(dark.exposure_s, dark.count) for dark in session_darks(session)] == [
+        (0.01, 2),
+        (0.04, 2),
+    ]
     assert mean_dark(session).exposure_s == 0.01
 
 

@@ -320,11 +320,11 @@ def test_a_line_with_any_flipped_bit_does_not_count():
 
 def test_a_line_after_a_torn_one_is_read(tmp_path):
     path = tmp_path / "j"
-    one, two, three = (RetryEntry(id="a", fault="x", attempt=n) for n in (1, 2, 3))
-    path.write_bytes(encode_line(one) + encode_line(two)[:-9])
+    first, two, three = (RetryEntry(id="a", fault="x", attempt=n) for n in (1, 2, 3))
+    path.write_bytes(encode_line(first) + encode_line(two)[:-9])
     Journal(SYSTEM_DISK, path).append(three)
     again = Journal(SYSTEM_DISK, path)
-    assert again.entries == [one, three]
+    assert again.entries == [first, three]
     assert again.unreadable == 1
 
 

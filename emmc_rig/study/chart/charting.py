@@ -146,9 +146,9 @@ def _head(chart: Chart | None) -> Head:
         f"{best.configuration.label} is the most accurate",
         f"{chart.title}: {_accuracy(chart, best)}",
         [
-            f"in {one.seconds:.3g} s: {one.configuration.label}, "
-            f"{best.psnr_db - one.psnr_db:.2f} dB less"
-            for one in reversed(quicker)
+            f"in {mark.seconds:.3g} s: {mark.configuration.label}, "
+            f"{best.psnr_db - mark.psnr_db:.2f} dB less"
+            for mark in reversed(quicker)
         ]
         + [f"use it: `emmc-rig reconstruct FRAMES --method {best.configuration.method}`"],
     )
@@ -212,7 +212,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class ChartOutcome:
-    """What was measured, and its page. left_out: what is missing and why, in words."""
+    """The measured charts, and their page. left_out: what is missing and why, in words."""
 
     charts: list[Chart]
     left_out: list[str]
@@ -228,7 +228,7 @@ def run_chart(settings: ChartSettings, out: Path, watcher: Watcher) -> ChartOutc
     """Measure into a folder that outlives interruptions, and write everything.
 
     Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
-    and the errors of the layers below; what is done is kept in each case.
+    and the errors of the layers below; measured points are kept in each case.
     """
     started = time.perf_counter()
     check_scene_names(settings.scenes)

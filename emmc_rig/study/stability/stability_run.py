@@ -67,7 +67,7 @@ BREAK_COLUMNS = (
     "scene", "fault", "unit", "repairable", "method", "best_db", "below_best_to", "below_best",
     "below_view_to", "below_view",
 )  # fmt: skip
-"""`..._to`: the strength from which on it is broken; empty: not within the sweep. Then in words."""
+"""`..._to`: the lowest strength that breaks a method; empty: beyond the sweep. Then in words."""
 PANEL_INCHES, COLUMNS = (3.9, 2.75), 3
 FLOOR_DB = 6.0
 """Below the least of the baseline: further down, a curve says nothing more."""
@@ -85,7 +85,7 @@ CAVEATS = (
 
 @dataclass(frozen=True)
 class StabilityOutcome:
-    """What was measured, and the page that shows it. left_out: in words, what is missing, why."""
+    """The measured curves, and their page. left_out: in words, what is missing, why."""
 
     curves: list[Curve]
     left_out: list[str]
@@ -106,7 +106,7 @@ def run_stability(
     scheduler whose workers share them, on a disk shared with them.
 
     Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
-    and the errors of the layers below; what is done is kept in each case.
+    and the errors of the layers below; measured points are kept in each case.
     """
     started = time.perf_counter()
     points = planned(settings)
@@ -201,8 +201,8 @@ def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) ->
     faults = list(dict.fromkeys(curve.fault.name for curve in curves))
     panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
     figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(COLUMNS, len(panels)))
-    for one, some in zip(axes, panels, strict=True):
-        _panel(one, some, colours)
+    for axis, some in zip(axes, panels, strict=True):
+        _panel(axis, some, colours)
     _legend(figure, curves, colours)
     return save_drawing(figure, path)
 
@@ -306,7 +306,7 @@ def answers(curves: Sequence[Curve]) -> list[str]:
         some = [(curve.below_best(), curve) for curve in curves if curve.fault is fault]
         never = [curve.method for place, curve in some if place is None]
         breaking = sorted(
-            ((place, curve) for place, curve in some if place is not None), key=lambda one: one[0]
+            ((place, curve) for place, curve in some if place is not None), key=lambda pair: pair[0]
         )
         if not breaking:
             sentences.append(f"{fault.title}: no method loses {LOST_DB:g} dB in this sweep.")

@@ -48,7 +48,9 @@ class StabilitySettings(Settings):
     @property
     def captures(self) -> list[Capture]:
         """Every scene through the camera."""
-        return [Capture(one, self.camera, self.size, self.seed, self.zoom) for one in self.scenes]
+        return [
+            Capture(scene, self.camera, self.size, self.seed, self.zoom) for scene in self.scenes
+        ]
 
 
 def stability_settings(
@@ -122,7 +124,7 @@ class StabilityStudy(Study[Point]):
         }
 
     def group(self, point: Point) -> Hashable:
-        """Return what all methods of one trial have in common."""
+        """Return the trial of a point, which all methods share."""
         return replace(point, method="")
 
     def measured(self, points: Sequence[Point]) -> Results:

@@ -120,7 +120,7 @@ def _head(results: Results) -> Head:
 
 @dataclass(frozen=True)
 class TablesOutcome:
-    """What was measured, and the page that shows it."""
+    """The measured tables, and their page."""
 
     grids: list[Grid]
     page: Path
@@ -139,7 +139,7 @@ def run_tables(
     folder_of_scenes: None takes the built-in ones. only: names with commas; None takes all.
 
     Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written, and
-    the errors of the layers below; what is done is kept in each case.
+    the errors of the layers below; measured cells are kept in each case.
     """
     started = time.perf_counter()
     parts = chosen_parts(only)

@@ -44,8 +44,8 @@ UNTRAINED = ("dct", "lambertian")
 class TablesSettings(Settings):
     """How everything is computed; sizes are middles of each scene.
 
-    The patches of `dict-admm`, and of `tv-dict` which starts from them, are coded once by the
-    solver of `methods.sparse`: ADMM, as in the paper. dictionary: see `open_dictionary`.
+    The solver of `methods.sparse`, ADMM as in the paper, codes the patches of `dict-admm` once;
+    `tv-dict` starts from the same patches. dictionary: see `open_dictionary`.
     """
 
     size: Size = None
@@ -119,8 +119,8 @@ def middle(light_field: NDArray, size: Size, multiple: int = 1) -> NDArray:
 def check_dictionary(
     dictionary: Dictionary, spec: str, scenes: Sequence[str], binning: int
 ) -> None:
-    """Raise AppError for a dictionary that does not fit the pixels, saw one of the scenes that it
-    shall score, or does not say what it saw.
+    """Raise AppError for a dictionary that does not fit the pixels, was trained on a scene of the
+    tables, or does not state its training scenes.
     """
     rows, columns = dictionary.patch_shape[2:4]
     if rows % binning or columns % binning:
