@@ -569,7 +569,10 @@ class PtpCamera(ShapeFromFrames):
         )
 
     def stop_exposure(self) -> bool:
-        """See `drivers.camera.StoppableCamera`."""
+        """Break off the exposure under way, within half a second; any thread may call.
+
+        `snap` raises `ExposureStoppedError`.
+        """
         self.session.stop_capture()
         return True
 
