@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from drivers import apt_codec as codec
 from drivers.apt_codec import Id, Message, StatusBit
@@ -112,7 +113,8 @@ class AptStage(HostStage):
         for axis, channel in self._channels.items():
             channel.send(Id.HW_NO_FLASH_PROGRAMMING)
             channel.send(Id.HW_STOP_UPDATEMSGS)
-            channel.link.settle()
+            # Once nothing comes any more, the next byte begins a message.
+            channel.link.transport.discard_until_quiet()
             channel.send(Id.MOD_SET_CHANENABLESTATE, channel.number, codec.ENABLE)
             no_backlash = codec.encode_position(channel.number, 0)
             channel.send(Id.MOT_SET_GENMOVEPARAMS, data=no_backlash)
@@ -236,16 +238,6 @@ class _Link:
             self._take_waiting()
             self.transport.write(raw)
 
-    def query(self, raw: bytes, answer: Id, channel: "_Channel", channel_matters: bool) -> Message:
-        """Send a question and return its answer, after a few attempts if need be."""
-        return repeated(
-            lambda: self._exchange(raw, answer, channel, channel_matters), answer.name, self.settle
-        )
-
-    def settle(self) -> None:
-        """Take everything off the wire until nothing comes: the next byte begins a message."""
-        self.transport.discard_until_quiet()
-
     def heard(self, message_id: Id, channel: "_Channel") -> bool:
         """Return whether this message came from the channel since it was last forgotten."""
         return any(
@@ -264,9 +256,10 @@ class _Link:
         complaint, self._complaint = self._complaint, None
         return complaint
 
-    def _exchange(
+    def exchange(
         self, raw: bytes, answer: Id, channel: "_Channel", channel_matters: bool
     ) -> Message:
+        """Send a question once and return its answer."""
         with self.transport.lock:
             self._take_waiting()
             self.transport.write(raw)
@@ -284,7 +277,7 @@ class _Link:
                 self._read_message()
             except (TransportTimeoutError, GarbledReplyError) as error:
                 _log.warning("dropped: %s", error)
-                self.settle()
+                self.transport.discard_until_quiet()
 
     def _read_message(self) -> Message:
         header = self.transport.read_exactly(codec.HEADER_SIZE)
@@ -323,8 +316,13 @@ class _Channel:
     def query(self, question: Id, answer: Id, with_channel: bool = True) -> Message:
         """Send a question and return its answer; an error carries the command and the axis."""
         raw = codec.encode(question, self._destination, self.number if with_channel else 0)
+        link = self.link
         try:
-            return self.link.query(raw, answer, self, with_channel)
+            return repeated(
+                partial(link.exchange, raw, answer, self, with_channel),
+                answer.name,
+                link.transport.discard_until_quiet,
+            )
         except DriverError as error:
             error.about(axis=self.name, command=question.name)
             raise

@@ -32,7 +32,8 @@ class Camera(Protocol):
     """A camera on manual exposure.
 
     Requested and actual setting differ where the camera has steps: `exposure_s` and `gain` are the
-    actual settings, read back from the camera.
+    actual settings, read back from the camera. Optional members: `stream` of `StreamingCamera`;
+    `stream_at`, `rate_limits_hz` and `stop_exposure` as in `drivers.u3v.U3vCamera`.
     """
 
     @property
@@ -92,30 +93,6 @@ class StreamingCamera(Camera, Protocol):
 
     def stream(self) -> Iterator[RawFrame]:
         """Yield frames as they come; closing the generator stops the acquisition."""
-        ...
-
-
-class PacedCamera(StreamingCamera, Protocol):
-    """A camera that can be told how many frames a second to send."""
-
-    @property
-    def rate_limits_hz(self) -> Limits:
-        """Fewest and most frames a second at the present exposure; equal: it has no choice."""
-        ...
-
-    def stream_at(self, rate_hz: float) -> Iterator[RawFrame]:
-        """Yield frames as `stream`, at the nearest rate; raises `CameraSettingError` beyond it."""
-        ...
-
-
-class StoppableCamera(Camera, Protocol):
-    """A camera that can break off an exposure."""
-
-    def stop_exposure(self) -> bool:
-        """Break off the exposure under way; False where this camera cannot. Any thread may call.
-
-        Whoever waits for the frame gets an `ExposureStoppedError`, half a second later at most.
-        """
         ...
 
 

@@ -113,7 +113,7 @@ class GrblStage(HostStage):
         self._choose(axes)
         self._stop_axis(self._axes[0])
         if self._controller.status().state == "Run":
-            self._controller.send(codec.FEED_HOLD)
+            self._transport.write(codec.FEED_HOLD)
         super().stop(axes)
 
     def _configure(self) -> None:
@@ -165,10 +165,10 @@ class GrblStage(HostStage):
 
     def _stop_axis(self, axis: str) -> None:
         """Cancel the jog, which keeps the position; homing can only be reset, which loses it."""
-        if self._controller.homes:
+        if self._controller.homing_lines:
             self._controller.abandon_homing()
         else:
-            self._controller.send(codec.JOG_CANCEL)
+            self._transport.write(codec.JOG_CANCEL)
 
     def _is_moving(self, axis: str) -> bool:
         status = self._controller.status()
@@ -242,7 +242,8 @@ class GrblStage(HostStage):
 class _Controller:
     """Lines and real-time commands to a Grbl, and its answers and unasked messages.
 
-    `on_lost` is called with the reason whenever the position became unknown.
+    `on_lost` is called with the reason whenever the position became unknown. homing_lines: the
+    commands of a homing under way that have no `ok` yet.
     """
 
     def __init__(self, transport: Transport, clock: Clock, on_lost: Callable[[str], None]) -> None:
@@ -252,23 +253,14 @@ class _Controller:
         self._on_lost = on_lost
         self._alarm: codec.Alarm | None = None
         self._restarted = False
-        self._homing_lines: list[str] = []
+        self.homing_lines: list[str] = []
         self._rests = False
         self._offset_mm: tuple[float, ...] | None = None
-
-    @property
-    def homes(self) -> bool:
-        """Whether homing was started and has not ended."""
-        return bool(self._homing_lines)
 
     def setting(self, number: int) -> float:
         """Return a setting, 0 where it is not stated; raises `GarbledReplyError`."""
         stated = self.settings.get(number)
         return 0.0 if stated is None else stated.value
-
-    def send(self, command: bytes) -> None:
-        """Send a real-time command, which has no answer."""
-        self._transport.write(command)
 
     def status(self) -> codec.Status:
         """Ask for a report, a few times if need be.
@@ -341,7 +333,7 @@ class _Controller:
         with self._transport.lock:
             self._take_waiting()
             self._rests = False
-            self._homing_lines = list(lines)
+            self.homing_lines = list(lines)
             for line in lines:
                 self._transport.write(codec.encode_line(line))
 
@@ -351,15 +343,15 @@ class _Controller:
         Homing ends with an `ok` for every line sent. Grbl reports no state while it homes: a report
         of rest without a following `ok` means that homing never began, or that its end is unknown.
         """
-        if not self._homing_lines:
+        if not self.homing_lines:
             return False
-        line = self._homing_lines[0]
+        line = self.homing_lines[0]
         with self._transport.lock:
             try:
                 message = self._read_message()
             except TransportTimeoutError:
                 if self._rests:
-                    self._homing_lines.clear()
+                    self.homing_lines.clear()
                     raise LostPositionError(ALL_AXES, "homing ended without an answer").about(
                         command=line
                     ) from None
@@ -369,22 +361,22 @@ class _Controller:
                 _log.warning("dropped: %s", error)
                 return True
             if isinstance(message, codec.Refusal):
-                self._homing_lines.clear()
+                self.homing_lines.clear()
                 raise _refused(line, message, ALL_AXES)
             self._note(message)
             self.raise_alarm()
             self._raise_restart()
-        return bool(self._homing_lines)
+        return bool(self.homing_lines)
 
     def abandon_homing(self) -> None:
         """Reset a controller during homing, which stops the axes at once."""
-        self._homing_lines.clear()
+        self.homing_lines.clear()
         self._on_lost("its homing was stopped")
         self._transport.write(codec.SOFT_RESET)
 
     def leave_alarm(self) -> None:
         """Reset a controller that waits for it, or is held; it stands, so nothing is lost."""
-        self._homing_lines.clear()
+        self.homing_lines.clear()
         try:
             state = self.status().state
         except (TransportTimeoutError, AxisFaultError):
@@ -407,7 +399,7 @@ class _Controller:
         """Raise the alarm that was received, if any; it stays until the next homing."""
         if self._alarm is None:
             return
-        self._homing_lines.clear()
+        self.homing_lines.clear()
         alarm = self._alarm
         fault = FAULTS_BY_ALARM.get(alarm.code, AxisFaultError)
         error = fault(ALL_AXES, f"alarm {alarm.code} ({alarm.meaning})")
@@ -419,7 +411,7 @@ class _Controller:
     def _raise_restart(self) -> None:
         if self._restarted:
             self._restarted = False
-            self._homing_lines.clear()
+            self.homing_lines.clear()
             raise LostPositionError(ALL_AXES, "the controller restarted")
 
     def wait_for_status(self) -> None:
@@ -469,8 +461,8 @@ class _Controller:
 
     def _note(self, message: codec.Message | None) -> None:
         """Remember what an unasked message says about homing."""
-        if isinstance(message, codec.Ok) and self._homing_lines:
-            self._homing_lines.pop(0)
+        if isinstance(message, codec.Ok) and self.homing_lines:
+            self.homing_lines.pop(0)
         elif isinstance(message, codec.Status):
             self._rests = message.state in ("Idle", "Alarm")
 

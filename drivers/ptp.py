@@ -188,10 +188,6 @@ class PtpSession:
             for storage in ids
         )
 
-    def delete(self, handle: int) -> None:
-        """Delete an object from the card."""
-        self.request(Operation.DELETE_OBJECT, handle, 0)
-
     def describe(self, code: int) -> codec.PropertyDescription | None:
         """Return a property's type, value and choices, None where the camera lacks it."""
         if code not in self.info.properties:
@@ -562,7 +558,7 @@ class PtpCamera(ShapeFromFrames):
             self._shape, self._cfa = frame.mosaic.shape, frame.cfa
             if self._from_card:
                 for handle in (taken.handle, *(other for other, _ in taken.others)):
-                    session.delete(handle)
+                    session.request(Operation.DELETE_OBJECT, handle, 0)
         return replace(
             frame,
             exposure_s=frame.exposure_s or exposure_s,
@@ -573,7 +569,10 @@ class PtpCamera(ShapeFromFrames):
         )
 
     def stop_exposure(self) -> bool:
-        """See `drivers.camera.StoppableCamera`."""
+        """Break off the exposure under way, within half a second; any thread may call.
+
+        `snap` raises `ExposureStoppedError`.
+        """
         self.session.stop_capture()
         return True
 

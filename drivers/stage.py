@@ -379,7 +379,10 @@ class HostStage(Stage, ABC):
             self._mark_unknown(chosen, "its homing did not finish")
             self._start_home(chosen)
             started_s = self._clock.now_s()
-            limits_s = {axis: self._homing_time_limit_s(axis) for axis in chosen}
+            limits_s = {
+                axis: HOMING_TIME_FACTOR * self._travel_time_s(axis, self._homing_speed_um_s(axis))
+                for axis in chosen
+            }
             self._wait_until_idle(limits_s, started_s, self._is_homing)
             for axis in chosen:
                 if not self._read(axis).homed:
@@ -433,7 +436,9 @@ class HostStage(Stage, ABC):
 
         Raises `MoveTimeoutError` when an axis moves longer than its whole travel takes.
         """
-        limits_s = {axis: self._full_travel_time_s(axis) for axis in self._choose(axes)}
+        limits_s = {
+            axis: self._travel_time_s(axis, self.speed_um_s(axis)) for axis in self._choose(axes)
+        }
         self._wait_until_idle(limits_s, self._clock.now_s(), self._is_moving)
         self._clock.sleep(self._settings.settle_s)
 
@@ -489,14 +494,9 @@ class HostStage(Stage, ABC):
             axis=axis, command="position"
         )
 
-    def _full_travel_time_s(self, axis: str) -> float:
+    def _travel_time_s(self, axis: str, speed_um_s: float) -> float:
         low_um, high_um = self._travel_um(axis)
-        return move_time_limit_s(high_um - low_um, self.speed_um_s(axis))
-
-    def _homing_time_limit_s(self, axis: str) -> float:
-        low_um, high_um = self._travel_um(axis)
-        limit_s = move_time_limit_s(high_um - low_um, self._homing_speed_um_s(axis))
-        return HOMING_TIME_FACTOR * limit_s
+        return move_time_limit_s(high_um - low_um, speed_um_s)
 
     def _is_moving_without_fault(self, axis: str) -> bool:
         try:

@@ -192,7 +192,7 @@ class U3vCamera:
 
     @property
     def rate_limits_hz(self) -> Limits:
-        """See `drivers.camera.PacedCamera`."""
+        """Fewest and most frames a second at the present exposure; equal for a fixed rate."""
         if not self.features.has(RATE):
             return 1 / LONGEST_S, 1 / SHORTEST_S
         if not self.features.is_writable(RATE):
@@ -218,7 +218,10 @@ class U3vCamera:
                 self._read_settings()
 
     def stop_exposure(self) -> bool:
-        """See `drivers.camera.StoppableCamera`."""
+        """Break off the exposure under way, within half a second; any thread may call.
+
+        `snap` or `stream` raises `ExposureStoppedError`.
+        """
         self._stream.stop_wanted.set()
         return True
 

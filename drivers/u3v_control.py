@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Callable
+from functools import partial
 from itertools import cycle
 
 from drivers import u3v_codec as codec
@@ -67,51 +68,32 @@ class U3vControl:
 
     def read(self, address: int, length: int) -> bytes:
         """Return `length` bytes; raises a `DriverError`."""
-        parts = []
-        for at in range(0, length, self._read_size):
-            size = min(self._read_size, length - at)
-            parts.append(self._read(address + at, size))
-        return b"".join(parts)
+        most = self._read_size
+        begins = range(0, length, most)
+        return b"".join(self._read(address + at, min(most, length - at)) for at in begins)
 
     def write(self, address: int, data: bytes) -> None:
         """Store `data`; raises a `DriverError`, after which the memory may have changed or not."""
         for at in range(0, len(data), self._write_size):
-            self._write(address + at, data[at : at + self._write_size])
+            part = data[at : at + self._write_size]
+            what = f"to write {part[:8].hex()} at {address + at:#x}"
+            encode = partial(codec.encode_write, address=address + at, data=part)
+            answer = self._exchange(what, codec.WRITEMEM_ACK, encode, 4)
+            # Old cameras leave the count out.
+            if len(answer) >= 4 and struct.unpack_from("<HH", answer)[1] not in (0, len(part)):
+                raise CameraFormatError(answer, f"not all {len(part)} bytes were written")
 
     def _read(self, address: int, length: int) -> bytes:
         what = f"to read {length} bytes at {address:#x}"
 
         def ask() -> bytes:
-            data = self._exchange(
-                what,
-                codec.READMEM_ACK,
-                lambda request_id: codec.encode_read(request_id, address, length),
-                length,
-            )
+            encode = partial(codec.encode_read, address=address, length=length)
+            data = self._exchange(what, codec.READMEM_ACK, encode, length)
             if len(data) != length:
                 raise CameraFormatError(data, f"{len(data)} bytes instead of {length}")
             return data
 
         return repeated(ask, f"{self.name} {what}", faults=_MENDABLE)
-
-    def _write(self, address: int, data: bytes) -> None:
-        what = f"to write {data[:8].hex()} at {address:#x}"
-        answer = self._exchange(
-            what,
-            codec.WRITEMEM_ACK,
-            lambda request_id: codec.encode_write(request_id, address, data),
-            4,
-        )
-        # Old cameras leave the count out.
-        if len(answer) >= 4 and struct.unpack_from("<HH", answer)[1] not in (0, len(data)):
-            raise CameraFormatError(answer, f"not all {len(data)} bytes were written")
-
-    def _recover(self, error: Exception) -> None:
-        """Make the pipes usable again, and forget what is still in them."""
-        if isinstance(error, UsbStalledError):
-            self._command.clear_halt()
-            self._answer.clear_halt()
-        self._answer.drain()
 
     def _exchange(
         self, what: str, expected: int, encode: Callable[[int], bytes], data_size: int
@@ -122,7 +104,11 @@ class U3vControl:
                 self._command.write(encode(request_id), self._timeout_s)
                 raw, message = self._await(what, request_id, data_size)
             except _MENDABLE as error:
-                self._recover(error)
+                # The pipes are made usable again, and emptied.
+                if isinstance(error, UsbStalledError):
+                    self._command.clear_halt()
+                    self._answer.clear_halt()
+                self._answer.drain()
                 raise
         if message.status:
             meaning, advice = codec.STATUS.get(message.status, codec.UNKNOWN_STATUS)

@@ -189,10 +189,6 @@ class UsbDevice:
         with suppress(usb.core.USBError, NotImplementedError):
             usb.util.dispose_resources(self._device)
 
-    def holders(self) -> tuple[str, ...]:
-        """Return name and process id of the programs that have the device open, but this one."""
-        return find_holders(self.listing.bus, self.listing.address, self._proc)
-
     def _require_open(self) -> None:
         if self._closed:
             raise UsbGoneError(self.name)
@@ -218,7 +214,7 @@ class UsbDevice:
         if code == errno.EPIPE:
             return UsbStalledError(self.name, endpoint)
         if code == errno.EBUSY:
-            holders = self.holders()
+            holders = find_holders(self.listing.bus, self.listing.address, self._proc)
             return UsbClaimedError(self.name, holders, _holder_advice(holders))
         return UsbTransferError(self.name, reason, ADVICE.get(code, CHECK_CABLE))
 

@@ -325,8 +325,20 @@ class _Chain:
 
     def ask(self, device: int, number: int, data: str, name: str) -> codec.Reply:
         """Exchange a command once; an error carries the command and the axis."""
+        place = device, number, next(self._message_ids)
         try:
-            message = self._exchange(device, number, data, name)
+            with self._transport.lock:
+                self._transport.discard_input()
+                self._transport.write(codec.encode_command(*place, data))
+                line = b""
+                for _ in turns(self._clock):
+                    line = self._transport.read_until(codec.TERMINATOR)
+                    message = codec.decode_message(line, device in self.checksummed)
+                    if message and (message.device, message.axis, message.message_id) == place:
+                        break
+                    _log.debug("%s: %r came in between", name, message)
+                else:
+                    raise GarbledReplyError(line, f"{name} never answered message {place[2]}")
         except DriverError as error:
             error.about(axis=name, command=data or "(status)")
             raise
@@ -351,25 +363,6 @@ class _Chain:
                 if message is not None and message.message_id == message_id:
                     replies.append(message)
         return replies
-
-    def _exchange(self, device: int, number: int, data: str, name: str) -> codec.Reply:
-        message_id = next(self._message_ids)
-        checksum_required = device in self.checksummed
-        with self._transport.lock:
-            self._transport.discard_input()
-            self._transport.write(codec.encode_command(device, number, message_id, data))
-            line = b""
-            for _ in turns(self._clock):
-                line = self._transport.read_until(codec.TERMINATOR)
-                message = codec.decode_message(line, checksum_required)
-                if message is not None and (
-                    message.device,
-                    message.axis,
-                    message.message_id,
-                ) == (device, number, message_id):
-                    return message
-                _log.debug("%s: %r came in between", name, message)
-            raise GarbledReplyError(line, f"{name} never answered message {message_id}")
 
 
 def find_devices(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> list[ZaberDevice]:

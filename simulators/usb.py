@@ -347,7 +347,7 @@ class SimulatedUsb(usb.backend.IBackend):
             taken = plug.function.bulk_out(ep, data.tobytes())
         if not taken and len(data):
             self._clock.sleep(timeout / 1000)
-            raise _timeout()
+            raise _fault(errno.ETIMEDOUT)
         return taken
 
     def bulk_read(
@@ -356,7 +356,8 @@ class SimulatedUsb(usb.backend.IBackend):
         """Fill the buffer with packets until one is short, it is full, or time is up."""
         plug = self._ready(dev_handle, ep, intf)
         room = memoryview(buff)
-        packet_size = _endpoint(plug.function.spec, ep).packet_size
+        endpoints = [e for i in plug.function.spec.interfaces for e in i.endpoints]
+        packet_size = next(e.packet_size for e in endpoints if e.address == ep)
         deadline_s = self._clock.now_s() + timeout / 1000
         count = 0
         while count < len(room):
@@ -366,7 +367,7 @@ class SimulatedUsb(usb.backend.IBackend):
                 self._clock.sleep(max(0.0, deadline_s - self._clock.now_s()))
                 if count:
                     return count
-                raise _timeout()
+                raise _fault(errno.ETIMEDOUT)
             size = min(len(pending), len(room) - count)
             if size < len(pending):
                 size -= size % packet_size
@@ -398,7 +399,7 @@ class SimulatedUsb(usb.backend.IBackend):
             message = plug.function.interrupt(ep, len(buff), timeout / 1000)
         if message is None:
             self._clock.sleep(timeout / 1000)
-            raise _timeout()
+            raise _fault(errno.ETIMEDOUT)
         if len(message) > len(buff):
             raise _fault(errno.EOVERFLOW)
         memoryview(buff)[: len(message)] = message
@@ -448,10 +449,6 @@ def _plug(handle: Handle) -> Plug:
     return handle.plug
 
 
-def _endpoint(spec: DeviceSpec, address: int) -> EndpointSpec:
-    return next(e for i in spec.interfaces for e in i.endpoints if e.address == address)
-
-
 def _string_descriptor(spec: DeviceSpec, value: int) -> bytes:
     kind, index = value >> 8, value & 0xFF
     texts = (spec.maker, spec.model, spec.serial)
@@ -462,8 +459,5 @@ def _string_descriptor(spec: DeviceSpec, value: int) -> bytes:
 
 
 def _fault(code: int) -> usb.core.USBError:
-    return usb.core.USBError(errno.errorcode[code], None, code)
-
-
-def _timeout() -> usb.core.USBTimeoutError:
-    return usb.core.USBTimeoutError("Operation timed out", None, errno.ETIMEDOUT)
+    kind = usb.core.USBTimeoutError if code == errno.ETIMEDOUT else usb.core.USBError
+    return kind(errno.errorcode[code], None, code)

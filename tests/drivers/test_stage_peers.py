@@ -254,15 +254,10 @@ def test_an_independent_apt_codec_reads_what_the_firmware_and_ours_write():
     assert third.msg == "mot_move_homed"
 
 
-@pytest.mark.slow
-def test_grbl_streamer_homes_streams_and_is_alarmed():
+@contextmanager
+def grbl_peer(device):
+    """Yield grbl-streamer on a controller that has booted, and the list of its events."""
     streamer = pytest.importorskip("grbl_streamer", reason="needs the extra `peers`")
-    quick = replace(
-        BENCH_AXES["X"], max_speed_um_s=200_000.0, acceleration_um_s2=1e7, start_um=24_000.0
-    )
-    device = GrblController(
-        SYSTEM_CLOCK, dict.fromkeys("XYZ", quick), settings={24: 6000, 25: 12_000}
-    )
     reported = []
     with PtyServer(device) as server:
         peer = streamer.GrblStreamer(lambda *event: reported.append(event))
@@ -271,49 +266,50 @@ def test_grbl_streamer_homes_streams_and_is_alarmed():
         try:
             wait_until(lambda: ("on_boot",) in reported)
             peer.poll_start()
-            wait_until(lambda: peer.cmode == "Alarm")
-            peer.homing()
-            wait_until(lambda: peer.cmode == "Idle")
-            wait_until(lambda: peer.cmpos == (-1.0, -1.0, -1.0))
-            peer.incremental_streaming = True
-            peer.write("G21 G90\nG53 G0 X-5 Y-3\nG1 F3000 X-6.5\nG91 G1 X1")
-            peer.job_run()
-            wait_until(lambda: ("on_job_completed",) in reported)
-            wait_until(lambda: peer.cmpos == (-5.5, -3.0, -1.0))
-            assert device.position_um("X") == pytest.approx(25_400 - 5_500, abs=3.5)
-            assert not any(event[0] == "on_error" for event in reported)
-            peer.send_immediately("G90 G0 X50")
-            wait_until(lambda: ("on_alarm", "ALARM:2") in reported)
-            peer.softreset()
-            peer.killalarm()
-            wait_until(lambda: peer.cmode == "Idle")
-            assert peer.cmpos == (-5.5, -3.0, -1.0)
+            yield peer, reported
         finally:
             peer.disconnect()
 
 
-@pytest.mark.slow
-def test_grbl_streamer_streams_again_in_a_second_session():
-    streamer = pytest.importorskip("grbl_streamer", reason="needs the extra `peers`")
+def quick_grbl(**settings):
     quick = replace(
         BENCH_AXES["X"], max_speed_um_s=200_000.0, acceleration_um_s2=1e7, start_um=24_000.0
     )
-    device = GrblController(SYSTEM_CLOCK, dict.fromkeys("XYZ", quick), settings={22: 0, 20: 0})
-    with PtyServer(device) as server:
-        for place in ("1.000", "0.500"):
-            reported = []
-            peer = streamer.GrblStreamer(lambda *event, reported=reported: reported.append(event))
-            peer.poll_interval = 0.01
-            peer.cnect(server.port)
-            try:
-                wait_until(lambda reported=reported: ("on_boot",) in reported)
-                peer.poll_start()
-                wait_until(lambda peer=peer: peer.cmode == "Idle")
-                peer.incremental_streaming = True
-                peer.write(f"G21 G90\nG53 G1 F3000 X-{place}")
-                peer.job_run()
-                wait_until(lambda reported=reported: ("on_job_completed",) in reported)
-                wait_until(lambda peer=peer, at=-float(place): peer.cmpos[0] == at)
-                assert not any(event[0] in ("on_error", "on_alarm") for event in reported)
-            finally:
-                peer.disconnect()
+    return GrblController(SYSTEM_CLOCK, dict.fromkeys("XYZ", quick), **settings)
+
+
+@pytest.mark.slow
+def test_grbl_streamer_homes_streams_and_is_alarmed():
+    device = quick_grbl(settings={24: 6000, 25: 12_000})
+    with grbl_peer(device) as (peer, reported):
+        wait_until(lambda: peer.cmode == "Alarm")
+        peer.homing()
+        wait_until(lambda: peer.cmode == "Idle")
+        wait_until(lambda: peer.cmpos == (-1.0, -1.0, -1.0))
+        peer.incremental_streaming = True
+        peer.write("G21 G90\nG53 G0 X-5 Y-3\nG1 F3000 X-6.5\nG91 G1 X1")
+        peer.job_run()
+        wait_until(lambda: ("on_job_completed",) in reported)
+        wait_until(lambda: peer.cmpos == (-5.5, -3.0, -1.0))
+        assert device.position_um("X") == pytest.approx(25_400 - 5_500, abs=3.5)
+        assert not any(event[0] == "on_error" for event in reported)
+        peer.send_immediately("G90 G0 X50")
+        wait_until(lambda: ("on_alarm", "ALARM:2") in reported)
+        peer.softreset()
+        peer.killalarm()
+        wait_until(lambda: peer.cmode == "Idle")
+        assert peer.cmpos == (-5.5, -3.0, -1.0)
+
+
+@pytest.mark.slow
+def test_grbl_streamer_streams_again_in_a_second_session():
+    device = quick_grbl(settings={22: 0, 20: 0})
+    for place in ("1.000", "0.500"):
+        with grbl_peer(device) as (peer, reported):
+            wait_until(lambda peer=peer: peer.cmode == "Idle")
+            peer.incremental_streaming = True
+            peer.write(f"G21 G90\nG53 G1 F3000 X-{place}")
+            peer.job_run()
+            wait_until(lambda reported=reported: ("on_job_completed",) in reported)
+            wait_until(lambda peer=peer, at=-float(place): peer.cmpos[0] == at)
+            assert not any(event[0] in ("on_error", "on_alarm") for event in reported)
