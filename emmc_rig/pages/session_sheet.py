@@ -214,7 +214,7 @@ def _frames(session: Session, pictures: int) -> Iterator[Section]:
         frames = [frame for frame in session.needed if frame.kind == kind]
         if not frames:
             continue
-        # The order of capture is another one.
+        # Frames are listed in the order of capture, which mixes shots and views.
         frames.sort(key=lambda f: (f.bench.shot, f.view or (), f.exposure_s or 0.0, f.repeat))
         shown = _chosen(frames, left)
         left -= len(shown)

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, sqrt
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -294,15 +293,8 @@ def _film_head(film: Film, metrics: Mapping[int, Mapping[str, object]]) -> Head:
     return replace(head, why=f"{first}: {head.why}")
 
 
-def _write(folder: Path, export: Export) -> None:
-    write_text(folder / "viewer.html", render_viewer(export))
-
-
-def _write_film(folder: Path, film: Film) -> None:
-    write_text(folder / "viewer.html", render_film(film))
-
-
 VIEWER = Format(
-    "viewer", "viewer.html, one page to turn, focus and look into", "8-bit pictures, maps", _write,
-    write_film=_write_film,
+    "viewer", "viewer.html, one page to turn, focus and look into", "8-bit pictures, maps",
+    lambda folder, export: write_text(folder / "viewer.html", render_viewer(export)),
+    write_film=lambda folder, film: write_text(folder / "viewer.html", render_film(film)),
 )  # fmt: skip

@@ -125,7 +125,7 @@ def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:
     """Return whether whiteboards show every view of every shot, as the method free takes them."""
     if pinholes is None:
         return False
-    opened = {(one.shot, one.pinhole) for one in pinholes.frames}
+    opened = {(board.shot, board.pinhole) for board in pinholes.frames}
     shots = range(len(camera.shots))
     return opened >= {(shot, view) for shot in shots for view in np.ndindex(camera.views)}
 
@@ -158,8 +158,8 @@ def psi_inputs(session: Session) -> dict[str, Any]:
 def stored_calibration(session: Session) -> tuple[Product | None, str]:
     """Return what the calibration stored in a session follows from, and a sentence that names it.
 
-    Returns None for a session without a calibration, with an empty sentence; and for a calibration
-    of other frames, another plan or another version of the program, with the reason.
+    Returns None and an empty sentence for a session without a calibration; None and the reason for
+    a calibration by other frames, by an earlier plan or by another version of the program.
     """
     folder = session.folder / CALIBRATION
     if not (folder / PSI).is_file():

@@ -24,11 +24,10 @@ THREADS = min(8, os.cpu_count() or 1)
 class Verdict:
     """What became of a session.
 
-    planned: frames, but for `spared` ones that the scene was found not to need, and
-    `dropped` ones of a film. missing: frames not
-    captured yet. damaged: by id, what is wrong. frozen: files that were
-    changed since the session began. unreadable: journal lines torn or damaged.
-    leftovers, foreign: files that do not count, relative to the session.
+    planned: frames of the plan, without spared shots and dropped frames of a film. missing: frames
+    not captured yet. damaged: by id, what is wrong. frozen: files that were changed since the
+    session began. unreadable: journal lines torn or damaged. leftovers, foreign: files that do not
+    count, relative to the session.
     """
 
     planned: int
