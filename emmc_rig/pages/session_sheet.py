@@ -98,16 +98,10 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     }
     sections.append(provenance_section(sources))
     lead = part("cards", _cards(session))
-    about = [_about(session)]
     return framed(
-        session.header["title"],
-        about,
-        (),
-        sections,
-        ["session.css"],
-        lead=lead,
-        head=_head(session),
-    )
+        session.header["title"], [_about(session)], sections=sections, styles=["session.css"],
+        lead=lead, head=_head(session),
+    )  # fmt: skip
 
 
 def _head(session: Session) -> Head:

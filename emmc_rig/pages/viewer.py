@@ -46,7 +46,7 @@ from emmc_rig.pages.display import (
     webp_of,
     webp_quality,
 )
-from emmc_rig.pages.page import VERDICTS, Head, estimated, fragment, light_field_head
+from emmc_rig.pages.page import VERDICTS, Head, estimated, framed, light_field_head
 
 Array = NDArray[np.floating]
 BYTES_PER_PIXEL = 0.36
@@ -89,13 +89,11 @@ class Overlay:
 
 def render_viewer(content: Export) -> str:
     """Return the page as text."""
-    return fragment(
-        "viewer_page.html",
-        title=content.title,
-        about=[*([content.caption] if content.caption else []), *estimated(content.metrics)],
-        caveats=(), sections=(), lead="",
-        summary=light_field_head(content.metrics, content.source, viewer=True),
-        styles=("viewer.css",), scripts=("viewer.js",),
+    return framed(
+        content.title,
+        [*([content.caption] if content.caption else []), *estimated(content.metrics)],
+        head=light_field_head(content.metrics, content.source, viewer=True),
+        template="viewer_page.html", styles=("viewer.css",), scripts=("viewer.js",),
         data={"viewer-data": viewer_data(content)}, poster=poster(content),
     )  # fmt: skip
 
@@ -266,10 +264,9 @@ def render_film(film: Film) -> str:
     )
     if shown.shape != film.shape:
         about += f", shown as {shown.shape[2]}x{shown.shape[3]}"
-    return fragment(
-        "viewer_page.html",
-        title=film.folder.resolve().name, about=[f"{about}."], caveats=(), sections=(), lead="",
-        summary=_film_head(film, metrics), styles=("viewer.css",),
+    return framed(
+        film.folder.resolve().name, [f"{about}."], head=_film_head(film, metrics),
+        template="viewer_page.html", styles=("viewer.css",),
         scripts=("viewer.js", "film.js"), data={"film-data": data},
         poster=poster(film.first, most_pixels, like), film=True,
     )  # fmt: skip
