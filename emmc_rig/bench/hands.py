@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from typing import Protocol
 
 import numpy as np
 
@@ -13,6 +14,30 @@ Ask = Callable[[str], None]
 MASK, APERTURE = ("mask_x", "mask_y"), ("aperture_x", "aperture_y")
 ON_A_HOLE = 0.25
 """Of an aperture cell: as far from a hole's middle a place still means that hole."""
+
+
+class Attendant(Protocol):
+    """What a person, or a relay, does at the bench between exposures."""
+
+    def set_lamp(self, colour: str) -> None:
+        """Light the scene or the board: off, white, red, green or blue."""
+        ...
+
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
+        """Put the "scene" or the "whiteboard" before the camera; the board turned in its plane."""
+        ...
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Fit the masks and the filter of a shot; or only its filter, the masks taken out."""
+        ...
+
+    def move(self, offsets_um: Mapping[str, float]) -> None:
+        """Bring axes that the stage has not to their places, from where each is centred."""
+        ...
+
+    def again(self, axes: Collection[str]) -> None:
+        """Take what `move` did with these axes for undone: the frame shows something else."""
+        ...
 
 
 class AskingAttendant:
@@ -90,23 +115,8 @@ class AskingAttendant:
             self._done[what] = wish
 
 
-class NoAttendant:
+class NoAttendant(Attendant):
     """An `Attendant` of a bench on which nothing ever changes."""
-
-    def set_lamp(self, colour: str) -> None:
-        """Leave the lamp as it is."""
-
-    def place(self, target: str, turn_deg: float = 0.0) -> None:
-        """Leave the board or scene where it is."""
-
-    def fit_masks(self, shot: int, fitted: bool = True) -> None:
-        """Leave the masks in or out."""
-
-    def move(self, offsets_um: Mapping[str, float]) -> None:
-        """Leave mask and aperture where they are."""
-
-    def again(self, axes: Collection[str]) -> None:
-        """Nothing was asked."""
 
 
 def hole_at(camera: Camera, offsets_um: Mapping[str, float]) -> tuple[int, int] | None:

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,7 @@ from emmc_rig.bench.device_config import (
     stage_of,
 )
 from emmc_rig.bench.environment import Source
+from emmc_rig.bench.hands import Attendant
 from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
@@ -91,30 +92,6 @@ SIMULATED_SCALES = {
     "apt": ",actuator=z825",
 }
 """What must be stated of simulated devices: models that no table has, an unnamed actuator."""
-
-
-class Attendant(Protocol):
-    """What a person, or a relay, does at the bench between exposures."""
-
-    def set_lamp(self, colour: str) -> None:
-        """Light the scene or the board: off, white, red, green or blue."""
-        ...
-
-    def place(self, target: str, turn_deg: float = 0.0) -> None:
-        """Put the "scene" or the "whiteboard" before the camera; the board turned in its plane."""
-        ...
-
-    def fit_masks(self, shot: int, fitted: bool = True) -> None:
-        """Fit the masks and the filter of a shot; or only its filter, the masks taken out."""
-        ...
-
-    def move(self, offsets_um: Mapping[str, float]) -> None:
-        """Bring axes that the stage has not to their places, from where each is centred."""
-        ...
-
-    def again(self, axes: Collection[str]) -> None:
-        """Take what `move` did with these axes for undone: the frame shows something else."""
-        ...
 
 
 def _unheard(name: str) -> None:

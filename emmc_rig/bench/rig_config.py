@@ -41,10 +41,6 @@ SIMULATED = "simulated"
 IMPORTED = "imported"
 """Kind of rig of a session with files of another program."""
 RECORDING, ANYWHERE_UM = "folder:", (-1e6, 1e6)
-LATER = (
-    "focus_um", "fixed_positions_um", "mask", "environment", "axes", "second_stage", "hands_um",
-    "usb_camera",
-)  # fmt: skip
 StageSpec = str | dict[str, Any]
 NO_SETTINGS = ("kind", "trigger")
 """What a description has, or had in version 0.2, beside the settings of a rig."""
@@ -131,6 +127,10 @@ class SimulatedAxes(AnyRig):
             if axis not in STAGE_AXES:
                 raise ValueError(f"{axis} is no axis of the bench: use {', '.join(STAGE_AXES)}")
         return axes
+
+
+LATER = tuple(SimulatedAxes.model_fields)
+"""Settings that came after version 0.2."""
 
 
 class SimulatedFile(SimulatedAxes):

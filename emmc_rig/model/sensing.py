@@ -372,7 +372,7 @@ class ImagingMatrix(PsiLayout):
             view_axes: what rows and columns of views are, each "angle", "band" or "time".
 
         Raises:
-            SensingError: a wrong shape, entries that are not finite, or a reading that depends on
+            SensingError: a wrong shape, infinite entries or NaN, or a reading that depends on
                 samples of another pixel.
             ArgumentError: an argument of another type.
 

@@ -126,21 +126,18 @@ _WORDS = (
 """Words of the file's format in place of Python's in messages of the validator."""
 
 
-def _kind(data: object) -> str:
-    """Return what plain data are, in words."""
-    if data is None:
-        return "nothing"
-    if isinstance(data, (list, tuple)):
-        return "a list"
-    if isinstance(data, bool):
-        return "true or false"
-    return "a number" if isinstance(data, (int, float)) else "text"
+_KINDS = {
+    type(None): "nothing", list: "a list", tuple: "a list", bool: "true or false",
+    int: "a number", float: "a number",
+}  # fmt: skip
+"""Types of plain data in words; all others are text."""
 
 
 def validated(cls: type[S], data: object, source: str, error: type[Exception]) -> S:
     """Return `cls` built from plain data; raise `error` with one line naming `source`."""
     if not isinstance(data, dict):
-        raise error(f"{source}: holds {_kind(data)}, where settings (key: value) are meant")
+        kind = _KINDS.get(type(data), "text")
+        raise error(f"{source}: holds {kind}, where settings (key: value) are meant")
     try:
         return cls.model_validate(data)
     except ValidationError as fault:

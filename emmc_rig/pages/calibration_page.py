@@ -119,7 +119,7 @@ def write_calibration_report(
     sections.append(provenance_section(_provenance(metrics)))
     title = f"Calibration of {metrics['camera']}"
     text = framed(
-        title, (), (), sections, ["calibration.css"], head=_head(outcome, metrics),
+        title, sections=sections, styles=["calibration.css"], head=_head(outcome, metrics),
         lead=part("cards", _cards(outcome, metrics, relative_deviation)),
     )  # fmt: skip
     write_text(path, text)

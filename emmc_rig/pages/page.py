@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -194,22 +195,25 @@ def part(name: str, *given: object, **values: object) -> Markup:
 
 def framed(
     title: str,
-    about: Sequence[str],
-    caveats: Sequence[str],
-    sections: Sequence[Section],
+    about: Sequence[str] = (),
+    caveats: Sequence[str] = (),
+    sections: Sequence[Section] = (),
     styles: Sequence[str] = (),
     lead: str = "",
     *,
     head: Head,
+    template: str = "page.html",
+    **more: Any,
 ) -> str:
-    """Return a page of sections.
+    """Return a page.
 
     about: sentences under the title. caveats: how to read it. styles: files beside the templates
-    that only this page needs. head: comes first. lead: HTML before the sections.
+    that only this page needs. head: comes first. lead: HTML before the sections. template: extends
+    page.html; more: its values, also scripts, and the data that these read, by element's id.
     """
     return fragment(
-        "page.html", title=title, about=about, caveats=caveats, sections=sections, styles=styles,
-        scripts=(), data={}, lead=lead, summary=head,
+        template, title=title, about=about, caveats=caveats, sections=sections, styles=styles,
+        lead=lead, summary=head, **{"scripts": (), "data": {}, **more},
     )  # fmt: skip
 
 

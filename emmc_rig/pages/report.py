@@ -25,7 +25,7 @@ from emmc_rig.pages.display import (
     reduced,
     round_up,
 )
-from emmc_rig.pages.page import Card, estimated, fragment, light_field_head
+from emmc_rig.pages.page import Card, estimated, framed, light_field_head
 from emmc_rig.pages.viewer import poster, viewer_data
 from reconstruction.verdict.rules import NOISE, UNEXPLAINED
 
@@ -77,15 +77,13 @@ def render(content: ReportContent) -> str:
         content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
         view_axes=axes,
     )  # fmt: skip
-    return fragment(
-        "report.html",
-        title=content.title,
+    return framed(
+        content.title,
+        head=light_field_head(content.metrics, content.source),
+        template="report.html",
         content=content,
-        caveats=(),
-        lead="",
         styles=("viewer.css",),
         warnings=_warnings(content),
-        summary=light_field_head(content.metrics, content.source),
         cards=_cards(content),
         cfa=None if content.described is None else content.described.sensor.cfa_name,
         frames=None if frames is None else _frames(frames),

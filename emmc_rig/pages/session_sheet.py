@@ -98,16 +98,10 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     }
     sections.append(provenance_section(sources))
     lead = part("cards", _cards(session))
-    about = [_about(session)]
     return framed(
-        session.header["title"],
-        about,
-        (),
-        sections,
-        ["session.css"],
-        lead=lead,
-        head=_head(session),
-    )
+        session.header["title"], [_about(session)], sections=sections, styles=["session.css"],
+        lead=lead, head=_head(session),
+    )  # fmt: skip
 
 
 def _head(session: Session) -> Head:
@@ -214,7 +208,7 @@ def _frames(session: Session, pictures: int) -> Iterator[Section]:
         frames = [frame for frame in session.needed if frame.kind == kind]
         if not frames:
             continue
-        # The order of capture is another one.
+        # Frames are listed in the order of capture, which mixes shots and views.
         frames.sort(key=lambda f: (f.bench.shot, f.view or (), f.exposure_s or 0.0, f.repeat))
         shown = _chosen(frames, left)
         left -= len(shown)

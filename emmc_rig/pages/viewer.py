@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, sqrt
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -47,7 +46,7 @@ from emmc_rig.pages.display import (
     webp_of,
     webp_quality,
 )
-from emmc_rig.pages.page import VERDICTS, Head, estimated, fragment, light_field_head
+from emmc_rig.pages.page import VERDICTS, Head, estimated, framed, light_field_head
 
 Array = NDArray[np.floating]
 BYTES_PER_PIXEL = 0.36
@@ -90,13 +89,11 @@ class Overlay:
 
 def render_viewer(content: Export) -> str:
     """Return the page as text."""
-    return fragment(
-        "viewer_page.html",
-        title=content.title,
-        about=[*([content.caption] if content.caption else []), *estimated(content.metrics)],
-        caveats=(), sections=(), lead="",
-        summary=light_field_head(content.metrics, content.source, viewer=True),
-        styles=("viewer.css",), scripts=("viewer.js",),
+    return framed(
+        content.title,
+        [*([content.caption] if content.caption else []), *estimated(content.metrics)],
+        head=light_field_head(content.metrics, content.source, viewer=True),
+        template="viewer_page.html", styles=("viewer.css",), scripts=("viewer.js",),
         data={"viewer-data": viewer_data(content)}, poster=poster(content),
     )  # fmt: skip
 
@@ -267,10 +264,9 @@ def render_film(film: Film) -> str:
     )
     if shown.shape != film.shape:
         about += f", shown as {shown.shape[2]}x{shown.shape[3]}"
-    return fragment(
-        "viewer_page.html",
-        title=film.folder.resolve().name, about=[f"{about}."], caveats=(), sections=(), lead="",
-        summary=_film_head(film, metrics), styles=("viewer.css",),
+    return framed(
+        film.folder.resolve().name, [f"{about}."], head=_film_head(film, metrics),
+        template="viewer_page.html", styles=("viewer.css",),
         scripts=("viewer.js", "film.js"), data={"film-data": data},
         poster=poster(film.first, most_pixels, like), film=True,
     )  # fmt: skip
@@ -294,15 +290,8 @@ def _film_head(film: Film, metrics: Mapping[int, Mapping[str, object]]) -> Head:
     return replace(head, why=f"{first}: {head.why}")
 
 
-def _write(folder: Path, export: Export) -> None:
-    write_text(folder / "viewer.html", render_viewer(export))
-
-
-def _write_film(folder: Path, film: Film) -> None:
-    write_text(folder / "viewer.html", render_film(film))
-
-
 VIEWER = Format(
-    "viewer", "viewer.html, one page to turn, focus and look into", "8-bit pictures, maps", _write,
-    write_film=_write_film,
+    "viewer", "viewer.html, one page to turn, focus and look into", "8-bit pictures, maps",
+    lambda folder, export: write_text(folder / "viewer.html", render_viewer(export)),
+    write_film=lambda folder, film: write_text(folder / "viewer.html", render_film(film)),
 )  # fmt: skip

@@ -147,11 +147,8 @@ def _groups(
     version = session.header["versions"]["emmc-rig"]
     noted = session.notes
     beside = [line.temperatures_c | line.environment for line in lines]
-    read = {
-        name: [values.get(name, np.nan) for values in beside]
-        for values in beside
-        for name in values
-    }
+    names = dict.fromkeys(name for values in beside for name in values)
+    read = {name: [values.get(name, np.nan) for values in beside] for name in names}
     detector = {
         "count_time": [line.exposure_s for line in lines],
         "gain": [line.gain for line in lines],

@@ -127,7 +127,7 @@ def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:
     """Return whether whiteboards show every view of every shot, as the method free takes them."""
     if pinholes is None:
         return False
-    opened = {(frame.shot, frame.pinhole) for frame in pinholes.frames}
+    opened = {(board.shot, board.pinhole) for board in pinholes.frames}
     shots = range(len(camera.shots))
     return opened >= {(shot, view) for shot in shots for view in np.ndindex(camera.views)}
 
@@ -160,8 +160,8 @@ def psi_inputs(session: Session) -> dict[str, Any]:
 def stored_calibration(session: Session) -> tuple[Product | None, str]:
     """Return what the calibration stored in a session follows from, and a sentence that names it.
 
-    Returns None for a session without a calibration, with an empty sentence, and for a stale
-    calibration, with the reason: frames, plan or program version have changed.
+    Returns None and an empty sentence for a session without a calibration; None and the reason for
+    a calibration by other frames, by an earlier plan or by another version of the program.
     """
     folder = session.folder / CALIBRATION
     if not (folder / PSI).is_file():

@@ -25,10 +25,10 @@ THREADS = min(8, os.cpu_count() or 1)
 class Verdict:
     """What became of a session.
 
-    planned: frames, without `spared` frames, which the scene did not need, and without `dropped`
-    frames of a film. missing: frames not captured yet. damaged: faults by id. frozen: files that
-    were changed since the session began. unreadable: journal lines torn or damaged.
-    leftovers, foreign: files that do not count, relative to the session.
+    planned: frames of the plan, without spared shots and dropped frames of a film. missing: frames
+    not captured yet. damaged: by id, what is wrong. frozen: files that were changed since the
+    session began. unreadable: journal lines torn or damaged. leftovers, foreign: files that do not
+    count, relative to the session.
     """
 
     planned: int

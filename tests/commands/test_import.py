@@ -1,4 +1,4 @@
-"""Files of another program become the session that the sequencer would have made of them."""
+"""Files of another program become a session, equal to a session of the sequencer."""
 
 import csv
 import hashlib
@@ -165,8 +165,8 @@ def hdf5(path, mosaic):
 
 
 @pytest.mark.parametrize(
-    "form", [pytest.param(one, marks=[] if one == "npy" else pytest.mark.slow)
-             for one in FORMATS]
+    "form", [pytest.param(item, marks=[] if item == "npy" else pytest.mark.slow)
+             for item in FORMATS]
 )  # fmt: skip
 def test_shots_of_every_format_read_as_those_of_the_captured_session(shots_only, tmp_path, form):
     table = exported(Session(shots_only / "session"), tmp_path / "files", FORMATS[form])
@@ -478,7 +478,10 @@ IN_CHILDREN = ("no MAT", "ms for s of an OME-TIFF", "a folder")
 
 @pytest.mark.parametrize(
     "mistake",
-    [pytest.param(one, marks=pytest.mark.slow if one in IN_CHILDREN else []) for one in MISTAKES],
+    [
+        pytest.param(item, marks=pytest.mark.slow if item in IN_CHILDREN else [])
+        for item in MISTAKES
+    ],
 )
 def test_a_mistake_is_named_in_one_line_and_nothing_is_written(mistake, tmp_path, run):
     change, words = MISTAKES[mistake]
@@ -548,7 +551,7 @@ def test_pages_of_an_ome_tiff_are_shots_with_its_exposures_and_times(tmp_path, r
     assert np.array_equal(mosaics(session, "shot"), LIT[:2])
     assert np.array_equal(mosaics(session, "dark"), DARK)
     shots = [session.stored[frame.id] for frame in session.frames if frame.kind == "shot"]
-    assert [(one.exposure_s, one.host_time_s) for one in shots] == [(0.02, 0.5), (0.04, 2.0)]
+    assert [(item.exposure_s, item.host_time_s) for item in shots] == [(0.02, 0.5), (0.04, 2.0)]
 
 
 @pytest.mark.slow

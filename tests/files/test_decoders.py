@@ -80,18 +80,18 @@ DECODERS = {
 
 
 def decoder_calls(source):
-    """(line, full name) of what a module takes of decoders, by whatever name it imports them."""
+    """(line, full name) of a module's uses of decoders, also under other names by import."""
     tree = ast.parse(source)
     names = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            for one in node.names:
-                names[one.asname or one.name.split(".")[0]] = (
-                    one.name if one.asname else one.name.split(".")[0]
+            for entry in node.names:
+                names[entry.asname or entry.name.split(".")[0]] = (
+                    entry.name if entry.asname else entry.name.split(".")[0]
                 )
         elif isinstance(node, ast.ImportFrom) and not node.level:
-            for one in node.names:
-                names[one.asname or one.name] = f"{node.module}.{one.name}"
+            for entry in node.names:
+                names[entry.asname or entry.name] = f"{node.module}.{entry.name}"
 
     def full(node):
         if isinstance(node, ast.Name):
@@ -108,7 +108,7 @@ def decoder_calls(source):
                 if full(first.func) == "json.dumps":
                     harmless.add(node.func)
             elif full(node.func) == "h5py.File" and [
-                one.value for one in node.args[1:2] if isinstance(one, ast.Constant)
+                entry.value for entry in node.args[1:2] if isinstance(entry, ast.Constant)
             ] == ["w"]:
                 harmless.add(node.func)
         for part in ("annotation", "returns"):
@@ -430,7 +430,7 @@ def test_whatever_a_device_is_called_it_is_understood_or_refused_in_one_line(spe
     for read in (
         parse_stage,
         parse_camera,
-        lambda one: rig_description(one, ImagedRig(scene="near-planar")),
+        lambda entry: rig_description(entry, ImagedRig(scene="near-planar")),
     ):
         said = ""
         try:

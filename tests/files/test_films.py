@@ -117,7 +117,7 @@ def test_ome_zarr_has_time_in_seconds_and_views_along_z(tmp_path, film):
     assert image.dims == ("t", "c", "z", "y", "x")
     assert image.data.shape == (6, 3, 9, *SIZE)
     assert (image.scale["t"], image.axes_units["t"], image.scale["z"]) == (0.125, "second", 1)
-    assert [image.data.shape[-2:] for image in stored.images] == [SIZE, (18, 24)]
+    assert [picture.data.shape[-2:] for picture in stored.images] == [SIZE, (18, 24)]
     frames = np.asarray(image.data)
     for place in film.frames:
         views = light_field_at(place).reshape(9, *SIZE, 3)
@@ -140,7 +140,7 @@ def test_a_video_shows_the_centre_view_at_the_film_s_rate(tmp_path, film, name, 
     folder, done = exported(tmp_path, film, name)
     with av.open(str(folder / f"film.{ending}")) as stream:
         assert float(stream.streams.video[0].average_rate) == pytest.approx(film.rate, rel=0.01)
-        shown = [frame.to_ndarray(format="rgb24") for frame in stream.decode(video=0)]
+        shown = [picture.to_ndarray(format="rgb24") for picture in stream.decode(video=0)]
     assert (len(shown), done) == (6, 5)
     for place, picture in enumerate(shown):
         missed = [np.abs(centre_codes(other) - picture).mean() for other in film.frames]
@@ -150,7 +150,7 @@ def test_a_video_shows_the_centre_view_at_the_film_s_rate(tmp_path, film, name, 
 
 def test_what_comes_before_the_first_frame_shows_that_frame(tmp_path):
     film = open_film(write_film(tmp_path / "film", missing=(0, 1, 5)))
-    shown = list(in_time(film, lambda frame: centre_view(frame.light_field)))
+    shown = list(in_time(film, lambda picture: centre_view(picture.light_field)))
     assert len(shown) == 6
     for place, picture in zip((2, 2, 2, 3, 4, 4), shown, strict=True):
         np.testing.assert_array_equal(picture, centre_view(light_field_at(place)))

@@ -1,4 +1,4 @@
-"""The set-up page: what it measures of a frame, what it does, and whom it refuses."""
+"""The set-up page: figures of a frame, actions, and requests that are refused."""
 
 import http.client
 import json
@@ -465,7 +465,7 @@ def test_an_exposure_beyond_4_s_is_offered_and_not_taken_unasked():
         offered = until(watch, lambda state: state["hint"] and "values" in state["hint"])
         assert camera.exposure_s <= 4.0
         assert offered["hint"]["label"] == "expose for 20 s"
-        step = next(one for one in offered["steps"] if one["name"] == "exposure")
+        step = next(each for each in offered["steps"] if each["name"] == "exposure")
         assert step["label"] == "expose for 20 s"
         watch.auto_expose(**offered["hint"]["values"])
         done = until(watch, lambda state: max(state["figures"]["brightest"].values()) > 0.7)
@@ -666,13 +666,13 @@ def test_a_stop_is_carried_out_while_a_hundred_pages_follow():
             threading.Thread(target=ask, args=("GET", f"/{TOKEN}/events"), daemon=True)
             for _ in range(100)
         ]
-        for one in pages:
-            one.start()
+        for each in pages:
+            each.start()
         assert ask("POST", f"/{TOKEN}/do/stop", "{}")[0] == 200
         assert stage.stops
-        assert all(one.is_alive() for one in pages)
-    for one in pages:
-        one.join(PATIENCE_S)
+        assert all(each.is_alive() for each in pages)
+    for each in pages:
+        each.join(PATIENCE_S)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Collection, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +34,8 @@ _REDUCED, _MASK = 1, 4
 """Bits of NewSubfileType: a smaller copy of another page, and its transparency."""
 _NODATA, _MICRO_MANAGER, _ORIENTATION = 42113, 51123, 274
 _COMPLETE_BITS = 8
+_TORN = ("invalid page offset", "missing data", "corrupted", "circular")
+"""Words in warnings of tifffile for pages that it could not find."""
 _GREY = ("MINISBLACK", "MINISWHITE", "CFA", "LINEAR_RAW")
 _COLOUR = ("RGB", "PALETTE", "YCBCR")
 _TO_RGB = (6, 7, 33003, 33004, 33005, 34712, 50001)
@@ -59,7 +61,7 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
     a colour picture; `opaque`, whether no pixel is transparent.
     """
     with ExitStack() as files:
-        complaints = files.enter_context(_Complaints())
+        check_whole = files.enter_context(_watched())
         tiff = files.enter_context(tifffile.TiffFile(path))
         members, described, notes = [path], tiff.ome_metadata, []
         if described is None:
@@ -72,7 +74,7 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
             series = _Series(tiff, Path(path), described, apart, files)
             taken, members = series.pages()
         taken = [_by_micro_manager(part) for part in taken]
-        complaints.check()
+        check_whole()
         is_alone = len(tiff.pages) == len(taken) == 1
         if described is None and is_alone and not tiff.is_micromanager:
             codes = _planes_of_one_page(tiff, taken[0].page)
@@ -85,7 +87,7 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
                 raise ValueError(
                     f"it states {stated} images and holds {len(shown.frames)}: cut short"
                 )
-        complaints.check()
+        check_whole()
         facts = {
             "full_scale": _full_scale(taken[0].page, shown.frames.dtype),
             "exposures_s": _each([part.exposure_s for part in taken], len(shown.frames)),
@@ -106,31 +108,23 @@ class _Shown(NamedTuple):
     opaque: bool
 
 
-class _Complaints(logging.Handler):
-    """What tifffile says beside what it returns: that pages are missing is an error here."""
+@contextmanager
+def _watched() -> Iterator[Callable[[], None]]:
+    """Yield a check that raises ValueError where tifffile logged pages that are missing."""
+    said: list[str] = []
+    handler, logger = logging.Handler(logging.WARNING), logging.getLogger("tifffile")
+    handler.emit = lambda record: said.append(record.getMessage())
 
-    _torn = ("invalid page offset", "missing data", "corrupted", "circular")
+    def check() -> None:
+        for words in said:
+            if any(torn in words for torn in _TORN):
+                raise ValueError(f"cut short: {words.rpartition('>')[2].strip()}")
 
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self._said: list[str] = []
-
-    def __enter__(self) -> _Complaints:
-        logging.getLogger("tifffile").addHandler(self)
-        return self
-
-    def __exit__(self, *fault: object) -> None:
-        logging.getLogger("tifffile").removeHandler(self)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep a message."""
-        self._said.append(record.getMessage())
-
-    def check(self) -> None:
-        """Raise ValueError where pages could not be found."""
-        for said in self._said:
-            if any(words in said for words in self._torn):
-                raise ValueError(f"cut short: {said.rpartition('>')[2].strip()}")
+    logger.addHandler(handler)
+    try:
+        yield check
+    finally:
+        logger.removeHandler(handler)
 
 
 def _is_copy(page: Any) -> bool:
