@@ -73,7 +73,7 @@ def reconstruct_adaptive(
     disparity: of the centre view (y, x), where it is known, in place of the one searched. patches:
     see `Patches`; they are asked for from `settings.patches` shots on, or where surfaces fail
     (`second`). film: that this is a frame of, see `reconstruction.result.Reconstruction.film`.
-    Raises ReconstructionError for inputs that do not fit each other.
+    Raises ReconstructionError for inputs of shapes that disagree.
     """
     settings = settings or AdaptiveSettings()
     started = running_s()
@@ -163,7 +163,7 @@ def reconstruct_moving(
         checked(psi.of_shots([n]), frames.cut(np.s_[n : n + 1,])) for n in range(psi.shots)
     )
     nothing, steps = np.zeros(psi.size), settings.start_steps
-    shown = [(one, plain_of(one, 1.0, nothing, steps).picture) for one in others]
+    shown = [(readings, plain_of(readings, 1.0, nothing, steps).picture) for readings in others]
     return _with_other_times(present, shown, settings, on_step, patches=patches)
 
 
