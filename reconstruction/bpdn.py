@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -21,7 +22,6 @@ from reconstruction.errors import ReconstructionError
 
 Array32 = NDArray[np.float32]
 Method = Literal["admm", "omp", "lars", "ista", "fista", "sl0"]
-MINIMISERS = ("admm", "lars", "ista", "fista")
 SL0_RIDGE = 0.03
 """Of A A^T, relative to its largest block: what readings hold beyond noise and atoms is not forced
 into directions that they hardly see. On 48x64 middles of four scenes of group A, three shots, 1e-5
@@ -80,11 +80,6 @@ class Code:
 EMPTY = Code(np.zeros(0, np.float32), 0.0, 0.0, 0.0, 0.0, True)
 
 
-def median_norm(atoms: Array32) -> float:
-    """Return the median norm of atoms (atom, measurement)."""
-    return float(np.median(solvers.norms(atoms)))
-
-
 def penalty_of(
     size: float, count: int, data: Array32, noise_sigma: float, settings: BPDNSettings
 ) -> float:
@@ -109,51 +104,47 @@ def prepared(
     will be coded, for the scale of ADMM's rho. The returned function takes one patch's data and
     how many of its measurements are usable.
     """
-    size = median_norm(atoms)
+    size, count = float(np.median(solvers.norms(atoms))), len(atoms)
     scale = float(np.sqrt(np.mean(np.sum(np.square(data, dtype=np.float64), axis=1))))
-    count, method = len(atoms), settings.method
 
-    def greedy(one: Array32, measured: int) -> Code:
+    def penalty(patch: Array32) -> float:
+        return penalty_of(size, count, patch, noise_sigma, settings)
+
+    def greedy(patch: Array32, measured: int) -> Code:
         tolerance = settings.tolerance_factor * noise_sigma * np.sqrt(measured)
-        if method == "omp":
+        if settings.method == "omp":
             most = min(settings.atoms, measured)
-            weights, steps, residual = solvers.omp(atoms, one, most, tolerance)
+            weights, steps, residual = solvers.omp(atoms, patch, most, tolerance)
         else:
             widths = settings.sl0_shrink, settings.sl0_inner_steps, settings.sl0_narrowest
-            weights, steps, residual = solvers.sl0(atoms, one, tolerance, *widths, SL0_RIDGE)
+            weights, steps, residual = solvers.sl0(atoms, patch, tolerance, *widths, SL0_RIDGE)
         return Code(weights, 0.0, np.nan, residual, steps, True)
 
-    if method not in MINIMISERS:
+    if settings.method in ("omp", "sl0"):
         return greedy
     if not size * scale > 0:
-        return lambda one, measured: Code(np.zeros(count, np.float32), 0, 0, 0, 0, True)
-    rho, inverse = 0.0, None
-    if method == "admm":
+        return lambda patch, measured: Code(np.zeros(count, np.float32), 0, 0, 0, 0, True)
+    minimise = {
+        "ista": partial(solvers.proximal_gradient, atoms, accelerate=False),
+        "fista": partial(solvers.proximal_gradient, atoms, accelerate=True),
+        "lars": partial(solvers.lars, atoms),
+    }.get(settings.method)
+    if minimise is None:
         # One factor serves all patches of a class, so their penalties share one rho.
-        eta = np.median([penalty_of(size, count, one, noise_sigma, settings) for one in data])
-        rho = float(eta / (settings.threshold * scale / size))
+        eta = float(np.median([penalty(patch) for patch in data]))
+        rho = eta / (settings.threshold * scale / size)
         try:
             inverse = solvers.ridge_inverse(atoms, rho)
         except np.linalg.LinAlgError as fault:
             raise ReconstructionError(
                 "a sensed dictionary is singular: raise the penalty"
             ) from fault
-    limits = settings.rtol, settings.max_steps
+        minimise = partial(solvers.admm, atoms, inverse=inverse, rho=rho, relax=settings.relaxation)
 
-    def minimise(one: Array32, measured: int) -> Code:
-        eta = penalty_of(size, count, one, noise_sigma, settings)
-        if method == "lars":
-            weights, steps, arrived = solvers.lars(atoms, one, eta, settings.max_steps)
-            gap = solvers.duality_gap(atoms, one, eta, weights)
-            return Code(
-                weights, eta, gap, np.nan, steps, gap <= (LARS_GAP if arrived else settings.rtol)
-            )
-        if inverse is not None:
-            relax = settings.relaxation
-            weights, steps, gap = solvers.admm(atoms, inverse, one, eta, rho, relax, *limits)
-        else:
-            accelerate = method == "fista"
-            weights, steps, gap = solvers.proximal_gradient(atoms, one, eta, accelerate, *limits)
-        return Code(weights, eta, gap, np.nan, steps, gap <= settings.rtol)
+    def convex(patch: Array32, measured: int) -> Code:
+        eta = penalty(patch)
+        weights, steps, gap = minimise(patch, eta, settings.rtol, settings.max_steps)
+        ended = settings.method == "lars" and steps < settings.max_steps
+        return Code(weights, eta, gap, np.nan, steps, gap <= (LARS_GAP if ended else settings.rtol))
 
-    return minimise
+    return convex

@@ -19,7 +19,7 @@ FIRST_STEPS = 20
 INNER_SHARE = 0.5
 """Of the tolerance, to which a working set is solved."""
 DEPENDENT = 1e-3
-"""An atom of which the chosen ones explain all but this share of its norm adds nothing."""
+"""An atom adds nothing if chosen atoms explain all but this share of its norm."""
 FRESH = 0.7
 """LARS: once the level fell to this share, correlations are computed anew: they are 32 bits."""
 DARKEST = 1e-6
@@ -58,14 +58,6 @@ def _relative(objective: float, dual: float) -> float:
     return (objective - dual) / objective if objective > 0 else 0.0
 
 
-def duality_gap(atoms: Array32, data: Array32, eta: float, code: Array) -> float:
-    """Return the relative duality gap of a code; its residual is the dual point."""
-    fitted = code @ atoms
-    residual = data - fitted
-    largest = float(np.abs(atoms @ residual).max())
-    return _relative(_objective(data, fitted, eta, code), _dual(data, residual, eta, largest))
-
-
 def _soft(values: Array, threshold: float) -> Array:
     return values - np.clip(values, np.float32(-threshold), np.float32(threshold))
 
@@ -78,19 +70,19 @@ def _largest(values: Array, wanted: int) -> NDArray[np.bool_]:
 
 def admm(
     atoms: Array32,
-    inverse: Array32,
     data: Array32,
     eta: float,
-    rho: float,
-    relax: float,
     rtol: float,
     max_steps: int,
+    inverse: Array32,
+    rho: float,
+    relax: float,
 ) -> tuple[Array32, float, float]:
     """Return the code of eq. 8 by ADMM on a growing working set, passes and relative gap.
 
-    A few steps on all atoms find which matter. ADMM then runs on those alone; atoms outside that
-    correlate with its dual point more than eta join, and it goes on from where it was. The gap
-    is that of the whole problem. inverse: (A A^T + rho 1)^-1.
+    A few steps on all atoms find which matter. ADMM then runs on this working set alone. Outside
+    atoms whose correlation with the dual point exceeds eta join the set, and ADMM continues from
+    its state. The gap is that of the whole problem. inverse: (A A^T + rho 1)^-1.
     """
     count, length = atoms.shape
     state, dual_point = np.zeros(count, np.float32), np.empty(length, np.float32)
@@ -121,7 +113,7 @@ def admm(
 
 
 def proximal_gradient(
-    atoms: Array32, data: Array32, eta: float, accelerate: bool, rtol: float, max_steps: int
+    atoms: Array32, data: Array32, eta: float, rtol: float, max_steps: int, accelerate: bool
 ) -> tuple[Array32, float, float]:
     """Return the code of eq. 8 by ISTA, or by FISTA with adaptive restart, steps and relative gap.
 
@@ -184,11 +176,14 @@ def omp(atoms: Array32, data: Array32, most: int, tolerance: float) -> tuple[Arr
     return code, len(chosen), float(np.linalg.norm(residual))
 
 
-def lars(atoms: Array32, data: Array32, eta: float, max_steps: int) -> tuple[Array32, int, bool]:
-    """Return the minimiser of eq. 8, followed from the largest penalty down to eta, and the steps.
+def lars(
+    atoms: Array32, data: Array32, eta: float, rtol: float, max_steps: int
+) -> tuple[Array32, int, float]:
+    """Return the minimiser of eq. 8, followed from the largest penalty to eta, steps and gap.
 
     The Lasso path of least angle regression (Efron 2004): every step ends where an atom joins or
-    leaves. Last whether eta was reached within the steps; else the code is that of a larger one.
+    leaves. At the step limit the code is that of a larger penalty than eta. rtol: not used, as the
+    path ends at the minimiser.
     """
     residual = data.astype(np.float64)
     correlation = atoms @ data
@@ -214,7 +209,8 @@ def lars(atoms: Array32, data: Array32, eta: float, max_steps: int) -> tuple[Arr
         down = (np.float32(level) + correlation) / np.maximum(1 + slope, tiny)
         joins = np.minimum(up, down)
         joins[[*chosen, *dependent, *resting]] = np.inf
-        # By its sign, not by its weight: of two that reach 0 together one may be past it.
+        # By sign, not by weight: of two atoms reaching 0 together, rounding may carry the second
+        # past 0.
         falling = np.maximum(signs[chosen] * weights[chosen], 0)
         leaves = np.full(len(chosen), np.inf)
         shrinking = signs[chosen] * direction < 0
@@ -237,7 +233,11 @@ def lars(atoms: Array32, data: Array32, eta: float, max_steps: int) -> tuple[Arr
             dependent = []
             chosen.remove(leaving)
             weights[leaving] = 0
-    return weights.astype(np.float32), steps, level <= eta
+    code = weights.astype(np.float32)
+    fitted = code @ atoms
+    residual = data - fitted
+    dual = _dual(data, residual, eta, float(np.abs(atoms @ residual).max()))
+    return code, steps, _relative(_objective(data, fitted, eta, code), dual)
 
 
 def _is_independent(atoms: Array32, chosen: list[int], further: int) -> bool:

@@ -73,8 +73,8 @@ def contrast(guess: Array) -> float:
 def smooth_guess(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return a blurred picture (y, x, c) that explains the frames' local means, float32.
 
-    Every colour is the ratio of blurred back-projections, as if all views were equal; where no
-    pixel has a filter, that is grey, and colours are those that the masks show (`colour`).
+    Every colour is the ratio of blurred back-projections, as if all views were equal; without
+    colour filters that ratio is grey, and colours follow from the masks (`colour`).
     """
     kept = np.where(usable, frames, 0).astype(np.float32)
     seen = psi.forward_picture(np.ones((*psi.size, 3), dtype=np.float32)) * usable

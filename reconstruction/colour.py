@@ -22,10 +22,10 @@ NEAREST_PX = 0.7
 """Deviation of the window whose mean is the texture. On 96x96 crops of group A and two built-in
 scenes, one shot of `scenario-iii-mono`, 1.0 costs 0.4 dB of the chrominance."""
 WINDOWS = (None, 1.0), (16.0, 0.15), (6.0, 0.1)
-"""Deviation of the window in pixels, None: the whole picture; and that of chrominance over
-brightness which is presumed there. Twice the latter two cost 0.9 dB, ending at 3 px 2 dB."""
+"""Deviation of the window in pixels, None: the whole picture; and the deviation presumed there of
+chrominance over brightness. Twice the latter two cost 0.9 dB, ending at 3 px 2 dB."""
 DETAIL = 1.5, 0.07
-"""The same of what is finer than these windows: not estimated, but for how much of it is left."""
+"""The same of what is finer than these windows: only its remaining amount is estimated."""
 ALIKE_PX = 3.0
 """Neighbouring pixels whose textures vary alike: so many make one observation. 1 costs 0.4 dB."""
 DIMMEST = 0.05
@@ -55,8 +55,8 @@ def chroma_of(
     signals = [frames, *(psi.forward_picture(grey * np.sqrt(3) * axis) for axis in OPPONENT[1:])]
     near = np.maximum(_blurred(good.sum(axis=0), NEAREST_PX), 1e-6)
     varied = []
-    for one in signals:
-        share = np.where(good, one / safe, 0)
+    for signal in signals:
+        share = np.where(good, signal / safe, 0)
         varied.append(np.where(good, share - _blurred(share.sum(axis=0), NEAREST_PX) / near, 0))
     left, signs = varied[0], np.stack(varied[1:], axis=-1)
     value, posterior = np.zeros((*level.shape[1:], 2)), np.zeros((*level.shape[1:], 2, 2))
@@ -73,8 +73,8 @@ def _regressed(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the chrominance within windows, (pixel_y, pixel_x, 2), and its covariance.
 
-    left: variation of the readings not yet explained, (shot, pixel_y, pixel_x). signs: by which it
-    varies for a chrominance of 1, (..., 2).
+    left: variation of the readings not yet explained, (shot, pixel_y, pixel_x). signs: variation by
+    a chrominance of 1, (..., 2).
     """
     size = left.shape[1:]
     square = np.einsum("syxi,syxj->yxij", signs, signs).reshape(*size, 4)

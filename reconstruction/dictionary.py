@@ -35,8 +35,8 @@ _SAME = 0.995
 class Dictionary:
     """atoms: (atom, v, u, y, x, c) float32, each of unit l2 norm. kind: one of KINDS.
 
-    provenance: JSON about the training: scenes, seed, settings, error history, versions.
-    Raises DictionaryError for another shape, values that are not finite, another norm than 1.
+    provenance: JSON about the training: scenes, seed, settings, error history, versions. Raises
+    DictionaryError for a wrong shape, values not finite, norms other than 1.
     """
 
     atoms: NDArray[np.float32]

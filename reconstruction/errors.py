@@ -1,4 +1,4 @@
-"""Errors of the reconstruction: each message says what is wrong and what to do, in one line."""
+"""Errors of the reconstruction: each message states the fault and its remedy in one line."""
 
 from emmc_rig.model.advice import AdvisedError
 

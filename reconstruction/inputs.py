@@ -1,4 +1,4 @@
-"""Frames checked before any method: they fit Psi, and are finite where they are used."""
+"""Frames checked before any method: shapes agree with Psi, used readings are finite."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _unlike(given: tuple[int, ...], needed: tuple[int, int, int]) -> str:
 
 
 def checked_inputs(psi: ImagingMatrix, frames: Frames) -> Frames:
-    """Return frames whose readings are of Psi's type, and 0 where they are not usable.
+    """Return frames with readings of Psi's type, 0 at unusable pixels.
 
     Raises ReconstructionError for frames that do not fit Psi or are not finite where usable, that
     are far brighter than a white scene, for deviations of usable readings that are negative or not

@@ -202,7 +202,7 @@ def _dual_rows(steps, stencils, ahead, dual, begin, end):
     width = values // 3
     raised = np.empty((count, 3, width), dual.dtype)
     size = np.empty(width, dual.dtype)
-    one = np.float32(1)
+    unit = np.float32(1)
     tiny = np.float32(1e-30)
     for y in range(begin, end):
         for v in range(views_v):
@@ -219,7 +219,7 @@ def _dual_rows(steps, stencils, ahead, dual, begin, end):
                             line[x] = before[x] + step * line[x]
                             size[x] += line[x] * line[x]
                 for x in range(width):
-                    size[x] = relax * min(one, bound / np.sqrt(size[x] + tiny))
+                    size[x] = relax * min(unit, bound / np.sqrt(size[x] + tiny))
                 for index in range(count):
                     if not _fits(dual.shape, stencils.reach[index], v, u, y):
                         continue
@@ -227,7 +227,7 @@ def _dual_rows(steps, stencils, ahead, dual, begin, end):
                     for c in range(3):
                         line, before = new[c], old[c * width : (c + 1) * width]
                         for x in range(width):
-                            before[x] = (one - relax) * before[x] + size[x] * line[x]
+                            before[x] = (unit - relax) * before[x] + size[x] * line[x]
 
 
 @njit(cache=True, nogil=True, fastmath=True)

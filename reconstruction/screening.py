@@ -50,8 +50,8 @@ BAD_STEPS = 3
 LEAST = 1e-3
 """Of the mean prediction, by which readings are divided at least."""
 BESIDE, SAMPLED = 2, 1000
-"""Lines of the same colours on either side that a line is compared with, and pixels of it, about,
-that are looked at."""
+"""Number of lines of the same colours compared on either side of a line, and of pixels examined
+along it, about."""
 TILES = 1, 2, 3, 4, 6, 12
 """Sides of tiles of colour filters."""
 UNVARYING = 0.15
@@ -59,8 +59,8 @@ UNVARYING = 0.15
 stuck. Of good lines of 13 scenes (96x96) it is 0.4 at least behind masks, 0.25 without; of lines
 that pass 2 % of the light 0.02."""
 DARK = 0.5
-"""Brightness of a line over that of most, below which it may be an edge of the light field: those
-of occlusions, buttercup and bikes have 0.00 to 0.03 of that beside."""
+"""Brightness of a line over that of most, below which it may be an edge of the light field: the
+edges of occlusions, buttercup and bikes have 0.00 to 0.03 of the brightness beside."""
 AS_LIGHT = 0.3
 """Square misfit of what a pixel reads too much, as light that the masks let through, over that as
 the same in every shot, below which it is a bright detail. On 64x80 middles of four real scenes,
@@ -298,13 +298,13 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
                     count[n + own] += alike[n]
                 for place in range(keep):
                     for n in range(width):
-                        one, other = least[place, n + own], small[n]
-                        least[place, n + own] = one if one < other else other
-                        small[n] = other if one < other else one
+                        kept, other = least[place, n + own], small[n]
+                        least[place, n + own] = kept if kept < other else other
+                        small[n] = other if kept < other else kept
                     for n in range(width):
-                        one, other = most[place, n + own], large[n]
-                        most[place, n + own] = other if one < other else one
-                        large[n] = one if one < other else other
+                        kept, other = most[place, n + own], large[n]
+                        most[place, n + own] = other if kept < other else kept
+                        large[n] = kept if kept < other else other
         for x in range(columns):
             if count[x] < fewest:
                 low[y, x], high[y, x] = -np.inf, np.inf

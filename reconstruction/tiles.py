@@ -51,8 +51,8 @@ blocks."""
 SAMPLE, SAMPLES = 96, 3
 """Rows and columns of a sample window of the survey, and windows along each axis."""
 SURE_PX, COVERED = 0.25, 99.0
-"""Largest deviation of the disparities that the halo is chosen by, and the percent of them that it
-covers. Fewer readings of a block show surfaces beyond; there it is averaged with its neighbour."""
+"""The halo covers this percentile of the disparities whose deviation is at most SURE_PX. Fewer
+readings of a block show surfaces beyond; the mean with the neighbouring block helps there."""
 
 Array = NDArray[np.floating]
 ArrayType = tuple[tuple[int, ...], np.dtype]
@@ -65,7 +65,7 @@ class Block:
     """A block of the grid, by rows and columns of the light field's samples.
 
     outer: reconstructed, with the halo; part: without the halo, overlapping the neighbours; inner:
-    nearer to this block than to any other. sides: of the light field, which the block touches."""
+    samples nearest to this block. sides: of the light field, which the block touches."""
 
     row: int
     column: int
@@ -80,10 +80,10 @@ class Block:
         return f"block-{self.row:03d}-{self.column:03d}"
 
 
-def within(one: Place, other: Place) -> Place:
+def within(place: Place, other: Place) -> Place:
     """Return rows and columns counted from the first of another place."""
     rows, columns = (
-        slice(a.start - b.start, a.stop - b.start) for a, b in zip(one, other, strict=True)
+        slice(a.start - b.start, a.stop - b.start) for a, b in zip(place, other, strict=True)
     )
     return rows, columns
 
@@ -98,7 +98,7 @@ def pixels_of(place: Place, binning: int) -> tuple[slice, slice, slice]:
 class Grid:
     """The canonical grid of blocks of a light field.
 
-    size: its rows and columns. multiple: of which all edges are, in samples. halo: samples beyond a
+    size: its rows and columns. multiple: divisor of all edges, in samples. halo: samples beyond a
     block's part that are reconstructed and thrown away.
     """
 
@@ -201,7 +201,7 @@ def assembled(grid: Grid, place: Place, axes: int, dtype: np.dtype, part: Part) 
     for block, shared, weight in grid.overlapping(place, blended):
         values = part(block, (*lead, *within(shared, block.part)))
         if total is None:
-            size = (one.stop - one.start for one in place)
+            size = (side.stop - side.start for side in place)
             shape = (*values.shape[:axes], *size, *values.shape[axes + 2 :])
             total = np.zeros(shape, dtype)
         at = (*lead, *within(shared, place))
@@ -215,7 +215,7 @@ def assembled(grid: Grid, place: Place, axes: int, dtype: np.dtype, part: Part) 
 
 @dataclass(frozen=True)
 class CaptureSurvey:
-    """What is settled once for the whole capture, so that blocks are functions of it.
+    """Decisions made once for the whole capture, on which every block depends.
 
     settings: of the methods, with mu, primal step and steps settled. halo: see `Grid`. left_out:
     shots, gains: of the shots, words: about both. largest_px: disparity, 0 where not searched.
@@ -291,10 +291,12 @@ def surveyed(
     windows = [psi.window(*place) for place in places]
     mosaic = replace(
         windows[0],
-        weights=np.concatenate([one.weights for one in windows], axis=5),
+        weights=np.concatenate([window.weights for window in windows], axis=5),
         colour=None
         if windows[0].colour is None
-        else np.concatenate([one.colour for one in windows if one.colour is not None], axis=2),
+        else np.concatenate(
+            [window.colour for window in windows if window.colour is not None], axis=2
+        ),
     )
     seen = [pixels_of(place, k) for place in places]
     use = np.concatenate([frames.usable[place] for place in seen], axis=2)
@@ -311,7 +313,7 @@ def surveyed(
     halo, largest, scout = REACH, 0.0, method.scout
     sparse = method.patches(mosaic, settings)
     if scout is not None:
-        firsts = np.cumsum([0, *(one.frames_shape[2] for one in windows)])
+        firsts = np.cumsum([0, *(window.frames_shape[2] for window in windows)])
         parts = [
             (window, np.s_[:, :, first : first + window.frames_shape[2]])
             for window, first in zip(windows, firsts, strict=False)
@@ -347,7 +349,7 @@ def _settled(
     settings: MethodSettings,
     sparse: SparseSettings | None,
 ) -> MethodSettings:
-    """Return the settings with what a block would choose for itself chosen for all of them.
+    """Return the settings with a block's own choices made once for all blocks.
 
     sparse: settings of the patches, of methods that draw total variation towards some.
     """
@@ -407,7 +409,7 @@ def solve_block(
 
 
 AXES = {"light_field": 2, "sigma": 2}
-"""Axes before (y, x) of the arrays of a result; maps that are not listed have none."""
+"""Axes before (y, x) of the arrays of a result; other maps have 0."""
 
 
 def summed_up(

@@ -65,7 +65,7 @@ def _place(disparity, moved, y, margin, size, taps, fractions):
     """
     views_v, views_u, _, _ = disparity.shape
     still = moved.shape[1] == 1
-    ahead, none, one = np.float32(margin - 1), np.float32(0), np.float32(1)
+    ahead, none, unit = np.float32(margin - 1), np.float32(0), np.float32(1)
     last_y, last_x = np.float32(size[0] - TAPS), np.float32(size[1] - TAPS)
     for v in range(views_v):
         for u in range(views_u):
@@ -74,7 +74,7 @@ def _place(disparity, moved, y, margin, size, taps, fractions):
             by = moved[:, 0, 0, 0] if still else moved[:, v, u, y]
             where = taps[:, ray], fractions[:, ray]
             _along(row, by[0], np.float32(y), none, dv, ahead, last_y, where[0][0], where[1][0])
-            _along(row, by[1], none, one, du, ahead, last_x, where[0][1], where[1][1])
+            _along(row, by[1], none, unit, du, ahead, last_x, where[0][1], where[1][1])
 
 
 @njit(forceinline=True, fastmath=True)

@@ -1,10 +1,9 @@
 """Edges that views do not reach: outermost rows and columns, black or nearly so.
 
 Light fields that were rectified often end so. The edge does not move with the surfaces beside it,
-and spoils their fit: that of begonia (434x625, one shot) by 3 dB over the whole. Its readings show
-it: in every line of it they are darker than those of the next lines within, and at its inner end
-more suddenly so than brightness changes within. How much of the scene its pixels show is then read
-from the frames, given the scene.
+and spoils their fit: that of begonia (434x625, one shot) by 3 dB over the whole. Readings of every
+line of an edge are darker than those of the next lines within. Which share of the scene the pixels
+of an edge show is then estimated from the frames, given the scene.
 """
 
 from __future__ import annotations
@@ -32,9 +31,6 @@ than half of it: 0.22 to 1, and 0.05 at most, on four real light fields. 2x 0.00
 ALL_ALONG = 0.9
 """Share of its length over which a line of an edge is darker by half of DARKER: on corners of four
 real light fields all of it; of a dark object that ends beside the picture's edge (dragons) 0.73."""
-SUDDEN = 3.0
-"""Times more that brightness changes, in squares, at the edge than at the next lines within: at
-least 3.5 on those four. 2x 0.00, 0.5x 0.00 dB."""
 TINY = 1e-20
 
 
@@ -54,73 +50,39 @@ def _blurred(line: Array) -> Array:
     return np.asarray(out, dtype=np.float32).reshape(line.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """Lines of pixels parallel to an edge, outermost first.
+def _colours(seen: Array, readings: Array) -> Array:
+    """Return the colours (along, c) of lines, as if all had the same, blurred along the edge.
 
-    seen: flat Psi, (line, shot, along, c), readings: (line, shot, along).
+    seen: flat Psi, (line, shot, along, c). readings: (line, shot, along).
     """
+    above, below = (
+        _blurred(np.einsum("lsac,lsa->ac", seen, part)) for part in (readings, seen.sum(axis=-1))
+    )
+    floor = 1e-3 * max(float(below.mean()), TINY)
+    return np.maximum(above, 0) / np.maximum(below, floor)
 
-    seen: Array
-    readings: Array
 
-    def colours(self, lines: slice) -> Array:
-        """Return the colours (along, c) that these lines share, blurred along the edge."""
-        seen, readings = self.seen[lines], self.readings[lines]
-        total = seen.sum(axis=-1)
-        above, below = (
-            _blurred(np.einsum("lsac,lsa->ac", seen, part)) for part in (readings, total)
-        )
-        floor = 1e-3 * max(float(below.mean()), TINY)
-        return np.maximum(above, 0) / np.maximum(below, floor)
+def _width(seen: Array, readings: Array) -> int:
+    """Return how many lines are an edge; seen, readings: see `_colours`, the outermost first.
 
-    def change(self, line: int) -> tuple[float, float, float]:
-        """Return by how much a line is brighter than those within: its mean, and mean square.
-
-        As a share of their brightness. Last, over which share of its length it is darker.
-        """
-        beside = self.colours(slice(line + 1, line + 1 + BESIDE))
-        seen = self.seen[line]
-        missed = self.readings[line] - np.einsum("sac,ac->sa", seen, beside)
-        light = seen.sum(axis=-1)
+    A line's brightness is compared with that of BESIDE lines within: r, the change relative to it,
+    in the mean along the line, and the share of the line where r < -DARKER / 2.
+    """
+    change, share = [], []
+    for line in range(WIDEST + 1):
+        within = slice(line + 1, line + 1 + BESIDE)
+        beside = _colours(seen[within], readings[within])
+        missed = readings[line] - np.einsum("sac,ac->sa", seen[line], beside)
+        light = seen[line].sum(axis=-1)
         above, below = (_blurred((light * part).sum(axis=0)) for part in (missed, light))
-        relative = above / np.maximum(below, TINY)
-        brightness = beside.mean(axis=-1)
-        return (
-            float(relative.mean() / max(brightness.mean(), TINY)),
-            float(np.square(relative).mean() / max(np.square(brightness).mean(), TINY)),
-            float((relative < -DARKER / 2 * brightness).mean()),
-        )
-
-
-def _lines(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], side: Side) -> _Lines:
-    """Return the lines at a side that are looked at."""
-    (axis, far), k = divmod(SIDES.index(side), 2), psi.binning
-    pixels = [slice(0, length) for length in frames.shape[1:]]
-    length, looked = frames.shape[1 + axis], WIDEST + 1 + BESIDE
-    pixels[axis] = slice(length - looked, length) if far else slice(0, looked)
-    rows, columns = pixels
-    part = psi.window(*(slice(one.start * k, one.stop * k) for one in pixels))
-    used = usable[:, rows, columns]
-    seen = part.picture_weights.reshape(*used.shape[:2], k, used.shape[2], k, -1).sum(axis=(2, 4))
-    kept = np.where(used, frames[:, rows, columns], 0)
-    seen = np.where(used[..., None], seen, 0)
-    if axis:
-        seen, kept = seen.swapaxes(1, 2), kept.swapaxes(1, 2)
-    if far:
-        seen, kept = seen[:, ::-1], kept[:, ::-1]
-    return _Lines(seen.swapaxes(0, 1), kept.swapaxes(0, 1))
-
-
-def _width(lines: _Lines) -> int:
-    """Return how many lines are an edge."""
-    mean, square, darker = zip(*(lines.change(line) for line in range(WIDEST + 1)), strict=True)
+        relative, brightness = above / np.maximum(below, TINY), beside.mean(axis=-1)
+        change.append(relative.mean() / max(brightness.mean(), TINY))
+        share.append((relative < -DARKER / 2 * brightness).mean())
     width = 0
     for last in range(WIDEST):
-        if mean[last] >= -DARKER or darker[last] < ALL_ALONG:
+        if change[last] >= -DARKER or share[last] < ALL_ALONG:
             break
-        ends = mean[last + 1] > -DARKER / 2
-        if ends and square[last] > SUDDEN * max(square[last + 1 :]):
+        if change[last + 1] > -DARKER / 2:
             width = last + 1
     return width
 
@@ -133,14 +95,21 @@ def dark_edges(
 ) -> DarkEdges | None:
     """Return the edges of the frames (shot, pixel_y, pixel_x) that are no part of the scene.
 
-    None if all are, and for frames too small to tell. sides: those that may have one.
+    None without any, and for frames too small to tell. sides: those that may have one.
     """
-    rows, columns = frames.shape[1:]
-    if min(rows, columns) < 4 * (WIDEST + 1 + BESIDE):
+    (shots, rows, columns), k = frames.shape, psi.binning
+    looked = WIDEST + 1 + BESIDE
+    if min(rows, columns) < 4 * looked:
         return None
-    top, bottom, left, right = (
-        _width(_lines(psi, frames, usable, side)) if side in sides else 0 for side in SIDES
-    )
+    seen = psi.picture_weights.reshape(shots, rows, k, columns, k, -1).sum(axis=(2, 4))
+    seen, readings = np.where(usable[..., None], seen, 0), np.where(usable, frames, 0)
+    widths = [0] * len(SIDES)
+    for number, side in enumerate(SIDES):
+        if side in sides:
+            axis, far = 1 + number // 2, number % 2
+            lines = (np.moveaxis(part, axis, 0) for part in (seen, readings))
+            widths[number] = _width(*(part[:: -1 if far else 1][:looked] for part in lines))
+    top, bottom, left, right = widths
     within = np.ones((rows, columns), dtype=bool)
     within[top : rows - bottom, left : columns - right] = False
     return DarkEdges((top, bottom, left, right), within) if within.any() else None

@@ -6,9 +6,10 @@ luminance and a b k in each chrominance, k(r) = exp((e - sqrt(r^2 + e^2)) / l): 
 natural picture's up to the optics' blur e. The patch's m readings are then Gaussian too, with
 covariance Psi K_d Psi^T + noise; their log-likelihood (marginal likelihood, evidence) compares d,
 the amplitude a and the colourfulness b alike, and pays for what a model could have explained but
-did not see (Occam's factor, log det). So it does for l, which differs from leaf to wall: textures
-of several lengths are compared, and the likelihood is their mean. With one length alone a picture
-that is finer than it seems to lie nearer to d = 0, where fewer rays of a pixel are averaged.
+did not see (Occam's factor, log det). The same holds for l, which differs from leaf to wall:
+textures of several lengths are compared, and the likelihood is their mean. With one length alone a
+picture that is finer than it seems to lie nearer to d = 0, where fewer rays of a pixel are
+averaged.
 
 Products of a patch: m R S for spectra of its rays, 2 m^2 / 2 S to correlate them, m^2 / 2 S of each
 texture (a length and a disparity) for its covariance, and m^3 / 6 of each and of each of P trials
@@ -182,7 +183,8 @@ def _spots(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
 def _textures(
     possible: NDArray[np.bool_], lengths: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return which textures each group compares, how many, and which of these are its probes.
+    """Return the textures that each group compares, their number, and the group's probes among
+    them.
 
     possible: (group, disparity). Textures (group, texture) count disparities of the first length,
     then of the next; what is beyond a group's number repeats its last.
@@ -191,8 +193,8 @@ def _textures(
     counts = possible.sum(axis=1)
     ordered = np.argsort(~possible, axis=1, kind="stable")
     at = np.arange(lengths * counts.max())[None]
-    length, one = np.divmod(np.minimum(at, lengths * counts[:, None] - 1), counts[:, None])
-    textures = length * disparities + np.take_along_axis(ordered, one, axis=1)
+    length, rank = np.divmod(np.minimum(at, lengths * counts[:, None] - 1), counts[:, None])
+    textures = length * disparities + np.take_along_axis(ordered, rank, axis=1)
     # The middle one first: most patches' disparities are nearest to it.
     order = np.argsort(np.abs(np.arange(PROBES) - PROBES // 2), kind="stable") + 1
     probes = np.rint(order * (counts[:, None] - 1) / (PROBES + 1)).astype(np.int64)
@@ -229,8 +231,8 @@ def patch_evidence(
     data: readings less those of the smooth picture, variance: theirs, both (shot, pixel_y,
     pixel_x). brightness: (patch,), of the smooth picture; sets the amplitudes' scale. corners:
     (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`. possible: (patch, disparity),
-    those to evaluate (default all): LANES patches that follow each other are worked on together,
-    at every disparity that one of them asks for. kinds: (patch, length) of texture, where known.
+    those to evaluate (default all): LANES patches in a row share a group, which evaluates every
+    disparity possible for any patch of it. kinds: (patch, length) of texture, where known.
     """
     count = len(corners)
     if possible is None:
@@ -245,12 +247,12 @@ def patch_evidence(
     evaluated = np.flatnonzero(used)
     tables = np.empty((len(pixels_apart), len(lengths), len(evaluated), len(waves)), np.float32)
 
-    def tabulate(one: int) -> None:
+    def tabulate(number: int) -> None:
         apart = pixels_apart[:, None] * psi.binning + separations[:, :2]
-        apart = apart - float(disparities[evaluated[one]]) * separations[:, 2:]
+        apart = apart - float(disparities[evaluated[number]]) * separations[:, 2:]
         square_px = np.square(apart).sum(axis=-1)
         for length, texture in enumerate(lengths):
-            tables[:, length, one] = texture.covariance(square_px) @ back
+            tables[:, length, number] = texture.covariance(square_px) @ back
 
     textures, counts, probes = _textures(asked[:, used], len(lengths))
     out = np.full((len(padded), len(lengths) * len(evaluated)), -np.inf, dtype=np.float32)

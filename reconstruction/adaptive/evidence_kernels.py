@@ -51,12 +51,11 @@ class Hypotheses(NamedTuple):
     from a patch's corner. binning: k. waves: (wave, ray), of which the rays' spectra are made, in
     multiples of SIDE. pairs: (set, SIDE, 2), the pairs of readings, first >= second, SIDE of them
     with pixels equally far apart a set; spots: (set, SIDE), where a pair lies in tiles. offsets:
-    (set,), how far apart, an index of tables. tables:
-    (offset, texture, wave), the texture's correlation; a texture is a length and a disparity: all
-    disparities of the first length, ... amplitudes, chromas: (kind,), variance of luminance, times
-    a patch's scale, and of a chrominance over that of luminance. trials: (trial, 3), of which
-    length, at which probe, and of which rank of the kinds by what was tried before, is tried one
-    after the other. freedom: of the Student t.
+    (set,), how far apart, an index of tables. tables: (offset, texture, wave), the texture's
+    correlation; a texture is a length and a disparity: all disparities of the first length, ...
+    amplitudes, chromas: (kind,), variance of luminance, times a patch's scale, and of a chrominance
+    over that of luminance. trials: (trial, 3), in order: length of the texture, probe, and rank of
+    its kind among those tried before. freedom: of the Student t.
     """
 
     weights: Any
@@ -157,18 +156,18 @@ def _correlate(given, spectra, starts, meetings, sums):
 
     spectra: (part, reading, wave * lane), waves being cosines and sines by turns. starts:
     (hypothesis,), of its row of an offset's table. meetings: (pair, wave * lane), flat, to work in.
-    The two chrominances are correlated alike: they are one part of the sums.
+    The two chrominances are added in one part of the sums.
     """
     pairs, spots, tables = given.pairs, given.spots.reshape(-1), given.tables
     terms = tables.shape[2]
     width, apart = terms * LANES, sums.shape[1] * sums.shape[2]
     flat = sums.reshape(-1)
-    for one in range(pairs.shape[0]):
-        table = tables[given.offsets[one]].reshape(-1)
+    for number in range(pairs.shape[0]):
+        table = tables[given.offsets[number]].reshape(-1)
         for part in range(sums.shape[1]):
             own = spectra[part].reshape(-1)
             for pair in range(SIDE):
-                here, there = pairs[one, pair, 0] * width, pairs[one, pair, 1] * width
+                here, there = pairs[number, pair, 0] * width, pairs[number, pair, 1] * width
                 for wave in range(0, width, 2 * LANES):
                     meet(own, here + wave, there + wave, meetings, pair * width + wave)
                 if part == 1:
@@ -178,7 +177,7 @@ def _correlate(given, spectra, starts, meetings, sums):
             for h in range(0, starts.size, SIDE):
                 tile = _product(table, starts, h, meetings, 0, width, terms)
                 at = h * apart + part * sums.shape[2]
-                scatter_tile(tile, flat, at, apart, spots, one * SIDE)
+                scatter_tile(tile, flat, at, apart, spots, number * SIDE)
 
 
 @njit(forceinline=True, fastmath=True)
@@ -188,9 +187,9 @@ def _log_likelihood(
     """Set out (lane,) to the log-likelihoods of readings, known (2, reading, lane).
 
     They are those of multivariate t distributions with `freedom` degrees and measured (lane,)
-    readings; constants are left out. The scale matrices are the variances that are known plus
-    sums (part, tile), the lower triangle in tiles (row, column, lane), row by row, all flat: sums
-    times mix (2, lane), flat, where only one part is stored that and its product with alike, as
+    readings; constants are left out. The scale matrices are the variances that are known plus sums
+    (part, tile), the lower triangle in tiles (row, column, lane), row by row, all flat: sums times
+    mix (2, lane), flat. Where sums have a single part, the second is its product with alike, in
     tiles. tiles, values: (reading, lane), flat, product, square: (lane,), to work in.
     """
     out[:] = 0
@@ -239,10 +238,10 @@ def _log_likelihood(
 def _compare_colours(given, seen, alike):
     """Set alike, flat tiles, to by how much more than a third the colours seen are the same."""
     third = np.float32(1.0 / 3.0)
-    for one in range(given.pairs.shape[0]):
+    for number in range(given.pairs.shape[0]):
         for pair in range(SIDE):
-            i, j = given.pairs[one, pair]
-            at = given.spots[one, pair]
+            i, j = given.pairs[number, pair]
+            at = given.spots[number, pair]
             for lane in range(LANES):
                 same = np.float32(1.0) if seen[i, lane] == seen[j, lane] else np.float32(0.0)
                 alike[at + lane] = same - third
@@ -312,8 +311,8 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
         best[:] = LOWEST
         for kind in range(kinds):
             ranks[kind, :] = kind
-        # First kinds are tried, then all textures with the best: one loop, since what it calls is
-        # compiled once for each place where it is called.
+        # First kinds are tried, then all textures with the best: one loop, since each call in the
+        # source compiles the helper once more.
         for turn in range(-trials, count):
             if turn < 0:
                 length, probe, rank = given.trials[turn + trials]

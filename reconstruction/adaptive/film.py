@@ -10,9 +10,9 @@ variance that what is foretold misses around it, so that where flow is wrong, or
 meanwhile, the present frame decides alone. Where readings stay what they were, within their noise,
 the scene rests: nothing is learnt there but less noise, and every fit begins as the first one did,
 as fits that go on from each other drift. Where the carried scene foretells the present frame no
-better than total variation does over more than NEW_SHARE of the picture, it is a first frame. So is
-one that leaves more of its own readings where something moves than the first one did: detail finer
-than the pixels changes as it moves, and nothing carried is right of it.
+better than total variation does over more than NEW_SHARE of the picture, it is a first frame. A
+frame with a larger residual beside motion than the first frame's also begins a new film: detail
+finer than the pixels changes as it moves, and nothing carried is right of it.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class Film:
     ) -> Film:
         """Return what is known after a frame; earlier: frames before, none of a first one.
 
-        rest: what stands at rest, None where nothing is known to.
+        rest: the parts at rest, None where unknown.
         """
         margin, texture = scene.surfaces.margin, scene.clean
         if self.known is not None:
@@ -209,7 +209,7 @@ class Film:
     def shown(self, psi: ImagingMatrix) -> list[tuple[Readings, Array]]:
         """Return frames before, each with its picture, where masks move; none of masks that rest.
 
-        psi: of the present frame; raises ReconstructionError where it is of another size.
+        psi: of the present frame. Raises ReconstructionError for another size.
         """
         if self.known is None:
             return []
@@ -222,7 +222,9 @@ class Film:
             )
         if np.array_equal(before.weights, psi.weights):
             return []
-        return [(one.readings.over(1 / scale), np.float32(scale) * one.picture) for one in latest]
+        return [
+            (frame.readings.over(1 / scale), np.float32(scale) * frame.picture) for frame in latest
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +256,7 @@ class Followed:
 
     @property
     def slow(self) -> bool:
-        """Whether so little moved that the next frame, too, follows from what this one did.
+        """Whether motion is so small that the next frame, too, continues from the last frame.
 
         Fits that go on from each other lose more than so little motion gains: films that pan by
         0.1 pixels a frame are up to 1.5 dB better for it (buttercup), or 0.9 (dragons).
@@ -287,7 +289,7 @@ def followed(
     def carried_by(back: Array) -> tuple[Array, Array, Array]:
         at = at_places(before.centre.shape) + padded(back, margin)
         centre = sampled(before.centre, at)
-        texture = np.stack([sampled(one, at, cubic=True) for one in before.texture])
+        texture = np.stack([sampled(colour, at, cubic=True) for colour in before.texture])
         surfaces = surfaces_of(psi, centre, margin, nearer, len(texture))
         return centre, texture, bright.frames - surfaces.forward(texture)
 
@@ -307,8 +309,8 @@ def followed(
     new = _share_new(foretold, plain)
     if new > NEW_SHARE:
         return None
-    earlier = [one.since(there, back) for one in before.earlier[-own.earlier :]]
-    seen = [one.seen(centre, margin, texture, nearer, own.misfit) for one in earlier]
+    earlier = [frame.since(there, back) for frame in before.earlier[-own.earlier :]]
+    seen = [frame.seen(centre, margin, texture, nearer, own.misfit) for frame in earlier]
     carried_on = beliefs = _carried(before.beliefs, back, still, psi.binning)
     fitted = replace(bright, usable=used)
 
@@ -344,7 +346,7 @@ def followed(
         _standing(before.rest.mean, own_fit, disparity, resting * (1 - 1 / _count(before.rest))),
         _standing(before.rest.first, own_fit, disparity, stands),
     ]
-    residuals: list[Array] = [given.frames - psi.forward(mixture.values(one)) for one in models]
+    residuals: list[Array] = [given.frames - psi.forward(mixture.values(model)) for model in models]
     models.append(plain.plain)
     residuals.append(plain.plain_residual)
     fits = Fits(models, residuals, scene, with_patches=False, understated=UNDERSTATED)
@@ -371,8 +373,8 @@ def _still(
     """
     weight = used.astype(np.float32)
     changed, noise = (
-        mean_around(one, weight, WINDOW_PX)[0]
-        for one in (np.square(bright.frames - before), 2 * bright.noise)
+        mean_around(square, weight, WINDOW_PX)[0]
+        for square in (np.square(bright.frames - before), 2 * bright.noise)
     )
     still = changed <= np.where(flows, *UNCHANGED) * noise
     return still & (np.mean(still | ~flows) >= CAMERA_RESTS)
@@ -407,8 +409,8 @@ def _share_new(foretold: Array, plain: Plain) -> float:
     if not plain.held.any():
         return 0.0
     own, others = (
-        mean_around(np.square(one), plain.held.astype(np.float32), HELD_WINDOW_PX)
-        for one in (foretold, plain.plain_residual / plain.scale)
+        mean_around(np.square(residual), plain.held.astype(np.float32), HELD_WINDOW_PX)
+        for residual in (foretold, plain.plain_residual / plain.scale)
     )
     return float(np.mean(own > others))
 

@@ -55,7 +55,7 @@ def fitted_models(
     """Return a fit of surfaces for each of `settings.misfits`, and one without any.
 
     All fits of surfaces but the last search the disparity again with their texture (`sweep`); where
-    that leads astray the last one, which keeps what the patches agreed on, predicts held-out
+    the sweep goes wrong, the last fit, which keeps the patches' disparities, predicts held-out
     readings better. The first steps are those of the first fit: there the texture presumed is so
     uncertain that the misfit matters little. on_step: called with the number of steps done.
 
@@ -91,7 +91,7 @@ def fitted_models(
 
         def then(padded: Array, margin: int, texture: Array, misfit: float = misfit) -> list[Seen]:
             at = padded, margin, texture, nearer, misfit, misfit / first
-            return [one.seen(*at) for one in others]
+            return [other.seen(*at) for other in others]
 
         scene = solve(
             given.psi,
@@ -143,7 +143,7 @@ def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
 
     disparity_sigma: deviation of the centre view's disparity, (y, x).
 
-    Their light fields are given back: what follows needs as much memory, and none of them.
+    Their light fields are given back: the following steps need as much memory, but no model.
     """
     given, held = survey.given, survey.held
     if held.any():
@@ -157,9 +157,9 @@ def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
     light_field, spread = together.light_field, float(together.spread.mean(dtype=np.float64))
     if not held.any():
         return Mean(light_field, shares, None)
-    residual = np.asarray(sum(s * one for s, one in zip(shares, fits.residuals, strict=True)))
+    residual = np.asarray(sum(s * missed for s, missed in zip(shares, fits.residuals, strict=True)))
     excess, its_own = (
-        mixture.excess(one, given.noise, held) for one in (residual, survey.plain_residual)
+        mixture.excess(missed, given.noise, held) for missed in (residual, survey.plain_residual)
     )
     over_plain = excess / max(its_own, 1e-20)
     variance = variance_of_mean(

@@ -1,4 +1,4 @@
-"""Optical flow between pictures of two times, and what it carries from one to the other.
+"""Optical flow between pictures of two times, and fields carried along it.
 
 Dense inverse search (Kroeger et al. 2016), as OpenCV has it, between the centre views of light
 fields without surfaces: they blur as the scene does, whatever the mask. Of real light fields that
@@ -22,7 +22,7 @@ def _codes(pictures: tuple[Array, Array]) -> list[NDArray[np.uint8]]:
     """Return the root of the brightness of pictures (y, x, c), as codes of one scale."""
     grey = [np.sqrt(np.maximum(picture.mean(axis=-1), 0)) for picture in pictures]
     white = max(float(np.percentile(np.stack(grey), WHITE)), 1e-6)
-    return [(np.clip(one / white, 0, 1) * 255).astype(np.uint8) for one in grey]
+    return [(np.clip(picture / white, 0, 1) * 255).astype(np.uint8) for picture in grey]
 
 
 def flow_between(first: Array, second: Array) -> tuple[Array, Array]:
@@ -30,8 +30,8 @@ def flow_between(first: Array, second: Array) -> tuple[Array, Array]:
     codes = _codes((first, second))
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
-    def flow(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Array:
-        across_first = search.calc(one, other, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    def flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Array:
+        across_first = search.calc(source, target, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
         return np.ascontiguousarray(across_first[..., ::-1], dtype=np.float32)
 
     return flow(*codes), flow(*codes[::-1])

@@ -111,12 +111,12 @@ def solve(
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
     centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
-    disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where
-    not usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the
-    disparity (y, x) of a texture (c, y, x) without noise, padded by a margin, given the present
-    surfaces. begun: of another fit of the same centre, from which to go on.
-    others: returns what other times saw of a disparity (y, x) and its texture, padded by the margin
-    between the two. margin: instead of the least.
+    disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where not
+    usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the disparity
+    (y, x) of a texture (c, y, x) without noise, padded by a margin, given the present surfaces.
+    begun: textures of another fit of the same centre, to continue from. others: returns what other
+    times saw of a disparity (y, x) and its texture, padded by the margin between the two. margin:
+    instead of the least.
     """
     if margin is None:
         margin = margin_of(psi, centre, settings.room_px)

@@ -44,7 +44,7 @@ from reconstruction.adaptive.survey import (
     plain_of,
     surveyed,
 )
-from reconstruction.adaptive.times import moved, of_present, surveyed_together
+from reconstruction.adaptive.times import OtherTime, moved, of_present, surveyed_together
 from reconstruction.adaptive.uncertainty import within_db
 from reconstruction.inputs import Readings
 from reconstruction.result import WITHIN, Progress, Reconstruction, Status
@@ -73,39 +73,11 @@ def reconstruct_adaptive(
     disparity: of the centre view (y, x), where it is known, in place of the one searched. patches:
     see `Patches`; they are asked for from `settings.patches` shots on, or where surfaces fail
     (`second`). film: that this is a frame of, see `reconstruction.result.Reconstruction.film`.
-    Raises ReconstructionError for inputs that do not fit each other.
+    Raises ReconstructionError for inputs of shapes that disagree.
     """
     settings = settings or AdaptiveSettings()
-    started = running_s()
-    total = len(settings.misfits) * settings.texture.steps + 3
-    searched_s = 0.0
-
-    def report(step: int) -> None:
-        nonlocal searched_s
-        if step == 2:
-            searched_s = running_s() - started
-        if on_step is not None:
-            on_step(Progress(step, None, None, total))
-
-    whole = checked(psi, frames)
     known = None if disparity is None else checked_disparity(disparity, psi)
-    given, edges = _without_edges(whole, settings)
-    survey = surveyed(given, settings, known, report)
-    second = searched_again(survey, settings) if known is None else None
-    if second is not None:
-        total = 2 * settings.texture.steps + 3
-    fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second)
-    believed = survey.volume if second is None else second
-    result = _result_of(survey, fits, survey.volume, believed, edges, whole, total, started)
-    report(total)
-    return replace(
-        result,
-        parameters=result.parameters | {"search_seconds": searched_s},
-        film=film
-        and film.after(
-            survey, fits.scene, result.light_field, believed, result.parameters["misfit"]
-        ),
-    )
+    return _reconstructed(checked(psi, frames), settings, on_step, film, patches, known=known)
 
 
 def reconstruct_next(
@@ -123,7 +95,7 @@ def reconstruct_next(
     started = running_s()
     whole = checked(psi, frames)
     if shown := film.shown(whole.psi):
-        return _with_other_times(whole, shown, settings, on_step, film)
+        return _reconstructed(whole, settings, on_step, film, shown=shown)
     given, edges = _without_edges(whole, settings)
     total = film.settings.texture.steps + 1
 
@@ -163,38 +135,53 @@ def reconstruct_moving(
         checked(psi.of_shots([n]), frames.cut(np.s_[n : n + 1,])) for n in range(psi.shots)
     )
     nothing, steps = np.zeros(psi.size), settings.start_steps
-    shown = [(one, plain_of(one, 1.0, nothing, steps).picture) for one in others]
-    return _with_other_times(present, shown, settings, on_step, patches=patches)
+    shown = [(readings, plain_of(readings, 1.0, nothing, steps).picture) for readings in others]
+    return _reconstructed(present, settings, on_step, patches=patches, shown=shown)
 
 
-def _with_other_times(
+def _reconstructed(
     whole: Readings,
-    shown: Sequence[tuple[Readings, Array]],
     settings: AdaptiveSettings,
     on_step: Callable[[Progress], None] | None,
     film: Film | None = None,
     patches: Patches | None = None,
+    shown: Sequence[tuple[Readings, Array]] = (),
+    known: Array | None = None,
 ) -> Reconstruction:
-    """Return the light field of a frame, from other times, too; shown: see `others_of`."""
+    """Return the light field of a frame.
+
+    shown: frames of other times, see `others_of`. known: disparity of the centre view (y, x).
+    """
     started = running_s()
-    given, edges = _without_edges(whole, settings)
+    searched_s = 0.0
     total = len(settings.misfits) * settings.texture.steps + 3
 
     def report(step: int) -> None:
+        nonlocal searched_s
+        if step == 2:
+            searched_s = running_s() - started
         if on_step is not None:
             on_step(Progress(step, None, None, total))
 
-    together, others = surveyed_together(given, shown, settings, report)
-    second = searched_again(together, settings)
-    survey = of_present(together, given)
+    given, edges = _without_edges(whole, settings)
+    others: list[OtherTime] = []
+    if shown:
+        together, others = surveyed_together(given, shown, settings, report)
+        survey = of_present(together, given)
+    else:
+        together = survey = surveyed(given, settings, known, report)
+    second = searched_again(together, settings) if known is None else None
+    if second is not None:
+        total = 2 * settings.texture.steps + 3
     fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second, others)
     beliefs, scene = survey.volume if second is None else second, fits.scene
     result = _result_of(survey, fits, survey.volume, beliefs, edges, whole, total, started)
     report(total)
     left = result.parameters["misfit"]
+    of_others = moved(others) if others else {}
     return replace(
         result,
-        parameters=result.parameters | moved(others),
+        parameters=result.parameters | {"search_seconds": searched_s} | of_others,
         film=film and film.after(survey, scene, result.light_field, beliefs, left, others),
     )
 

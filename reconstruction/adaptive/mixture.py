@@ -40,7 +40,7 @@ HIDDEN = 1.2
 disparity errs in both directions among the rays of a pixel. Of buttercup, dice, fish and
 deep-occlusions, three shots, 0.9 to 1.5; 1 and 1.5 lose 0.05 dB in the mean."""
 LEVELS = 65535
-"""Of values in [0, 1] as they are stored."""
+"""Number of steps of stored values in [0, 1]."""
 PRIOR_READINGS = 4.0
 """Readings that the whole picture's mean square counts for at every place. 2x 0.00, 0.5x 0.00 dB.
 """
@@ -87,7 +87,7 @@ def beside_patches(
     Surfaces err alike, so they are averaged first, and their mean with the patches.
     """
     of_surfaces = shares_of(residuals[:-1], noise, held)
-    weighted = [share * one for share, one in zip(of_surfaces, residuals, strict=False)]
+    weighted = [share * residual for share, residual in zip(of_surfaces, residuals, strict=False)]
     surfaces = np.sum(weighted, axis=0)
     pair = _shares([surfaces, residuals[-1]], noise, held, PATCHES_WINDOW_PX, PATCHES_POWER)
     patches = pair[1] * np.float32(HIDDEN**PATCHES_POWER)
@@ -116,7 +116,7 @@ def _around(values: Array, window_px: float) -> NDArray[np.float64]:
 def stored(light_field: Array) -> NDArray[np.uint16]:
     """Return a light field (v, u, y, x, c) in [0, 1] as 16 bits: to 8e-6, in half the memory.
 
-    All models of the mean are at hand at its end, and the first ones while others are fitted.
+    The mean needs all models at its end, and the first models stay in memory during later fits.
     """
     levels: NDArray[np.uint16] = np.empty(light_field.shape, dtype=np.uint16)
 
@@ -135,7 +135,8 @@ def values(levels: NDArray[np.uint16]) -> NDArray[np.float32]:
 @dataclass(frozen=True, eq=False)
 class Together:
     """light_field: the mean of models, (v, u, y, x, c). spread: their variance about it, apart: the
-    squared difference of it and another one, both (v, u, y, x), averaged over colours."""
+    squared difference between the mean and another light field; both (v, u, y, x), averaged over
+    colours."""
 
     light_field: NDArray[np.float32]
     spread: NDArray[np.float32]
@@ -161,19 +162,19 @@ def averaged(
     spread: NDArray[np.float32] = np.empty((*views, rows, columns), dtype=np.float32)
     apart = np.empty_like(spread)
 
-    def square(one: Array, another: Array) -> Array:
-        difference = (one - another).reshape(rows, columns, colours)
+    def square(first: Array, second: Array) -> Array:
+        difference = (first - second).reshape(rows, columns, colours)
         return np.einsum("yxc,yxc->yx", difference, difference) / np.float32(colours)
 
     def work(at: tuple[int, int]) -> None:
-        seen = [values(one[at]).reshape(rows, -1) for one in models]
+        seen = [values(model[at]).reshape(rows, -1) for model in models]
         of_view = mean[at].reshape(rows, -1)
         np.multiply(wide[0], seen[0], out=of_view)
-        for share, one in zip(wide[1:], seen[1:], strict=True):
-            of_view += share * one
+        for share, model in zip(wide[1:], seen[1:], strict=True):
+            of_view += share * model
         spread[at] = alone[0] * square(seen[0], of_view)
-        for share, one in zip(alone[1:], seen[1:], strict=True):
-            spread[at] += share * square(one, of_view)
+        for share, model in zip(alone[1:], seen[1:], strict=True):
+            spread[at] += share * square(model, of_view)
         apart[at] = square(values(other[at]).reshape(rows, -1), of_view)
 
     in_views(work, mean.shape[:2])

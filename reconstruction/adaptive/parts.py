@@ -25,7 +25,7 @@ def to_arrays(value: Any, arrays: dict[str, NDArray]) -> Any:
     if type(value) in PLAIN:
         return value
     if isinstance(value, tuple):
-        return [to_arrays(one, arrays) for one in value]
+        return [to_arrays(item, arrays) for item in value]
     if isinstance(value, (np.ndarray, np.generic)):
         name = str(len(arrays))
         arrays[name] = np.asarray(value, order="C")
@@ -35,7 +35,9 @@ def to_arrays(value: Any, arrays: dict[str, NDArray]) -> Any:
         return kind
     if isinstance(value, Settings):
         return kind | {"settings": value.model_dump(mode="json")}
-    return kind | {one.name: to_arrays(getattr(value, one.name), arrays) for one in fields(value)}
+    return kind | {
+        field.name: to_arrays(getattr(value, field.name), arrays) for field in fields(value)
+    }
 
 
 def from_arrays(
@@ -53,7 +55,7 @@ def from_arrays(
 
     def whole(part: Any) -> Any:
         if isinstance(part, list):
-            return tuple(whole(one) for one in part)
+            return tuple(whole(item) for item in part)
         if not isinstance(part, dict):
             return part
         kind = part[KIND]
@@ -63,6 +65,6 @@ def from_arrays(
             return next_psi()
         if "settings" in part and issubclass(known[kind], Settings):
             return known[kind].model_validate(part["settings"])
-        return known[kind](**{name: whole(one) for name, one in part.items() if name != KIND})
+        return known[kind](**{name: whole(item) for name, item in part.items() if name != KIND})
 
     return whole(plain)

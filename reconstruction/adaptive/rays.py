@@ -167,7 +167,7 @@ class Surfaces:
         texture: (c, y, x). frames, precision: (shot, pixel_y, pixel_x). sums: (2, c, y, x).
         """
         texture, frames, precision = (
-            np.ascontiguousarray(one, dtype=np.float32) for one in (texture, frames, precision)
+            np.ascontiguousarray(given, dtype=np.float32) for given in (texture, frames, precision)
         )
         for band in self._bands():
             band.add_missed(texture, frames, precision, sums.reshape(2, -1))

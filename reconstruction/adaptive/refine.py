@@ -33,11 +33,11 @@ def _applied(sums, direction, residual, ridge, first, last, products):
     products: (row, 4), set to d.q, r.q, q.q and r.r of direction d and residual r.
     """
     for row in range(first, last):
-        one, other, along, left = sums[0, row], sums[1, row], direction[row], residual[row]
+        product_row, other, along, left = sums[0, row], sums[1, row], direction[row], residual[row]
         dq, rq, qq, rr = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
         for x in range(along.size):
-            product = ridge * along[x] - one[x] - other[x]
-            one[x] = product
+            product = ridge * along[x] - product_row[x] - other[x]
+            product_row[x] = product
             dq += product * along[x]
             rq += product * left[x]
             qq += product * product
@@ -72,11 +72,11 @@ def conjugate_gradients(
     the sum of sums[0] and sums[1], both of x's shape.
 
     The square of the next residual r - s q follows from products of this one, so that a step is two
-    passes over memory: q and its products, then all that moves.
+    passes over memory: q and its products, then all updates.
     """
     sums = np.zeros((2, *rhs.shape), dtype=np.float32)
     solution, residual, direction = np.zeros_like(rhs), rhs.copy(), rhs.copy()
-    moved = [one.reshape(-1, rhs.shape[-1]) for one in (direction, residual, solution)]
+    moved = [part.reshape(-1, rhs.shape[-1]) for part in (direction, residual, solution)]
     by_row = sums.reshape(2, -1, rhs.shape[-1])
     products = np.empty((by_row.shape[1], 4), dtype=np.float32)
 
@@ -129,15 +129,15 @@ def fitted(
     earlier: what other times saw of the same texture.
     """
     all_seen = [Seen(surfaces, frames, precision), *earlier]
-    dark = [np.zeros_like(one.frames) for one in all_seen]
+    dark = [np.zeros_like(seen.frames) for seen in all_seen]
 
     def subtract(texture: Array, sums: Array) -> None:
-        for one, nothing in zip(all_seen, dark, strict=True):
-            one.surfaces.add_missed(texture, nothing, one.precision, sums)
+        for seen, nothing in zip(all_seen, dark, strict=True):
+            seen.surfaces.add_missed(texture, nothing, seen.precision, sums)
 
     missed = surfaces.missed(prior, frames, precision)
-    for one in earlier:
-        missed += one.surfaces.missed(prior, one.frames, one.precision)
+    for seen in earlier:
+        missed += seen.surfaces.missed(prior, seen.frames, seen.precision)
     return prior + conjugate_gradients(subtract, 1 / sigma**2, missed, steps)
 
 

@@ -23,7 +23,7 @@ from reconstruction.adaptive.vectors import FLOAT, Code, function, intrinsic
 LANES = 16
 """Problems side by side: a vector register of AVX-512; other processors take several for it."""
 SIDE = 4
-"""Of a tile. Its 16 vectors and 8 of what it is the product of fit the 32 registers."""
+"""Of a tile. Its 16 vectors and 8 of the factors fit the 32 registers."""
 
 _VECTOR = ir.VectorType(FLOAT, LANES)
 _TILE_OF = ir.ArrayType(_VECTOR, SIDE * SIDE)
@@ -61,14 +61,14 @@ class _Code(Code):
         function = cgutils.get_or_insert_function(self.builder.module, kind, name)
         return self.builder.call(function, vectors)
 
-    def plus(self, total: Any, one: Any, other: Any) -> Any:
-        return self.called("fmuladd", one, other, total)
+    def plus(self, total: Any, left: Any, right: Any) -> Any:
+        return self.called("fmuladd", left, right, total)
 
-    def less(self, total: Any, one: Any, other: Any) -> Any:
-        return self.plus(total, self.builder.fneg(one), other)
+    def less(self, total: Any, left: Any, right: Any) -> Any:
+        return self.plus(total, self.builder.fneg(left), right)
 
-    def times(self, one: Any, other: Any) -> Any:
-        return self.builder.fmul(one, other)
+    def times(self, left: Any, right: Any) -> Any:
+        return self.builder.fmul(left, right)
 
     def rows(self, tile: Any) -> list[list[Any]]:
         """Return the vectors of a tile, row by row."""
@@ -153,11 +153,14 @@ def combined(context, tile, other, flat):
 
     def write(code, tile, other, flat):
         zero = ir.Constant(ir.IntType(64), 0)
-        one, two = code.read(flat, zero, 0), code.read(flat, zero, 1)
+        first, second = code.read(flat, zero, 0), code.read(flat, zero, 1)
         pairs = zip(code.rows(tile), code.rows(other), strict=True)
         return code.tile(
             [
-                [code.plus(code.times(own, one), its, two) for own, its in zip(*rows, strict=True)]
+                [
+                    code.plus(code.times(own, first), its, second)
+                    for own, its in zip(*rows, strict=True)
+                ]
                 for rows in pairs
             ]
         )
@@ -212,9 +215,9 @@ def less_products(context, tile, flat, left, right):
         for term in _EACH:
             others = [code.read(flat, right, SIDE * column + term) for column in _EACH]
             for row in _EACH:
-                one = code.read(flat, left, SIDE * row + term)
+                factor = code.read(flat, left, SIDE * row + term)
                 for column in _EACH:
-                    out[row][column] = code.less(out[row][column], one, others[column])
+                    out[row][column] = code.less(out[row][column], factor, others[column])
         return code.tile(out)
 
     return _function(_TILE, (tile, flat, left, right), write)
@@ -229,7 +232,7 @@ def factored(context, tile, least):
 
     def write(code, tile, least):
         out = code.rows(tile)
-        least, one = code.spread(least, LANES), ir.Constant(_VECTOR, [1.0] * LANES)
+        least, unit = code.spread(least, LANES), ir.Constant(_VECTOR, [1.0] * LANES)
         for column in _EACH:
             for row in range(column, SIDE):
                 for term in range(column):
@@ -238,7 +241,7 @@ def factored(context, tile, least):
                     )
                 if row == column:
                     square = code.called("maxnum", out[row][column], least)
-                    out[row][column] = code.builder.fdiv(one, code.called("sqrt", square))
+                    out[row][column] = code.builder.fdiv(unit, code.called("sqrt", square))
                 else:
                     out[row][column] = code.times(out[row][column], out[column][column])
         return code.tile(out)
@@ -271,8 +274,8 @@ def take_applied(context, tile, flat, source, target):
         given = [code.read(flat, source, column) for column in _EACH]
         for row, vectors in enumerate(code.rows(tile)):
             left = code.read(flat, target, row)
-            for vector, one in zip(vectors, given, strict=True):
-                left = code.less(left, vector, one)
+            for vector, value in zip(vectors, given, strict=True):
+                left = code.less(left, vector, value)
             code.write(flat, target, row, left)
 
     return _function(types.void, (tile, flat, source, target), write)
@@ -286,8 +289,8 @@ def substitute(context, tile, flat, at):
         solved = []
         for row, vectors in enumerate(code.rows(tile)):
             left = code.read(flat, at, row)
-            for vector, one in zip(vectors, solved, strict=False):
-                left = code.less(left, vector, one)
+            for vector, value in zip(vectors, solved, strict=False):
+                left = code.less(left, vector, value)
             solved.append(code.times(left, vectors[row]))
             code.write(flat, at, row, solved[row])
 

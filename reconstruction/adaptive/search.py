@@ -7,8 +7,8 @@ disparities a scene really has; it does so in steps of SMOOTH_PX, and in finer o
 best of a patch that decides.
 
 Where patches lie is arbitrary, and changes the disparities they agree on: shifted by 3 pixels, they
-make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). So what two grids of
-patches believe, one between the other, is averaged: +0.2 dB (benchmarks/tried.md).
+make a 96x96 crop of group A 0.5 dB better or worse (standard deviation). The beliefs of two
+interleaved grids of patches are averaged: +0.2 dB (benchmarks/tried.md).
 
 Neighbouring patches agree by belief propagation: their disparities differ as d - d' is Laplace
 distributed, or, with a small probability, are not related (another object). Messages are passed
@@ -68,8 +68,9 @@ decides: the log-likelihood of fine textures waves with a period of 0.75 px. 2x 
 dB."""
 KEPT = 4
 """Kinds of texture that patches of the fine search compare further after their first probe, where
-textures of several lengths are compared: `adaptive-fast`, with one, loses 0.04 dB by it. The coarse
-search compares all: its disparities, far apart, would lose the right one. 2x +0.03, 0.5x +0.01 dB.
+textures of several lengths are compared: `adaptive-fast`, with a single length, loses 0.04 dB by
+it. The coarse search compares all: its disparities, far apart, would lose the right one. 2x +0.03,
+0.5x +0.01 dB.
 """
 CONTENDING = 4.0
 """Log-likelihood below a patch's best within which it is evaluated at all disparities: interpolated
@@ -351,7 +352,8 @@ def fine(
 
 
 def _shared(possible: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return what is possible at any patch of a tile for each of them, (row, column, label).
+    """Return the labels possible at any patch of a tile, for every patch of it, (row, column,
+    label).
 
     The rough search alone is no reason to exclude what patches beside one allow: of a capture by
     others (smem/resolution_target, a disperser by 2 px a band) patches kept to their own agreed on
@@ -396,7 +398,7 @@ def _extended(evidence: NDArray[np.float32]) -> NDArray[np.float32]:
 def _packed(asked: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the patches that ask for any label, asked (patch, label), alike ones side by side.
 
-    Patches are evaluated LANES at a time, at what any of them asks for.
+    LANES patches are evaluated together, at every label requested by any patch.
     """
     some = np.flatnonzero(asked.any(axis=1))
     last = asked.shape[1] - asked[some, ::-1].argmax(axis=1)

@@ -35,8 +35,8 @@ WIDE_SHARE = 0.1
 BESIDE, MISSED = 0.15, 0.35
 """Sparse patches are worth their time where the rays of one pixel spread over BESIDE of the
 picture's shorter side, and the residual of surfaces at held-out readings is MISSED of that of total
-variation. One shot of dice, 64x80: patches gain 0.8 dB where that share is 0.4 to 0.5, and nothing
-where it is 0.25 to 0.3 (two cameras)."""
+variation. One shot of dice, 64x80: patches gain 0.8 dB at shares of 0.4 to 0.5, nothing at 0.25 to
+0.3 (two cameras)."""
 
 Array = NDArray[np.floating]
 
@@ -74,5 +74,5 @@ def surfaces_fail(survey: Survey, residuals: Sequence[Array]) -> bool:
     side = min(given.psi.frames_shape[1:])
     if np.mean(_spread_px(survey) > BESIDE * side) < WIDE_SHARE or not held.any():
         return False
-    least = min(mixture.excess(one, given.noise, held) for one in residuals)
+    least = min(mixture.excess(residual, given.noise, held) for residual in residuals)
     return least > MISSED**2 * mixture.excess(survey.plain_residual, given.noise, held)

@@ -79,8 +79,8 @@ class Plain:
 
 @dataclass(frozen=True, eq=False)
 class Survey(Plain):
-    """data, prior, rough: of the fine search, for another one. volume: beliefs about disparities.
-    centre: the centre view's disparity (y, x), to begin with.
+    """data, prior, rough: inputs of the fine search, for a second search. volume: beliefs about
+    disparities. centre: the centre view's disparity (y, x), to begin with.
     """
 
     data: search.SearchData

@@ -7,9 +7,9 @@ present surfaces. Its tails are heavy (occlusions), so the log-likelihood is tha
 
     l_d(p) = -(nu + 1) / 2 sum_shots log(1 + (I - F_d)^2(p) / (nu s^2(p))).
 
-It is averaged along the picture's edges (guided filter, He, Sun and Tang 2013) and added to what
-the patches believe, without which it would favour the disparity that T was fitted with. Neighbours
-agree by belief propagation as in the search.
+It is averaged along the picture's edges (guided filter, He, Sun and Tang 2013) and added to the
+patches' beliefs: alone it would favour the disparity of T's fit. Neighbours agree by belief
+propagation as in the search.
 """
 
 from __future__ import annotations
@@ -206,7 +206,9 @@ def swept(
         for label, known in enumerate(all_known[first:last], first):
             of_plane = frames - plane_frames(psi, texture, labels[label], margin)
             likelihood = _likelihood(of_plane, variance, weight, alike)[::STRIDE, ::STRIDE]
-            believed = interpolated(volume, lambda grid, one=known: grid.probability[..., one], at)
+            believed = interpolated(
+                volume, lambda grid, known=known: grid.probability[..., known], at
+            )
             evidence[..., label] = likelihood + np.log(believed + LEAST_BELIEF)
 
     in_bands(work, len(labels))

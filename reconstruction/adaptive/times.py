@@ -1,9 +1,9 @@
-"""Frames of other times than the present: what each saw of its surfaces, through its own masks.
+"""Frames of other times: each shows the scene's surfaces at its time, through its own masks.
 
 By the flow between the times, a reading of another one saw the present texture elsewhere (`Seen`):
-so far as it explains the readings around it, it counts as one of the present. The disparity is
-searched in all frames at once, as in shots of one capture, each moved by whole pixels (`aligned`):
-there the fraction of a pixel is one of the errors that the search allows for.
+as far as that explains the readings around, the reading counts as a present reading. The disparity
+is searched in all frames at once, as in shots of one capture, each moved by whole pixels
+(`aligned`): there the fraction of a pixel is one of the errors that the search allows for.
 """
 
 from __future__ import annotations
@@ -36,25 +36,26 @@ WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0
 """Deviations of the windows that squared residuals are averaged in: of all readings, and of the few
 that are held out."""
 ANOTHER = 4.0
-"""Squared residual of total variation at another time over that at held-out readings, from which on
-the other frame shows another scene."""
+"""Ratio of squared residuals of total variation, at another time over held-out readings, above
+which the other frame shows another scene."""
 LEAST_SEEN = 0.3
-"""Share of another frame's readings that must show this scene; below it none of them counts."""
+"""Least share of another frame's readings that must show this scene, for the frame to count at
+all."""
 REST, REST_PX = 1.12, 2.0
 """Squared residual of total variation without motion over that with it, up to which a place rests:
 0.95 to 1.12 at rest, 1.2 to 2 with motion of 0.3 px. And the blur of the places."""
 RESTING, ALL_MOVES = np.float32(0.1), np.float32(1)
-"""Share of what is missed by which readings are doubted: where the scene rests, and elsewhere."""
+"""Share of the residual added to the readings' variance, where the scene rests and elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
 class OtherTime:
-    """A frame of another time, and where its points are at present.
+    """A frame of another time, and the present positions of its points.
 
     readings: over the scale. used: those that count, (shot, pixel_y, pixel_x). picture: centre view
     of its light field without surfaces, (y, x, c). there, back: flow from its time to the present,
-    and back, (y, x, 2). moving: share of what is missed, by which readings are doubted, RESTING to
-    1 (pixel_y, pixel_x).
+    and back, (y, x, 2). moving: share of the residual added to the readings' variance, RESTING to 1
+    (pixel_y, pixel_x).
     """
 
     readings: Readings
@@ -97,7 +98,7 @@ class OtherTime:
         """Return what it saw of the present texture; a reading counts the less the more is missed.
 
         centre, texture (c, y, x): at present, padded by a margin. misfit: deviation of readings
-        that no texture explains. doubt: share of what is missed that counts.
+        that no texture explains. doubt: share of the residual added to the variance.
         """
         surfaces = self.surfaces(centre, margin, nearer, len(texture))
         missed = self.readings.frames - surfaces.forward(texture)

@@ -67,9 +67,9 @@ def held_out(
 ) -> NDArray[np.bool_]:
     """Return which usable readings (shot, pixel_y, pixel_x) to keep from the fit.
 
-    A pixel is kept with all its shots: one of them would predict the others, whether or not the
-    light field is right between the rays. More than the share where there are few readings, so that
-    a deviation can be fitted to them.
+    A pixel is kept with all its shots: each ray would predict the others, whether or not the light
+    field is right between the rays. More than the share where there are few readings, so that a
+    deviation can be fitted to them.
     """
     share = min(max(share, 2 * FEWEST / max(int(usable.sum()), 1)), MOST_SHARE)
     return usable & (np.random.default_rng(seed).random(usable.shape[1:]) < share)
@@ -92,7 +92,7 @@ class _Parts:
 
     def weighted(self, weights: Sequence[float]) -> NDArray[np.float32]:
         """Return the sum of N, B and E, so many times each, in place of the spread."""
-        let_in, steep, spread = (np.float32(one) for one in weights)
+        let_in, steep, spread = (np.float32(weight) for weight in weights)
 
         def work(at: tuple[int, int]) -> None:
             out = self.spread[at]
@@ -191,7 +191,7 @@ def variance_of_mean(
     logs = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
     over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), least)
     scale = max(float(np.quantile(over, WITHIN_ONE)), LEAST_SCALE)
-    blur, apart = (float(one) for one in np.exp(logs))
+    blur, apart = (float(value) for value in np.exp(logs))
     return parts.weighted((scale, scale * blur, scale * apart))
 
 
@@ -252,10 +252,10 @@ def foretold_db(of: Mapping[str, float]) -> tuple[float, float]:
     """Return the dB of the mean square error over the mean variance, and of the square of the
     deviation over the variance, for a capture of these FEATURES."""
     error_db, deviation_db = ERROR_DB, DEVIATION_DB
-    for name, one in FEATURES.items():
-        value = min(max(of[name], one.lowest), one.highest)
-        error_db += one.error_db * value
-        deviation_db += one.deviation_db * value
+    for name, feature in FEATURES.items():
+        value = min(max(of[name], feature.lowest), feature.highest)
+        error_db += feature.error_db * value
+        deviation_db += feature.deviation_db * value
     return error_db, deviation_db
 
 

@@ -16,19 +16,19 @@ Array = NDArray[np.floating]
 REACH = 0.75
 """A point covers the samples within this distance along each axis."""
 SAME_SURFACE = 0.35
-"""Disparities that differ less, in pixels, are those of one surface."""
+"""Pixels: disparities with a smaller difference belong to the same surface."""
 SETTLING = 2
 """Steps to the point that a ray meets on a slanted surface."""
 EMPTY = np.float32(-1e30)
-"""Disparity of rays that no point reaches, until they are given one."""
+"""Mark of rays that no point reaches, until a disparity is filled in."""
 
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _carry(centre, margin, nearer, dv, du, out, mark):
     """Set out and mark (y, x) to disparities and hidden rays of the view dv, du steps off.
 
-    A point covers one or two samples along each axis, so that it is written to four places of which
-    some are the same; what leaves the view goes to samples laid around it.
+    A point covers one or two samples along each axis: it is written to four places, some equal.
+    Points outside of the view are written to a margin of samples.
     """
     rows, columns = out.shape
     wide = columns + 2

@@ -42,13 +42,13 @@ def offered() -> Iterator[Method]:
         yield from entry.load().METHODS
 
 
-METHODS = {method.name: method for method in sorted(offered(), key=lambda one: one.name)}
+METHODS = {method.name: method for method in sorted(offered(), key=lambda method: method.name)}
 
 
 if TYPE_CHECKING:
     MethodSettings = ShippedSettings
 else:
-    _own = {one.part: (one.settings, one.settings()) for one in METHODS.values()}
+    _own = {method.part: (method.settings, method.settings()) for method in METHODS.values()}
     _own = {part: kind for part, kind in _own.items() if part not in ShippedSettings.model_fields}
     MethodSettings = create_model("MethodSettings", __base__=ShippedSettings, **_own)
 
@@ -85,12 +85,11 @@ def reconstruct(
     """Return the light field that the method called `name` estimates.
 
     All readings count by one deviation, `frames.noise_sigma`: that of a single reading follows from
-    the reading itself, and is least where noise made that small.
-    estimates: what `estimate_patches` found from the same inputs, for `dict-...` and `tv-dict` to
-    go on from. film: that the frames, of one shot, are the next one of: `Film()` before the first,
-    then `film` of the result before. moving: see `Given`. Raises ReconstructionError for a method
-    that is not known or takes no films, a dictionary that is missing, and inputs that do not fit
-    each other.
+    the reading itself, and is least where noise made that small. estimates: what `estimate_patches`
+    found from the same inputs, for `dict-...` and `tv-dict` to go on from. film: continued by these
+    frames, of one shot: `Film()` before the first frame, then `film` of the last result. moving:
+    see `Given`. Raises ReconstructionError for an unknown method, a method that takes no films, a
+    missing dictionary, and inputs of shapes that disagree.
     """
     method = find_method(name)
     if (film is not None or moving) and not method.films:

@@ -23,54 +23,38 @@ def _solve(solver: bpdn.Method, given: Given, settings: ShippedSettings) -> Reco
     )
 
 
-def _method(solver: bpdn.Method, title: str, assumes: str, cost: str, when: str) -> Method:
-    solve = partial(_solve, solver)
-    return Method(
-        f"dict-{solver}", title, assumes, cost, when, solve, "sparse", SparseSettings, True
+METHODS = tuple(
+    Method(
+        f"dict-{solver}", f"sparse patches by {title}", assumes, cost, when,
+        partial(_solve, solver), "sparse", SparseSettings, True,
     )
-
-
-METHODS = (
-    _method(
-        "admm",
-        "sparse patches by ADMM with working sets (the paper's Dict-ADMM)",
-        "every patch is a sum of a few atoms of the dictionary",
-        cost_words(1.4, 4.3),
-        "one shot with a dictionary of similar scenes",
-    ),
-    _method(
-        "lars",
-        "sparse patches by the Lasso path (LARS)",
-        "as dict-admm, and the same minimiser to rounding",
-        "longer than dict-admm",
-        "the exact minimiser, or few atoms per patch",
-    ),
-    _method(
-        "omp",
-        "sparse patches by orthogonal matching pursuit",
-        "every patch is a sum of at most `atoms` atoms",
-        cost_words(0.83, 1.6),
-        "coarse previews",
-    ),
-    _method(
-        "ista",
-        "sparse patches by proximal gradient",
-        "as dict-admm",
-        "longer than dict-fista",
-        "to compare solvers",
-    ),
-    _method(
-        "fista",
-        "sparse patches by accelerated proximal gradient with restart",
-        "as dict-admm",
-        "about 20 times as long as dict-admm",
-        "to compare solvers",
-    ),
-    _method(
-        "sl0",
-        "sparse patches by smoothed l0 (as [18])",
-        "every patch is a sum of the fewest atoms that explain the frames",
-        cost_words(2.4, 4.4),
-        "little noise; to compare with [18]",
-    ),
-)
+    for solver, title, assumes, cost, when in (
+        (
+            "admm", "ADMM with working sets (the paper's Dict-ADMM)",
+            "every patch is a sum of a few atoms of the dictionary",
+            cost_words(1.4, 4.3), "one shot with a dictionary of similar scenes",
+        ),
+        (
+            "lars", "the Lasso path (LARS)", "as dict-admm, and the same minimiser to rounding",
+            "longer than dict-admm", "the exact minimiser, or few atoms per patch",
+        ),
+        (
+            "omp", "orthogonal matching pursuit",
+            "every patch is a sum of at most `atoms` atoms",
+            cost_words(0.83, 1.6), "coarse previews",
+        ),
+        (
+            "ista", "proximal gradient", "as dict-admm", "longer than dict-fista",
+            "to compare solvers",
+        ),
+        (
+            "fista", "accelerated proximal gradient with restart", "as dict-admm",
+            "about 20 times as long as dict-admm", "to compare solvers",
+        ),
+        (
+            "sl0", "smoothed l0 (as [18])",
+            "every patch is a sum of the fewest atoms that explain the frames",
+            cost_words(2.4, 4.4), "little noise; to compare with [18]",
+        ),
+    )
+)  # fmt: skip

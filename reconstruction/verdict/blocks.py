@@ -16,7 +16,8 @@ DOUBTED_SHARE = Limits(0.25, 1.0)
 """Share of the blocks that are doubted alone, beyond which the whole is: each is judged by fewer
 readings than the whole, so that a few of them are doubted by chance."""
 REFUSED_SHARE = Limits(0.0, 0.5)
-"""Of those that alone are not to be used: one is a place to look at, half of them the capture."""
+"""Share of blocks with the verdict do not use: one is a place to look at, half of them the
+capture."""
 
 
 @dataclass(frozen=True)
@@ -56,16 +57,19 @@ COMBINED: dict[str, Combine] = {
 
 
 def _combined(key: str, values: Sequence[Any], weights: Sequence[float]) -> Any:
-    """Return one figure, or a collection of them, from those of the blocks that have any."""
+    """Return the combined value of a figure, or collection of figures, over the blocks with
+    values."""
     having = [(value, weight) for value, weight in zip(values, weights, strict=True)
               if value is not None]  # fmt: skip
     if not having:
         return None
     first = having[0][0]
-    some, heavy = [one for one, _ in having], [weight for _, weight in having]
+    some, heavy = [figure for figure, _ in having], [weight for _, weight in having]
     if isinstance(first, dict):
-        keys = dict.fromkeys(name for one in some for name in one)
-        return {name: _combined(name, [one.get(name) for one in some], heavy) for name in keys}
+        keys = dict.fromkeys(name for figure in some for name in figure)
+        return {
+            name: _combined(name, [figure.get(name) for figure in some], heavy) for name in keys
+        }
     if isinstance(first, tuple):
         return tuple(_combined(key, each, heavy) for each in zip(*some, strict=True))
     return COMBINED.get(key, _mean)(some, heavy)
@@ -75,14 +79,18 @@ def _places(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
     """Return figures of the worst block of each kind: hole and motion."""
     found: dict[str, Any] = {}
     e = [(block, block.verdict.evidence) for block in blocks]
-    block, one = max(e, key=lambda each: each[1].hole_px)
-    found["hole_at"] = _at(block, one.hole_at)
-    moved = [(one.motion, block, one) for block, one in e if one.motion is not None]
+    block, figures = max(e, key=lambda each: each[1].hole_px)
+    found["hole_at"] = _at(block, figures.hole_at)
+    moved = [(figures.motion, block, figures) for block, figures in e if figures.motion is not None]
     if moved:
-        ratio, block, one = max(moved, key=lambda each: each[0])
-        found |= {"motion": ratio, "motion_effect": one.motion_effect, "moved_px": one.moved_px}
-        if one.moved_at is not None:
-            found["moved_at"] = (one.moved_at[0], *_at(block, one.moved_at[1:]))
+        ratio, block, figures = max(moved, key=lambda each: each[0])
+        found |= {
+            "motion": ratio,
+            "motion_effect": figures.motion_effect,
+            "moved_px": figures.moved_px,
+        }
+        if figures.moved_at is not None:
+            found["moved_at"] = (figures.moved_at[0], *_at(block, figures.moved_at[1:]))
     return found
 
 

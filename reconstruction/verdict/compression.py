@@ -29,7 +29,8 @@ def _cosines() -> NDArray[np.float64]:
 
 
 def blockiness(frames: Array, usable: NDArray[np.bool_]) -> float | None:
-    """Return by how much smaller coefficients are in one raster of blocks than in the others.
+    """Return the contrast between coefficients of the most compressed raster of blocks and of the
+    others.
 
     The mean of log(|coefficient| / its root mean square), by which one of the 64 rasters of blocks
     lies below their median, of the shot where that is most. None with too few whole blocks.

@@ -8,7 +8,7 @@ of the readings beyond Psi's own modulation is regressed on one cause at a time,
     contrast: - m, whatever the level;
     blur, distance, vignetting: as the masks' shadow changes by the camera's design.
 
-Where Psi has no design, blur is that of its own shadow. Displacements are also measured by tiles.
+A Psi without a design has the blur of its own shadow. Displacements are also measured by tiles.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ ALIKE = 0.5
 FEWEST, MOST_CONDITION = 20, 1e8
 """Readings for each value that a regression determines, and the condition of its matrix."""
 DECOYS_PX = (36, 12), (-24, 48), (36, -36), (-24, -24)
-"""By how much derivatives are moved (y, x) so that they mean nothing: further than masks correlate,
-and by whole tiles of colour filters of 2, 3, 4 and 6 pixels."""
+"""Displacements (y, x) that make derivatives meaningless: further than masks correlate, and by
+whole tiles of colour filters of 2, 3, 4 and 6 pixels."""
 DECOY = 0.2
 """Correlation with the derivatives themselves above which moved ones still mean something: those of
 periodic masks."""
@@ -57,7 +57,7 @@ periodic masks."""
 
 @dataclass(frozen=True)
 class Change:
-    """One way in which masks or readings may be otherwise than Psi says, if it is the only one.
+    """A possible deviation of masks or readings from Psi, as if no other were present.
 
     value, deviation: of the change. gain: by how much it lowers the weighted squared residual.
     """
@@ -73,9 +73,9 @@ class Displaced:
 
     shift: (y, x), the weighted mean over tiles. size_px: their root mean square beyond what the
     deviations make, and beyond what derivatives elsewhere make of the same readings (a placebo:
-    what a wrong picture adds to both). Both None without a design that determines them. changes: of
-    `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost rays lose;
-    `offset`, added to the readings, over their mean; `gamma`, power of the light less 1;
+    what a wrong picture adds to both). Both are None if no design determines shifts.
+    changes: of `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost
+    rays lose; `offset`, added to the readings, over their mean; `gamma`, power of the light less 1;
     `contrast`, what the masks' modulation loses everywhere, relative.
     """
 
@@ -128,7 +128,7 @@ def displaced(psi: ImagingMatrix, found: Relief) -> Displaced:
     shifts = () if design is None else design.shifts
     others = _blurs(psi, found) if design is None else design.changes.items()
     changes: dict[str, Change] = {}
-    # One at a time: they are so correlated that together none could be estimated.
+    # One cause at a time: together, correlated as they are, no cause could be estimated.
     for name, cause in (*_of_readings(psi, found), *others):
         fit = _regressed([cause, *shifts], found.seen - found.masks, found.weight)
         if fit is not None and not (name in changes and changes[name].gain > fit.gain):
@@ -148,7 +148,8 @@ def _tiled(found: Relief, shift_y: Array, shift_x: Array) -> _Regression | None:
 
 
 def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
-    """Return how the masks' shadow changes by the camera's design; None where that is not Psi's."""
+    """Return the changes of the masks' shadow by the camera's design; None for a Psi of another
+    design."""
     camera = _camera(psi)
     good = found.good
     if camera is None or not good.any():

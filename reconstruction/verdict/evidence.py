@@ -31,24 +31,23 @@ by a flat field the white level differs from pixel to pixel."""
 
 @dataclass(frozen=True)
 class Evidence:
-    """Figures of a capture and of a light field found from it; None where there is nothing to say.
+    """Figures of a capture and of a light field found from it; None stands for an unknown figure.
 
-    method: its name; status: its status. left_out: shots that screening left out. bad: share of
-    the pixels that screening left out. noise: the readings' deviation over their mean.
-    motion: ratio of `Motion`, above 1 where shots saw different scenes; motion_effect: its effect;
-    moved_at: shot (None: any), row, column; moved_px: its rows and columns; moved: share of the
-    readings left out for it. off: share of readings that are far off all around, where neighbours
-    agree; unusable, saturated: shares of the readings. blind: share of the pixels that lie far from
-    any that a shot sees; hole_px, hole_at: radius and centre (y, x) of the largest hole. kept:
-    readings kept from the fit; explained: share of the smooth picture's squared residual of these,
-    less noise, that the light field removes; noise_share: share of its own that is noise.
-    colour_error: root mean square by colours that frames do not show, over the brightness. short:
-    share of the readings that only say that there was at least so much light, and are needed.
-    gains: by which the shots' brightness was evened. over_flat, over_neighbours: see
-    `over_baselines`. parallax: root mean square by which views differ from the middle one, over it.
-    blockiness: see there. steps: noise by quantisation, over the noise stated. stated: standard
-    deviation that held-out readings show, root mean square over the light field, over its mean.
-    view_axes: Psi's.
+    method: its name; status: its status. left_out: shots that screening left out. bad: share of the
+    pixels that screening left out. noise: the readings' deviation over their mean. motion: ratio of
+    `Motion`, above 1 where shots saw different scenes; motion_effect: its effect; moved_at: shot
+    (None: any), row, column; moved_px: its rows and columns; moved: share of the readings left out
+    for it. off: share of readings that are far off all around, where neighbours agree; unusable,
+    saturated: shares of the readings. blind: share of the pixels that lie far from any that a shot
+    sees; hole_px, hole_at: radius and centre (y, x) of the largest hole. kept: readings kept from
+    the fit; explained: share of the smooth picture's squared residual of these, less noise, that
+    the light field removes; noise_share: noise's share of the light field's own. colour_error: root
+    mean square by colours that frames do not show, over the brightness. short: share of the
+    readings that only say that there was at least so much light, and are needed. gains: by which
+    the shots' brightness was evened. over_flat, over_neighbours: see `over_baselines`. parallax:
+    root mean square by which views differ from the middle one, over it. blockiness: see there.
+    steps: noise by quantisation, over the noise stated. stated: standard deviation that held-out
+    readings show, root mean square over the light field, over its mean. view_axes: Psi's.
     """
 
     method: str
@@ -113,8 +112,8 @@ class FittedFrames:
     kept, excluded: (shot, pixel_y, pixel_x); which are kept, and the readings of pixels that were
     not usable before screening, 0 elsewhere. left_out: shots that screening left out, for being
     dark or for repeating others. bad: share of the pixels that it left out, for differing from
-    their neighbours. short: share of the readings that are saturated and that a light field fitted
-    without them falls short of. gains: by which screening divided the shots.
+    their neighbours. short: share of the readings that are saturated, above the prediction of a
+    light field fitted without them. gains: by which screening divided the shots.
     """
 
     frames: Frames
@@ -178,7 +177,7 @@ def gathered(
         strength_errors=_plain(masks.error),
         other_strengths=tuple(_plain(row) for row in shots.masks),
         displaced_px=off.size_px,
-        changes={name: _plain(astuple(one)) for name, one in off.changes.items()},
+        changes={name: _plain(astuple(change)) for name, change in off.changes.items()},
         brightness=_plain(shots.brightness),
         **({} if moved is None else moved.figures()),
         bad=read.bad,
@@ -224,7 +223,7 @@ def _parallax(light_field: Array, view_axes: ViewAxes) -> float | None:
     middle = centre_view(light_field)
     square = sum_of_squares(middle) / middle.size
     views = (light_field[v, u] - middle for v, u in np.ndindex(light_field.shape[:2]))
-    apart = sum(sum_of_squares(one) for one in views) / light_field.size
+    apart = sum(sum_of_squares(view) for view in views) / light_field.size
     return float(np.sqrt(apart / max(square, 1e-30)))
 
 

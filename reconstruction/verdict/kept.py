@@ -1,4 +1,5 @@
-"""How well a light field predicts readings: those kept from its fit, and all, place by place."""
+"""How well a light field predicts readings: validation readings kept from its fit, and all
+readings, place by place."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ SEED = 1
 """Differs from the seed by which `adaptive` keeps readings for its standard deviation."""
 
 FLAT_STEPS = 60
-"""Of total variation for one picture that all views are: `tv` ends after about 50 for buttercup and
-70 for dragons, full frames."""
+"""Steps of total variation for a single picture in all views: `tv` ends after about 50 for
+buttercup and 70 for dragons, full frames."""
 WINDOW_PX = 9
 """Side of the square that a place is judged by: 81 readings a shot distinguish 1 from 1.25."""
 

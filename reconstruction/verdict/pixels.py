@@ -1,4 +1,4 @@
-"""Pixels that cannot be used and are not listed, and holes that those listed leave."""
+"""Unusable pixels missing from the list, and holes left by the listed pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
 BLIND_PX = 1.9
-"""Distance from any pixel that a shot sees, from which on one is blind."""
+"""A pixel is blind at this distance from the nearest pixel with a usable reading."""
 SMOOTH = 0.5
 """Largest spread of the neighbours with which a pixel is compared, over their typical value."""
 DIMMEST = 0.2

@@ -51,14 +51,14 @@ VIGNETTING = Limits(0.2, 0.5)
 FLICKER = Limits(0.05, 0.15)
 """Difference of a shot's brightness from the shots' mean, over that."""
 MOTION = Limits(1.0, 5.0)
-"""Ratio by which shots saw different scenes; refused only where nobody knows which shots, as that
-cannot be mended: where they are 7 dB or more worse for it, it is 2 to 13 (built-in scenes, 64x80,
+"""Ratio by which shots saw different scenes; refused only where the shots in question are unknown,
+as nothing mends that. Motion that costs 7 dB or more has ratios of 2 to 13 (built-in scenes, 64x80,
 two and three shots, `tv`)."""
 OFF = Limits(0.0215, 0.05)
 """Share of readings that differ from all their neighbours. In clean frames of fine soil and leaves
 it is up to 2 %."""
 BAD = Limits(0.02, 0.1)
-"""Share of pixels that the clean-up calls bad: where it is large, others are overlooked."""
+"""Share of pixels that the clean-up calls bad. Above it further bad pixels are overlooked."""
 SATURATED = Limits(0.14, 0.35)
 SHORT = Limits(0.02, 0.35)
 """Share of the readings."""
@@ -76,8 +76,8 @@ UNEXPLAINED = Limits(0.75, 1.1)
 UNDECIDED = Limits(0.75, 1.0)
 NOISY, LEFT_OPEN = 0.08, 0.35
 """Noise over the mean reading, and share of undecided patches, that together cost 3 dB. In six
-scenes of group A (64x80) 500 electrons do: 0.08 to 0.21, and 39 to 77 %. Of those that lose 1 dB at
-most none has both."""
+scenes of group A (64x80) 500 electrons do: 0.08 to 0.21, and 39 to 77 %. No scene that loses 1 dB
+at most has both."""
 SLIGHT_LOSS, SLIGHT_PX, UNLIKE_SURFACES = 0.05, 0.09, 0.5
 """An error of Psi too small for the limits above: strength that is missing, displacement in pixels;
 and the mean square residual of surfaces over total variation's from which on it does harm. Clean
@@ -123,10 +123,11 @@ DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 DRIFT = "calibrate the drift of the masks since then, or calibrate again"
 ANOTHERS = 0.5
-"""Strength of another shot's masks above which, and of its own below which, shots are confused."""
+"""Shots are confused where another shot's masks show more strongly than this, and a shot's own
+less."""
 LEAST_STRENGTH = 0.25
-"""Displacements are measured by first differences, which scale with the shadow's strength: they are
-divided by it, but not by less than this."""
+"""Displacements are measured by first differences, which scale with the shadow's strength. The
+divisor is that strength, at least this."""
 
 
 @dataclass(frozen=True)
@@ -330,14 +331,15 @@ def _colour(e: Evidence) -> Iterator[Reason]:
 def _psi_tolerance(e: Evidence, power: float) -> float:
     """Return by how much errors of Psi weigh less than on one shot reconstructed by tv.
 
-    They set several shots against one another, and mislead methods that assume more than tv.
+    Errors of Psi contradict each other between shots, and mislead methods with more assumptions
+    than tv.
     """
     shots = sum(strength is not None for strength in e.strengths)
     return shots**-power * _sensitivity(e).psi
 
 
 def _masks(e: Evidence) -> Iterator[Reason]:
-    """Of all that may be wrong with the masks, the one reason that the readings speak most for."""
+    """The likeliest reason among possible errors of the masks, given the readings."""
     weakest = _strength(e)
     if weakest is None:
         return
@@ -406,13 +408,13 @@ def _likeliest(causes: dict[str, tuple[float, float, float]]) -> tuple[str, floa
     Contrast, which names no cause, only where it explains clearly more.
     """
     few = {"contrast": AS_LIKELY}
-    name = max(causes, key=lambda one: few.get(one, 1.0) * causes[one][2], default="")
+    name = max(causes, key=lambda cause: few.get(cause, 1.0) * causes[cause][2], default="")
     value, deviation, _ = causes.get(name, (0.0, 0.0, 0.0))
     return (name, value, deviation) if abs(value) > SURE * deviation else ("", 0.0, 0.0)
 
 
 def _named(cause: str, value: float, strength: float) -> tuple[str, str]:
-    """Return a cause in words, with its size, and what to do about it."""
+    """Return a cause in words, with its size, and the remedy."""
     weak = f"the masks' contrast is {strength:.0%} of that in Psi"
     size, more = abs(value), value > 0
     if strength < LEAST_STRENGTH:

@@ -1,7 +1,7 @@
 """A reconstruction with its verdict: readings kept from the fit are predicted afterwards.
 
 A saturated reading is a lower bound of the light. The light field is first fitted without saturated
-readings. Bounds that it does not reach join the readings, and it is fitted again (an active set of
+readings. Bounds above the fitted light then join the readings for a second fit (an active set of
 one round: a second round changed 64x80 crops by 0.0 to 0.4 dB). Readings of a shot that shows
 another scene than the others are left out, and the light field is fitted again. Where several shots
 do, the scene moved, and all shots are carried to the time of the first.
@@ -55,10 +55,10 @@ def reconstruct_judged(
 ) -> tuple[Reconstruction, Verdict]:
     """Return the result of `reconstruct`, given the same, and whether to trust it.
 
-    frames: the reading of a pixel that is not usable is the least that it can be, see
-    `FittedFrames.clipped`; 0 says nothing. The light field is that of all readings but the few
-    kept, which costs it next to nothing. Where every pixel sees the same colour, its three colours
-    are alike. film: see `reconstruct`.
+    frames: an unusable pixel's reading is a lower bound, see `FittedFrames.clipped`; 0 says
+    nothing. The light field follows from all readings but a few kept for validation, at hardly any
+    cost. Where every pixel sees the same colour, its three colours are alike. film: see
+    `reconstruct`.
     """
     settings, compiling = settings or MethodSettings(), compiling_s()
     read, notes = _as_fitted(psi, frames.of_one_deviation(), settings.screening)
@@ -205,7 +205,7 @@ def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDA
 def _as_fitted(
     psi: ImagingMatrix, frames: Frames, screening: bool
 ) -> tuple[FittedFrames, tuple[str, ...]]:
-    """Return the frames as a method gets them, and what was done to them before, in words."""
+    """Return the frames for a method, and notes about their preparation."""
     checked, excluded = checked_inputs(psi, frames), np.where(frames.usable, 0, frames.readings)
     if not screening:
         return FittedFrames(checked, kept_readings(psi, checked.usable), excluded), ()

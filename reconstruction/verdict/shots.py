@@ -1,7 +1,7 @@
 """Whether shots belong together: their brightness, their masks, and whether they saw one scene.
 
-What one light field leaves of the readings in all shots alike is texture that it lacks; what it
-leaves in single shots, as a change of brightness of whole spots, is of something that moved.
+Texture missing from a light field leaves the same residual in all shots. Motion leaves a residual
+in single shots: whole spots change their brightness.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ that; where an object of 30x30 pixels moved by 2 pixels in one shot the least ha
 AROUND, MARGIN_PX = 0.5, 4
 """Share of the ratio from which on windows beside belong to the place, and its margin."""
 CLEARLY = 2.0
-"""Times the square that any other shot leaves, from which on a shot is the one that differs."""
+"""Ratio of a shot's squared residual to any other shot's, above which that shot alone differs."""
 NEAR_PX, BAD = 5, 20.0
 """Side of the window, and times the median of what is left there, that make a bad pixel."""
 UNSURE = 0.005
 """Share of the mean reading that no Psi and no solver is right to."""
 LEAST_STRENGTH = 0.65
-"""Of the masks, below which Psi is another camera's, and all shots differ by that."""
+"""Least strength of the masks: below it Psi belongs to another camera and fits no shot."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """The place where shots differ most in what they saw.
 
-    ratio: of what they differ by over its limit; something moved where it is above 1. effect: root
-    mean square change of the readings there, over the mean reading. place, size: middle and extent
-    (y, x), pixels. shot: that differs from the others; None where it may be any. moved: readings
-    (shot, pixel_y, pixel_x) of all such places, where the shot is known.
+    ratio: difference between shots over its limit; above 1 something moved. effect: root mean
+    square change of the readings there, over the mean reading. place, size: middle and extent (y,
+    x), pixels. shot: the number of a single differing shot, else None. moved: readings (shot,
+    pixel_y, pixel_x) of all such places, where the shot is known.
     """
 
     ratio: float
@@ -88,7 +88,8 @@ def compared(found: Relief) -> ShotAgreement:
 
 
 def motion(found: Relief, residual: Array, noise_sigma: float) -> Motion | None:
-    """Return where shots differ in what they saw; None where their masks do not show, or of one.
+    """Return where shots differ in what they saw; None for a single shot, and where the masks do
+    not show.
 
     residual: what a light field of all shots leaves of the readings, (shot, pixel_y, pixel_x).
     """
@@ -144,12 +145,12 @@ def _differences(
     expected = np.where(good, found.level[shots] * (1 + found.masks[shots]), 0).astype(np.float32)
     left = np.where(good, residual[shots], 0).astype(np.float32)
     # A pixel that leaves far more than all about it is a bad one.
-    around = np.stack([cv2.medianBlur(one, NEAR_PX) for one in np.abs(left)])
+    around = np.stack([cv2.medianBlur(frame, NEAR_PX) for frame in np.abs(left)])
     left[np.abs(left) > BAD * np.maximum(around, noise_sigma)] = 0
     weight = np.maximum(_spots(np.square(expected)), 1e-12)
     brighter = _spots(expected * left) / weight
-    # A lamp that flickers is nothing that moves, and what moves is less than half of the picture.
-    lamp = [np.median(one[of_shot]) for one, of_shot in zip(brighter, good, strict=True)]
+    # Flicker of the lamp is no motion, and motion covers less than half of the picture.
+    lamp = [np.median(frame[of_shot]) for frame, of_shot in zip(brighter, good, strict=True)]
     brighter -= np.array(lamp, np.float32)[:, None, None]
     apart = weight * np.square(brighter - np.average(brighter, axis=0, weights=weight))
     alone = np.square(left - expected * brighter)
@@ -168,8 +169,8 @@ def _differing(squares: NDArray[np.floating], shots: NDArray[np.intp]) -> int | 
 
 
 def _spots(values: Array) -> NDArray[np.float32]:
-    return np.stack([cv2.GaussianBlur(one, (0, 0), SPOT_PX) for one in values])
+    return np.stack([cv2.GaussianBlur(frame, (0, 0), SPOT_PX) for frame in values])
 
 
 def _windows(values: Array, side: int) -> NDArray[np.float32]:
-    return np.stack([cv2.blur(one, (side, side)) for one in values])
+    return np.stack([cv2.blur(frame, (side, side)) for frame in values])
