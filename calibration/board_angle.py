@@ -9,7 +9,7 @@ ways, and with it a quarter turn shows its sense. The mask may have moved meanwh
 fitted beside.
 
 What no turn changes, a lamp from one side, gloss, a board that does not fill the aperture, looks as
-if the aperture let so much through. `leaning` says how large it is, if it is lopsided.
+if the aperture let so much through. `leaning` measures the lopsided part.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SAMPLED = 500_000
 CLEARLY = 12.0
 """Difference of the squared misfits, in deviations, that decides the sense of turning."""
 LEAST_LEANING, LEANS = 5e-3, 5.0
-"""Of the light, peak to peak over the views, and deviations of it, from which on it matters."""
+"""The least share of the light, peak to peak over the views, and its least deviations to count."""
 NATURAL = 2.0
 """Times what the cosine law makes of the outermost views: more is said."""
 

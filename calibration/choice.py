@@ -23,7 +23,7 @@ ROUTES = ("combined", "parametric", "mixed", "free")
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """How one description predicts a whiteboard that it has not seen.
+    """How well a route's Psi predicts a held-out whiteboard.
 
     chi2: mean squared residual over its variance, all usable pixels. residual: (pixel_y, pixel_x),
     in deviations, 0 where not usable. brightness: of the whiteboard, over what is predicted.
@@ -40,7 +40,7 @@ class HeldOut:
 
 def worst(judged: Mapping[str, HeldOut]) -> HeldOut:
     """Return the judgement of the kind of whiteboards that a description predicts worst."""
-    groups = {name: one.chi2 for name, one in judged.items()}
+    groups = {name: held.chi2 for name, held in judged.items()}
     return replace(judged[max(groups, key=lambda name: groups[name])], groups=groups)
 
 
@@ -110,7 +110,7 @@ def judge(
     for rows in bands(scaled):
         good = usable[rows]
         reading, prediction = (
-            np.where(good, one[rows], np.float64(0)) for one in (board.reading, predicted)
+            np.where(good, plane[rows], np.float64(0)) for plane in (board.reading, predicted)
         )
         residual = reading - brighter * prediction
         variance = board.variance[rows].astype(np.float64) + spread[rows]
@@ -147,21 +147,21 @@ def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
     """
     if not judged:
         raise CalibrationError("no calibration method gave a Psi: capture whiteboards")
-    known = sorted(judged, key=lambda one: ROUTES.index(one.route))
-    for one in known:
-        if one.chi2 <= LARGEST_CHI2:
-            return one, f"calibration good: {_residual(one)}"
-    best = min(known, key=lambda one: one.chi2)
+    known = sorted(judged, key=lambda held: ROUTES.index(held.route))
+    for held in known:
+        if held.chi2 <= LARGEST_CHI2:
+            return held, f"calibration good: {_residual(held)}"
+    best = min(known, key=lambda held: held.chi2)
     return best, (
         f"calibration doubtful: {_residual(best)}; the deviation of Psi includes the residual"
     )
 
 
-def _residual(one: HeldOut) -> str:
+def _residual(held: HeldOut) -> str:
     """Return the square residual over the noise's variance, of the worst whiteboard, in words."""
-    kind = max(one.groups, key=lambda name: one.groups[name], default="")
-    worst = f", worst: {kind}" if len(one.groups) > 1 else ""
+    kind = max(held.groups, key=lambda name: held.groups[name], default="")
+    worst = f", worst: {kind}" if len(held.groups) > 1 else ""
     return (
-        f"residual {one.chi2:.2f} x noise variance (limit {LARGEST_CHI2:g}{worst}), "
-        f"calibration method {one.route}"
+        f"residual {held.chi2:.2f} x noise variance (limit {LARGEST_CHI2:g}{worst}), "
+        f"calibration method {held.route}"
     )

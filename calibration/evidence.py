@@ -29,7 +29,7 @@ FLOOR_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The planes' splines: for every disparity, what grid point adds to what pixel of what view.
+    """The planes' splines by disparity: the share of every grid point in every pixel of a view.
 
     down, across: (disparity, view, pixel, spline), of every grid in turn. grids: (grid, 2), first
     spline and number. spreads: per grid. Grids: fine, coarse, constant; coarse is also that of
@@ -57,9 +57,9 @@ def plane_prior(views: tuple[int, int], side: int, disparities_px: Array) -> Pri
     knots, grids = [], []
     for step in (FINE_PX, COARSE_PX):
         count = int(np.ceil((side - 1 + 2 * reach) / step)) + 3
-        grids.append((sum(len(one[0]) for one in knots), count))
+        grids.append((sum(len(points) for points, _ in knots), count))
         knots.append(((np.arange(count) - (count - 1) / 2) * step, step))
-    grids.append((sum(len(one[0]) for one in knots), 1))
+    grids.append((sum(len(points) for points, _ in knots), 1))
     pixels = np.arange(side) - (side - 1) / 2
 
     def table(count: int) -> NDArray[np.float64]:

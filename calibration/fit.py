@@ -220,17 +220,15 @@ def _own_variances(boards: Sequence[Board]) -> NDArray[np.float64]:
     return own2
 
 
-def _scaled_residuals(
-    shadow: Shadow, sample: Sample, at: _State, index: int
-) -> NDArray[np.float64]:
-    opening = at.opening(sample.board, index)
-    predicted = shadow.readings(sample.pixels, sample.channels, *opening)
-    return (sample.reading - (1 + at.own[index, 0]) * predicted) / sample.deviation
-
-
 def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> list[Array]:
-    shadow = Shadow(mask, at.placement)
-    return [_scaled_residuals(shadow, sample, at, index) for index, sample in enumerate(samples)]
+    """Return the residuals of every whiteboard's sample, in deviations."""
+    shadow, found = Shadow(mask, at.placement), []
+    for index, sample in enumerate(samples):
+        opening = at.opening(sample.board, index)
+        predicted = shadow.readings(sample.pixels, sample.channels, *opening)
+        brighter = 1 + at.own[index, 0]
+        found.append((sample.reading - brighter * predicted) / sample.deviation)
+    return found
 
 
 def _with_own_slopes(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:

@@ -7,9 +7,9 @@ squares that noise does not explain (variance components; medians of like slopes
 
 Of a coefficient that the pinhole measured as well there are two estimates. The misfit is what the
 two differ by beyond their deviations, over what lies in a view alike close to the mask's edges, and
-around a pixel (empirical Bayes: Efron 2010, chapter 1); weighing both by their variances, Psi is
-the model's where it holds and the pinhole's where it does not (dust, a bent mask, glass), and its
-deviation says which.
+around a pixel (empirical Bayes: Efron 2010, chapter 1); with both weighed
+by their variances, Psi is the model's where the misfit is small, and the pinhole's where it is
+large (dust, a bent mask, glass).
 """
 
 from __future__ import annotations
@@ -88,12 +88,12 @@ def measured_misfit(
 def beyond_chance(misfits: Sequence[Misfit]) -> list[Misfit]:
     """Return the views' misfits, none where noise alone explains them.
 
-    No estimate is below zero, so that those of half the views are above it by chance. The noise's
+    Estimates are at least zero: without any misfit half the views have one by chance. The noise's
     own variance, alike for all, is as sure as the squares of one view are.
     """
-    if np.mean([one.evidence for one in misfits]) > SURE:
+    if np.mean([misfit.evidence for misfit in misfits]) > SURE:
         return list(misfits)
-    return [one if one.evidence > SURE * np.sqrt(2) else Misfit() for one in misfits]
+    return [misfit if misfit.evidence > SURE * np.sqrt(2) else Misfit() for misfit in misfits]
 
 
 def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> Calibration:
@@ -112,10 +112,9 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
 
     def of_plane(place: tuple[int, int, int, slice, int]) -> tuple[Array, ...]:
         """Return what pinhole and model say, and the variances of both."""
-        measured, expected = (one.psi.weights[place].astype(np.float64) for one in (free, model))
-        noise, inherent = (
-            np.square(one.deviation[place], dtype=np.float64) for one in (free, model)
-        )
+        both = free, model
+        measured, expected = (known.psi.weights[place].astype(np.float64) for known in both)
+        noise, inherent = (np.square(known.deviation[place], dtype=np.float64) for known in both)
         return measured, expected, noise, inherent
 
     views = []

@@ -1,4 +1,4 @@
-"""Whiteboards that no Psi may be made of, each named with its remedy as a CalibrationError.
+"""Refusals of whiteboards that are unfit for a Psi: CalibrationErrors that name the remedy.
 
 Saturated, dark, lit darks, without the mask, of another camera, of a bench or a board that moved.
 """

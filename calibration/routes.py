@@ -32,7 +32,7 @@ from calibration.choice import (
     worst,
 )
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
-from calibration.defects import View, find_defects, loss_variance
+from calibration.defects import find_defects, loss_variance
 from calibration.dust import moved_dust
 from calibration.errors import CalibrationError
 from calibration.fit import OFFSETS, fit_placement
@@ -152,7 +152,7 @@ def calibrate(
 
 @dataclass
 class _Work:
-    """The whiteboards of a calibration, and what its steps have made of them.
+    """The whiteboards of a calibration, and the results of its steps.
 
     sets: every set as captured; the others are as under a steady lamp after
     `correct_lamp_and_response`. good: (pixel_y, pixel_x), pixels to use. judges, seen: held-out
@@ -354,9 +354,9 @@ class _Work:
     def _unsteady(self, route: str) -> float:
         """Return the relative error that shutter and lamp leave in all of a Psi alike.
 
-        Every whiteboard is divided by the references, which are as unsteady as it is: from frame to
-        frame, as repeats show, which their number averages; and slowly, as the fit shows. Of single
-        views as measured through a pinhole each has its own beside.
+        Every whiteboard is divided by the references. Their brightness changes from frame to frame,
+        as repeats show, by a variance that the number of frames divides; and slowly, as the fit
+        shows. A view that is measured through a pinhole has the error of its own frames beside.
         """
         shared = {id(frame): frame for boards in self.sets for frame in boards.references.values()}
         references, dark_dn = list(shared.values()), self.sets[0].dark.mean_dn
@@ -594,10 +594,8 @@ def _with_defect_variance(
         channels = np.full(len(touched), stored, dtype=np.uint8)
         if layout.colour is not None:
             channels = layout.colour[shot, y, x]
-        seen = View(opened, stages[shot], shot)
-        of_losses = loss_variance(
-            model.defects, model.mask, model.fit.placement, touched, channels, seen
-        )
+        how = touched, channels, (opened, stages[shot], shot)
+        of_losses = loss_variance(model.defects, model.mask, model.fit.placement, *how)
         of_outline = model.of_defects * np.square(bare - plane)[y, x]
         place = (shot, v, u, y, stored, x)
         more = of_losses / deviation.shape[4] ** 2 + of_outline
@@ -623,7 +621,7 @@ def _white(boards: BoardSet, layout: PsiLayout, shot: int) -> NDArray[np.float32
     lamps = ("white",) if white else lamps_needed(layout)
     total = np.zeros(layout.frames_shape[1:], dtype=np.float64)
     for lamp in lamps:
-        reference = boards.references.get((shot, lamp)) or boards.references.get((0, lamp))
+        reference = boards.reference(shot, lamp)
         if reference is None:
             raise CalibrationError(f"no reference whiteboard for shot {shot}, {lamp} lamp")
         above = reference.mean_dn - boards.dark_at(reference.exposure_s).mean_dn

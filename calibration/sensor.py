@@ -351,8 +351,8 @@ class _Points:
     def saturation(self) -> tuple[float, float]:
         """The signal where all pixels are full, else that of the greatest variance; the step.
 
-        Between two exposures the latter, EMVA 1288's saturation point, is known to their step: it
-        may be higher by that step.
+        Between two exposures the latter, EMVA 1288's saturation point, may be higher by their
+        step.
         """
         found = []
         for phase in range(self.signal.shape[1]):

@@ -49,7 +49,7 @@ class Calibration:
 
     deviation: standard deviation of every coefficient, shaped as `psi.weights`.
     white_dn_per_s: (shot, y, x), what a reading of 1 gives. gain: of the sensor. good: (y, x),
-    pixels to use at all (None: every one).
+    pixels to use at all (None: all).
     """
 
     psi: ImagingMatrix
@@ -92,7 +92,7 @@ def measure_psi(
 ) -> Calibration:
     """Return the measured Psi with the standard deviation of every coefficient.
 
-    design: Psi as designed, or what it is for; gives the sizes, the colour of every pixel, and how
+    design: Psi as designed, or its layout; gives the sizes, the colour of every pixel, and how
     a pixel's coefficient is shared among its samples (of a layout: evenly). empty: makes the arrays
     of coefficients, written view by view: in memory, or on disk for sensors whose Psi does not fit
     there. on_plane: called after each. Raises CalibrationError for missing frames, frames of
@@ -127,7 +127,7 @@ def measured_planes(
     gain = _gain(boards, layout)
     views_v, views_u = layout.views
     k = layout.binning
-    pinholes = {(one.shot, one.pinhole, one.lamp): one for one in boards.frames}
+    pinholes = {(board.shot, board.pinhole, board.lamp): board for board in boards.frames}
     for shot in range(layout.weights_shape[0]):
         references = _references(boards, gain, layout, shot)
         for v, u in np.ndindex(views_v, views_u):
@@ -231,8 +231,6 @@ def _samples(pixels: Array, binning: int) -> Array:
 
 def _shares(designed: Array, binning: int) -> Array:
     """Return what share of its pixel's coefficient each sample has in the design, (y, x)."""
-    if binning == 1:
-        return np.ones_like(designed)
     rows, columns = designed.shape[0] // binning, designed.shape[1] // binning
     sums = designed.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
     whole = _samples(sums, binning)
