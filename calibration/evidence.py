@@ -105,7 +105,7 @@ def _add_grid(coefficients, down, across, first, count, matrix, at):
 
 
 @njit(cache=True, parallel=True)
-def _evidences(coefficients, colours, readings, noise, down, across, grids, chosen, found):
+def _compute_evidence(coefficients, colours, readings, noise, down, across, grids, chosen, found):
     """Set found (block, candidate) to each block's log evidence at its chosen disparities.
 
     coefficients: (block, stored, shot, pixel, v, u); colours, readings, noise: (block, shot,
@@ -185,7 +185,7 @@ def log_evidence(
     a reading. chosen: (block, candidate), indices into the prior's disparities.
     """
     found = np.empty(chosen.shape)
-    _evidences(
+    _compute_evidence(
         np.ascontiguousarray(coefficients, dtype=np.float64),
         np.ascontiguousarray(colours),
         np.ascontiguousarray(readings, dtype=np.float64),

@@ -110,7 +110,7 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
         for shot, v, u, colour in np.ndindex(shots, views_v, views_u, stored)
     ]
 
-    def of_plane(place: tuple[int, int, int, slice, int]) -> tuple[Array, ...]:
+    def estimates_of(place: tuple[int, int, int, slice, int]) -> tuple[Array, ...]:
         """Return what pinhole and model say, and the variances of both."""
         both = free, model
         measured, expected = (known.psi.weights[place].astype(np.float64) for known in both)
@@ -119,13 +119,13 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
 
     views = []
     for place in places:
-        measured, expected, noise, inherent = of_plane(place)
+        measured, expected, noise, inherent = estimates_of(place)
         squares = (measured - expected) ** 2
         views.append(measured_misfit(squares, noise + inherent, expected, usable))
     for place, view in zip(places, beyond_chance(views), strict=True):
-        measured, expected, noise, inherent = of_plane(place)
+        measured, expected, noise, inherent = estimates_of(place)
         squares = (measured - expected) ** 2
-        misfit = _around(squares, noise + inherent, view.variance(expected), usable)
+        misfit = _local_misfit(squares, noise + inherent, view.variance(expected), usable)
         share = (inherent + misfit) / (inherent + misfit + noise)
         share = np.where(squares > OUTLIER2 * (noise + inherent + misfit), 1.0, share)
         share = np.where(usable, share, 0.0)
@@ -135,7 +135,7 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
     return replace(free, psi=replace(free.psi, weights=weights), deviation=deviation, good=good)
 
 
-def _around(
+def _local_misfit(
     squares: Array, variance: Array, misfit: Array, usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the misfit's variance (y, x), that of a pixel's surroundings where surely another."""

@@ -282,7 +282,9 @@ class _Work:
         model = self.models["parametric"] = with_misfit(Parametric(fit, mask), self.seen)
         if {"mixed", "combined"} & self.routes and self.design.binning == 1:
             self.on_stage("defects of the mask")
-            self.models["mixed"] = with_misfit(_mixed(self.seen, self.camera, model), self.seen)
+            self.models["mixed"] = with_misfit(
+                _fit_with_defects(self.seen, self.camera, model), self.seen
+            )
         for name, fitted in self.models.items():
             missed = _missed_at_defects(fitted, [*self.seen, *self.judges])
             model = replace(fitted, of_defects=missed)
@@ -306,7 +308,7 @@ class _Work:
         deviation = psi_deviation(model.shadow, layout, self.stages, covariance, astray2)
         if model.defects is not None and model.defects.count:
             deviation = _with_defect_variance(deviation, model, layout, self.stages)
-        white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])
+        white = np.stack([_white_dn_per_s(boards, layout, shot) for shot in range(layout.shots)])
         return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), self.good)
 
     def measure_views(self, empty: NewArray, on_plane: Callable[[str], None]) -> None:
@@ -434,7 +436,7 @@ class _Work:
         return found
 
 
-def _mixed(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
+def _fit_with_defects(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
     """Return the fit with defects: found, and the placement refined with them in the mask."""
     start = parametric.fit.placement
     defects = find_defects(seen, parametric.mask, start)
@@ -528,7 +530,7 @@ def _judged_model(
     return worst(groups)
 
 
-def _light_cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
+def _lost_at_aperture_edge(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
     """Return the share of a single pinhole's light that the aperture's edge keeps from it.
 
     moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
@@ -560,7 +562,7 @@ def _correct_pinhole_places(
         (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
         off_x, off_y = check.moved_um
         unsure_um = check.moved_deviation_um
-        lost = _light_cut_off(check.moved_um, board, model.mask)
+        lost = _lost_at_aperture_edge(check.moved_um, board, model.mask)
         for stored in range(layout.weights_shape[4]):
             place = board.shot, v, u, stored
 
@@ -615,7 +617,7 @@ def _with_misfit_variance(known: Calibration, model: Parametric) -> Calibration:
     return replace(known, deviation=np.sqrt(deviation).astype(np.float32))
 
 
-def _white(boards: BoardSet, layout: PsiLayout, shot: int) -> NDArray[np.float32]:
+def _white_dn_per_s(boards: BoardSet, layout: PsiLayout, shot: int) -> NDArray[np.float32]:
     """Return what a reading of 1 gives in DN per second: all lamp colours together."""
     white = {(shot, "white"), (0, "white")} & set(boards.references)
     lamps = ("white",) if white else lamps_needed(layout)
