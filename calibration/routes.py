@@ -282,9 +282,8 @@ class _Work:
         model = self.models["parametric"] = with_misfit(Parametric(fit, mask), self.seen)
         if {"mixed", "combined"} & self.routes and self.design.binning == 1:
             self.on_stage("defects of the mask")
-            self.models["mixed"] = with_misfit(
-                _fit_with_defects(self.seen, self.camera, model), self.seen
-            )
+            mixed = _fit_with_defects(self.seen, self.camera, model)
+            self.models["mixed"] = with_misfit(mixed, self.seen)
         for name, fitted in self.models.items():
             missed = _missed_at_defects(fitted, [*self.seen, *self.judges])
             model = replace(fitted, of_defects=missed)

@@ -139,18 +139,17 @@ def measured_planes(
                 values, deviation = (np.empty(layout.size, dtype=np.float32) for _ in range(2))
                 for rows in bands(pinhole.mean_dn):
                     signal, variance = signal_of(pinhole, dark, gain, rows)
-                    reference, reference_variance = _reference_signal(
+                    white, white_variance = _reference_signal(
                         boards, gain, references[stored], rows
                     )
-                    ratio = signal / reference
-                    relative = reference_variance / reference**2
+                    ratio = signal / white
+                    relative = white_variance / white**2
                     spread = np.sqrt(variance / white**2 + ratio**2 * relative)
                     samples = slice(k * rows.start, k * rows.stop)
                     share = 1 / (k**2 * len(lamps))
                     if designed is not None and k > 1:
-                        share = _designed_shares(designed[shot, v, u, samples, stored], k) / len(
-                            lamps
-                        )
+                        plane = designed[shot, v, u, samples, stored]
+                        share = _designed_shares(plane, k) / len(lamps)
                     values[samples] = share * _repeat_samples(np.maximum(ratio, 0), k)
                     deviation[samples] = share * _repeat_samples(spread, k)
                 yield (shot, v, u, stored), values, deviation
