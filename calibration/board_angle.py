@@ -9,7 +9,7 @@ ways, and with it a quarter turn shows its sense. The mask may have moved meanwh
 fitted beside.
 
 What no turn changes, a lamp from one side, gloss, a board that does not fill the aperture, looks as
-if the aperture let so much through. `leaning` says how large it is, if it is lopsided.
+if the aperture let so much through. `leaning` measures the lopsided part.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SAMPLED = 500_000
 CLEARLY = 12.0
 """Difference of the squared misfits, in deviations, that decides the sense of turning."""
 LEAST_LEANING, LEANS = 5e-3, 5.0
-"""Of the light, peak to peak over the views, and deviations of it, from which on it matters."""
+"""The least share of the light, peak to peak over the views, and its least deviations to count."""
 NATURAL = 2.0
 """Times what the cosine law makes of the outermost views: more is said."""
 
@@ -67,7 +67,7 @@ class BoardAngle:
         return self.significance > SIGNIFICANT and float(np.ptp(self.radiance)) > LEAST_UNEVENNESS
 
 
-def _terms(views: tuple[int, int], turn_deg: float) -> NDArray[np.float64]:
+def _radiance_terms(views: tuple[int, int], turn_deg: float) -> NDArray[np.float64]:
     """Return the gradients and saddles over the aperture of a board turned so, (term, v, u)."""
     v, u = (np.linspace(-1, 1, count) if count > 1 else np.zeros(1) for count in views)
     turn = np.deg2rad(turn_deg)
@@ -77,7 +77,7 @@ def _terms(views: tuple[int, int], turn_deg: float) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Turned:
+class _TurnedBoard:
     """What one turned board says: change of the radiance by term, its information, the mask's move.
 
     squares: mean squared residual, over the noise.
@@ -98,17 +98,17 @@ def board_over_angle(
     stands (None: it is taken to stand still).
     """
     views = psi.light_field_shape[:2]
-    upright = _terms(views, 0.0)
+    upright = _radiance_terms(views, 0.0)
     size, flat = len(upright), upright.reshape(len(upright), -1)
-    seen = {turn: _turned(psi, board, flat, shadow) for turn, board in turned.items()}
+    seen = {turn: _fit_turned_board(psi, board, flat, shadow) for turn, board in turned.items()}
     noise = max(1.0, float(np.mean([measured.squares for measured in seen.values()])))
 
-    def solved(sense: int) -> tuple[Array, Array, float, Array]:
+    def solve_for_sense(sense: int) -> tuple[Array, Array, float, Array]:
         """Return terms, covariance, squared misfit and what each board leaves."""
         matrix, right = np.zeros((size, size)), np.zeros(size)
         maps = {}
         for turn, measured in seen.items():
-            change = (_terms(views, sense * turn) - upright).reshape(size, -1)
+            change = (_radiance_terms(views, sense * turn) - upright).reshape(size, -1)
             # The change by its own terms.
             maps[turn] = change @ np.linalg.pinv(flat)
             matrix += maps[turn] @ measured.information @ maps[turn].T
@@ -120,7 +120,7 @@ def board_over_angle(
         misfit = sum(float(off @ measured.information @ off) for off, measured in pairs)
         return found, inverse * noise, misfit / noise, left
 
-    both = {sense: solved(sense) for sense in (1, -1)}
+    both = {sense: solve_for_sense(sense) for sense in (1, -1)}
     sense = min(both, key=lambda tried: both[tried][2])
     found, covariance, misfit, left = both[sense]
     freedom = size * (len(seen) - 1)
@@ -143,7 +143,9 @@ def board_over_angle(
     )
 
 
-def _turned(psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None) -> _Turned:
+def _fit_turned_board(
+    psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None
+) -> _TurnedBoard:
     """Return what a board says of the change of radiance; flat: the terms, (term, view)."""
     sample = board.sampled(np.inf, SAMPLED, np.random.default_rng(0))
     channels, reading, deviation = sample.channels, sample.reading, sample.deviation
@@ -180,14 +182,14 @@ def _turned(psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None
     squares = float((weight * left**2).sum() / weight.sum())
     # The levels of the colours and the mask's place are free: what is left determines the terms.
     inside, outside = slice(0, size), slice(size, None)
-    solved = np.linalg.solve(normal[outside, outside], normal[outside, inside])
-    information = normal[inside, inside] - normal[inside, outside] @ solved
+    solve_for_sense = np.linalg.solve(normal[outside, outside], normal[outside, inside])
+    information = normal[inside, inside] - normal[inside, outside] @ solve_for_sense
     moved_deviation = 0.0
     if slopes.shape[1]:
         covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) * max(squares, 1.0)
         moved_deviation = float(np.sqrt(np.diag(covariance)[size : size + 2].max()))
     moved_um = float(move[0]), float(move[1]), moved_deviation
-    return _Turned(solution[:size].astype(np.float64), information, moved_um, squares)
+    return _TurnedBoard(solution[:size].astype(np.float64), information, moved_um, squares)
 
 
 def take_out(board: BoardAngle, known: Calibration) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -91,6 +91,10 @@ class BoardSet:
     def dark_at(self, exposure_s: float) -> MeanFrame:
         """Return the dark frame of an exposure: black level and dark current of every pixel."""
         return dark_at(self.darks, exposure_s)
+
+    def reference(self, shot: int, lamp: str) -> MeanFrame | None:
+        """Return the reference of a shot under a lamp, by default that of the first shot."""
+        return self.references.get((shot, lamp)) or self.references.get((0, lamp))
 
     @property
     def exposures(self) -> int:
@@ -220,14 +224,7 @@ def gain_of(boards: BoardSet) -> SensorGain:
 def as_readings(
     boards: BoardSet, layout: PsiLayout, usable: NDArray[np.bool_] | None = None
 ) -> list[Board]:
-    """Return the whiteboards as readings, as `each_reading` does."""
-    return list(each_reading(boards, layout, usable))
-
-
-def each_reading(
-    boards: BoardSet, layout: PsiLayout, usable: NDArray[np.bool_] | None = None
-) -> Iterator[Board]:
-    """Yield the whiteboards as readings, each read as it is asked for.
+    """Return the whiteboards as readings.
 
     usable: (pixel_y, pixel_x), pixels known to be good; a pixel whose reference is not bright
     enough to divide by is left out as well. Raises CalibrationError for frames of another size,
@@ -236,10 +233,9 @@ def each_reading(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
+    found = []
     for board in boards.frames:
-        reference = boards.references.get((board.shot, board.lamp)) or boards.references.get(
-            (0, board.lamp)
-        )
+        reference = boards.reference(board.shot, board.lamp)
         if reference is None:
             raise CalibrationError(f"{board.name}: no reference whiteboard under that lamp")
         taken = board.frame
@@ -250,7 +246,8 @@ def each_reading(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        yield _board(board, taken, reference, boards, gain, layout, good)
+        found.append(_board(board, taken, reference, boards, gain, layout, good))
+    return found
 
 
 def _board(
@@ -284,18 +281,14 @@ def _board(
         raise CalibrationError(
             f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
         )
-    k = layout.binning
-    if layout.colour is not None:
-        channels = layout.colour[board.shot, ::k, ::k]
-    elif board.lamp in LAMP_COLOURS:
-        channels = np.full(reading.shape, LAMP_COLOURS.index(board.lamp), dtype=np.uint8)
-    else:
-        channels = np.full(reading.shape, 3, dtype=np.uint8)
+    channels = channels_of(layout, board.shot)
+    if layout.colour is None and board.lamp in LAMP_COLOURS:
+        channels[:] = LAMP_COLOURS.index(board.lamp)
     return Board(
         board.name,
         reading,
         variance,
-        np.ascontiguousarray(channels),
+        channels,
         views_open(layout.views, board.pinhole, board.window),
         board.stage_um,
         board.shot,
@@ -333,21 +326,16 @@ def signal_of(
     """Return DN per second above the dark of some rows, and its variance."""
     signal = (frame.mean_dn[rows] - dark.mean_dn[rows]).astype(np.float64)
     own = gain.gain_dn_per_electron * np.maximum(signal, 0) + dark.variance_dn2
-    variance = own / frame.count + _dark_variance(dark) + frame.extra_variance_dn2
+    of_dark = dark.variance_dn2 / dark.count + dark.extra_variance_dn2
+    variance = own / frame.count + of_dark + frame.extra_variance_dn2
     return signal / frame.exposure_s, variance / frame.exposure_s**2
-
-
-def _dark_variance(dark: MeanFrame) -> float:
-    """Return the variance of a mean dark frame."""
-    return dark.variance_dn2 / dark.count + dark.extra_variance_dn2
 
 
 def channels_of(layout: PsiLayout, shot: int = 0) -> NDArray[np.uint8]:
     """Return the colour that each pixel sees under white light, (pixel_y, pixel_x); 3: all."""
-    k = layout.binning
     if layout.colour is None:
         return np.full(layout.frames_shape[1:], 3, dtype=np.uint8)
-    return np.ascontiguousarray(layout.colour[shot, ::k, ::k])
+    return np.ascontiguousarray(layout.colour[shot, :: layout.binning, :: layout.binning])
 
 
 def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:

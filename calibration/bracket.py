@@ -9,6 +9,8 @@ reason whether a longer exposure saturates is predicted from the shorter ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +49,7 @@ def fuse(
     current is not known: the deviation counts DARK_ELECTRONS_PER_S. gain: its variance in the dark
     is that of the shortest dark.
 
-    Raises CalibrationError for no frame, or for frames of another size than the dark one.
+    Raises CalibrationError for no frame, and for frames of another size than the darks.
     """
     if not frames_dn or len(frames_dn) != len(exposures_s):
         raise CalibrationError("a bracket needs frames, and an exposure for each")
@@ -55,106 +57,89 @@ def fuse(
         raise CalibrationError("a bracket's frames differ in size from the dark frame")
     order = np.argsort(exposures_s, kind="stable")
     times_s = np.asarray(exposures_s, dtype=np.float64)[order]
-    shares = [dark_shares(darks, time_s) for time_s in times_s]
-    means_dn = [one.mean_dn.astype(np.float64) for one in darks]
-    own_dn = [np.tensordot(share, means_dn, 1) for share in shares]
-    shortest_dn = means_dn[int(np.argmin([one.exposure_s for one in darks]))]
-    # Dark current is shot noise too.
-    current_dn = [np.maximum(one - shortest_dn, 0) for one in own_dn]
-    signals = [frames_dn[i] - own for i, own in zip(order, own_dn, strict=True)]
-    unclipped = [frames_dn[i] < white_level_dn for i in order]
-    room_dn = [white_level_dn - own for own in own_dn]
-    used = _used(signals, unclipped, times_s, gain, room_dn, current_dn)
-    rate = _pooled(signals, used, times_s)
+    shares = np.array([dark_shares(darks, time_s) for time_s in times_s])
+    means_dn = np.array([dark.mean_dn for dark in darks], dtype=np.float64)
+    shortest_dn = means_dn[int(np.argmin([dark.exposure_s for dark in darks]))]
+    taken = _Bracket(
+        np.array([frames_dn[i] for i in order]), times_s, np.tensordot(shares, means_dn, 1),
+        shortest_dn, gain, white_level_dn,
+    )  # fmt: skip
+    used = taken.used()
+    # All light over all time: the estimate where shot noise is all there is.
+    spent_s = np.tensordot(times_s, used, 1)
+    rate = np.where(used, taken.signal_dn, 0).sum(axis=0) / np.where(spent_s > 0, spent_s, 1.0)
+    by_time = times_s[:, None, None]
     for _ in range(ROUNDS):
-        weights = _weights(rate, used, times_s, gain, current_dn)
-        total = np.sum(weights, axis=0)
+        spread = np.maximum(taken.variance_dn2(rate), QUANTISATION_DN2)
+        weights = np.where(used, by_time**2 / spread, 0.0)
+        total = weights.sum(axis=0)
         seen = total > 0
         safe = np.where(seen, total, 1.0)
-        rate = np.sum([w * s / t for w, s, t in _zip(weights, signals, times_s)], axis=0) / safe
-    # What a dark frame is off by is common to all exposures that it serves.
-    levers = [w / t / safe for w, t in zip(weights, times_s, strict=True)]
+        rate = (weights * taken.signal_dn / by_time).sum(axis=0) / safe
+    # The error of a dark frame is common to all exposures that it serves.
+    levers = weights / by_time / safe
     variance = 1 / safe
-    for place, one in enumerate(darks):
-        own_variance = gain.variance_dn2(means_dn[place] - shortest_dn) / one.count
-        lever = sum(share[place] * lever for share, lever in zip(shares, levers, strict=True))
-        variance = variance + lever**2 * (own_variance + one.extra_variance_dn2)
-    unknown_dn = [_unknown_dn(darks, time_s, gain) for time_s in times_s]
-    variance = variance + sum(dn * lever for dn, lever in zip(unknown_dn, levers, strict=True)) ** 2
-    clipped = ~(seen | unclipped[0])
-    rate = np.where(clipped, np.maximum(signals[0], 0) / times_s[0], rate)
+    for place, dark in enumerate(darks):
+        own_variance = gain.variance_dn2(means_dn[place] - shortest_dn) / dark.count
+        lever = np.tensordot(shares[:, place], levers, 1)
+        variance = variance + lever**2 * (own_variance + dark.extra_variance_dn2)
+    unknown_dn = np.array([_unknown_dn(darks, time_s, gain) for time_s in times_s])
+    variance = variance + np.tensordot(unknown_dn, levers, 1) ** 2
+    clipped = ~(seen | (taken.frames_dn[0] < white_level_dn))
+    rate = np.where(clipped, np.maximum(taken.signal_dn[0], 0) / times_s[0], rate)
     return rate.astype(np.float32), np.where(seen, variance, np.inf).astype(np.float32), seen
 
 
 def _unknown_dn(darks: Sequence[MeanFrame], exposure_s: float, gain: SensorGain) -> float:
     """Return the deviation of the dark current that no dark shows, in DN of an exposure."""
-    if dark_current_known([one.exposure_s for one in darks], exposure_s):
+    if dark_current_known([dark.exposure_s for dark in darks], exposure_s):
         return 0.0
     further_s = abs(exposure_s - darks[0].exposure_s)
     return gain.gain_dn_per_electron * DARK_ELECTRONS_PER_S * further_s
 
 
-def _zip(weights: list[Array], signals: list[Array], times_s: Array) -> list[tuple]:
-    return list(zip(weights, signals, times_s, strict=True))
+@dataclass(frozen=True, eq=False)
+class _Bracket:
+    """Frames from the shortest exposure on, and their darks: (frame, y, x)."""
 
+    frames_dn: NDArray[np.uint16]
+    times_s: Array
+    dark_dn: Array
+    shortest_dark_dn: Array
+    gain: SensorGain
+    white_level_dn: int
 
-def _used(
-    signals: list[Array],
-    unclipped: list[NDArray[np.bool_]],
-    times_s: Array,
-    gain: SensorGain,
-    room_dn: Sequence[Array],
-    current_dn: Sequence[Array],
-) -> list[NDArray[np.bool_]]:
-    """Return where each frame is used: the shortest where not clipped, others as predicted."""
-    used = []
-    collected = np.zeros_like(signals[0])
-    collected_s = np.zeros_like(signals[0])
-    count = np.zeros_like(signals[0])
-    for signal, whole, time_s, room, current in zip(
-        signals, unclipped, times_s, room_dn, current_dn, strict=True
-    ):
-        known = collected_s > 0
-        safe_s = np.where(known, collected_s, 1.0)
-        rate = np.maximum(collected / safe_s, 0)
-        expected_dn = rate * time_s
-        spread = gain.gain_dn_per_electron * collected + count * gain.dark_variance_dn2
-        variance = np.maximum(spread, 0) / safe_s**2 * time_s**2 + gain.variance_dn2(
-            expected_dn + current
-        )
-        fits = expected_dn + SAFETY_SIGMAS * np.sqrt(variance) < room
-        shortest = time_s == times_s[0]
-        use = whole if shortest else whole & known & fits
-        used.append(use)
-        collected = collected + np.where(use, signal, 0)
-        collected_s = collected_s + np.where(use, time_s, 0)
-        count = count + use
-    return used
+    @cached_property
+    def signal_dn(self) -> Array:
+        """What is above the dark."""
+        return self.frames_dn - self.dark_dn
 
+    @cached_property
+    def current_dn(self) -> Array:
+        """The dark current's signal, which is shot noise too."""
+        return np.maximum(self.dark_dn - self.shortest_dark_dn, 0)
 
-def _pooled(signals: list[Array], used: list[NDArray[np.bool_]], times_s: Array) -> Array:
-    """Return all light over all time: the estimate where shot noise is all there is."""
-    light = np.sum([np.where(u, s, 0) for u, s in zip(used, signals, strict=True)], axis=0)
-    spent_s = np.sum([u * t for u, t in zip(used, times_s, strict=True)], axis=0)
-    return light / np.where(spent_s > 0, spent_s, 1.0)
+    def variance_dn2(self, rate: Array) -> Array:
+        """Return the variance of every frame at a rate, (frame, y, x)."""
+        expected_dn = np.maximum(rate * self.times_s[:, None, None], 0)
+        return self.gain.variance_dn2(expected_dn + self.current_dn)
 
-
-def _weights(
-    rate: Array,
-    used: list[NDArray[np.bool_]],
-    times_s: Array,
-    gain: SensorGain,
-    current_dn: Sequence[Array],
-) -> list[Array]:
-    """Return the inverse variance of each frame's rate, 0 where it is not used."""
-    return [
-        np.where(
-            use,
-            time_s**2
-            / np.maximum(
-                gain.variance_dn2(np.maximum(rate * time_s, 0) + current), QUANTISATION_DN2
-            ),
-            0.0,
-        )
-        for use, time_s, current in zip(used, times_s, current_dn, strict=True)
-    ]
+    def used(self) -> NDArray[np.bool_]:
+        """Return where each frame is used: the shortest where not clipped, others as predicted."""
+        used = self.frames_dn < self.white_level_dn
+        collected, collected_s, count = (np.zeros(used.shape[1:]) for _ in range(3))
+        for k, time_s in enumerate(self.times_s):
+            if time_s > self.times_s[0]:
+                known = collected_s > 0
+                safe_s = np.where(known, collected_s, 1.0)
+                expected_dn = np.maximum(collected / safe_s, 0) * time_s
+                spread = self.gain.gain_dn_per_electron * collected
+                spread = np.maximum(spread + count * self.gain.dark_variance_dn2, 0)
+                variance = spread / safe_s**2 * time_s**2
+                variance = variance + self.gain.variance_dn2(expected_dn + self.current_dn[k])
+                room_dn = self.white_level_dn - self.dark_dn[k]
+                used[k] &= known & (expected_dn + SAFETY_SIGMAS * np.sqrt(variance) < room_dn)
+            collected = collected + np.where(used[k], self.signal_dn[k], 0)
+            collected_s = collected_s + np.where(used[k], time_s, 0)
+            count = count + used[k]
+        return used

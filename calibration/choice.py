@@ -23,7 +23,7 @@ ROUTES = ("combined", "parametric", "mixed", "free")
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """How one description predicts a whiteboard that it has not seen.
+    """How well a route's Psi predicts a held-out whiteboard.
 
     chi2: mean squared residual over its variance, all usable pixels. residual: (pixel_y, pixel_x),
     in deviations, 0 where not usable. brightness: of the whiteboard, over what is predicted.
@@ -40,7 +40,7 @@ class HeldOut:
 
 def worst(judged: Mapping[str, HeldOut]) -> HeldOut:
     """Return the judgement of the kind of whiteboards that a description predicts worst."""
-    groups = {name: one.chi2 for name, one in judged.items()}
+    groups = {name: held.chi2 for name, held in judged.items()}
     return replace(judged[max(groups, key=lambda name: groups[name])], groups=groups)
 
 
@@ -53,16 +53,16 @@ def predicted_by_shadow(shadow: Shadow, board: Board) -> Array:
 
 def predicted_by_psi(psi: ImagingMatrix, board: Board) -> Array:
     """Return what a measured Psi predicts of a whiteboard at its shot's position, white lamp."""
-    return _by_pixel(psi.weights, board, psi.binning, lambda plane: plane)
+    return _sum_over_views(psi.weights, board, psi.binning, lambda plane: plane)
 
 
 def prediction_variance(deviation: Array, board: Board, binning: int) -> Array:
     """Return the variance of `predicted_by_psi` from the deviation of its coefficients."""
     # The samples of a pixel were measured as one: their deviations add up.
-    return _by_pixel(deviation, board, binning, np.square) * binning**2
+    return _sum_over_views(deviation, board, binning, np.square) * binning**2
 
 
-def _by_pixel(
+def _sum_over_views(
     coefficients: Array, board: Board, binning: int, change: Callable[[Array], Array]
 ) -> Array:
     """Return changed coefficients summed over samples, open views and colours, (pixel_y, pixel_x).
@@ -71,11 +71,11 @@ def _by_pixel(
     """
     total = np.zeros(board.reading.shape)
     for v, u in np.argwhere(board.views_open):
-        total += _of_pixels(change(coefficients[board.shot, v, u].astype(np.float64)), binning)
+        total += _sum_by_pixel(change(coefficients[board.shot, v, u].astype(np.float64)), binning)
     return total
 
 
-def _of_pixels(view: Array, binning: int) -> Array:
+def _sum_by_pixel(view: Array, binning: int) -> Array:
     """Return what a view's coefficients (y, stored colour, x) sum to, (pixel_y, pixel_x)."""
     rows, colours, columns = view.shape
     shape = (rows // binning, binning, colours, columns // binning, binning)
@@ -85,7 +85,7 @@ def _of_pixels(view: Array, binning: int) -> Array:
 def white_by_view(psi: ImagingMatrix, shot: int) -> Iterator[Array]:
     """Yield what pixels read of a white board before each view in turn, (pixel_y, pixel_x)."""
     for v, u in np.ndindex(psi.light_field_shape[:2]):
-        yield _of_pixels(psi.weights[shot, v, u].astype(np.float64), psi.binning)
+        yield _sum_by_pixel(psi.weights[shot, v, u].astype(np.float64), psi.binning)
 
 
 def judge(
@@ -106,11 +106,11 @@ def judge(
     spread = np.broadcast_to(predicted_variance, usable.shape)
     scaled = np.empty(usable.shape, dtype=np.float32)
     missed = power = light = expected = 0.0
-    brighter = 1 + _brighter(board, predicted, spread, unsteady)
+    brighter = 1 + _likeliest_excess(board, predicted, spread, unsteady)
     for rows in bands(scaled):
         good = usable[rows]
         reading, prediction = (
-            np.where(good, one[rows], np.float64(0)) for one in (board.reading, predicted)
+            np.where(good, plane[rows], np.float64(0)) for plane in (board.reading, predicted)
         )
         residual = reading - brighter * prediction
         variance = board.variance[rows].astype(np.float64) + spread[rows]
@@ -126,7 +126,7 @@ def judge(
     )
 
 
-def _brighter(board: Board, predicted: Array, spread: Array, unsteady: float) -> float:
+def _likeliest_excess(board: Board, predicted: Array, spread: Array, unsteady: float) -> float:
     """Return by which share a whiteboard is likeliest brighter than predicted."""
     if unsteady == 0:
         return 0.0
@@ -147,21 +147,21 @@ def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
     """
     if not judged:
         raise CalibrationError("no calibration method gave a Psi: capture whiteboards")
-    known = sorted(judged, key=lambda one: ROUTES.index(one.route))
-    for one in known:
-        if one.chi2 <= LARGEST_CHI2:
-            return one, f"calibration good: {_residual(one)}"
-    best = min(known, key=lambda one: one.chi2)
+    known = sorted(judged, key=lambda held: ROUTES.index(held.route))
+    for held in known:
+        if held.chi2 <= LARGEST_CHI2:
+            return held, f"calibration good: {_state_residual(held)}"
+    best = min(known, key=lambda held: held.chi2)
     return best, (
-        f"calibration doubtful: {_residual(best)}; the deviation of Psi includes the residual"
+        f"calibration doubtful: {_state_residual(best)}; the deviation of Psi includes the residual"
     )
 
 
-def _residual(one: HeldOut) -> str:
+def _state_residual(held: HeldOut) -> str:
     """Return the square residual over the noise's variance, of the worst whiteboard, in words."""
-    kind = max(one.groups, key=lambda name: one.groups[name], default="")
-    worst = f", worst: {kind}" if len(one.groups) > 1 else ""
+    kind = max(held.groups, key=lambda name: held.groups[name], default="")
+    worst = f", worst: {kind}" if len(held.groups) > 1 else ""
     return (
-        f"residual {one.chi2:.2f} x noise variance (limit {LARGEST_CHI2:g}{worst}), "
-        f"calibration method {one.route}"
+        f"residual {held.chi2:.2f} x noise variance (limit {LARGEST_CHI2:g}{worst}), "
+        f"calibration method {held.route}"
     )

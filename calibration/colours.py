@@ -1,10 +1,10 @@
-"""Crosstalk of a colour filter: what its pixels see of the other colours, and Psi in three of them.
+"""Crosstalk of the colour filters: the other colours that pixels see, and Psi in three colours.
 
 Under a lamp of one colour after another, the whiteboard without masks gives the share K[f, c] that
 pixels behind filter f see of colour c. A mask of transmittances T_c then looks to them like
 sum_c K[f, c] T_c, which is what a fit under white light needs; and a coefficient of Psi has the
 part K[f, c] T_c in colour c. The parts in other colours than the pixel's own are the model's; its
-own is what they leave of the coefficient measured.
+own part is the coefficient measured less the others.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ SUPPORT deviations), then solved for together with the prior N(0, SIZE^2), and l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from calibration.boards import Board
+from calibration.boards import Board, Opening
 from calibration.placement import Placement
 from calibration.robust import deviation_of
 from calibration.shadow import Shadow, ShadowMask
@@ -80,25 +80,17 @@ def _influence(corners, shares_y, shares_x, weights, starts, through, channels, 
                         )
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """Through which views (v, u) the mask is seen, and where it stands: as `Board` says."""
-
-    views_open: NDArray[np.bool_]
-    stage_um: tuple[float, float]
-    shot: int
-
-
 def _entries(
-    shadow: Shadow, seen: View | Board, pixels: NDArray[np.int64], channels: NDArray[np.uint8]
+    shadow: Shadow, opening: Opening, pixels: NDArray[np.int64], channels: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return (pixel, grain) indices into the flat mask and their influences."""
-    corners, shares_y, shares_x, weights = shadow.footprints(pixels, seen.views_open, seen.stage_um)
+    views_open, stage_um, shot = opening
+    corners, shares_y, shares_x, weights = shadow.footprints(pixels, views_open, stage_um)
     count = shares_x.shape[2]
     starts = corners.min(axis=1)
     spans = (corners.max(axis=1) - starts).max(axis=0) + count
     placement = shadow.placement
-    cells = shadow.mask.cells[seen.shot % len(shadow.mask.cells)]
+    cells = shadow.mask.cells[shot % len(shadow.mask.cells)]
     through = placement.leak + (placement.clear - placement.leak) * cells.astype(np.float64)
     out = np.empty((len(pixels), *spans))
     _influence(corners, shares_y, shares_x, weights, starts, through, channels, out)
@@ -115,37 +107,27 @@ def _entries(
 def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement) -> Defects:
     """Return the defects that these whiteboards support, under the placement fitted to them."""
     fine = _grained(mask)
-    height, width = fine.cells.shape[1:3]
-    lost = np.zeros(height * width)
-    covariance = sparse.csr_array((height * width, height * width))
+    shadow, size = Shadow(fine, placement), fine.cells.shape[1:3]
+    lost, count = np.zeros(size), int(np.prod(size))
+    covariance = sparse.csr_array((count, count))
     for _ in range(ROUNDS):
-        shadow = Shadow(fine, placement)
-        gradient, curvature = np.zeros(height * width), np.zeros(height * width)
-        current = Shadow(_with_losses(fine, placement, lost.reshape(height, width)), placement)
+        current = Shadow(_with_losses(fine, placement, lost), placement)
         residuals = [_residual(current, board) for board in boards]
         spread = max(1.0, deviation_of(np.concatenate(residuals)))
-        for board, residual in zip(boards, residuals, strict=True):
-            pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
-            deviations = np.sqrt(board.variance[board.usable].astype(np.float64)) * spread
-            for first in range(0, len(pixels), CHUNK):
-                part = slice(first, first + CHUNK)
-                index, influence = _entries(shadow, board, pixels[part], channels[part])
-                scaled = influence / deviations[part, None]
-                pull = -scaled * (residual[part, None] / spread)
-                gradient += np.bincount(index.ravel(), pull.ravel(), height * width)
-                curvature += np.bincount(index.ravel(), (scaled**2).ravel(), height * width)
+        gradient, curvature = np.zeros(count), np.zeros(count)
+        for index, influence, deviations, residual in _influences(shadow, boards, residuals):
+            scaled = influence / (deviations * spread)[:, None]
+            pull = -scaled * (residual / spread)[:, None]
+            gradient += np.bincount(index.ravel(), pull.ravel(), count)
+            curvature += np.bincount(index.ravel(), (scaled**2).ravel(), count)
         evidence = gradient / np.sqrt(np.maximum(curvature, 1e-12))
         chosen = (np.abs(evidence) > SUPPORT) & (curvature > 1 / SIZE**2)
-        chosen |= lost != 0
+        chosen |= lost.ravel() != 0
         if not chosen.any() or chosen.mean() > LARGEST_SHARE:
             break
-        lost, covariance = _solved(boards, shadow, fine, placement, np.flatnonzero(chosen), spread)
-    losses = lost.reshape(height, width)
-    return Defects(
-        losses.astype(np.float32),
-        covariance,
-        _with_losses(fine, placement, losses),
-    )
+        losses, covariance = _solve_losses(boards, shadow, np.flatnonzero(chosen), spread)
+        lost = losses.reshape(size)
+    return Defects(lost.astype(np.float32), covariance, _with_losses(fine, placement, lost))
 
 
 def mask_with_losses(mask: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:
@@ -160,37 +142,39 @@ def _residual(shadow: Shadow, board: Board) -> Array:
     return (board.reading[board.usable] - predicted) / scale
 
 
-def _solved(
-    boards: Sequence[Board],
-    shadow: Shadow,
-    fine: ShadowMask,
-    placement: Placement,
-    chosen: NDArray[np.intp],
-    spread: float,
+def _influences(
+    shadow: Shadow, boards: Sequence[Board], residuals: Sequence[Array]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], Array, Array]]:
+    """Yield `_entries` of CHUNK usable pixels, their deviations and residuals, board by board."""
+    for board, residual in zip(boards, residuals, strict=True):
+        pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
+        deviations = np.sqrt(board.variance[board.usable].astype(np.float64))
+        for first in range(0, len(pixels), CHUNK):
+            part = slice(first, first + CHUNK)
+            entries = _entries(shadow, board.opening, pixels[part], channels[part])
+            yield *entries, deviations[part], residual[part]
+
+
+def _solve_losses(
+    boards: Sequence[Board], shadow: Shadow, chosen: NDArray[np.intp], spread: float
 ) -> tuple[NDArray[np.float64], sparse.csr_array]:
     """Return the losses of the chosen grains and their covariance, on the flat mask."""
-    place = np.full(fine.cells.shape[1] * fine.cells.shape[2], -1)
+    place = np.full(shadow.mask.cells[0, :, :, 0].size, -1)
     place[chosen] = np.arange(len(chosen))
     matrix = sparse.csc_array(sparse.diags_array(np.full(len(chosen), 1 / SIZE**2)))
     right = np.zeros(len(chosen))
-    for board in boards:
-        residual = _residual(shadow, board)
-        pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
-        deviations = np.sqrt(board.variance[board.usable].astype(np.float64)) * spread
-        for first in range(0, len(pixels), CHUNK):
-            part = slice(first, first + CHUNK)
-            index, influence = _entries(shadow, board, pixels[part], channels[part])
-            column = place[index]
-            rows, entries = np.nonzero((column >= 0) & (influence > 0))
-            values = influence[rows, entries] / deviations[part][rows]
-            shape = (len(index), len(chosen))
-            slopes = sparse.csc_array((-values, (rows, column[rows, entries])), shape=shape)
-            matrix = matrix + slopes.T @ slopes
-            right += slopes.T @ (residual[part] / spread)
+    residuals = [_residual(shadow, board) for board in boards]
+    for index, influence, deviations, residual in _influences(shadow, boards, residuals):
+        column = place[index]
+        rows, entries = np.nonzero((column >= 0) & (influence > 0))
+        values = influence[rows, entries] / (deviations * spread)[rows]
+        shape = (len(index), len(chosen))
+        slopes = sparse.csc_array((-values, (rows, column[rows, entries])), shape=shape)
+        matrix = matrix + slopes.T @ slopes
+        right += slopes.T @ (residual / spread)
     matrix = sparse.csc_array(matrix)
-    solution = np.ravel(np.asarray(spsolve(matrix, right)))
     lost = np.zeros(len(place))
-    lost[chosen] = np.clip(solution, -1, 1)
+    lost[chosen] = np.clip(np.ravel(np.asarray(spsolve(matrix, right))), -1, 1)
     blocks, rows, columns = [], [], []
     count, part_of = connected_components(matrix, directed=False)
     for part in range(count):
@@ -208,7 +192,7 @@ def loss_variance(
     placement: Placement,
     pixels: NDArray[np.int64],
     channels: NDArray[np.uint8],
-    seen: View,
+    opening: Opening,
 ) -> NDArray[np.float64]:
     """Return what the losses' covariance makes of the variance of readings at pixels (n, 2).
 
@@ -216,7 +200,7 @@ def loss_variance(
     """
     if len(pixels) == 0:
         return np.zeros(0)
-    index, influence = _entries(Shadow(_grained(mask), placement), seen, pixels, channels)
+    index, influence = _entries(Shadow(_grained(mask), placement), opening, pixels, channels)
     rows = np.arange(len(pixels)).repeat(index.shape[1])
     shape = (len(pixels), defects.lost.size)
     slopes = sparse.csr_array((influence.ravel(), (rows, index.ravel())), shape=shape)

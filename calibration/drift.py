@@ -368,11 +368,11 @@ def find_drift(
 
     def climbed(blocks: _Blocks, start: Array) -> tuple[Array, int, bool]:
         search.begin(blocks, start, settings.candidates)
-        return _climb(search, start, settings.tolerance)
+        return _ascend(search, start, settings.tolerance)
 
     half_px, widest_px = START_PX / 2, max(frames.shape[1:]) / 2
     blocks = _blocks(frames, channels, side, settings.coarse_blocks, rng, half_px)
-    starts = _starts(frames, channels[0], mask, placement, stages, settings, len(names))
+    starts = _starting_drifts(frames, channels[0], mask, placement, stages, settings, len(names))
     tried = [climbed(blocks, start)[0] for start in starts]
     search.begin(blocks, starts[0])
     drift = max(tried, key=search.total)
@@ -382,8 +382,8 @@ def find_drift(
         drift = climbed(blocks, drift)[0]
     blocks = _blocks(frames, channels, side, settings.blocks, rng)
     drift, steps_taken, converged = climbed(blocks, drift)
-    drift, covariance = _polish(search, drift)
-    recognised = _recognised(search, blocks, drift, settings, rng)
+    drift, covariance = _newton_step(search, drift)
+    recognised = _margin_over_decoys(search, blocks, drift, settings, rng)
     count = len(KINDS)
     mask_alone = drift[:count]
     statistic = float(mask_alone @ np.linalg.solve(covariance[:count, :count], mask_alone))
@@ -414,7 +414,7 @@ def find_drift(
     )
 
 
-def _starts(
+def _starting_drifts(
     frames: Frames,
     channels: NDArray[np.uint8],
     mask: ShadowMask,
@@ -429,8 +429,8 @@ def _starts(
     every = np.ones(mask.views, dtype=bool)
     board = Board("captures", flat, variance, channels, every, stages[0], 0)
     reach_um = SPARE * settings.search_px * mask.pitch_um * mask.binning
-    turns = _grid(settings.search_deg, TURN_STEP_DEG)
-    scales = _grid(settings.search_scale, SCALE_STEP)
+    turns = _symmetric_grid(settings.search_deg, TURN_STEP_DEG)
+    scales = _symmetric_grid(settings.search_scale, SCALE_STEP)
     found = []
     for turn, scale in product(np.deg2rad(turns), scales):
         trial = np.zeros(size)
@@ -449,13 +449,13 @@ def _starts(
     return chosen
 
 
-def _grid(reach: float, step: float) -> Array:
+def _symmetric_grid(reach: float, step: float) -> Array:
     """Return values from below -reach to above reach, 0 among them."""
     count = int(np.ceil(reach / step)) + 1 if reach else 0
     return np.arange(-count, count + 1) * step
 
 
-def _recognised(
+def _margin_over_decoys(
     search: _Search,
     blocks: _Blocks,
     drift: Array,
@@ -477,7 +477,7 @@ def _recognised(
     return float((search.total(drift) - np.mean(evidence)) / max(np.std(evidence), 1e-9))
 
 
-def _climb(search: _Search, drift: Array, tolerance: float) -> tuple[Array, int, bool]:
+def _ascend(search: _Search, drift: Array, tolerance: float) -> tuple[Array, int, bool]:
     """Return the drift after Gauss-Newton steps on the blocks' scores, their count, converged."""
     for taken in range(1, MOST_STEPS + 1):
         slopes = search.scores(drift, central=False)
@@ -501,7 +501,7 @@ def _climb(search: _Search, drift: Array, tolerance: float) -> tuple[Array, int,
     return drift, MOST_STEPS, False
 
 
-def _polish(search: _Search, drift: Array) -> tuple[Array, NDArray[np.float64]]:
+def _newton_step(search: _Search, drift: Array) -> tuple[Array, NDArray[np.float64]]:
     """Return the drift after a last step, Newton's own, and its sandwich covariance.
 
     Its derivatives are without the bias of the one-sided differences before.

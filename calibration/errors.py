@@ -1,4 +1,4 @@
-"""Errors of the calibration: each message says what is wrong and what to do, in one line."""
+"""Errors of the calibration: each message names a fault and its remedy in one line."""
 
 from emmc_rig.model.advice import AdvisedError
 

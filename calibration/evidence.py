@@ -29,7 +29,7 @@ FLOOR_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The planes' splines: for every disparity, what grid point adds to what pixel of what view.
+    """The planes' splines by disparity: the share of every grid point in every pixel of a view.
 
     down, across: (disparity, view, pixel, spline), of every grid in turn. grids: (grid, 2), first
     spline and number. spreads: per grid. Grids: fine, coarse, constant; coarse is also that of
@@ -57,9 +57,9 @@ def plane_prior(views: tuple[int, int], side: int, disparities_px: Array) -> Pri
     knots, grids = [], []
     for step in (FINE_PX, COARSE_PX):
         count = int(np.ceil((side - 1 + 2 * reach) / step)) + 3
-        grids.append((sum(len(one[0]) for one in knots), count))
+        grids.append((sum(len(points) for points, _ in knots), count))
         knots.append(((np.arange(count) - (count - 1) / 2) * step, step))
-    grids.append((sum(len(one[0]) for one in knots), 1))
+    grids.append((sum(len(points) for points, _ in knots), 1))
     pixels = np.arange(side) - (side - 1) / 2
 
     def table(count: int) -> NDArray[np.float64]:
@@ -105,7 +105,7 @@ def _add_grid(coefficients, down, across, first, count, matrix, at):
 
 
 @njit(cache=True, parallel=True)
-def _evidences(coefficients, colours, readings, noise, down, across, grids, chosen, found):
+def _compute_evidence(coefficients, colours, readings, noise, down, across, grids, chosen, found):
     """Set found (block, candidate) to each block's log evidence at its chosen disparities.
 
     coefficients: (block, stored, shot, pixel, v, u); colours, readings, noise: (block, shot,
@@ -185,7 +185,7 @@ def log_evidence(
     a reading. chosen: (block, candidate), indices into the prior's disparities.
     """
     found = np.empty(chosen.shape)
-    _evidences(
+    _compute_evidence(
         np.ascontiguousarray(coefficients, dtype=np.float64),
         np.ascontiguousarray(colours),
         np.ascontiguousarray(readings, dtype=np.float64),

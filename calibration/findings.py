@@ -103,14 +103,14 @@ UNWATCHED = {
         "turned: 2",
     ),
 }
-"""What no whiteboard shows, what that costs, and the line of a plan after which one shows it: with
+"""Influences, the error of Psi by each, and the plan's line whose whiteboards measure it: with
 lamp, response, colours and the turned board left out of the plan (48x64, 1024 rays) the effects of
 these names in `simulators.effects` make Psi 1.27, 0.36, 6.76 and 2.54 % wrong at 2, 1, 5 and 10 %;
 an ordinary bench has 0.32 %."""
 
 
 def unwatched(missing: Sequence[str]) -> list[str]:
-    """Return what these whiteboards were not there to tell, and how much that may cost."""
+    """Return in words the influences that were not measured, and the error of Psi by each."""
     lacking = (UNWATCHED[name] for name in missing)
     return [
         f"not measured: {what} ({cost}); add `{line}` under whiteboards in the plan"
@@ -179,7 +179,7 @@ def views_assumed(worth: PinholeWorth) -> str:
         "not measured: each view alone; the views' shares of the light are those of the design, "
         f"uncertain by {worth.weights:.1%} each, which Psi's deviation includes; expected error of "
         f"Psi {worth.now:.2%}, with one whiteboard through the pinhole before view ({v}, {u}) "
-        f"{worth.one:.2%}, with one before every view {worth.every:.2%}"
+        f"{worth.with_best:.2%}, with one before every view {worth.every:.2%}"
     )
 
 

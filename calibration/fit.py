@@ -220,39 +220,37 @@ def _own_variances(boards: Sequence[Board]) -> NDArray[np.float64]:
     return own2
 
 
-def _scaled_residuals(
-    shadow: Shadow, sample: Sample, at: _State, index: int
-) -> NDArray[np.float64]:
-    opening = at.opening(sample.board, index)
-    predicted = shadow.readings(sample.pixels, sample.channels, *opening)
-    return (sample.reading - (1 + at.own[index, 0]) * predicted) / sample.deviation
-
-
 def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> list[Array]:
-    shadow = Shadow(mask, at.placement)
-    return [_scaled_residuals(shadow, sample, at, index) for index, sample in enumerate(samples)]
+    """Return the residuals of every whiteboard's sample, in deviations."""
+    shadow, found = Shadow(mask, at.placement), []
+    for index, sample in enumerate(samples):
+        opening = at.opening(sample.board, index)
+        predicted = shadow.readings(sample.pixels, sample.channels, *opening)
+        brighter = 1 + at.own[index, 0]
+        found.append((sample.reading - brighter * predicted) / sample.deviation)
+    return found
 
 
-def _with_own_slopes(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
+def _join_slopes(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
     """Return the slopes by the placement and by a whiteboard's own, (n, parameter + OWN)."""
     brighter = 1 + own[0]
     rows = [brighter * slope, read, brighter * slope[:, OFFSETS]]
     return np.column_stack(rows).astype(np.float64, copy=False)
 
 
-def _places(at: _State, index: int) -> NDArray[np.int64]:
+def _parameter_places(at: _State, index: int) -> NDArray[np.int64]:
     """Return where the placement's and one whiteboard's own parameters lie in the vector."""
     size = len(at.placement.vector())
     return np.concatenate([np.arange(size), size + index * OWN + np.arange(OWN)])
 
 
-def _spread(residuals: Sequence[Array]) -> float:
+def _robust_spread(residuals: Sequence[Array]) -> float:
     """Return the robust deviation of the residuals in units of the noise, at least 1."""
     return max(1.0, deviation_of(np.concatenate(residuals)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Normal:
+class _NormalEquations:
     """Gauss-Newton normal equations, and what the residuals are like."""
 
     matrix: NDArray[np.float64]
@@ -263,7 +261,7 @@ class _Normal:
     count: int
 
 
-def _chunks(
+def _pixel_chunks(
     at: _State, sample: Sample, index: int, residual: Array
 ) -> Iterator[tuple[Any, Array, Array]]:
     """Yield what `Shadow` takes of some pixels, their residuals, and their deviations (n, 1)."""
@@ -274,18 +272,18 @@ def _chunks(
         yield how, residual[part], sample.deviation[part, None]
 
 
-def _normal(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> _Normal:
+def _normal_equations(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> _NormalEquations:
     shadow = Shadow(mask, at.placement)
     residuals = _all_residuals(mask, at, samples)
-    spread = _spread(residuals)
+    spread = _robust_spread(residuals)
     size = len(at.vector())
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
     for index, sample in enumerate(samples):
-        places = _places(at, index)
-        for how, residual, deviation in _chunks(at, sample, index, residuals[index]):
+        places = _parameter_places(at, index)
+        for how, residual, deviation in _pixel_chunks(at, sample, index, residuals[index]):
             read, slope = shadow.with_slopes(*how)
-            slope = _with_own_slopes(read, slope, at.own[index]) / (deviation * spread)
+            slope = _join_slopes(read, slope, at.own[index]) / (deviation * spread)
             scaled = residual / spread
             weight = tukey_weights(scaled)
             matrix[np.ix_(places, places)] += slope.T @ (slope * weight[:, None])
@@ -294,7 +292,7 @@ def _normal(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> _Normal:
             squares += float((residual[inside] ** 2).sum())
             kept += int(inside.sum())
     count = sum(map(len, residuals))
-    return _Normal(matrix, gradient, spread, squares, kept, count)
+    return _NormalEquations(matrix, gradient, spread, squares, kept, count)
 
 
 def _view_terms(
@@ -307,13 +305,13 @@ def _view_terms(
     pull = np.zeros(own_size)
     residuals = _all_residuals(mask, at, samples)
     for index, sample in enumerate(samples):
-        for how, residual, deviation in _chunks(at, sample, index, residuals[index]):
+        for how, residual, deviation in _pixel_chunks(at, sample, index, residuals[index]):
             slope, by_view = shadow.slopes_by_view(*how)
-            slope = _with_own_slopes(shadow.readings(*how), slope, at.own[index])
+            slope = _join_slopes(shadow.readings(*how), slope, at.own[index])
             scaled, scale = residual / spread, 1 / (deviation * spread)
             slope, by_view = slope * scale, by_view * scale
             weighted = by_view * tukey_weights(scaled)[:, None]
-            mixed[_places(at, index)] += slope.T @ weighted
+            mixed[_parameter_places(at, index)] += slope.T @ weighted
             own += by_view.T @ weighted
             pull += weighted.T @ scaled
     return mixed, own, pull
@@ -355,11 +353,11 @@ def _rows_covariance(
     for index, residual in enumerate(_all_residuals(mask, at, samples)):
         sample, rows = samples[index], known[index]
         by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
-        for how, left, deviation in _chunks(at, sample, index, residual):
+        for how, left, deviation in _pixel_chunks(at, sample, index, residual):
             read, slope = shadow.with_slopes(*how)
             weight = tukey_weights(left / spread)[:, None] / np.square(deviation * spread)
-            pull = _with_own_slopes(read, slope, at.own[index]) * weight
-            where = how[0][:, :1], _places(at, index)
+            pull = _join_slopes(read, slope, at.own[index]) * weight
+            where = how[0][:, :1], _parameter_places(at, index)
             np.add.at(by_row, where, pull)
             np.add.at(read_by_row, where, pull * read[:, None])
         by_row, read_by_row = by_row / rows.white_dn[0], read_by_row / rows.white_dn[1]
@@ -413,8 +411,8 @@ def _posterior(
     return sum(tukey_loss(residual / spread) for residual in residuals) + prior.loss(at)
 
 
-def _widths(
-    normal: _Normal, at: _State, placement: Array, centre: Array, own2: NDArray[np.float64]
+def _likeliest_widths(
+    normal: _NormalEquations, at: _State, placement: Array, centre: Array, own2: NDArray[np.float64]
 ) -> tuple[float, float]:
     """Return the widths of brightness and place that make the readings likeliest, at a fit.
 
@@ -457,12 +455,7 @@ def fit_placement(
     if not boards:
         raise CalibrationError("no whiteboard with the mask in: capture at least one")
     soft = starting_placement(camera, mask)
-    if start is None:
-        clearest = max(boards, key=_contrast)
-        registered = register(clearest, mask, soft)
-        placement = registered.placement
-    else:
-        placement = start
+    placement = start or register(max(boards, key=_contrast), mask, soft).placement
     centre = soft.vector()
     deviations = tolerances.deviations(camera.views)
     if any(board.loose for board in boards):
@@ -477,7 +470,7 @@ def fit_placement(
     rng = np.random.default_rng(settings.seed)
     steps, converged = 0, False
     normal = None
-    for half_px, limit in _windows(mask, settings):
+    for half_px, limit in _widening_windows(mask, settings):
         each = max(limit // len(boards), FEWEST_PIXELS)
         samples = [board.sampled(half_px, each, rng) for board in boards]
         prior = _prior(of_placement, centre, widths, own2)
@@ -485,7 +478,7 @@ def fit_placement(
         steps += taken
     assert normal is not None
     for _ in range(WIDTH_ROUNDS):
-        widths = _widths(normal, at, of_placement, centre, own2)
+        widths = _likeliest_widths(normal, at, of_placement, centre, own2)
         prior = _prior(of_placement, centre, widths, own2)
         at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
         steps += taken
@@ -495,7 +488,7 @@ def fit_placement(
     of_views, astray2 = bias_covariance(covariance, *terms)
     of_rows = _rows_covariance(mask, at, samples, normal.spread, covariance)
     covariance = (covariance + of_views + of_rows)[:size, :size]
-    checks = tuple(_check(mask, at, sample, index) for index, sample in enumerate(samples))
+    checks = tuple(_check_board(mask, at, sample, index) for index, sample in enumerate(samples))
     alike = _fitted_correlation(mask, at, samples)
     placement = with_aperture_mean_one(at.placement)
     if alike < LEAST_FIT_CORRELATION:
@@ -504,16 +497,7 @@ def fit_placement(
             f"design is {alike:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use calibration method free"
         )
-    shares = shares_of_prior(placement, covariance, tolerances)
-    undecided = tuple(
-        name
-        for name, share in zip(labels(camera.views), shares, strict=True)
-        if share > MOST_OF_PRIOR
-    )
-    # Precision beyond the prior's grows with the number of whiteboards.
-    have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
-    lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
-    more = int(np.clip(np.ceil(lacking * len(boards)), 0, MOST_MORE_BOARDS))
+    undecided, more = _find_undecided(placement, covariance, tolerances, len(boards))
     kept = max(normal.kept, 1)
     # A pinhole that a hand put a little off looks like a mask that moved, and is none.
     firm = [check for check, board in zip(checks, boards, strict=True) if not board.loose]
@@ -535,6 +519,20 @@ def fit_placement(
         moved_um,
         astray2,
     )
+
+
+def _find_undecided(
+    placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances, boards: int
+) -> tuple[tuple[str, ...], int]:
+    """Return the parameters that the prior decides, and how many more boards would decide them."""
+    shares = shares_of_prior(placement, covariance, tolerances)
+    rows, columns = np.shape(placement.aperture)
+    names = zip(labels((rows, columns)), shares, strict=True)
+    # Precision beyond the prior's grows with the number of whiteboards.
+    have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
+    lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
+    more = int(np.clip(np.ceil(lacking * boards), 0, MOST_MORE_BOARDS))
+    return tuple(name for name, share in names if share > MOST_OF_PRIOR), more
 
 
 def _farthest_um(width_um: float, checks: Sequence[BoardCheck]) -> float:
@@ -576,7 +574,7 @@ def shares_of_prior(
     return share
 
 
-def _windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]:
+def _widening_windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]:
     """Return half sides of windows, in pixels, that widen to the picture, and how many pixels."""
     whole = max(mask.pixel_shape()) / 2
     half, found = float(FIRST_WINDOW_PX), []
@@ -592,17 +590,17 @@ def _descend(
     samples: Sequence[Sample],
     prior: _Prior,
     settings: FitSettings,
-) -> tuple[_State, int, bool, _Normal]:
+) -> tuple[_State, int, bool, _NormalEquations]:
     """Return the state after Levenberg-Marquardt steps on these samples."""
     damping = 1e-3
-    normal = _normal(mask, at, samples)
+    normal = _normal_equations(mask, at, samples)
     for step in range(settings.max_steps):
         pull = prior.precision * (prior.centre - at.vector())
         value = _posterior(mask, at, samples, normal.spread, prior)
         while True:
             matrix = normal.matrix + np.diag(prior.precision)
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            trial = _stepped(at, matrix, normal.gradient + pull)
+            trial = _step_within_limits(at, matrix, normal.gradient + pull)
             found = _posterior(mask, trial, samples, normal.spread, prior)
             if found <= value or damping > 1e6:
                 break
@@ -612,13 +610,13 @@ def _descend(
         size = float(np.max(np.abs(trial.vector() - at.vector()) / deviations))
         if found <= value:
             at = trial
-        normal = _normal(mask, at, samples)
+        normal = _normal_equations(mask, at, samples)
         if size < settings.tolerance or value - found < LEAST_GAIN:
             return at, step + 1, True, normal
     return at, settings.max_steps, False, normal
 
 
-def _stepped(at: _State, matrix: Array, gradient: Array) -> _State:
+def _step_within_limits(at: _State, matrix: Array, gradient: Array) -> _State:
     """Return the state after a step; parameters at a limit are held, the others solved again."""
     here = at.vector()
     move = np.linalg.solve(matrix, gradient)
@@ -655,7 +653,7 @@ def _fitted_correlation(mask: ShadowMask, at: _State, samples: Sequence[Sample])
     return correlation(reading, reading - residuals * deviation, np.concatenate(channels))
 
 
-def _check(mask: ShadowMask, at: _State, sample: Sample, index: int) -> BoardCheck:
+def _check_board(mask: ShadowMask, at: _State, sample: Sample, index: int) -> BoardCheck:
     """Return how far one board's brightness and mask are off, the placement as fitted."""
     shadow = Shadow(mask, at.placement)
     board, own = sample.board, at.own[index]
@@ -670,9 +668,9 @@ def _check(mask: ShadowMask, at: _State, sample: Sample, index: int) -> BoardChe
         matrix = rows.T @ (rows * weight[:, None])
         more = np.linalg.solve(matrix, rows.T @ (weight * residual))
         left = residual - rows @ more
-        weight = tukey_weights(left / _spread([left]))
+        weight = tukey_weights(left / _robust_spread([left]))
     found = own + more
-    spread = _spread([residual])
+    spread = _robust_spread([residual])
     inside = tukey_weights(residual / spread) > 0
     deviation = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
     return BoardCheck(

@@ -33,7 +33,7 @@ class MeanFrame:
 
     mean_dn: (y, x) float32. variance_dn2: variance of one frame, averaged over the pixels, from
     the spread between repeats; NaN with one frame. taken_s: when, on any clock of the capture.
-    extra_variance_dn2: of the mean beyond its own noise, from what was subtracted of it.
+    extra_variance_dn2: of the mean, by the errors of frames that were subtracted from it.
     level_variance_dn2: of a frame's mean between repeats. rows_dn2: covariance of a row's mean
     between repeats with itself and with the next row's: lamp and shutter change whole rows alike,
     which is no noise of single pixels.
@@ -172,13 +172,13 @@ def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:
 
 
 def dark_shares(darks: Sequence[MeanFrame], exposure_s: float) -> NDArray[np.float64]:
-    """Return of which darks that of an exposure is the sum, and by which share of each, (dark,).
+    """Return the share of every dark in the dark frame of an exposure, (dark,).
 
     The one of that exposure; else a line through the shortest and the longest, whose slope is the
     dark current; where all are of one exposure, the first.
     """
     shares = np.zeros(len(darks))
-    times_s = np.array([one.exposure_s for one in darks])
+    times_s = np.array([dark.exposure_s for dark in darks])
     own = np.flatnonzero(np.isclose(times_s, exposure_s, rtol=SAME_EXPOSURE))
     first, last = int(np.argmin(times_s)), int(np.argmax(times_s))
     if own.size or not dark_current_known(times_s, exposure_s):
@@ -194,14 +194,14 @@ def dark_at(darks: Sequence[MeanFrame], exposure_s: float) -> MeanFrame:
     shares = dark_shares(darks, exposure_s)
     if shares.max() == 1:
         return darks[int(np.argmax(shares))]
-    used = [(share, one) for share, one in zip(shares, darks, strict=True) if share]
-    mean = sum(share * one.mean_dn for share, one in used)
-    spread = max(float(sum(share * one.variance_dn2 for share, one in used)), 0.0)
-    noise = float(sum(share**2 * one.variance_dn2 / one.count for share, one in used))
-    count = min(one.count for _, one in used)
+    used = [(share, dark) for share, dark in zip(shares, darks, strict=True) if share]
+    mean = sum(share * dark.mean_dn for share, dark in used)
+    spread = max(float(sum(share * dark.variance_dn2 for share, dark in used)), 0.0)
+    noise = float(sum(share**2 * dark.variance_dn2 / dark.count for share, dark in used))
+    count = min(dark.count for _, dark in used)
     extra = max(noise - spread / count, 0.0)
     mean_dn = np.asarray(mean, dtype=np.float32)
-    own, following = (sum(share * one.rows_dn2[lag] for share, one in used) for lag in (0, 1))
+    own, following = (sum(share * dark.rows_dn2[lag] for share, dark in used) for lag in (0, 1))
     return MeanFrame(
         mean_dn, spread, count, exposure_s, extra_variance_dn2=extra, rows_dn2=(own, following)
     )

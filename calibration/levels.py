@@ -1,10 +1,10 @@
 """What lamp and sensor response did while whiteboards were taken, from boards seen more than once.
 
 A check is a board's mean level, seen again and again: with the aperture open and the masks in one
-place, or without masks, at one exposure or several. Its logarithm is that of the board, plus that
-of the lamp at that time, less what the response loses: log(level / exposure) = c_board + l(time) -
-b level. l is a line between knots in time, for every colour of pixels, and b one figure for the
-sensor; both are the linear least squares of all checks together.
+place, or without masks, at one exposure or several. Its logarithm is the sum
+of the board's, the lamp's at that time, and the response's loss: log(level / exposure) = c_board +
+l(time) - b level. l is a line between knots in time, for every colour of pixels, and b a figure of
+the sensor; both are the linear least squares of all checks together.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Check:
     """One look at a board that is seen several times.
 
     board: which one; masks_in: seen through the masks. above_dn: mean above the dark by the colour
-    pixels see (3: all), NaN where there are none. deviation: relative, of that mean.
+    pixels see (3: all), NaN for colours without pixels. deviation: relative, of that mean.
     """
 
     board: str
@@ -122,7 +122,7 @@ def check_of(
         for c in range(CHANNELS)
     )
     level = max(float(above.mean()), 1e-9)
-    # Shot noise at a gain of one is what there is at most.
+    # At most: shot noise at 1 DN per electron.
     deviation = np.sqrt(CHANNELS / above.size / frame.count / level)
     return Check(board, frame.taken_s, frame.exposure_s, means, float(deviation), masks_in)
 
@@ -130,17 +130,17 @@ def check_of(
 def fit_levels(checks: Sequence[Check]) -> Levels | None:
     """Return lamp and response from checks; None where no board was seen twice.
 
-    Raises CalibrationError for one that is dark.
+    Raises CalibrationError for a dark board.
     """
-    boards = sorted({one.board for one in checks})
+    boards = sorted({check.board for check in checks})
     if len(checks) <= len(boards):
         return None
-    if any(np.nanmin(one.above_dn) <= 0 for one in checks):
+    if any(np.nanmin(check.above_dn) <= 0 for check in checks):
         raise CalibrationError(
             "a whiteboard that was seen again is dark: is the lamp on, and the aperture open?"
         )
-    times = np.array([one.taken_s for one in checks])
-    levels = np.array([one.above_dn for one in checks])
+    times = np.array([check.taken_s for check in checks])
+    levels = np.array([check.above_dn for check in checks])
     channels = np.flatnonzero(np.isfinite(levels).all(axis=0))
     brightest = float(np.nanmax(levels))
     repeats = len(np.unique(times))
@@ -151,15 +151,15 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
     size = len(channels) * per_channel + 1
     rows, values = [], []
     for k, channel in enumerate(channels):
-        for i, one in enumerate(checks):
+        for i, check in enumerate(checks):
             row = np.zeros(size)
             at = k * per_channel
-            row[at + boards.index(one.board)] = 1
+            row[at + boards.index(check.board)] = 1
             row[at + len(boards) : at + per_channel] = hats[i, 1:]
             row[-1] = -levels[i, channel] / brightest
-            deviation = max(one.deviation, LEAST_DEVIATION)
+            deviation = max(check.deviation, LEAST_DEVIATION)
             rows.append(row / deviation)
-            values.append(np.log(levels[i, channel] / one.exposure_s) / deviation)
+            values.append(np.log(levels[i, channel] / check.exposure_s) / deviation)
         for knot in range(1, count - 1):
             row = np.zeros(size)
             for step, share in ((-1, 1), (0, -2), (1, 1)):
@@ -182,9 +182,7 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
         lamp[1:, channel] = solution[part]
         deviations.append(np.sqrt(np.diag(covariance)[part]) * max(residual, 1.0))
         steps.append(np.abs(lamp[1:, channel]))
-    known = any(
-        np.ptp([one.exposure_s for one in checks if one.board == board]) > 0 for board in boards
-    )
+    known = len({(check.board, check.exposure_s) for check in checks}) > len(boards)
     spread = np.ptp(lamp[:, channels], axis=0)
     differences = lamp[:, channels] - lamp[:, channels].mean(axis=1, keepdims=True)
     return Levels(

@@ -281,7 +281,7 @@ def refine(
         half_px = min(half_px, whole)
         sample = board.sampled(half_px, REFINED_PIXELS, rng)
         _require_usable(len(sample.pixels), board)
-        found = _refined(board, mask, found.placement, sample, fitted)
+        found = _fit_window(board, mask, found.placement, sample, fitted)
         if found.correlation < LEAST_CORRELATION:
             raise CalibrationError(
                 f"the mask's shadow is not seen (correlation {found.correlation:.2f}, at least "
@@ -300,7 +300,7 @@ def _require_usable(pixels: int, board: Board) -> None:
         )
 
 
-def _refined(
+def _fit_window(
     board: Board, mask: ShadowMask, placement: Placement, sample: Sample, fitted: Sequence[str]
 ) -> Location:
     """Return the placement after Gauss-Newton steps on one window.

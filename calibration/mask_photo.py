@@ -27,7 +27,7 @@ from calibration.errors import CalibrationError
 from emmc_rig.model.masks import fiducial_marks
 
 FEWEST_PX = 5.0
-"""Of a cell's side: with 4, blur of one pixel leaves nothing in a cell that is its own."""
+"""The least side of a cell: with 4 px, a blur of one pixel mixes neighbours into all of a cell."""
 INNER, INNER_CHECK = 0.7, 0.25
 """Of a cell's side is sampled: a grid that is off by a seventh of a cell mixes no neighbour in. How
 far the cells are others by the inner samples alone, part of their deviation, is what blur and grid
@@ -45,7 +45,9 @@ FIT_CELLS, FIT_SAMPLES, FIT_STEP = 4096, 6, 0.05
 """How many cells the fit of the grid looks at, samples along a side of each, and how far corners
 are moved for a slope, cells."""
 SAME_AS = 0.1
-"""In transmittance: from here on a cell is not what the others of its kind are."""
+"""Least difference in transmittance between two kinds of cells."""
+GREY = 0.03
+"""Root mean square difference of colours below which a mask is grey."""
 NO_LIGHT = 1e-3
 """Of what saturates: clear parts are brighter everywhere."""
 
@@ -60,7 +62,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Defect:
-    """A cell (row, column) that is not as it should be, and how."""
+    """A faulty cell (row, column), and its fault."""
 
     row: int
     column: int
@@ -116,7 +118,7 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class MaskReading:
-    """What a photograph says of a mask.
+    """Transmittances of a mask's cells by its photograph.
 
     cells: transmittance against the clear parts, (row, column, colour), 1 colour where all are
     alike or the photograph is grey. sigma: its standard deviation by the photograph's noise, of
@@ -150,7 +152,7 @@ def read_mask(
 
     Raises:
         CalibrationError: no mask found, of other cells, too small, turned or mirrored, overexposed
-            or without clear parts; what does not fit to another.
+            or without clear parts; arguments of different sizes.
     """
     light = np.atleast_3d(np.asarray(photo, np.float32))
     if light.ndim != 3 or light.size == 0 or not (light.min() >= -1 and light.max() <= 1):
@@ -176,17 +178,16 @@ def read_mask(
             f"{start.pitch_px():.1f} pixels a cell of {_shown(cells)}, at least {FEWEST_PX:g} are "
             "needed: photograph it closer, or correct the number of cells"
         )
-    grid = _fitted(light, _bowed(light, start))
+    grid = _fit_grid(light, _find_bow(light, start))
     _check_count(_line_spectra(light, grid), cells)
     values, sigma, spread, blur = _cell_values(light, grid, INNER)
     fewer = _cell_values(light, grid, INNER_CHECK)[0]
     sigma = np.hypot(sigma, np.sqrt(((fewer - values) ** 2).mean(axis=(0, 1))))
-    level, light_sigma, clear = _light(values, grid)
+    level, light_sigma, clear = _fit_light(values, grid)
     inner = (slice(RING, -RING),) * 2
-    found, sigma = (values / level)[inner], (sigma / level)[inner]
-    spread = (spread / level)[inner]
-    if _is_grey(found):
-        found, spread = (one.mean(axis=-1, keepdims=True) for one in (found, spread))
+    found, sigma, spread = (array[inner] / level[inner] for array in (values, sigma, spread))
+    if np.sqrt(((found - found.mean(axis=-1, keepdims=True)) ** 2).mean()) < GREY:
+        found, spread = (array.mean(axis=-1, keepdims=True) for array in (found, spread))
         sigma = np.sqrt((sigma**2).mean(axis=-1, keepdims=True) / sigma.shape[-1])
     _check_face(found, ordered)
     defects = tuple(_defects(found, spread, ordered))
@@ -313,7 +314,7 @@ def _check_corners(corners: Array, photo: tuple[int, ...]) -> None:
         )
 
 
-def _bowed(light: Array, start: Grid) -> Grid:
+def _find_bow(light: Array, start: Grid) -> Grid:
     """Return the grid with the bow for which edges lie on its lines most regularly.
 
     Raises CalibrationError where they lie on the lines of another number of cells.
@@ -325,7 +326,10 @@ def _bowed(light: Array, start: Grid) -> Grid:
         for bow in np.linspace(-BOWS, BOWS, 2 * count + 1).tolist()
     ]
     spectra = [_line_spectra(light, grid) for grid in tried]
-    strength = [sum(_at(one, n) for one, n in zip(by, start.cells, strict=True)) for by in spectra]
+    strength = [
+        sum(float(by[n]) for by, n in zip(both, start.cells, strict=True) if n < by.size)
+        for both in spectra
+    ]
     strongest = [np.max([by[axis] for by in spectra], axis=0) for axis in (0, 1)]
     seen = tuple(_line_count(by, n) for by, n in zip(strongest, start.cells, strict=True))
     if 0 in seen:
@@ -352,12 +356,12 @@ def _other_count(seen: tuple[int, ...], asked: tuple[int, int]) -> CalibrationEr
 def _check_count(spectra: tuple[Array, Array], cells: tuple[int, int]) -> None:
     """Raise CalibrationError unless edges in the fitted grid repeat as often as it has cells.
 
-    With one cell more or fewer they repeat at several neighbouring numbers (ratio 0.7 to 2.7 of
-    these to the one asked for; below 0.06 where it is right).
+    With a cell more or fewer they repeat at several neighbouring numbers, 0.7 to 2.7 times as
+    strongly as at the number given; below 0.06 where that is right.
     """
     near = [by[n - 2 : n + 3] / by[n] for by, n in zip(spectra, cells, strict=True)]
-    if any(np.sort(one)[-2] > 0.4 or one.max() > 1 for one in near):
-        seen = tuple(n - 2 + int(one.argmax()) for n, one in zip(cells, near, strict=True))
+    if any(np.sort(ratios)[-2] > 0.4 or ratios.max() > 1 for ratios in near):
+        seen = tuple(n - 2 + int(ratios.argmax()) for n, ratios in zip(cells, near, strict=True))
         raise _other_count(seen, cells)
 
 
@@ -377,10 +381,6 @@ def _line_spectra(light: Array, grid: Grid) -> tuple[Array, Array]:
     return spectra[0], spectra[1]
 
 
-def _at(spectrum: Array, n: int) -> float:
-    return float(spectrum[n]) if n < spectrum.size else 0.0
-
-
 def _line_count(spectrum: Array, asked: int) -> int:
     """Return the number of cells along a side: `asked` where the spectrum bears it out, 0: none."""
     least = max(FEWEST_CELLS, asked // 4)
@@ -396,7 +396,7 @@ def _line_count(spectrum: Array, asked: int) -> int:
     )
 
 
-def _fitted(light: Array, start: Grid) -> Grid:
+def _fit_grid(light: Array, start: Grid) -> Grid:
     """Return the grid whose cells are most even within; raises CalibrationError for none."""
     every = int(np.ceil(np.sqrt(np.prod(start.cells) / FIT_CELLS)))
     # With the surround: blurred into the outer cells, it would move the corners inward.
@@ -450,11 +450,11 @@ def _cell_values(light: Array, grid: Grid, width: float) -> tuple[Array, Array, 
 
     def misfit(blur: float) -> float:
         down, across = (_blurred_boxes(n, inside, blur) for n in few)
-        return float((_residual(some, down, across)[1] ** 2).sum())
+        return float((_fit_cells(some, down, across)[1] ** 2).sum())
 
     blur = float(cast("Any", fminbound(misfit, *BLURS, xtol=0.005)))
     down, across = (_blurred_boxes(n + 2 * RING, inside, blur) for n in grid.cells)
-    values, residual = _residual(seen, down, across)
+    values, residual = _fit_cells(seen, down, across)
     by_cell = residual.reshape(len(values), count, -1, count, values.shape[-1])
     rms = np.sqrt((by_cell**2).mean(axis=(1, 3)))
     gain = [np.linalg.norm(np.linalg.pinv(boxes), axis=1) for boxes in (down, across)]
@@ -474,14 +474,14 @@ def _blurred_boxes(cells: int, inside: Array, blur: float) -> NDArray[np.float64
     return np.diff(-ndtr((at - edges) / blur), axis=1)
 
 
-def _residual(seen: Array, down: Array, across: Array) -> tuple[Array, Array]:
+def _fit_cells(seen: Array, down: Array, across: Array) -> tuple[Array, Array]:
     """Return the cells whose blurred boxes come nearest to samples (y, x, colour), and the rest."""
     inverse = [np.linalg.pinv(boxes) for boxes in (down, across)]
     cells = np.einsum("ry,yxk,cx->rck", inverse[0], seen, inverse[1], optimize=True)
     return cells, seen - np.einsum("yr,rck,xc->yxk", down, cells, across, optimize=True)
 
 
-def _light(values: Array, grid: Grid) -> tuple[Array, float, float]:
+def _fit_light(values: Array, grid: Grid) -> tuple[Array, float, float]:
     """Return the light on cells and ring (row, column, colour), its deviation, the clear share.
 
     Raises CalibrationError where nothing is seen to be clear.
@@ -556,16 +556,9 @@ def _clear_cells(relative: Array, inner: Flags, within: float) -> Flags:
 
 def _spread_out(clear: Flags) -> bool:
     """Return whether clear cells lie in most of the 16 parts of a mask, in every colour."""
-    parts = [
-        part.any(axis=(0, 1))
-        for band in np.array_split(clear, 4)
-        for part in np.array_split(band, 4, 1)
-    ]
+    bands = [np.array_split(band, 4, 1) for band in np.array_split(clear, 4)]
+    parts = [part.any(axis=(0, 1)) for band in bands for part in band]
     return bool((np.sum(parts, axis=0) > 12).all())
-
-
-def _is_grey(cells: Array) -> bool:
-    return bool(np.sqrt(((cells - cells.mean(axis=-1, keepdims=True)) ** 2).mean()) < 0.03)
 
 
 def _check_face(cells: Array, ordered: Array | None) -> None:
@@ -583,9 +576,8 @@ def _check_face(cells: Array, ordered: Array | None) -> None:
         for quarter in range(4):
             seen = np.rot90(grey[:, ::-1] if mirrored else grey, quarter)
             if seen.shape == wanted.shape:
-                how = ["mirrored"] * mirrored + [f"turned by {90 * quarter} degrees"] * (
-                    quarter > 0
-                )
+                how = ["mirrored"] * mirrored
+                how += [f"turned by {90 * quarter} degrees"] * (quarter > 0)
                 likeness[" and ".join(how)] = float(np.corrcoef(seen.flat, wanted.flat)[0, 1])
     best = max(likeness, key=lambda name: likeness[name])
     if likeness[best] < 0.5:
@@ -604,14 +596,10 @@ def _check_ring(grey: Array) -> None:
     ring, cross = fiducial_marks()
     if min(grey.shape) < 3 * len(ring):
         return
+    photo = grey.astype(np.float32)
+    marks = (mark.astype(np.float32) for mark in (ring, cross))
     seen = [
-        np.argwhere(
-            cv2.matchTemplate(
-                grey.astype(np.float32), mark.astype(np.float32), cv2.TM_CCOEFF_NORMED
-            )
-            > 0.85
-        )
-        for mark in (ring, cross)
+        np.argwhere(cv2.matchTemplate(photo, mark, cv2.TM_CCOEFF_NORMED) > 0.85) for mark in marks
     ]
     if len(seen[0]) != 1 or len(seen[1]) != 3:
         return

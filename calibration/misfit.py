@@ -7,9 +7,9 @@ squares that noise does not explain (variance components; medians of like slopes
 
 Of a coefficient that the pinhole measured as well there are two estimates. The misfit is what the
 two differ by beyond their deviations, over what lies in a view alike close to the mask's edges, and
-around a pixel (empirical Bayes: Efron 2010, chapter 1); weighing both by their variances, Psi is
-the model's where it holds and the pinhole's where it does not (dust, a bent mask, glass), and its
-deviation says which.
+around a pixel (empirical Bayes: Efron 2010, chapter 1); with both weighed
+by their variances, Psi is the model's where the misfit is small, and the pinhole's where it is
+large (dust, a bent mask, glass).
 """
 
 from __future__ import annotations
@@ -88,12 +88,12 @@ def measured_misfit(
 def beyond_chance(misfits: Sequence[Misfit]) -> list[Misfit]:
     """Return the views' misfits, none where noise alone explains them.
 
-    No estimate is below zero, so that those of half the views are above it by chance. The noise's
+    Estimates are at least zero: without any misfit half the views have one by chance. The noise's
     own variance, alike for all, is as sure as the squares of one view are.
     """
-    if np.mean([one.evidence for one in misfits]) > SURE:
+    if np.mean([misfit.evidence for misfit in misfits]) > SURE:
         return list(misfits)
-    return [one if one.evidence > SURE * np.sqrt(2) else Misfit() for one in misfits]
+    return [misfit if misfit.evidence > SURE * np.sqrt(2) else Misfit() for misfit in misfits]
 
 
 def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> Calibration:
@@ -110,23 +110,22 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
         for shot, v, u, colour in np.ndindex(shots, views_v, views_u, stored)
     ]
 
-    def of_plane(place: tuple[int, int, int, slice, int]) -> tuple[Array, ...]:
+    def estimates_of(place: tuple[int, int, int, slice, int]) -> tuple[Array, ...]:
         """Return what pinhole and model say, and the variances of both."""
-        measured, expected = (one.psi.weights[place].astype(np.float64) for one in (free, model))
-        noise, inherent = (
-            np.square(one.deviation[place], dtype=np.float64) for one in (free, model)
-        )
+        both = free, model
+        measured, expected = (known.psi.weights[place].astype(np.float64) for known in both)
+        noise, inherent = (np.square(known.deviation[place], dtype=np.float64) for known in both)
         return measured, expected, noise, inherent
 
     views = []
     for place in places:
-        measured, expected, noise, inherent = of_plane(place)
+        measured, expected, noise, inherent = estimates_of(place)
         squares = (measured - expected) ** 2
         views.append(measured_misfit(squares, noise + inherent, expected, usable))
     for place, view in zip(places, beyond_chance(views), strict=True):
-        measured, expected, noise, inherent = of_plane(place)
+        measured, expected, noise, inherent = estimates_of(place)
         squares = (measured - expected) ** 2
-        misfit = _around(squares, noise + inherent, view.variance(expected), usable)
+        misfit = _local_misfit(squares, noise + inherent, view.variance(expected), usable)
         share = (inherent + misfit) / (inherent + misfit + noise)
         share = np.where(squares > OUTLIER2 * (noise + inherent + misfit), 1.0, share)
         share = np.where(usable, share, 0.0)
@@ -136,7 +135,7 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
     return replace(free, psi=replace(free.psi, weights=weights), deviation=deviation, good=good)
 
 
-def _around(
+def _local_misfit(
     squares: Array, variance: Array, misfit: Array, usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the misfit's variance (y, x), that of a pixel's surroundings where surely another."""

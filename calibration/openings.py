@@ -56,5 +56,8 @@ def parts(views: tuple[int, int]) -> list[Window]:
     corner_x, corner_y = columns // 2, rows // 2
     halves = [(half_x, 0), (-half_x, 0), (0, half_y), (0, -half_y)]
     corners = [(x, y) for x in (corner_x, -corner_x) for y in (corner_y, -corner_y)]
-    found = [one for one in (*halves, *corners) if views_open(views, None, one).any()]
-    return [one for one in dict.fromkeys(found) if one != CENTRED]
+    return [
+        window
+        for window in dict.fromkeys((*halves, *corners))
+        if window != CENTRED and views_open(views, None, window).any()
+    ]

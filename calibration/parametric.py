@@ -28,7 +28,7 @@ class Parametric:
     """What the parametric routes know of the bench: fit and mask, with its defects if sought.
 
     misfit: of the model at whiteboards of few views, by view; None without any. of_defects: mean
-    square of what is missed where the mask has defects, over the square of what they take.
+    square of the error where the mask has defects, over the square of the light they take.
     """
 
     fit: Fit

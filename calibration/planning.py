@@ -4,8 +4,8 @@ Parametric: a frame of N pixels adds the Fisher information sum over pixels of (
 variance; with n frames of each kind the covariance of the placement is C = (prior + sum n_k I_k)^-1
 and the expected squared error of Psi trace(G C), G from `psi_information`. Every kind is taken
 once: a view that is never opened is known from its neighbours alone, whose shadows are nearly its
-own, and takes up whatever the model misses. Frames are then added one by one, always the kind that
-lowers that error most (greedy A-optimal design: Pukelsheim 2006, ch. 5).
+own, and takes up whatever the model misses. Frames are then added, each of the kind that lowers
+that error most (greedy A-optimal design: Pukelsheim 2006, ch. 5).
 
 Free: a coefficient's relative variance is that of its signal and of the reference it is divided
 by, so the relative error of Psi after n frames a view is the root of
@@ -36,7 +36,7 @@ DARK_FRAMES = 2
 REFERENCE_FRAMES = 4
 MOST_FRAMES = 400
 MODEL_ERROR = 0.0022
-"""Of Psi, relative: what the fitted mask with its defects misses on the bench as it is shipped.
+"""Of Psi, relative: error of the fitted mask with its defects on the bench as it is shipped.
 
 `benchmarks/calibration_checks.py psi --size 64x80 --rays 8192`: 0.223 % by the mixed route. With
 fewer rays it is the bench that is grainy: 0.42 % at 2048, 1.11 % at 512.
@@ -46,7 +46,7 @@ fewer rays it is the bench that is grainy: 0.42 % at 2048, 1.11 % at 512.
 FEW_MODEL_ERROR = 0.0043
 """The same where parts of the aperture are opened: views never opened alone take up what is missed.
 
-All that `benchmarks/calibration_checks.py few` is off by, its noise with it.
+The whole error of `benchmarks/calibration_checks.py few`, with noise.
 """
 
 
@@ -122,22 +122,22 @@ def information_of(
 class PinholeWorth:
     """What whiteboards through the pinhole would add to open ones alone.
 
-    weights: relative deviation of the views' shares of the light, as known now. now, one, every:
-    relative error of Psi expected now, with a whiteboard before `view`, the best, and before every
-    view.
+    weights: relative deviation of the views' shares of the light, as known now. now, with_best,
+    every: relative error of Psi expected now, with a whiteboard before `view`, the best, and before
+    every view.
     """
 
     weights: float
     view: tuple[int, int]
     now: float
-    one: float
+    with_best: float
     every: float
 
 
 def pinhole_worth(known: Parametric, boards: Sequence[Board], stated: float) -> PinholeWorth:
     """Return what whiteboards through the pinhole are worth beside `boards`, taken as the first.
 
-    stated: relative error of Psi; what of it is not the placement's stays.
+    stated: relative error of Psi; the part that is not by the placement stays.
     """
     shadow, fit, board = known.shadow, known.fit, boards[0]
     mask = shadow.mask

@@ -1,4 +1,4 @@
-"""Whiteboards that no Psi may be made of, each named with its remedy as a CalibrationError.
+"""Refusals of whiteboards that are unfit for a Psi: CalibrationErrors that name the remedy.
 
 Saturated, dark, lit darks, without the mask, of another camera, of a bench or a board that moved.
 """
@@ -256,7 +256,7 @@ def refuse_tilted_board(
     the whole aperture is open.
     """
     for board in boards:
-        across, deviation = _gradient(shadow, board)
+        across, deviation = _fit_gradient(shadow, board)
         limit = model * limits[bool(board.views_open.all())]
         worst = int(np.argmax(np.abs(across)))
         if abs(across[worst]) > max(limit, SURE * deviation):
@@ -268,7 +268,7 @@ def refuse_tilted_board(
             )
 
 
-def _gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
+def _fit_gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
     """Return by how much a whiteboard's brightness changes down and across, and how sure."""
     sample = board.sampled(np.inf, SAMPLED_GRADIENT, np.random.default_rng(0))
     (rows, columns), (y, x), channels = board.reading.shape, sample.pixels.T, sample.channels

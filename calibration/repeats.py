@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 ALIKE = 0.9
-"""Correlation of a mask with itself, shifted, from which on a shadow hardly shows the shift: where
-one cell of twenty differs, it is that."""
+"""Correlation of a mask with itself, shifted, from which on a shadow hardly shows the shift: 0.9
+where a twentieth of the cells differ."""
 PARALLEL = 0.2
 """Sine of the angle between two shifts, below which one is a multiple of the other."""
 
@@ -33,7 +33,7 @@ class Repeats:
 
     @property
     def words(self) -> str:
-        """What is not known of a mask's place, "" where it is unique."""
+        """The ambiguity of a mask's place in words, "" where the place is unique."""
         if self.uniform:
             return "the mask looks the same all along one direction: its place there is not seen"
         steps = ", ".join(f"({x:.0f}, {y:.0f})" for x, y in self.steps_um)
@@ -71,9 +71,9 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float) -> Repeats:
         return Repeats(uniform=True)
     ones = np.ones(energy.shape)
 
-    def overlapped(one: Array, other: Array) -> Array:
+    def overlapped(first: Array, second: Array) -> Array:
         rows, columns = (slice(n - 1 - r, n + r) for n, r in zip(kept, reach, strict=True))
-        return np.asarray(fftconvolve(one, other[::-1, ::-1])[rows, columns])
+        return np.asarray(fftconvolve(first, second[::-1, ::-1])[rows, columns])
 
     product = sum(overlapped(plane, plane) for plane in np.moveaxis(middle, -1, 0))
     both = overlapped(energy, ones) + overlapped(ones, energy)
@@ -90,10 +90,10 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float) -> Repeats:
             place + vertex(likeness.T if axis else likeness, at[::-1] if axis else at) - most
             for axis, (place, most) in enumerate(zip(at, reach, strict=True))
         )
-        # Of a shift and its opposite, one.
+        # A shift and its opposite are the same step.
         if (round(y), round(x)) > (0, 0):
             peaks.append((float(x) * cell_um, float(y) * cell_um))
-    steps = sorted(peaks, key=lambda one: float(np.hypot(*one)))
+    steps = sorted(peaks, key=lambda step: float(np.hypot(*step)))
     for x, y in steps[1:]:
         first_x, first_y = steps[0]
         area = abs(first_x * y - first_y * x)

@@ -32,7 +32,7 @@ from calibration.choice import (
     worst,
 )
 from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
-from calibration.defects import View, find_defects, loss_variance
+from calibration.defects import find_defects, loss_variance
 from calibration.dust import moved_dust
 from calibration.errors import CalibrationError
 from calibration.fit import OFFSETS, fit_placement
@@ -152,7 +152,7 @@ def calibrate(
 
 @dataclass
 class _Work:
-    """The whiteboards of a calibration, and what its steps have made of them.
+    """The whiteboards of a calibration, and the results of its steps.
 
     sets: every set as captured; the others are as under a steady lamp after
     `correct_lamp_and_response`. good: (pixel_y, pixel_x), pixels to use. judges, seen: held-out
@@ -282,7 +282,8 @@ class _Work:
         model = self.models["parametric"] = with_misfit(Parametric(fit, mask), self.seen)
         if {"mixed", "combined"} & self.routes and self.design.binning == 1:
             self.on_stage("defects of the mask")
-            self.models["mixed"] = with_misfit(_mixed(self.seen, self.camera, model), self.seen)
+            mixed = _fit_with_defects(self.seen, self.camera, model)
+            self.models["mixed"] = with_misfit(mixed, self.seen)
         for name, fitted in self.models.items():
             missed = _missed_at_defects(fitted, [*self.seen, *self.judges])
             model = replace(fitted, of_defects=missed)
@@ -306,7 +307,7 @@ class _Work:
         deviation = psi_deviation(model.shadow, layout, self.stages, covariance, astray2)
         if model.defects is not None and model.defects.count:
             deviation = _with_defect_variance(deviation, model, layout, self.stages)
-        white = np.stack([_white(boards, layout, shot) for shot in range(layout.shots)])
+        white = np.stack([_white_dn_per_s(boards, layout, shot) for shot in range(layout.shots)])
         return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), self.good)
 
     def measure_views(self, empty: NewArray, on_plane: Callable[[str], None]) -> None:
@@ -354,9 +355,9 @@ class _Work:
     def _unsteady(self, route: str) -> float:
         """Return the relative error that shutter and lamp leave in all of a Psi alike.
 
-        Every whiteboard is divided by the references, which are as unsteady as it is: from frame to
-        frame, as repeats show, which their number averages; and slowly, as the fit shows. Of single
-        views as measured through a pinhole each has its own beside.
+        Every whiteboard is divided by the references. Their brightness changes from frame to frame,
+        as repeats show, by a variance that the number of frames divides; and slowly, as the fit
+        shows. A view that is measured through a pinhole has the error of its own frames beside.
         """
         shared = {id(frame): frame for boards in self.sets for frame in boards.references.values()}
         references, dark_dn = list(shared.values()), self.sets[0].dark.mean_dn
@@ -434,7 +435,7 @@ class _Work:
         return found
 
 
-def _mixed(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
+def _fit_with_defects(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
     """Return the fit with defects: found, and the placement refined with them in the mask."""
     start = parametric.fit.placement
     defects = find_defects(seen, parametric.mask, start)
@@ -528,7 +529,7 @@ def _judged_model(
     return worst(groups)
 
 
-def _light_cut_off(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
+def _lost_at_aperture_edge(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
     """Return the share of a single pinhole's light that the aperture's edge keeps from it.
 
     moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
@@ -560,7 +561,7 @@ def _correct_pinhole_places(
         (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
         off_x, off_y = check.moved_um
         unsure_um = check.moved_deviation_um
-        lost = _light_cut_off(check.moved_um, board, model.mask)
+        lost = _lost_at_aperture_edge(check.moved_um, board, model.mask)
         for stored in range(layout.weights_shape[4]):
             place = board.shot, v, u, stored
 
@@ -594,10 +595,8 @@ def _with_defect_variance(
         channels = np.full(len(touched), stored, dtype=np.uint8)
         if layout.colour is not None:
             channels = layout.colour[shot, y, x]
-        seen = View(opened, stages[shot], shot)
-        of_losses = loss_variance(
-            model.defects, model.mask, model.fit.placement, touched, channels, seen
-        )
+        how = touched, channels, (opened, stages[shot], shot)
+        of_losses = loss_variance(model.defects, model.mask, model.fit.placement, *how)
         of_outline = model.of_defects * np.square(bare - plane)[y, x]
         place = (shot, v, u, y, stored, x)
         more = of_losses / deviation.shape[4] ** 2 + of_outline
@@ -617,13 +616,13 @@ def _with_misfit_variance(known: Calibration, model: Parametric) -> Calibration:
     return replace(known, deviation=np.sqrt(deviation).astype(np.float32))
 
 
-def _white(boards: BoardSet, layout: PsiLayout, shot: int) -> NDArray[np.float32]:
+def _white_dn_per_s(boards: BoardSet, layout: PsiLayout, shot: int) -> NDArray[np.float32]:
     """Return what a reading of 1 gives in DN per second: all lamp colours together."""
     white = {(shot, "white"), (0, "white")} & set(boards.references)
     lamps = ("white",) if white else lamps_needed(layout)
     total = np.zeros(layout.frames_shape[1:], dtype=np.float64)
     for lamp in lamps:
-        reference = boards.references.get((shot, lamp)) or boards.references.get((0, lamp))
+        reference = boards.reference(shot, lamp)
         if reference is None:
             raise CalibrationError(f"no reference whiteboard for shot {shot}, {lamp} lamp")
         above = reference.mean_dn - boards.dark_at(reference.exposure_s).mean_dn

@@ -184,7 +184,7 @@ def _phases(frame: NDArray) -> list[NDArray]:
     return [frame[y::2, x::2] for y in range(2) for x in range(2)]
 
 
-def _level(
+def _measure_pair(
     pair: Pair, good: Flags, white_level_dn: int
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return exposure, mean, variance and clipped share of a pair, see `_Levels`."""
@@ -213,7 +213,7 @@ def _level(
     return pair.exposure_s, mean, variance, clipped
 
 
-def _line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
+def _fit_line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
     """Return slope and intercept of the weighted line."""
     total = weight.sum()
     mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
@@ -231,12 +231,12 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
     times_s = [pair.exposure_s for pair in darks]
     if len(set(times_s)) < 2:
         raise CalibrationError("the dark current needs dark pairs at two exposures at least")
-    hot = _hot(darks[int(np.argmax(times_s))])
+    hot = _hot_pixels(darks[int(np.argmax(times_s))])
     good = ~hot
-    dark = _stacked(_level(pair, good, white_level_dn) for pair in darks)
+    dark = _stack_levels(_measure_pair(pair, good, white_level_dn) for pair in darks)
     flat, unsaturated = _read_flats(flats, good, white_level_dn)
     brightest_dn, light, brightest = unsaturated[-1]
-    dead = _dead(brightest, darks[0])
+    dead = _dead_pixels(brightest, darks[0])
     good &= ~dead
     light = light - dark.over(EVERY, "mean").mean(axis=1).min()
     share = np.nanmean(light / np.nanmax(light, axis=(0, 1)), axis=2)
@@ -287,7 +287,7 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
     )
 
 
-def _stacked(levels: Iterable[tuple]) -> _Levels:
+def _stack_levels(levels: Iterable[tuple]) -> _Levels:
     return _Levels(*(np.array(values) for values in zip(*levels, strict=True)))
 
 
@@ -299,7 +299,7 @@ def _read_flats(
     unsaturated: list[tuple[float, Array, Pair]] = []
     loudest = 0.0
     for pair in flats:
-        level = _level(pair, good, white_level_dn)
+        level = _measure_pair(pair, good, white_level_dn)
         levels.append(level)
         _, means, variances, clipped = level
         # A phase that saturates loses its variance.
@@ -313,7 +313,7 @@ def _read_flats(
             f"{len(levels)} flat exposures: the photon transfer curve needs four at least, and "
             "some below saturation"
         )
-    return _stacked(levels), unsaturated
+    return _stack_levels(levels), unsaturated
 
 
 def _deviations(dark: _Levels, flat: _Levels, bright: Flags) -> dict[str, float]:
@@ -351,8 +351,8 @@ class _Points:
     def saturation(self) -> tuple[float, float]:
         """The signal where all pixels are full, else that of the greatest variance; the step.
 
-        Between two exposures the latter, EMVA 1288's saturation point, is known to their step: it
-        may be higher by that step.
+        Between two exposures the latter, EMVA 1288's saturation point, may be higher by their
+        step.
         """
         found = []
         for phase in range(self.signal.shape[1]):
@@ -384,7 +384,7 @@ class _Points:
         expected = y
         for _ in range(2):
             # By the measured variance a level that is low by chance would count more.
-            gain, zero = _line(x, y, 1 / np.maximum(expected, 1e-9) ** 2)
+            gain, zero = _fit_line(x, y, 1 / np.maximum(expected, 1e-9) ** 2)
             expected = gain * x + zero
         if gain <= 0:
             raise CalibrationError(
@@ -419,7 +419,7 @@ class _Points:
             inside = (y >= low) & (self.bright_signal[:, phase] <= high)
             if inside.sum() < 3:
                 continue
-            slope, zero = _line(t[inside], y[inside], 1 / y[inside] ** 2)
+            slope, zero = _fit_line(t[inside], y[inside], 1 / y[inside] ** 2)
             line = slope * t[inside] + zero
             residual[inside, phase] = 100 * (y[inside] - line) / line
         if np.isnan(residual).all():
@@ -433,8 +433,8 @@ def _transfer_points(dark: _Levels, flat: _Levels, tiles: Flags, bright: Flags) 
     """Return the photon transfer curve of some tiles, (block, tile) flags."""
     means = dark.over(tiles, "mean").mean(axis=1)
     variances = dark.over(tiles, "variance").mean(axis=1)
-    slope, black = _line(dark.exposure_s, means, np.ones_like(means))
-    _, variance = _line(dark.exposure_s, variances, 1 / np.maximum(variances, 1e-9) ** 2)
+    slope, black = _fit_line(dark.exposure_s, means, np.ones_like(means))
+    _, variance = _fit_line(dark.exposure_s, variances, 1 / np.maximum(variances, 1e-9) ** 2)
     times_s = flat.exposure_s[:, None].repeat(4, axis=1)
     dark_dn = black + slope * times_s
     lit = tiles & bright if (tiles & bright).any() else bright
@@ -451,14 +451,14 @@ def _transfer_points(dark: _Levels, flat: _Levels, tiles: Flags, bright: Flags) 
     )
 
 
-def _hot(longest: Pair) -> Flags:
+def _hot_pixels(longest: Pair) -> Flags:
     """Return pixels whose longest dark frame stands out."""
     mean = (longest.first.astype(np.float64) + longest.second) / 2
     off = mean - np.median(mean)
     return np.abs(off) > HOT_DEVIATIONS * max(deviation_of(off), 0.5)
 
 
-def _dead(flat: Pair, dark: Pair) -> Flags:
+def _dead_pixels(flat: Pair, dark: Pair) -> Flags:
     """Return pixels that see less than half of what their colour's do."""
     signal = (flat.first.astype(np.float64) + flat.second - dark.first - dark.second) / 2
     dead = np.zeros(signal.shape, dtype=bool)
@@ -482,7 +482,7 @@ def _nonuniformity(pair: Pair, dark: Pair | None, good: Flags) -> Nonuniformity:
     planes = (_phases(plane[:rows, :columns]) for plane in (*frames, good))
     for *both, use in zip(*planes, strict=True):
         # Each frame's own surface: the lamp may differ between them.
-        surfaces = [_quadratic(plane, use) for plane in both]
+        surfaces = [_fit_quadratic(plane, use) for plane in both]
         a, b = (
             np.where(use, (plane - smooth) / (smooth if dark is not None else 1.0), 0)
             for plane, smooth in zip(both, surfaces, strict=True)
@@ -509,7 +509,7 @@ def _uncertainty(a: Array, b: Array, count: float) -> float:
     return of_product(a, b, count) + sum(lines)
 
 
-def _quadratic(values: Array, use: Flags) -> Array:
+def _fit_quadratic(values: Array, use: Flags) -> Array:
     """Return the quadratic surface through the pixels to use, (y, x)."""
     y, x = (np.linspace(-1, 1, count) for count in values.shape)
     yy, xx = np.meshgrid(y, x, indexing="ij")

@@ -98,7 +98,7 @@ def shadow_mask(camera: Camera, size: tuple[int, int]) -> ShadowMask:
     roomy = camera.model_copy(
         update={"masks": {name: mask.model_copy(update={"spare_cells": spare})}}
     )
-    plate = _roomier(draw_plates(camera, size)[name], draw_plates(roomy, size)[name])
+    plate = _larger_if_same(draw_plates(camera, size)[name], draw_plates(roomy, size)[name])
     mean = plate.cells.mean(axis=-1, keepdims=True)
     return ShadowMask(
         np.ascontiguousarray(np.concatenate([plate.cells, mean], axis=-1)),
@@ -116,7 +116,7 @@ def shadow_mask(camera: Camera, size: tuple[int, int]) -> ShadowMask:
     )
 
 
-def _roomier(made: Plate, roomy: Plate) -> Plate:
+def _larger_if_same(made: Plate, roomy: Plate) -> Plate:
     """Return the larger plate where it is the one made with cells around it (tiles begin anew)."""
     rims = [(a - b) // 2 for a, b in zip(roomy.cells.shape, made.cells.shape, strict=True)][1:3]
     middle = roomy.cells[
@@ -132,7 +132,7 @@ def _third_integral(t: Array, sigma: float) -> Array:
     return 0.5 * ((t * t + sigma * sigma) * ndtr(z) + t * sigma * density)
 
 
-def _below(t: Array, widths: tuple[float, float], sigma: float) -> Array:
+def _share_below(t: Array, widths: tuple[float, float], sigma: float) -> Array:
     """Return the share of the footprint (two boxes and a Gaussian, in cells) below t."""
     a, b = (max(width, NARROWEST_CELLS) for width in widths)
     outer, inner = (a + b) / 2, (a - b) / 2
@@ -149,7 +149,7 @@ def _shares(
     """Return the share of `count` cells for footprints at `places` in the first: (place, cell)."""
     widths = ((1 - ratio) * mask.pixel_um / mask.cell_um, ratio * mask.aperture_um / mask.cell_um)
     edges = np.arange(1, count)[None, :] - reach - places[:, None]
-    below = _below(edges, widths, blur_um / mask.cell_um)
+    below = _share_below(edges, widths, blur_um / mask.cell_um)
     ends = np.zeros((len(places), 1)), np.ones((len(places), 1))
     return np.diff(np.hstack([ends[0], below, ends[1]]), axis=1)
 

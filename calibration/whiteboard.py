@@ -49,7 +49,7 @@ class Calibration:
 
     deviation: standard deviation of every coefficient, shaped as `psi.weights`.
     white_dn_per_s: (shot, y, x), what a reading of 1 gives. gain: of the sensor. good: (y, x),
-    pixels to use at all (None: every one).
+    pixels to use at all (None: all).
     """
 
     psi: ImagingMatrix
@@ -92,7 +92,7 @@ def measure_psi(
 ) -> Calibration:
     """Return the measured Psi with the standard deviation of every coefficient.
 
-    design: Psi as designed, or what it is for; gives the sizes, the colour of every pixel, and how
+    design: Psi as designed, or its layout; gives the sizes, the colour of every pixel, and how
     a pixel's coefficient is shared among its samples (of a layout: evenly). empty: makes the arrays
     of coefficients, written view by view: in memory, or on disk for sensors whose Psi does not fit
     there. on_plane: called after each. Raises CalibrationError for missing frames, frames of
@@ -109,7 +109,7 @@ def measure_psi(
     for shot, reading in enumerate(white):
         for reference in _references(boards, gain, design, shot):
             for rows in bands(reading):
-                reading[rows] += _bright(boards, gain, reference, rows)[0]
+                reading[rows] += _reference_signal(boards, gain, reference, rows)[0]
     return Calibration(design.psi(weights), deviation, boards.dark.mean_dn, white, gain)
 
 
@@ -127,28 +127,31 @@ def measured_planes(
     gain = _gain(boards, layout)
     views_v, views_u = layout.views
     k = layout.binning
-    pinholes = {(one.shot, one.pinhole, one.lamp): one for one in boards.frames}
+    pinholes = {(board.shot, board.pinhole, board.lamp): board for board in boards.frames}
     for shot in range(layout.weights_shape[0]):
         references = _references(boards, gain, layout, shot)
         for v, u in np.ndindex(views_v, views_u):
             for stored, lamp in enumerate(lamps):
                 name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
                 taken = pinholes.get((shot, (v, u), lamp))
-                pinhole = _checked(boards, None if taken is None else taken.frame, name)
+                pinhole = _require_frame(boards, None if taken is None else taken.frame, name)
                 dark = boards.dark_at(pinhole.exposure_s)
                 values, deviation = (np.empty(layout.size, dtype=np.float32) for _ in range(2))
                 for rows in bands(pinhole.mean_dn):
                     signal, variance = signal_of(pinhole, dark, gain, rows)
-                    reference, reference_variance = _bright(boards, gain, references[stored], rows)
-                    ratio = signal / reference
-                    relative = reference_variance / reference**2
-                    spread = np.sqrt(variance / reference**2 + ratio**2 * relative)
+                    white, white_variance = _reference_signal(
+                        boards, gain, references[stored], rows
+                    )
+                    ratio = signal / white
+                    relative = white_variance / white**2
+                    spread = np.sqrt(variance / white**2 + ratio**2 * relative)
                     samples = slice(k * rows.start, k * rows.stop)
                     share = 1 / (k**2 * len(lamps))
                     if designed is not None and k > 1:
-                        share = _shares(designed[shot, v, u, samples, stored], k) / len(lamps)
-                    values[samples] = share * _samples(np.maximum(ratio, 0), k)
-                    deviation[samples] = share * _samples(spread, k)
+                        plane = designed[shot, v, u, samples, stored]
+                        share = _designed_shares(plane, k) / len(lamps)
+                    values[samples] = share * _repeat_samples(np.maximum(ratio, 0), k)
+                    deviation[samples] = share * _repeat_samples(spread, k)
                 yield (shot, v, u, stored), values, deviation
 
 
@@ -167,7 +170,7 @@ def _references(
     for lamp in lamps_needed(layout):
         what = f"shot {shot}, {lamp} lamp"
         frame = boards.references.get((shot, lamp))
-        frame = _checked(boards, frame, f"{what}, open aperture without masks")
+        frame = _require_frame(boards, frame, f"{what}, open aperture without masks")
         dark = [
             (frame.mean_dn[rows] - boards.dark.mean_dn[rows] < DARKEST_REFERENCE_DN).sum()
             for rows in bands(frame.mean_dn)
@@ -205,7 +208,7 @@ def ideal_boards(
     return BoardSet((frame(np.zeros(size)),), references, pinholes)
 
 
-def _checked(boards: BoardSet, frame: MeanFrame | None, what: str) -> MeanFrame:
+def _require_frame(boards: BoardSet, frame: MeanFrame | None, what: str) -> MeanFrame:
     """Return a frame that is there, and of the size of the others."""
     if frame is None:
         raise CalibrationError(f"whiteboard missing: {what}; capture it before measuring Psi")
@@ -214,7 +217,7 @@ def _checked(boards: BoardSet, frame: MeanFrame | None, what: str) -> MeanFrame:
     return frame
 
 
-def _bright(
+def _reference_signal(
     boards: BoardSet, gain: SensorGain, frame: MeanFrame, rows: slice
 ) -> tuple[Array, Array]:
     """Return `signal_of` a reference whiteboard.
@@ -225,16 +228,14 @@ def _bright(
     return np.maximum(signal, DARKEST_REFERENCE_DN / frame.exposure_s), variance
 
 
-def _samples(pixels: Array, binning: int) -> Array:
+def _repeat_samples(pixels: Array, binning: int) -> Array:
     return np.repeat(np.repeat(pixels, binning, axis=0), binning, axis=1)
 
 
-def _shares(designed: Array, binning: int) -> Array:
+def _designed_shares(designed: Array, binning: int) -> Array:
     """Return what share of its pixel's coefficient each sample has in the design, (y, x)."""
-    if binning == 1:
-        return np.ones_like(designed)
     rows, columns = designed.shape[0] // binning, designed.shape[1] // binning
     sums = designed.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
-    whole = _samples(sums, binning)
+    whole = _repeat_samples(sums, binning)
     even = 1 / binning**2
     return np.where(whole > 0, designed / np.where(whole > 0, whole, 1), even)

@@ -34,6 +34,10 @@ def bracket_of(readings, rng, exposures_s=EXPOSURES_S):
     return [NOISE.expose_dn(readings, exposure_s, 1.0, rng) for exposure_s in exposures_s]
 
 
+def fused(frames, darks, exposures_s=EXPOSURES_S):
+    return fuse(frames, exposures_s, darks, GAIN, NOISE.white_level_dn)
+
+
 def true_rate(readings):
     return NOISE.gain_dn_per_electron * NOISE.electrons_per_s * readings
 
@@ -47,9 +51,7 @@ def ramp():
 def test_the_fused_rate_is_unbiased_and_its_deviation_is_true(ramp):
     rng = np.random.default_rng(0)
     darks = dark_frames(ramp.shape, rng)
-    rate, variance, usable = fuse(
-        bracket_of(ramp, rng), EXPOSURES_S, darks, GAIN, NOISE.white_level_dn
-    )
+    rate, variance, usable = fused(bracket_of(ramp, rng), darks)
     # Above 3 the shortest exposure comes near white itself.
     judged = usable & (ramp < 3.0)
     assert judged[:, ramp[0] < 3.0].all()
@@ -73,9 +75,7 @@ def test_dark_current_is_subtracted_of_every_exposure_or_counted_as_unknown(dark
     readings = np.geomspace(0.01, 0.9, 200)[None].repeat(300, axis=0)
     lit = readings + electrons_per_s / NOISE.electrons_per_s
     darks = dark_frames(readings.shape, rng, darks_s, electrons_per_s)
-    rate, variance, usable = fuse(
-        bracket_of(lit, rng), EXPOSURES_S, darks, GAIN, NOISE.white_level_dn
-    )
+    rate, variance, usable = fused(bracket_of(lit, rng), darks)
     score = ((rate - true_rate(readings)) / np.sqrt(variance))[usable]
     if len(darks_s) > 1:
         assert abs(score.mean()) < 0.02
@@ -88,7 +88,7 @@ def test_the_bracket_beats_its_single_exposures(ramp):
     rng = np.random.default_rng(1)
     darks = dark_frames(ramp.shape, rng)
     frames = bracket_of(ramp, rng)
-    rate, _, _ = fuse(frames, EXPOSURES_S, darks, GAIN, NOISE.white_level_dn)
+    rate, _, _ = fused(frames, darks)
     shadow, light = ramp[0] < 0.01, (ramp[0] > 1.2) & (ramp[0] < 3)
     truth = true_rate(ramp)
 
@@ -105,9 +105,7 @@ def test_a_pixel_saturated_in_every_exposure_is_not_usable():
     rng = np.random.default_rng(2)
     readings = np.full((8, 8), 0.1)
     readings[3, 4] = 50.0
-    rate, variance, usable = fuse(
-        bracket_of(readings, rng), EXPOSURES_S, dark_frames((8, 8), rng), GAIN, NOISE.white_level_dn
-    )
+    rate, variance, usable = fused(bracket_of(readings, rng), dark_frames((8, 8), rng))
     assert not usable[3, 4]
     assert np.isinf(variance[3, 4])
     assert usable.sum() == 63
@@ -121,8 +119,8 @@ def test_repeats_of_one_exposure_divide_the_variance():
     readings = np.full((40, 50), 0.2)
     darks = dark_frames(readings.shape, rng)
     frames = bracket_of(readings, rng, [0.02] * 9)
-    _, of_many, _ = fuse(frames, [0.02] * 9, darks, GAIN, NOISE.white_level_dn)
-    _, of_single, _ = fuse(frames[:1], [0.02], darks, GAIN, NOISE.white_level_dn)
+    _, of_many, _ = fused(frames, darks, [0.02] * 9)
+    _, of_single, _ = fused(frames[:1], darks, [0.02])
     shared = GAIN.dark_variance_dn2 / DARKS / 0.02**2
     assert np.median(of_single - shared) == pytest.approx(9 * np.median(of_many - shared), rel=0.05)
 
@@ -131,8 +129,8 @@ def test_the_order_of_the_exposures_does_not_matter(ramp):
     rng = np.random.default_rng(4)
     darks = dark_frames(ramp.shape, rng)
     frames = bracket_of(ramp, rng)
-    rate, _, _ = fuse(frames, EXPOSURES_S, darks, GAIN, NOISE.white_level_dn)
-    reversed_rate, _, _ = fuse(frames[::-1], EXPOSURES_S[::-1], darks, GAIN, NOISE.white_level_dn)
+    rate, _, _ = fused(frames, darks)
+    reversed_rate, _, _ = fused(frames[::-1], darks, EXPOSURES_S[::-1])
     np.testing.assert_array_equal(rate, reversed_rate)
 
 

@@ -14,7 +14,7 @@ from whiteboard_bench import (
 
 from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
-from calibration.defects import View, find_defects, loss_variance, mask_with_losses
+from calibration.defects import find_defects, loss_variance, mask_with_losses
 from calibration.errors import CalibrationError
 from calibration.findings import fit_advice
 from calibration.fit import FitSettings, fit_placement, shares_of_prior
@@ -318,7 +318,7 @@ def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(
         boards[i] = replace(board, reading=(board.reading - taken.reshape(SIZE)).astype(np.float32))
     found = find_defects(boards, mask, truth)
     assert found.count > 0
-    seen = View(np.ones(VIEWS, dtype=bool), (0.0, 0.0), 0)
+    seen = np.ones(VIEWS, dtype=bool), (0.0, 0.0), 0
     channels = design.colour[0].ravel()
     variance = loss_variance(found, mask, truth, pixels, channels, seen)
     grains = np.flatnonzero(found.lost)
@@ -329,7 +329,7 @@ def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(
         drawn = np.zeros(found.lost.size)
         drawn[grains] = root @ rng.standard_normal(len(grains))
         other = mask_with_losses(mask, truth, drawn.reshape(found.lost.shape))
-        spread.append(Shadow(other, truth).readings(pixels, channels, seen.views_open))
+        spread.append(Shadow(other, truth).readings(pixels, channels, *seen))
     touched = variance > 0.1 * variance.max()
     ratio = np.var(spread, axis=0)[touched] / variance[touched]
     # 200 draws tell a variance to 10 %.

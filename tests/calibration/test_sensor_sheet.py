@@ -141,14 +141,22 @@ def test_the_stated_deviation_of_the_gain_is_that_of_repeated_measurements():
     assert 0.5 < np.std(gains, ddof=1) / np.mean(stated) < 1.8
 
 
-def test_too_few_exposures_no_light_and_other_sizes_are_refused():
-    darks = frames(lit=False, times=DARKS_S)
-    with pytest.raises(CalibrationError, match="two exposures at least"):
-        characterise(darks[:1], frames(), WHITE_DN)
-    with pytest.raises(CalibrationError, match="3 flat exposures"):
-        characterise(darks, frames(times=FLATS_S[:3]), WHITE_DN)
-    with pytest.raises(CalibrationError, match=r"brighter|below 70 %|between 5 and 95"):
-        characterise(darks, frames(lit=False, times=FLATS_S[:5]), WHITE_DN)
-    small = [Pair(1.0, darks[0].first[:50], darks[0].second[:50])] * 4
-    with pytest.raises(CalibrationError, match="are they of one camera"):
-        characterise(darks, small, WHITE_DN)
+DARKS = frames(lit=False, times=DARKS_S)
+
+
+@pytest.mark.parametrize(
+    ("darks", "flats", "complaint"),
+    [
+        (DARKS[:1], FLATS_S, "two exposures at least"),
+        (DARKS, FLATS_S[:3], "3 flat exposures"),
+        (DARKS, None, r"brighter|below 70 %|between 5 and 95"),
+        (DARKS, [Pair(1.0, DARKS[0].first[:50], DARKS[0].second[:50])] * 4, "of one camera"),
+    ],
+)
+def test_too_few_exposures_no_light_and_other_sizes_are_refused(darks, flats, complaint):
+    if flats is None:
+        flats = frames(lit=False, times=FLATS_S[:5])
+    elif isinstance(flats, tuple):
+        flats = frames(times=flats)
+    with pytest.raises(CalibrationError, match=complaint):
+        characterise(darks, flats, WHITE_DN)
