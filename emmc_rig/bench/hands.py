@@ -115,8 +115,23 @@ class AskingAttendant:
             self._done[what] = wish
 
 
-class NoAttendant(Attendant):
+class NoAttendant:
     """An `Attendant` of a bench on which nothing ever changes."""
+
+    def set_lamp(self, colour: str) -> None:
+        """Leave the lamp as it is."""
+
+    def place(self, target: str, turn_deg: float = 0.0) -> None:
+        """Leave the board or scene where it is."""
+
+    def fit_masks(self, shot: int, fitted: bool = True) -> None:
+        """Leave the masks in or out."""
+
+    def move(self, offsets_um: Mapping[str, float]) -> None:
+        """Leave mask and aperture where they are."""
+
+    def again(self, axes: Collection[str]) -> None:
+        """Nothing was asked."""
 
 
 def hole_at(camera: Camera, offsets_um: Mapping[str, float]) -> tuple[int, int] | None:
