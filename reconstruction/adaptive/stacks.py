@@ -19,7 +19,7 @@ SIDE = 8
 CELL = SIDE // 2
 STACK = 16
 """A power of two."""
-COSINES = dct(np.eye(SIDE), axis=0, norm="ortho").astype(np.float32)
+COSINES = np.asarray(dct(np.eye(SIDE), axis=0, norm="ortho"), dtype=np.float32)
 """The matrix C of the orthonormal cosine transform, a frequency a row; its inverse is C^T."""
 INVERSE = np.ascontiguousarray(COSINES.T)
 

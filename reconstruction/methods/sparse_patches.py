@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 
-from reconstruction import bpdn
 from reconstruction.method import Given, Method, cost_words
 from reconstruction.result import Reconstruction
 from reconstruction.settings import ShippedSettings
 from reconstruction.sparse import SparseSettings, reconstruct_sparse
 
 
-def _solve(solver: bpdn.Method, given: Given, settings: ShippedSettings) -> Reconstruction:
+def _solve(solver: str, given: Given, settings: ShippedSettings) -> Reconstruction:
     chosen = settings.sparse.solver.model_copy(update={"method": solver})
     return reconstruct_sparse(
         given.psi,

@@ -9,7 +9,7 @@ from numba import njit
 from programs import wait_until
 
 from emmc_rig.commands import first_run
-from reconstruction import wave
+from reconstruction import kernels
 from reconstruction.adaptive import evidence, rays
 
 SLEEPS = "import time; time.sleep(600)"
@@ -152,7 +152,7 @@ def test_each_part_runs_the_kernels_that_it_is_named_after(monkeypatch):
         monkeypatch.setattr(module, kernel, lambda *given: ran.append(kernel) or real(*given))
 
     for module, kernel in (
-        (evidence, "evidence"), (wave, "_pass"), (rays, "_render"),
+        (evidence, "evidence"), (kernels, "_sweep_band"), (rays, "_render"),
     ):  # fmt: skip
         note(module, kernel)
     done = {}
@@ -161,5 +161,5 @@ def test_each_part_runs_the_kernels_that_it_is_named_after(monkeypatch):
         done[part] = set(ran)
         ran.clear()
     assert done["fit"] == {"_render"}
-    assert done["variation"] == {"_pass"}
+    assert done["variation"] == {"_sweep_band"}
     assert done["search"] >= {"evidence"}
