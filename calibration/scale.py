@@ -31,22 +31,27 @@ class RawValues(Protocol):
     @property
     def mosaic(self) -> NDArray[np.uint16]:
         """Values in DN, (y, x), black level included."""
+        ...
 
     @property
     def black_level_dn(self) -> NDArray[np.floating]:
         """Black levels, a tile that repeats over the mosaic, DN."""
+        ...
 
     @property
     def white_level_dn(self) -> int:
         """Value of saturated pixels, DN."""
+        ...
 
     @property
     def exposure_s(self) -> float | None:
         """Exposure in seconds; None if unknown."""
+        ...
 
     @property
     def gain(self) -> float | None:
         """Gain, 1 at the base sensitivity; None if unknown, taken as 1."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,7 +109,7 @@ def test_a_pixel_saturated_in_every_exposure_is_not_usable():
     assert not usable[3, 4]
     assert np.isinf(variance[3, 4])
     assert usable.sum() == 63
-    # It says only that there was at least as much light as fills it in the shortest exposure.
+    # The least light that fills the pixel in the shortest exposure.
     fills = (NOISE.white_level_dn - NOISE.black_level_dn) / EXPOSURES_S[0]
     assert rate[3, 4] == pytest.approx(fills, rel=0.01)
 

@@ -55,7 +55,7 @@ def placed():
 
 @cache
 def captured(shots=1, seed=0, scene="deep-occlusions", sensor=PERFECT_SENSOR, kind=(), size=SIZE):
-    """Return captures and their camera; kind: of its sensor, where it is not CAMERA's."""
+    """Return captures and their camera; kind: changes of CAMERA's sensor."""
     own = CAMERA.sensor.model_copy(update=dict(kind))
     camera = CAMERA.model_copy(update={"sensor": own}).with_shots(shots)
     fine = fine_scene(scene, 2, 2, size=size, views=camera.views, seed=3)

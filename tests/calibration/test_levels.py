@@ -177,7 +177,7 @@ def test_crosstalk_is_what_a_filter_sees_of_other_lamps():
     np.testing.assert_allclose(found.seen, through, atol=1e-5)
     assert found.largest == pytest.approx(0.05)
     assert crosstalk(set_of(np.eye(3)), channels, good) is None
-    # One filter that sees less than half of its own colour is enough.
+    # The green filter sees less than half of its own colour.
     swapped = np.array([[0.9, 0.1, 0.0], [0.6, 0.4, 0.0], [0.0, 0.02, 0.98]])
     with pytest.raises(CalibrationError, match="behind the green filter see 40% green"):
         crosstalk(set_of(swapped), channels, good)

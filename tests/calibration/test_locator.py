@@ -82,7 +82,7 @@ def test_a_frame_shifted_by_fourier_interpolation_is_found_shifted_by_as_much(sh
     name = "rgbw-mono"
     mask, signal = mask_of(name), signal_at(name, (0.0, 0.0))
     moved = np.fft.ifft2(fourier_shift(np.fft.fft2(signal), shift_px)).real
-    # Rows and columns that came in from the other side are not of this mask.
+    # Rows and columns that wrap around show another part of the mask.
     rim = np.ones(signal.shape, dtype=bool)
     rim[8:-8, 8:-8] = False
     here, there = (

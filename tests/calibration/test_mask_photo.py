@@ -160,7 +160,7 @@ def test_given_corners_serve_where_no_outline_is_seen():
     whole = plain()
     found = find_corners(whole[..., None].astype(np.float32), CELLS)
     edge = int(np.floor(found.min(axis=0)[0])) + 8
-    # What lies left of the mask, and a little of it, is another bright thing.
+    # A bright object covers the left edge of the mask.
     disturbed = whole.copy()
     disturbed[:, : edge - 20] = 0.7 * np.random.default_rng(0).random((len(whole), edge - 20))
     with pytest.raises(CalibrationError, match="corners"):
@@ -183,7 +183,7 @@ def test_defects_are_listed_where_they_are():
     truth[5, 7] = 0.5
     truth[20, 30] = 1
     photo = photograph(truth, speck=(20.5, 30.5))
-    found = {(one.row, one.column): one.what for one in read_mask(photo, CELLS).defects}
+    found = {(cell.row, cell.column): cell.what for cell in read_mask(photo, CELLS).defects}
     assert set(found) == {(5, 7), (20, 30)}
     assert "partly open" in found[5, 7]
     assert "uneven within" in found[20, 30]
@@ -194,7 +194,7 @@ def test_cells_that_are_not_as_ordered_are_defects():
     made = ordered.copy()
     made[11, 13] = 1.02 - made[11, 13]
     found = read_mask(photograph(made), CELLS, ordered=ordered).defects
-    assert [(one.row, one.column) for one in found] == [(11, 13)]
+    assert [(cell.row, cell.column) for cell in found] == [(11, 13)]
     assert "not as ordered" in found[0].what
 
 

@@ -1,4 +1,4 @@
-"""Parts of the aperture: which views the moved window uncovers, and that it uncovers whole ones."""
+"""Parts of the aperture: the moved window uncovers whole views, on the side of its move."""
 
 import json
 
@@ -62,9 +62,11 @@ def test_where_the_aperture_stays_open_only_the_mask_moves(run, tmp_path):
     assert code == 0
     boards = yaml.safe_load((tmp_path / "plan" / "plan.yaml").read_text())["whiteboards"]
     assert boards["views"] == []
-    assert not any("window" in one for one in boards["open"])
+    assert not any("window" in board for board in boards["open"])
     places = {
-        tuple(one.get("mask_um", (0, 0))) for one in boards["open"] if not one.get("validation")
+        tuple(board.get("mask_um", (0, 0)))
+        for board in boards["open"]
+        if not board.get("validation")
     }
     assert len(places) == 4
     metrics = json.loads((tmp_path / "plan" / "metrics.json").read_text())
@@ -83,8 +85,8 @@ def test_few_whiteboards_are_planned_by_parts_of_the_aperture(run, tmp_path):
     assert code == 0
     boards = yaml.safe_load((out / "plan.yaml").read_text())["whiteboards"]
     assert boards["views"] == []
-    windows = [tuple(one.get("window", (0, 0))) for one in boards["open"]]
+    windows = [tuple(board.get("window", (0, 0))) for board in boards["open"]]
     assert set(parts(CAMERA.views)) <= set(windows)
     metrics = json.loads((out / "metrics.json").read_text())
-    assert sum(one["frames"] for one in metrics["whiteboards"]) <= 12
+    assert sum(board["frames"] for board in metrics["whiteboards"]) <= 12
     assert metrics["model_error"] < metrics["expected_relative_error"] <= 0.01

@@ -35,6 +35,8 @@ FEW = [
     Setting(stage_um=(270.0, 162.0), repeats=4),
     *(Setting(pinhole=view, repeats=2) for view in ((1, 1), (0, 0), (2, 0), (0, 2), (2, 2))),
 ]
+MASK = shadow_mask(CAMERA, SIZE)
+PIXELS = np.argwhere(np.ones(SIZE, dtype=bool))
 HELD_OUT = [Setting(repeats=4), Setting(stage_um=(-207.0, 118.0), repeats=4)]
 
 
@@ -75,7 +77,7 @@ def test_the_fit_finds_where_the_mask_sits(outcome):
 def test_dust_is_found_and_psi_is_better_for_it(bench, design, outcome):
     exact = bench.exact_psi(design)
     errors = {
-        name: one.psi.relative_difference(exact) for name, one in outcome.calibrations.items()
+        name: known.psi.relative_difference(exact) for name, known in outcome.calibrations.items()
     }
     assert design.relative_difference(exact) > 0.3
     assert errors["mixed"] < 0.8 * errors["parametric"] < 0.03
@@ -99,37 +101,24 @@ def test_one_frame_verifies_a_stage_position_that_was_never_calibrated(outcome, 
 def synthetic(design, placement, noise=0.004, seed=0, settings=FEW):
     """Whiteboards drawn from the model itself, with its noise: for statistics alone."""
     rng = np.random.default_rng(seed)
-    mask = shadow_mask(CAMERA, SIZE)
-    shadow = Shadow(mask, placement)
+    shadow = Shadow(MASK, placement)
     boards = []
-    pixels = np.argwhere(np.ones(SIZE, dtype=bool))
     for setting in settings:
-        views_open = np.full(VIEWS, setting.pinhole is None)
-        if setting.pinhole is not None:
-            views_open[setting.pinhole] = True
-        clean = shadow.readings(pixels, design.colour[0].ravel(), views_open, setting.stage_um)
+        views_open = setting.views_open(VIEWS)
+        clean = shadow.readings(PIXELS, design.colour[0].ravel(), views_open, setting.stage_um)
         deviation = noise * clean.max()
         read = (clean + rng.normal(0, deviation, len(clean))).reshape(SIZE)
         variance = np.full(SIZE, deviation**2, np.float32)
-        boards.append(
-            Board(
-                "test",
-                read.astype(np.float32),
-                variance,
-                design.colour[0],
-                views_open,
-                setting.stage_um,
-                0,
-            )
-        )
+        reading, channels = read.astype(np.float32), design.colour[0]
+        place = setting.stage_um
+        boards.append(Board("test", reading, variance, channels, views_open, place, 0))
     return boards
 
 
 def test_brightness_that_repeats_show_to_differ_counts_in_the_fit(design):
-    mask = shadow_mask(CAMERA, SIZE)
     steady = synthetic(design, designed_placement(CAMERA), settings=FEW[:2])
-    jumping = [replace(one, repeats=2, unsteady2=0.02**2) for one in steady]
-    known, less = (fit_placement(boards, CAMERA, mask) for boards in (steady, jumping))
+    jumping = [replace(board, repeats=2, unsteady2=0.02**2) for board in steady]
+    known, less = (fit_placement(boards, CAMERA, MASK) for boards in (steady, jumping))
     # Two whiteboards of two frames each are as bright as the mean of four.
     assert less.deviation("clear") == pytest.approx(0.02 / 2 * less.placement.clear, rel=0.2)
     assert known.deviation("clear") < 0.4 * less.deviation("clear")
@@ -139,16 +128,14 @@ def test_brightness_that_repeats_show_to_differ_counts_in_the_fit(design):
 def cramer_rao(boards, shadow):
     """The inverse of the Fisher information of all readings, with the prior."""
     information = np.diag(1 / Tolerances().deviations(VIEWS) ** 2)
-    pixels = np.argwhere(np.ones(SIZE, dtype=bool))
     for board in boards:
-        slopes = shadow.with_slopes(pixels, board.channels.ravel(), *board.opening)[1]
+        slopes = shadow.with_slopes(PIXELS, board.channels.ravel(), *board.opening)[1]
         information += slopes.T @ (slopes / np.broadcast_to(board.variance, SIZE).reshape(-1, 1))
     return np.linalg.inv(information)
 
 
 @pytest.mark.slow
 def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
-    mask = shadow_mask(CAMERA, SIZE)
     truth = replace(
         designed_placement(CAMERA), offset_x_um=4.0, rotation_rad=0.001, blur_um=3.0, leak=0.02
     )
@@ -156,8 +143,8 @@ def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
     for seed in range(8):
         boards = synthetic(design, truth, 0.02, seed)
         settings = FitSettings(seed=seed, first_pixels=1500)
-        fits.append(fit_placement(boards, CAMERA, mask, settings, start=truth))
-        bounds.append(np.diag(cramer_rao(boards, Shadow(mask, truth))))
+        fits.append(fit_placement(boards, CAMERA, MASK, settings, start=truth))
+        bounds.append(np.diag(cramer_rao(boards, Shadow(MASK, truth))))
     errors = np.array([fit.placement.vector() - truth.vector() for fit in fits])
     stated = np.mean([np.diag(fit.covariance) for fit in fits], axis=0)
     bound = np.mean(bounds, axis=0)
@@ -173,10 +160,8 @@ def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
 
 @pytest.mark.slow
 def test_views_displaced_on_their_own_bias_the_weights_by_as_much_as_is_stated(design):
-    mask = shadow_mask(CAMERA, SIZE)
     truth = replace(designed_placement(CAMERA), blur_um=3.0, leak=0.02)
-    shadow, rng = Shadow(mask, truth), np.random.default_rng(3)
-    pixels = np.argwhere(np.ones(SIZE, dtype=bool))
+    shadow, rng = Shadow(MASK, truth), np.random.default_rng(3)
     channels = design.colour[0]
     # Between views alike far from the middle: neither a common level nor a falloff is in them.
     pairs = np.array([(0, 2), (0, 6), (0, 8), (1, 7), (3, 5)]) + len(SCALARS)
@@ -191,7 +176,7 @@ def test_views_displaced_on_their_own_bias_the_weights_by_as_much_as_is_stated(d
             alone = np.zeros(VIEWS, dtype=bool)
             alone[v, u] = True
             x, y = places[v, u]
-            each[v, u] = shadow.readings(pixels, channels.ravel(), alone, (x, y)).reshape(SIZE)
+            each[v, u] = shadow.readings(PIXELS, channels.ravel(), alone, (x, y)).reshape(SIZE)
         boards = []
         for window in (CENTRED, *parts(VIEWS)):
             opened = views_open(VIEWS, None, window)
@@ -201,7 +186,7 @@ def test_views_displaced_on_their_own_bias_the_weights_by_as_much_as_is_stated(d
             reading, variance = read.astype(np.float32), deviation**2
             boards.append(Board("", reading, variance, channels, opened, (0.0, 0.0), 0))
         settings = FitSettings(seed=seed, first_pixels=1500)
-        fit = fit_placement(boards, CAMERA, mask, settings, start=truth)
+        fit = fit_placement(boards, CAMERA, MASK, settings, start=truth)
         off = contrasts @ (fit.placement.vector() - truth.vector())
         scaled.append(off**2 / np.diag(contrasts @ fit.covariance @ contrasts.T))
         by_bound.append(off**2 / np.diag(contrasts @ cramer_rao(boards, shadow) @ contrasts.T))
@@ -225,8 +210,7 @@ def test_a_mask_that_is_not_the_design_is_refused_with_the_correlation(design, b
 
 
 def test_a_mirrored_mask_is_named_as_such(design):
-    mask = shadow_mask(CAMERA, SIZE)
-    mirrored = replace(mask, cells=np.ascontiguousarray(mask.cells[:, :, ::-1]))
+    mirrored = replace(MASK, cells=np.ascontiguousarray(MASK.cells[:, :, ::-1]))
     boards = synthetic(design, designed_placement(CAMERA), settings=FEW[:1])
     with pytest.raises(CalibrationError, match="mirrored left to right"):
         register(boards[0], mirrored, designed_placement(CAMERA))
@@ -242,7 +226,7 @@ def test_registration_finds_a_mask_that_sits_far_off(design, x, y, turn_deg):
         blur_um=3.0,
     )
     boards = synthetic(design, truth, settings=FEW[:1])
-    found = register(boards[0], shadow_mask(CAMERA, SIZE), designed_placement(CAMERA))
+    found = register(boards[0], MASK, designed_placement(CAMERA))
     assert found.placement.offset_x_um == pytest.approx(x, abs=12)
     assert found.placement.offset_y_um == pytest.approx(y, abs=12)
     assert found.correlation > 0.6
@@ -256,7 +240,7 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
         synthetic(design, replace(truth, offset_x_um=3.0), settings=FEW[2:3])[0], name="third"
     )
     seen = [boards[0], replace(flickered, name="second"), moved, *boards[3:]]
-    fit = fit_placement(seen, CAMERA, shadow_mask(CAMERA, SIZE))
+    fit = fit_placement(seen, CAMERA, MASK)
     advice = " ".join(fit_advice(fit))
     assert "second" in advice
     assert "in brightness against the other whiteboards" in advice
@@ -282,19 +266,17 @@ def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():
 
 def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
     boards = synthetic(design, designed_placement(CAMERA), 0.05, settings=FEW[:1])
-    fit = fit_placement(boards, CAMERA, shadow_mask(CAMERA, SIZE))
+    fit = fit_placement(boards, CAMERA, MASK)
     assert any(name.startswith("aperture") for name in fit.undecided)
     assert fit.more_boards > 0
     assert "too few whiteboards" in fit_advice(fit)[-1]
-    enough = fit_placement(
-        synthetic(design, designed_placement(CAMERA), 0.005), CAMERA, shadow_mask(CAMERA, SIZE)
-    )
+    enough = fit_placement(synthetic(design, designed_placement(CAMERA), 0.005), CAMERA, MASK)
     assert enough.undecided == ()
     assert enough.more_boards == 0
 
 
 def test_deviations_of_psi_do_not_depend_on_the_bands_they_are_computed_in(design, monkeypatch):
-    shadow = Shadow(shadow_mask(CAMERA, SIZE), designed_placement(CAMERA))
+    shadow = Shadow(MASK, designed_placement(CAMERA))
     covariance = np.diag(np.full(len(shadow.placement.vector()), 1e-4))
     found = []
     for pixels in (2**16, 130):
@@ -306,21 +288,19 @@ def test_deviations_of_psi_do_not_depend_on_the_bands_they_are_computed_in(desig
 
 def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(design):
     truth = replace(designed_placement(CAMERA), blur_um=3.0)
-    mask = shadow_mask(CAMERA, SIZE)
-    middle = np.array(mask.cells.shape[1:3]) // 2
-    lost = np.zeros((2 * mask.cells.shape[1], 2 * mask.cells.shape[2]))
+    middle = np.array(MASK.cells.shape[1:3]) // 2
+    lost = np.zeros((2 * MASK.cells.shape[1], 2 * MASK.cells.shape[2]))
     lost[2 * middle[0] : 2 * middle[0] + 2, 2 * middle[1] : 2 * middle[1] + 2] = 0.5
-    boards, soiled = synthetic(design, truth, 0.005), mask_with_losses(mask, truth, lost)
-    pixels = np.argwhere(np.ones(SIZE, dtype=bool))
+    boards, soiled = synthetic(design, truth, 0.005), mask_with_losses(MASK, truth, lost)
     for i, board in enumerate(boards):
-        args = pixels, board.channels.ravel(), board.views_open, board.stage_um, board.shot
-        taken = Shadow(mask, truth).readings(*args) - Shadow(soiled, truth).readings(*args)
+        args = PIXELS, board.channels.ravel(), board.views_open, board.stage_um, board.shot
+        taken = Shadow(MASK, truth).readings(*args) - Shadow(soiled, truth).readings(*args)
         boards[i] = replace(board, reading=(board.reading - taken.reshape(SIZE)).astype(np.float32))
-    found = find_defects(boards, mask, truth)
+    found = find_defects(boards, MASK, truth)
     assert found.count > 0
     seen = np.ones(VIEWS, dtype=bool), (0.0, 0.0), 0
     channels = design.colour[0].ravel()
-    variance = loss_variance(found, mask, truth, pixels, channels, seen)
+    variance = loss_variance(found, MASK, truth, PIXELS, channels, seen)
     grains = np.flatnonzero(found.lost)
     dense = found.covariance[grains][:, grains].toarray()
     root = np.linalg.cholesky(dense + 1e-12 * np.trace(dense) * np.eye(len(grains)))
@@ -328,8 +308,8 @@ def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(
     for _ in range(200):
         drawn = np.zeros(found.lost.size)
         drawn[grains] = root @ rng.standard_normal(len(grains))
-        other = mask_with_losses(mask, truth, drawn.reshape(found.lost.shape))
-        spread.append(Shadow(other, truth).readings(pixels, channels, *seen))
+        other = mask_with_losses(MASK, truth, drawn.reshape(found.lost.shape))
+        spread.append(Shadow(other, truth).readings(PIXELS, channels, *seen))
     touched = variance > 0.1 * variance.max()
     ratio = np.var(spread, axis=0)[touched] / variance[touched]
     # 200 draws tell a variance to 10 %.
@@ -339,27 +319,28 @@ def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(
 def test_no_defects_are_found_on_a_clean_mask(design):
     truth = replace(designed_placement(CAMERA), blur_um=3.0)
     boards = synthetic(design, truth)
-    assert find_defects(boards, shadow_mask(CAMERA, SIZE), truth).count == 0
+    assert find_defects(boards, MASK, truth).count == 0
 
 
 def test_the_expected_error_of_psi_is_the_error_of_psi(design):
-    mask = shadow_mask(CAMERA, SIZE)
     truth = replace(designed_placement(CAMERA), blur_um=3.0)
-    exact = psi_at(Shadow(mask, truth), design, shot_stages(CAMERA))
+    exact = psi_at(Shadow(MASK, truth), design, shot_stages(CAMERA))
     squares, expected = [], []
     for seed in range(4):
-        fit = fit_placement(synthetic(design, truth, 0.03, seed), CAMERA, mask, start=truth)
-        psi = psi_at(Shadow(mask, fit.placement), design, shot_stages(CAMERA))
+        fit = fit_placement(synthetic(design, truth, 0.03, seed), CAMERA, MASK, start=truth)
+        psi = psi_at(Shadow(MASK, fit.placement), design, shot_stages(CAMERA))
         squares.append(psi.relative_difference(exact) ** 2)
-        matrix, power = psi_information(Shadow(mask, fit.placement))
+        matrix, power = psi_information(Shadow(MASK, fit.placement))
         expected.append(np.trace(matrix @ fit.covariance) / power)
     assert np.sqrt(np.mean(squares) / np.mean(expected)) == pytest.approx(1, abs=0.35)
 
 
 def test_frames_of_another_camera_are_refused(few, design):
     cut = [
-        BoardFrame.held(replace(one.frame, mean_dn=one.frame.mean_dn[:-2]), one.stage_um, one.shot)
-        for one in few.frames
+        BoardFrame.held(
+            replace(board.frame, mean_dn=board.frame.mean_dn[:-2]), board.stage_um, board.shot
+        )
+        for board in few.frames
     ]
     with pytest.raises(CalibrationError, match="42 x 60 pixels, the camera has 44 x 60"):
         as_readings(few.with_frames(cut), design)
@@ -376,7 +357,7 @@ def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
     with pytest.raises(CalibrationError, match="no dark frame"):
         BoardSet((), few.references, few.frames)
     with pytest.raises(CalibrationError, match="no whiteboard with the mask in"):
-        fit_placement([], CAMERA, shadow_mask(CAMERA, SIZE))
+        fit_placement([], CAMERA, MASK)
 
 
 def test_the_simplest_method_at_the_noise_is_chosen():

@@ -1,4 +1,4 @@
-"""Whiteboards that no Psi may be made of are named, each for what is wrong with it."""
+"""Faulty whiteboards are refused, and the refusal names the fault."""
 
 import re
 from dataclasses import replace

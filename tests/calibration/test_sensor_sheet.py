@@ -64,8 +64,8 @@ def test_the_full_well_is_where_every_pixel_is_full_whatever_the_steps_of_exposu
 
 
 def test_the_pixels_own_differences_are_separated_from_noise_and_lamp(sheet):
-    for one, scale, truth in ((sheet.prnu, 100, 1.0), (sheet.dsnu, 1, 1.5)):
-        value, deviation = one.figure(scale)
+    for differences, scale, truth in ((sheet.prnu, 100, 1.0), (sheet.dsnu, 1, 1.5)):
+        value, deviation = differences.figure(scale)
         assert abs(value - truth) < 4 * deviation
         assert value == pytest.approx(truth, rel=0.05)
 
@@ -74,10 +74,10 @@ def test_the_stated_deviation_of_dsnu_is_that_of_repeated_measurements():
     found = []
     for seed in range(10):
         flaws = SensorFlaws(offset_spread_dn=1.5, full_well_electrons=50_000.0, seed=seed)
-        one = characterise(
+        sheet = characterise(
             frames(flaws, lit=False, times=DARKS_S, seed=seed), frames(flaws, seed=50), WHITE_DN
         )
-        found.append(one.dsnu.figure(1.0))
+        found.append(sheet.dsnu.figure(1.0))
     values, stated = np.transpose(found)
     assert 0.5 < np.std(values, ddof=1) / np.mean(stated) < 1.8
 
@@ -133,11 +133,11 @@ def test_a_straight_sensor_is_straight_and_a_bent_one_bends():
 def test_the_stated_deviation_of_the_gain_is_that_of_repeated_measurements():
     gains, stated = [], []
     for seed in range(8):
-        one = characterise(
+        sheet = characterise(
             frames(lit=False, times=DARKS_S, seed=100 + seed), frames(seed=seed), WHITE_DN
         )
-        gains.append(one.gain_dn_per_electron)
-        stated.append(one.deviations["gain_dn_per_electron"])
+        gains.append(sheet.gain_dn_per_electron)
+        stated.append(sheet.deviations["gain_dn_per_electron"])
     assert 0.5 < np.std(gains, ddof=1) / np.mean(stated) < 1.8
 
 

@@ -47,12 +47,12 @@ def misses(true, sheet):
         for name, of in TRUE.items()
         if not sheet.bound(name)
     }
-    for name, one, scale, truth in (
+    for name, differences, scale, truth in (
         ("prnu", sheet.prnu, 1.0, true.prnu),
         ("dsnu", sheet.dsnu, 1 / sheet.gain_dn_per_electron, true.dsnu),
     ):
         if not sheet.bound(name):
-            value, deviation = one.figure(scale)
+            value, deviation = differences.figure(scale)
             found[name] = (value - truth) / deviation
     return found
 

@@ -36,16 +36,16 @@ def test_psi_on_disk_is_psi_in_memory(session, tmp_path, monkeypatch):
     assert psi.camera_json == whole.psi.camera_json
     np.testing.assert_array_equal(psi.colour, whole.psi.colour)
     with (
-        h5py.File(out / "calibration.h5") as one,
-        h5py.File(tmp_path / "whole/calibration.h5") as two,
+        h5py.File(out / "calibration.h5") as streamed,
+        h5py.File(tmp_path / "whole/calibration.h5") as kept,
     ):
-        assert set(one) == set(two)
-        assert set(one.attrs) == set(two.attrs)
-        for name in two:
-            written, kept = one[name], two[name]
+        assert set(streamed) == set(kept)
+        assert set(streamed.attrs) == set(kept.attrs)
+        for name in kept:
+            written, whole_array = streamed[name], kept[name]
             assert isinstance(written, h5py.Dataset)
-            assert isinstance(kept, h5py.Dataset)
-            np.testing.assert_allclose(written[...], kept[...], rtol=1e-5, atol=1e-9)
+            assert isinstance(whole_array, h5py.Dataset)
+            np.testing.assert_allclose(written[...], whole_array[...], rtol=1e-5, atol=1e-9)
     judged = [
         json.loads((tmp_path / name / "metrics.json").read_text())["held_out"]["free"]
         for name in ("streamed", "whole")

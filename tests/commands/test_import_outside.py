@@ -216,7 +216,7 @@ def test_psi_of_whiteboards_of_another_bench_errs_as_much_as_it_says(tmp_path, r
     with h5py.File(tmp_path / "bench/calibration/calibration.h5") as file:
         found = agreement(bench, psi.weights, np.array(file["deviation"]), np.array(file["good"]))
     assert 0.4 < found["true"] / found["stated"] < 1.6, found
-    assert 0.45 < found["one"] < 0.95, found
-    assert found["two"] > 0.88, found
+    assert 0.45 < found["within_1"] < 0.95, found
+    assert found["within_2"] > 0.88, found
     assert found["true"] < 0.01, found
     assert verdict(tmp_path / "bench")["level"] != "do not use"

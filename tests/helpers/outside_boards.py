@@ -103,6 +103,6 @@ def agreement(
     return {
         "true": float(np.sqrt(np.mean(off**2))) / scale,
         "stated": float(np.sqrt(np.mean(stated**2))) / scale,
-        "one": float(np.mean(np.abs(off) < stated)),
-        "two": float(np.mean(np.abs(off) < 2 * stated)),
+        "within_1": float(np.mean(np.abs(off) < stated)),
+        "within_2": float(np.mean(np.abs(off) < 2 * stated)),
     }
