@@ -60,8 +60,8 @@ def design_page(
         held=(
             ["Mask", *names],
             [
-                [one.candidate.label, *(number(one.psnr_db[name], ".2f") for name in names)]
-                for one in found.held
+                [mask.candidate.label, *(number(mask.psnr_db[name], ".2f") for name in names)]
+                for mask in found.held
             ],
         ),
         simulated=simulated,

@@ -144,8 +144,8 @@ def simulated_table(found: Sequence[Simulated]) -> Table:
     """Return the heads and rows of theory and simulation, a row a camera."""
     scenes = list(found[0].psnr_db)
     rows = [
-        [one.name, *(f"{db:.2f}" for db in (one.expected_db, one.mean_db, *one.psnr_db.values()))]
-        for one in found
+        [row.name, *(f"{db:.2f}" for db in (row.expected_db, row.mean_db, *row.psnr_db.values()))]
+        for row in found
     ]
     return ("Camera", "Theory", "Simulated, mean", *scenes), rows
 
@@ -223,7 +223,7 @@ def _verdict(compared: Sequence[Simulated]) -> str:
     """Return what the design gains on the best shipped camera, in words; the design is first."""
     if len(compared) == 1:
         return "no shipped camera of this sensor has as many shots to compare with."
-    best = max(compared[1:], key=lambda one: one.mean_db)
+    best = max(compared[1:], key=lambda camera: camera.mean_db)
     gain_db = compared[0].mean_db - best.mean_db
     worth = "order it" if gain_db >= GOAL_DB else "a mask you have may do as well"
     return (
@@ -239,8 +239,8 @@ def _metrics(
         "winner": asdict(found.winner),
         "expected": asdict(found.expected),
         "expected_without_diffraction_db": found.ideal_db,
-        "manufacturing_db": {one.candidate.label: dict(one.psnr_db) for one in found.held},
-        "tried": [{**asdict(one), **asdict(what)} for one, what in found.tried],
-        "simulated": [asdict(one) for one in compared],
+        "manufacturing_db": {mask.candidate.label: dict(mask.psnr_db) for mask in found.held},
+        "tried": [{**asdict(mask), **asdict(theory)} for mask, theory in found.tried],
+        "simulated": [asdict(camera) for camera in compared],
         "settings": bench.model_dump(mode="json"),
     }

@@ -48,7 +48,7 @@ class StabilitySettings(Settings):
     @property
     def captures(self) -> list[Capture]:
         """Every scene through the camera."""
-        return [Capture(one, self.camera, self.size, self.seed, self.zoom) for one in self.scenes]
+        return [Capture(s, self.camera, self.size, self.seed, self.zoom) for s in self.scenes]
 
 
 def stability_settings(
