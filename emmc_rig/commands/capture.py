@@ -22,8 +22,7 @@ from emmc_rig.commands.options import (
     RigSceneOption,
     RigSizeOption,
 )
-from emmc_rig.commands.output import emit, give_result, json_wanted, say, tell
-from emmc_rig.commands.verdict import show_reason
+from emmc_rig.commands.output import emit, give_result, json_wanted, say, show_reason, tell
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.progress import Event, Watcher
 

@@ -10,6 +10,7 @@ import typer
 from emmc_rig.commands.options import (
     DictionaryOption,
     MethodsOption,
+    OutOption,
     ScenesOption,
     SeedOption,
     SizeOption,
@@ -33,9 +34,7 @@ def chart(
         int | None, typer.Option("--repeats", min=1, help="timed runs of each method")
     ] = None,
     seed: SeedOption = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="folder to write (default: emmc-chart)")
-    ] = None,
+    out: OutOption = Path("emmc-chart"),
 ) -> None:
     """Chart the speed and accuracy of every method.
 
@@ -49,9 +48,8 @@ def chart(
         fast, scene or [], camera or [], parse_size(size), repeats,
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
     )  # fmt: skip
-    place = out or Path("emmc-chart")
     with shown_progress() as bars:
-        outcome = run_chart(settings, place, bars)
+        outcome = run_chart(settings, out, bars)
     for panel in outcome.shown():
         rows = [
             (m.configuration.label, f"{m.seconds:.3g}", f"{m.psnr_db:.2f}") for m in panel.front()
@@ -59,5 +57,5 @@ def chart(
         show_table(("method", "s", "dB"), rows, panel.title)
     for line in outcome.left_out:
         say("excluded", line)
-    tell(f"{outcome.seconds:.0f} s; open {place / outcome.page.name}")
-    give_result(place)
+    tell(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
+    give_result(out)

@@ -18,8 +18,7 @@ from emmc_rig.commands.options import (
     ShotsOption,
     SizeOption,
 )
-from emmc_rig.commands.output import give_result, say, shown_progress, tell
-from emmc_rig.commands.verdict import show_verdict
+from emmc_rig.commands.output import give_result, say, show_verdict, shown_progress, tell
 
 DEMO_SCENE = "toy-table"
 """Large even surfaces, sharp edges and letters: what a light field of few pixels can show well."""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import ScenesOption, SeedOption, SizeOption
+from emmc_rig.commands.options import OutOption, ScenesOption, SeedOption, SizeOption
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 
 
@@ -21,10 +21,7 @@ def design(
     scene: ScenesOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="folder to write (default: emmc-design)"),
-    ] = None,
+    out: OutOption = Path("emmc-design"),
 ) -> None:
     """Design the mask to order, by theory and simulation."""
     from emmc_rig.files.results import parse_size
@@ -34,8 +31,7 @@ def design(
     described = load_bench(bench)
     sides = parse_size(size)
     with shown_progress() as bars:
-        place = out or Path("emmc-design")
-        designed = run_design(described, scene or [], sides, seed, place, bars)
+        designed = run_design(described, scene or [], sides, seed, out, bars)
     best = designed.found.expected
     loss_db = designed.found.ideal_db - best.psnr_db
     tell(designed.found.winner.label)
@@ -48,4 +44,4 @@ def design(
     for line in designed.left_out:
         say("note", line)
     tell(f"open {designed.page}")
-    give_result(place)
+    give_result(out)

@@ -45,6 +45,7 @@ from emmc_rig.progress import Watcher
 console = Console(stderr=True)
 json_wanted: ContextVar[bool] = ContextVar("json_wanted", default=False)
 """Whether the running command was given --json."""
+VERDICT_COLOURS = {"trust": "green", "cannot tell": "cyan", "doubt": "yellow", "do not use": "red"}
 
 
 def tell(text: str = "", style: str | None = None) -> None:
@@ -53,6 +54,20 @@ def tell(text: str = "", style: str | None = None) -> None:
         emit("message", text=text)
     else:
         typer.secho(text, fg=style)
+
+
+def show_reason(level: str, what: str, remedy: str, figure: float) -> None:
+    """Print one reason in a line."""
+    tell(f"{level}: {what}; {remedy}", VERDICT_COLOURS[level])
+
+
+def show_verdict(verdict: dict) -> None:
+    """Print a verdict, a line for each reason."""
+    colour = VERDICT_COLOURS[verdict["level"]]
+    if not verdict["reasons"]:
+        tell("trust: the light field agrees with frames, Psi and noise", colour)
+    for reason in verdict["reasons"]:
+        show_reason(**reason)
 
 
 def say(label: str, text: object, style: str = "yellow") -> None:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from emmc_rig.commands.options import PARALLEL, ClusterOption, DictionaryOption, check_workers
-from emmc_rig.commands.output import give_result, say, shown_progress, tell
-from emmc_rig.commands.verdict import show_verdict
+from emmc_rig.commands.output import give_result, say, show_verdict, shown_progress, tell
 
 if TYPE_CHECKING:
     from emmc_rig.processing.captures import Capture

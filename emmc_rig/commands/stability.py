@@ -11,6 +11,7 @@ from emmc_rig.commands.options import (
     PARALLEL,
     ClusterOption,
     DictionaryOption,
+    OutOption,
     ScenesOption,
     SeedOption,
     SizeOption,
@@ -51,10 +52,7 @@ def stability(
         ),
     ] = None,
     cluster: ClusterOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="folder to write (default: emmc-stability)"),
-    ] = None,
+    out: OutOption = Path("emmc-stability"),
 ) -> None:
     """Find the strength of faults at which methods fail.
 
@@ -69,7 +67,6 @@ def stability(
         _list_faults()
         return
     check_workers(workers, cluster)
-    out = out or Path("emmc-stability")
     settings = stability_settings(
         fast, scene or [], parse_size(size), camera=camera or CAMERA, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,

@@ -27,7 +27,7 @@ SHOWN = {
     "emmc_rig/pages/session_sheet.py": "a report's next command",
     "emmc_rig/session/export.py": "what made a file is stored in it",
     "emmc_rig/study/chart/charting.py": "a report's next command",
-    "emmc_rig/study/design/design_page.py": "a report's next command",
+    "emmc_rig/study/design/designing.py": "a report's next command",
     "emmc_rig/study/design/search.py": "what made a camera is stored in it",
     "emmc_rig/study/stability/stability_run.py": "a report's next command",
     "emmc_rig/study/tables/tables_page.py": "a report's next command",

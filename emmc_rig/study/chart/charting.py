@@ -212,7 +212,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class ChartOutcome:
-    """The measured charts, and their page. left_out: what is missing and why, in words."""
+    """Charts and their page. left_out: points that are missing and why, in words."""
 
     charts: list[Chart]
     left_out: list[str]
@@ -308,7 +308,7 @@ def _about(study: ChartStudy, load: str, left_out: Sequence[str]) -> list[str]:
     settings = study.settings
     done = [result for result in study.results.values() if "failed" not in result]
     busy = any(result["load"] > available_cores() + 0.5 for result in done)
-    lines = [
+    return [
         f"{len(done)} points on {', '.join(Path(s).stem for s in settings.scenes)}, through "
         f"{', '.join(Path(c).stem for c in settings.cameras)}.",
         f"{machine()}; load average while measuring {load}. "
@@ -317,5 +317,5 @@ def _about(study: ChartStudy, load: str, left_out: Sequence[str]) -> list[str]:
             if busy
             else "The machine was quiet."
         ),
+        *([f"Excluded: {'; '.join(left_out)}."] if left_out else []),
     ]
-    return [*lines, *([f"Excluded: {'; '.join(left_out)}."] if left_out else [])]

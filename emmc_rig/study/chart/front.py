@@ -53,7 +53,7 @@ class Chart:
 def pareto_front(marks: Sequence[Mark]) -> list[Mark]:
     """Return the marks for which no other is as quick and more accurate, or the reverse."""
     found: list[Mark] = []
-    for mark in sorted(marks, key=lambda one: (one.seconds, -one.psnr_db)):
+    for mark in sorted(marks, key=lambda mark: (mark.seconds, -mark.psnr_db)):
         if not found or mark.psnr_db > found[-1].psnr_db:
             found.append(mark)
     return found

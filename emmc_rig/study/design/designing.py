@@ -13,10 +13,19 @@ import yaml
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.pages.page import (
+    Card,
+    Head,
+    Section,
+    fragment,
+    framed,
+    number,
+    provenance_section,
+    typed,
+)
 from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import result_folder
 from emmc_rig.study.design.bench import DesignBench, bench_text
-from emmc_rig.study.design.design_page import Table, design_page
 from emmc_rig.study.design.expected import SIZE, expected
 from emmc_rig.study.design.mask_file import (
     GDSII,
@@ -41,6 +50,16 @@ GOAL_DB = 1.5
 """Over the best shipped camera, from which a mask of one's own is worth its price."""
 SCENES = ("deep-occlusions", "near-planar", "non-lambertian")
 SIZE_PX = (96, 96)
+CAVEATS = (
+    "Theory assumes textures on two planes half a sample of disparity apart, and noise, without "
+    "occlusion. Differences of a tenth of a dB are below its accuracy.",
+    "Frames are simulated by the Psi of the mask as printed, on the grid of the reconstruction; "
+    "on a bench, calibration measures that Psi.",
+)
+SHOWN = 20
+"""Masks in the table."""
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Heads of the columns, and rows."""
 
 
 @dataclass(frozen=True)
@@ -144,18 +163,77 @@ def simulated_table(found: Sequence[Simulated]) -> Table:
     """Return the heads and rows of theory and simulation, a row a camera."""
     scenes = list(found[0].psnr_db)
     rows = [
-        [
-            camera.name,
-            *(f"{db:.2f}" for db in (camera.expected_db, camera.mean_db, *camera.psnr_db.values())),
-        ]
-        for camera in found
+        [row.name, *(f"{db:.2f}" for db in (row.expected_db, row.mean_db, *row.psnr_db.values()))]
+        for row in found
     ]
     return ("Camera", "Theory", "Simulated, mean", *scenes), rows
 
 
+def design_page(
+    about: Sequence[str],
+    found: Search,
+    simulated: Table,
+    verdict: str,
+    camera: Path,
+    provenance: Mapping[str, str],
+) -> str:
+    """Return the page of a design.
+
+    simulated: theory and simulation, a row a camera. camera: its file, as it will lie.
+    """
+    best = found.expected
+    loss_db = found.ideal_db - best.psnr_db
+    cards = (
+        Card(
+            "Expected PSNR",
+            f"{best.psnr_db:.2f} dB",
+            f"{found.held[0].worst_db:.2f} with the maker's worst error",
+        ),
+        Card("Light", f"{best.light:.0%}", "of the open camera's"),
+        Card("Fresnel number", f"{best.fresnel:.2g}", f"diffraction loses {loss_db:.2f} dB"),
+    )
+    names = list(found.held[0].psnr_db)
+    body = fragment(
+        "design.html",
+        cards=cards,
+        tried=(
+            ("Mask", "Expected PSNR, dB", "Light", "Fresnel number"),
+            [
+                [
+                    mask.label,
+                    f"{theory.psnr_db:.2f}",
+                    f"{theory.light:.0%}",
+                    f"{theory.fresnel:.2g}",
+                ]
+                for mask, theory in found.tried[:SHOWN]
+            ],
+        ),
+        held=(
+            ["Mask", *names],
+            [
+                [mask.candidate.label, *(number(mask.psnr_db[name], ".2f") for name in names)]
+                for mask in found.held
+            ],
+        ),
+        simulated=simulated,
+    )
+    sections = [Section("design", found.winner.label, body, "Design")]
+    sections.append(provenance_section(provenance))
+    head = Head(
+        found.winner.label,
+        verdict,
+        [
+            "try it on a scene of your own: "
+            f"`emmc-rig simulate --camera {typed(camera)} --scene FOLDER`",
+            "to have it made, send the mask's GDSII file, which is beside that camera",
+        ],
+    )
+    return framed("Which mask to order", about, CAVEATS, sections, head=head)
+
+
 @dataclass(frozen=True)
 class Designed:
-    """What was found and written. left_out: lines about what could not be."""
+    """The search, the comparison and the page. left_out: a line for each file not written."""
 
     found: Search
     simulated: tuple[Simulated, ...]
@@ -242,8 +320,8 @@ def _metrics(
         "winner": asdict(found.winner),
         "expected": asdict(found.expected),
         "expected_without_diffraction_db": found.ideal_db,
-        "manufacturing_db": {tested.candidate.label: dict(tested.psnr_db) for tested in found.held},
-        "tried": [{**asdict(candidate), **asdict(what)} for candidate, what in found.tried],
+        "manufacturing_db": {mask.candidate.label: dict(mask.psnr_db) for mask in found.held},
+        "tried": [{**asdict(mask), **asdict(theory)} for mask, theory in found.tried],
         "simulated": [asdict(camera) for camera in compared],
         "settings": bench.model_dump(mode="json"),
     }

@@ -107,7 +107,7 @@ def candidates(bench: DesignBench) -> list[Candidate]:
             patterns, bench.tried_cells_um, bench.distances_mm, steps
         )
     ]
-    within = [one for one in every if one.is_within(bench)]
+    within = [mask for mask in every if mask.is_within(bench)]
     if not within:
         raise AppError(
             "no mask is left to choose from: let the maker print a family, smaller cells, or give "
@@ -178,7 +178,7 @@ def search(bench: DesignBench, watcher: Watcher) -> Search:
         figures = {name: _expected(bench, candidate, how).psnr_db for name, how in errors}
         held.append(Held(candidate, figures))
         watcher.step(candidate.label)
-    held.sort(key=lambda one: -one.worst_db)
+    held.sort(key=lambda finalist: -finalist.worst_db)
     ideal = _expected(bench, held[0].candidate, Print(diffraction=False))
     return Search(tuple(ordered), tuple(held), ideal.psnr_db)
 
@@ -186,7 +186,7 @@ def search(bench: DesignBench, watcher: Watcher) -> Search:
 def _beside(at: Candidate, every: Sequence[Candidate], changed: Sequence[str]) -> list[Candidate]:
     """Return the candidates that differ from one by these properties alone."""
     same = [name for name in at.__dataclass_fields__ if name not in changed]
-    return [one for one in every if all(getattr(one, n) == getattr(at, n) for n in same)]
+    return [mask for mask in every if all(getattr(mask, n) == getattr(at, n) for n in same)]
 
 
 def _expected(bench: DesignBench, candidate: Candidate, how: Print) -> Expected:

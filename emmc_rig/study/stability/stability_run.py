@@ -85,7 +85,7 @@ CAVEATS = (
 
 @dataclass(frozen=True)
 class StabilityOutcome:
-    """The measured curves, and their page. left_out: in words, what is missing, why."""
+    """Curves and the page of a sweep. left_out: points that are missing and why, in words."""
 
     curves: list[Curve]
     left_out: list[str]
@@ -189,11 +189,11 @@ def _row(point: Point, result: dict) -> dict[str, object]:
 def _about(study: StabilityStudy, left_out: Sequence[str]) -> list[str]:
     settings = study.settings
     size = "whole views" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
-    lines = [
+    return [
         f"{len(study.results)} points on {', '.join(Path(s).stem for s in settings.scenes)}, "
-        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}."
+        f"{size}, through {Path(settings.camera).stem}; seed {settings.seed}.",
+        *([f"Excluded: {'; '.join(left_out)}."] if left_out else []),
     ]
-    return [*lines, *([f"Excluded: {'; '.join(left_out)}."] if left_out else [])]
 
 
 def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) -> Path:
@@ -201,8 +201,8 @@ def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) ->
     faults = list(dict.fromkeys(curve.fault.name for curve in curves))
     panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
     figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(COLUMNS, len(panels)))
-    for axis, some in zip(axes, panels, strict=True):
-        _panel(axis, some, colours)
+    for panel_axes, some in zip(axes, panels, strict=True):
+        _panel(panel_axes, some, colours)
     _legend(figure, curves, colours)
     return save_drawing(figure, path)
 

@@ -48,9 +48,7 @@ class StabilitySettings(Settings):
     @property
     def captures(self) -> list[Capture]:
         """Every scene through the camera."""
-        return [
-            Capture(scene, self.camera, self.size, self.seed, self.zoom) for scene in self.scenes
-        ]
+        return [Capture(s, self.camera, self.size, self.seed, self.zoom) for s in self.scenes]
 
 
 def stability_settings(

@@ -238,7 +238,9 @@ class TablesStudy(Study[Cell]):
                 dictionary = self.dictionary(setup.binning)
                 if patches is None:
                     started = time.perf_counter()
-                    patches = _coded(made, dictionary, settings.sparse)
+                    inputs = checked_inputs(made.psi, made.frames)
+                    # Dict-ADMM ends with these patches; TV-Dict starts from them.
+                    patches = estimate_patches(made.psi, inputs, dictionary, settings.sparse)
                     coding_s = time.perf_counter() - started
             result = solvers.reconstruct(
                 cell.method, made.psi, made.frames, dictionary, settings,
@@ -254,8 +256,3 @@ class TablesStudy(Study[Cell]):
                 "status": result.status,
                 "advice": result.advice,
             }
-
-
-def _coded(made: Trial, dictionary: Dictionary, settings: SparseSettings) -> PatchEstimates:
-    """Return the patches of Dict-ADMM, from which TV-Dict goes on."""
-    return estimate_patches(made.psi, checked_inputs(made.psi, made.frames), dictionary, settings)
