@@ -202,7 +202,9 @@ def check_few(size: Size, seed: int) -> Iterator[Row]:
     settings = settings_for(size, seed, few=True, target=0.005 if size.rays > 1000 else 0.02)
     boards = simulated_plan(settings).whiteboards
     assert boards is not None
-    yield Row("few: whiteboards", sum(one.repeats for one in boards.open if not one.validation), 12)
+    yield Row(
+        "few: whiteboards", sum(board.repeats for board in boards.open if not board.validation), 12
+    )
     yield from _error_rows("few", calibrate_simulated(settings).found.metrics, 0.005)
 
 
@@ -245,10 +247,12 @@ def check_session(size: Size, seed: int) -> Iterator[Row]:
 
 
 def scenes(count: int) -> Sequence[str]:
-    """Return scenes: real ones where EMMC_LIGHTFIELDS has them, else built-in ones."""
+    """Return names of scenes: REAL_SCENES of EMMC_LIGHTFIELDS if present, else BUILT_IN."""
     folder = os.environ.get("EMMC_LIGHTFIELDS")
     real = [str(Path(folder) / name) for name in REAL_SCENES] if folder else []
-    return (real if real and all(Path(one).is_dir() for one in real) else list(BUILT_IN))[:count]
+    return (real if real and all(Path(folder).is_dir() for folder in real) else list(BUILT_IN))[
+        :count
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,8 +400,8 @@ def drawn(
 def draw_session(folder: Path, settings: CalibrateSettings, channels: NDArray[np.uint8]) -> Shadow:
     """Write a session of every view as a mask off its design draws it; return that mask's shadow.
 
-    Rays through 24 megapixels would take days, so that this one check inverts the model that made
-    its data: it asks for memory and time. With shot and read noise.
+    Rays through 24 megapixels would take days: this check of memory and time inverts the model that
+    made its data. With shot and read noise.
     """
     camera, noise = settings.camera, settings.camera.sensor.noise
     mask = shadow_mask(camera, settings.size)

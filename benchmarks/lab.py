@@ -7,7 +7,7 @@ import csv
 import datetime
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import joblib
@@ -15,7 +15,6 @@ import matplotlib
 import pandas as pd
 
 import emmc_rig
-from emmc_rig.study.trial import Capture
 
 matplotlib.use("Agg")
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
@@ -63,19 +62,17 @@ def parsed(parser: argparse.ArgumentParser, given: Sequence[str] | None = None):
     return args
 
 
-def captures(args, **changed: object) -> list[Capture]:
-    """Return each scene through the camera."""
-    return [
-        Capture(scene, args.camera, args.size, args.seed, **changed)  # pyright: ignore
-        for scene in args.scenes
-    ]
+def points(args, choices: Iterable[Mapping]) -> list[dict]:
+    """Return each scene with each choice: keywords of a `measure`, beside camera, size and seed."""
+    shared, choices = {"camera": args.camera, "size": args.size, "seed": args.seed}, list(choices)
+    return [{"scene": scene, **shared, **choice} for scene in args.scenes for choice in choices]
 
 
 def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, args) -> pd.DataFrame:
-    """Return a row for each point: the point's values and what `measure(**point)` returns.
+    """Return a row for each point: the point's values and those of `measure(**point)`.
 
-    Rows are kept in NAME.csv as they are done; those that it holds are not measured again. Delete
-    the file after a change of the program. The run's command and date go into RUNS.
+    NAME.csv keeps each finished row, and a later run skips it: delete the file after a change of
+    the program. The run's command and date go into RUNS.
     """
     points = list(points)
     path = args.out / f"{name}.csv"

@@ -259,13 +259,13 @@ def test_a_resumed_training_is_the_undisturbed_one():
 
 def test_the_same_seed_gives_the_same_result_and_another_another():
     _, patches = planted(300, noise=0.1)
-    one, same, other = (
+    first, same, other = (
         learn_ksvd(patches, SHAPE, settings_of(iterations=2, seed=seed)) for seed in (5, 5, 6)
     )
-    assert one.history == same.history
-    for key, array in arrays(one).items():
+    assert first.history == same.history
+    for key, array in arrays(first).items():
         np.testing.assert_array_equal(array, arrays(same)[key])
-    assert one.history != other.history
+    assert first.history != other.history
 
 
 def test_every_step_is_seen_and_steps_do_not_change_their_input():
@@ -360,12 +360,12 @@ def test_patches_come_from_every_scene_evenly_and_by_the_seed():
     levels = training_patches(scenes, settings)[:, 0, 0, 0, 0, 0]
     assert np.unique(levels, return_counts=True)[1].tolist() == [10, 10]
     ramp = [ramp_scene]
-    one, same, other = (
+    first, same, other = (
         training_patches(ramp, PatchSettings(rows=4, columns=4, count=20, seed=seed))
         for seed in (1, 1, 2)
     )
-    np.testing.assert_array_equal(one, same)
-    assert (one != other).any()
+    np.testing.assert_array_equal(first, same)
+    assert (first != other).any()
 
 
 def test_every_scene_is_read_twice_one_at_a_time():

@@ -1,4 +1,4 @@
-"""The learned aperture: what is learned, what the error is, and what is refused."""
+"""The learned aperture: learned cells, error of the decoder, refused cameras."""
 
 import math
 
@@ -79,7 +79,6 @@ def test_learning_beats_every_random_aperture_and_leaves_little_light_out(moment
 
 
 def test_one_view_of_no_noise_is_known_and_nothing_else_of_independent_views():
-    """Views that say nothing of each other: a shot's error is what it does not see."""
     aperture = aperture_of(find_camera("learned-aperture"))
     size = VIEWS * PATCH_PX**2
     alone = Moments(np.full(VIEWS, 1e-9), np.eye(size).reshape(2 * (VIEWS, PATCH_PX**2)) * 1e6)
@@ -143,8 +142,8 @@ def test_the_shipped_aperture_is_better_than_a_random_one_by_the_moments_of_othe
     moments = patch_moments(3, 1, (5, 5))
     shipped = find_camera("learned-aperture")
     learned, random = (
-        decibels(one.error(one.cells(), moments))
-        for one in map(aperture_of, (shipped, random_aperture(shipped)))
+        decibels(aperture.error(aperture.cells(), moments))
+        for aperture in map(aperture_of, (shipped, random_aperture(shipped)))
     )
     assert learned > random + 1
 
@@ -159,11 +158,13 @@ def test_the_shipped_aperture_is_better_where_neither_worlds_nor_a_linear_decode
         decibels(
             np.mean(
                 np.square(
-                    reconstruct(one.psi(size), one.expose(grey, seed=0), "tv").light_field.mean(-1)
+                    reconstruct(
+                        camera.psi(size), camera.expose(grey, seed=0), "tv"
+                    ).light_field.mean(-1)
                     - grey[..., 0]
                 )
             )
         )
-        for one in (shipped, random_aperture(shipped))
+        for camera in (shipped, random_aperture(shipped))
     )
     assert learned > random + 1
