@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from programs import one_line
+from programs import done, refused
 
 from emmc_rig.acquisition.by_hand import HandPlaces, with_hands
 from emmc_rig.acquisition.expand import expand
@@ -118,7 +118,7 @@ def test_frames_show_where_hands_put_the_pinhole_within_what_they_state(name):
 
 THREE = {(0, 0): (0, 1), (1, 1): (2, 2), (2, 2): (1, 1)}
 TWENTY = {
-    (v, u): tuple(int(one) for one in np.add((v, u), step) % 5)
+    (v, u): tuple(int(index) for index in np.add((v, u), step) % 5)
     for (v, u), step in zip(
         list(np.ndindex(5, 5))[::-1][:20], [(0, 1), (1, 0), (1, 1), (4, 4), (2, 3)] * 4, strict=True
     )
@@ -149,8 +149,7 @@ def test_wrong_holes_are_named_and_asked_for_again(swaps, views, tmp_path, monke
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN | {"whiteboards": boards}))
     (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_x, mask_y]\nhands_um: 100\n")
     plan, rig = tmp_path / "plan.yaml", tmp_path / "rig.yaml"
-    code, _, err = run("capture", plan, "--rig", rig, "--size", "48x64", "--rays", 64)
-    assert code == 0, err
+    done(run("capture", plan, "--rig", rig, "--size", "48x64", "--rays", 64))
     session = Session(tmp_path / "plan-session")
     faults = [entry.fault for entry in of_kind(session.journal.entries, RetryEntry)]
     assert len(faults) == len(swaps)
@@ -168,9 +167,9 @@ def test_wrong_holes_are_named_and_asked_for_again(swaps, views, tmp_path, monke
 def test_a_simulated_rig_with_an_axis_that_no_bench_has_is_refused(tmp_path, run):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
     (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_z]\n")
-    code, _, err = run("capture", tmp_path / "plan.yaml", "--rig", tmp_path / "rig.yaml")
-    assert code == 1
-    assert "mask_z is no axis of the bench: use mask_x, mask_y" in one_line(err)
+    assert "mask_z is no axis of the bench: use mask_x, mask_y" in refused(
+        run("capture", tmp_path / "plan.yaml", "--rig", tmp_path / "rig.yaml")
+    )
 
 
 def test_a_bench_is_told_what_it_can_do_and_what_one_more_part_would_buy(tmp_path, run):

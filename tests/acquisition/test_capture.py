@@ -1,4 +1,4 @@
-"""The sequencer: what it takes, retries, refuses, and how it leaves the bench."""
+"""The sequencer: frames, retries, refusals, resumption, and the bench after a capture."""
 
 import errno
 import os
@@ -243,7 +243,7 @@ def test_a_resume_refuses_another_stage_unless_it_is_meant():
     with pytest.raises(AppError, match=r"begun with mask_y on .*, now it is on .* 999") as refused:
         refuse_other_devices(session, of_serial("999"))
     assert refused.value.advice == "other-devices"
-    # Meant, it goes on, and later runs are compared with that one.
+    # Later runs are compared with the stage that was meant.
     refuse_other_devices(session, of_serial("999"), meant=True)
     again = Session(session.folder, session.disk)
     again.discard(next(iter(again.stored)), "wanted once more")
@@ -416,8 +416,8 @@ def test_an_emergency_stop_is_never_argued_with():
 def test_what_has_to_be_mended_follows_from_the_fault():
     found = [mending(DriverError("x"), attempt) for attempt in range(1, 8)]
     assert found[0] == Mending(wait_s=0.1)
-    assert [one.wait_s for one in found] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
-    assert [one.reopen_camera for one in found] == [False, False, True, False, False, True, False]
+    assert [step.wait_s for step in found] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
+    assert [step.reopen_camera for step in found] == [False, False, True, False, False, True, False]
 
 
 def planned(kind):
@@ -446,10 +446,10 @@ def test_a_frame_that_cannot_be_right_is_refused(kind, level, line):
 
 
 def test_a_frame_that_comes_twice_is_refused_and_another_one_is_not():
-    one, other = frame_at(900), frame_at(900, seed=1)
-    check(planned("shot"), other, figures(other), one.mosaic, Checks())
+    frame, other = frame_at(900), frame_at(900, seed=1)
+    check(planned("shot"), other, figures(other), frame.mosaic, Checks())
     with pytest.raises(DriverError, match="is identical to the frame before it"):
-        check(planned("shot"), one, figures(one), one.mosaic.copy(), Checks())
+        check(planned("shot"), frame, figures(frame), frame.mosaic.copy(), Checks())
 
 
 def test_the_longer_exposures_of_a_bracket_may_saturate():

@@ -69,8 +69,8 @@ def session():
 def test_metered_shots_reach_the_level_alike_and_nothing_speaks_against_them(session):
     assert verify(session).is_complete
     shots = shot_exposures(session)
-    assert [one.shot for one in shots] == [0, 1, 2]
-    assert all(0.55 < one.level < 0.9 for one in shots)
+    assert [shot.shot for shot in shots] == [0, 1, 2]
+    assert all(0.55 < shot.level < 0.9 for shot in shots)
     assert len({session.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)}) == 1
     assert exposure_reasons(shots) == []
     assert not any(frame.is_optional for frame in session.needed)
@@ -89,7 +89,7 @@ def test_what_metering_asks_for_is_journalled_before_the_first_shot(session):
 def test_the_level_is_reached_in_dim_and_bright_scenes(brightness):
     session, outcome = captured(brightness=brightness)
     assert outcome.complete
-    assert all(0.55 < one.level < 0.9 for one in shot_exposures(session))
+    assert all(0.55 < shot.level < 0.9 for shot in shot_exposures(session))
 
 
 def test_shots_with_other_masks_are_metered_each_and_exposed_alike_unless_asked_otherwise():
@@ -111,7 +111,7 @@ def test_a_scene_with_a_bright_spot_is_bracketed_and_its_dark_part_read_with_les
     assert taken_s["shot-0-e1-r0"] == pytest.approx(
         BRACKET_STEP * taken_s["shot-0-e0-r0"], rel=0.01
     )
-    assert all(one.saturated < 0.01 for one in shot_exposures(session))
+    assert all(shot.saturated < 0.01 for shot in shot_exposures(session))
     assert verify(session).is_complete
     plain, _ = captured(AUTO + "metering: {bracket: false}\n", brightness=0.05, spot=8.0)
     assert not any(name.endswith("e1-r0") for name in plain.stored)
@@ -201,6 +201,6 @@ def test_less_light_than_metering_asks_for_is_reported_with_its_true_cost_in_noi
     text = AUTO.replace("auto", "0.02")
     session, _ = captured(text)
     (reason,) = exposure_reasons(shot_exposures(session))
-    level = min(one.level for one in shot_exposures(session))
+    level = min(shot.level for shot in shot_exposures(session))
     assert level == pytest.approx(0.06, abs=0.03)
     assert f"{10 * np.log10(0.7 / level):.1f} dB" in reason.what

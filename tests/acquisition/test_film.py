@@ -85,17 +85,17 @@ class Run:
     def lines(self):
         """The journal lines of the film's frames, in the order of time."""
         stored = self.session.stored
-        return [stored[one.id] for one in self.session.frames if one.film is not None
-                and one.id in stored]  # fmt: skip
+        return [stored[frame.id] for frame in self.session.frames if frame.film is not None
+                and frame.id in stored]  # fmt: skip
 
     @property
     def places(self):
-        return [int(one.id.removeprefix("film-")) for one in self.lines]
+        return [int(line.id.removeprefix("film-")) for line in self.lines]
 
     @property
     def dropped(self):
         entries = of_kind(self.session.journal.entries, DroppedEntry)
-        return {int(name[5:]): one.reason for one in entries for name in one.ids}
+        return {int(name[5:]): entry.reason for entry in entries for name in entry.ids}
 
     @property
     def segments(self):
@@ -108,13 +108,13 @@ def test_a_film_of_a_still_mask_comes_from_the_cameras_stream_at_its_rate():
     assert verify(run.session).is_complete
     assert run.places == list(range(12))
     film_s, camera_s = (
-        np.array([getattr(one, name) for one in run.lines], dtype=float)
+        np.array([getattr(line, name) for line in run.lines], dtype=float)
         for name in ("film_s", "camera_time_s")
     )
     np.testing.assert_allclose(film_s, np.arange(12) / 10, atol=1e-6)
     np.testing.assert_allclose(np.diff(camera_s), 0.1, atol=1e-6)
-    assert [int(one.metadata["block_id"]) for one in run.lines] == list(range(12))
-    assert [(one.segment, one.id, one.rate_hz) for one in run.segments] == [
+    assert [int(line.metadata["block_id"]) for line in run.lines] == list(range(12))
+    assert [(segment.segment, segment.id, segment.rate_hz) for segment in run.segments] == [
         (0, "film-000000", 10.0)
     ]
     assert not run.dropped
@@ -182,7 +182,7 @@ def test_a_stop_and_a_pause_keep_every_frame_and_the_film_goes_on_in_another_seg
     begun = int(run.segments[1].id.removeprefix("film-"))
     assert begun >= 5
     assert run.places == list(range(12))
-    assert [one.segment for one in run.lines] == [0] * begun + [1] * (12 - begun)
+    assert [line.segment for line in run.lines] == [0] * begun + [1] * (12 - begun)
     assert run.lines[begun].film_s == 0
     assert not run.dropped
 
@@ -211,7 +211,7 @@ def test_after_a_power_cut_what_is_stored_stays_and_the_rest_is_another_segment(
     assert run.go(rig=rig).complete
     assert run.lines[: len(before)] == before
     assert run.places == list(range(12))
-    assert {one.segment for one in run.lines[len(before) :]} == {run.segments[-1].segment}
+    assert {segment.segment for segment in run.lines[len(before) :]} == {run.segments[-1].segment}
     assert verify(run.session).is_complete
 
 
@@ -219,7 +219,7 @@ def test_a_camera_that_is_unplugged_in_a_film_goes_on_in_another_segment():
     run = Run()
     run.rig.still.faults.inject("unplug_in_payload", when=lambda block: block == 5)
     assert run.go().complete
-    assert {one.segment for one in run.lines} == {0, 1}
+    assert {line.segment for line in run.lines} == {0, 1}
     assert set(run.places) | set(run.dropped) == set(range(12))
     assert of_kind(run.session.journal.entries, RetryEntry)
 
@@ -229,10 +229,10 @@ def test_a_stepped_mask_goes_through_the_plans_shots_in_a_cycle():
     assert run.go().complete
     assert run.places == list(range(7))
     cell_um = planned_camera(run.plan).masks["mask"].cell_um
-    stood = [[one.read_um["mask_x"], one.read_um["mask_y"]] for one in run.lines]
+    stood = [[line.read_um["mask_x"], line.read_um["mask_y"]] for line in run.lines]
     cycle = np.array([[0, 0], [2, 0], [0, 2]]) * cell_um
     np.testing.assert_allclose(stood, cycle[np.arange(7) % 3], atol=1)
-    times_s = np.array([one.film_s for one in run.lines])
+    times_s = np.array([line.film_s for line in run.lines])
     np.testing.assert_allclose(times_s, np.arange(7) / 2, atol=0.05)
 
 
@@ -243,9 +243,9 @@ def test_frames_for_which_the_stage_comes_too_late_are_dropped_with_their_places
     session, plan = begun(ROOT, SimulatedDisk(), rig, text)
     assert Sequencer(session, plan, rig).run().complete
     gone = of_kind(session.journal.entries, DroppedEntry)
-    assert {one.reason for one in gone} == {films.LATE}
+    assert {entry.reason for entry in gone} == {films.LATE}
     taken = [name for name in session.stored if name.startswith("film")]
-    names = sorted([*taken, *(name for one in gone for name in one.ids)])
+    names = sorted([*taken, *(name for entry in gone for name in entry.ids)])
     assert names == [f"film-{place:06d}" for place in range(9)]
     for name in taken:
         due_s = int(name[5:]) / 2
@@ -277,7 +277,7 @@ class Stream(PreparedCamera):
 
 
 def arrived(ring):
-    return [one for one in ring if one is not None]
+    return [frame for frame in ring if frame is not None]
 
 
 def test_frames_take_the_place_nearest_in_time_and_those_of_a_faster_camera_are_passed_over():
@@ -350,7 +350,7 @@ def test_micro_managers_stream_becomes_a_film_at_the_plans_rate():
         )
         session, plan = begun(ROOT, SimulatedDisk(), rig, text)
         assert Sequencer(session, plan, rig).run().complete
-    gone = [name for one in of_kind(session.journal.entries, DroppedEntry) for name in one.ids]
+    gone = [name for entry in of_kind(session.journal.entries, DroppedEntry) for name in entry.ids]
     assert {*session.stored, *gone} == {frame.id for frame in session.frames}
     for name, entry in session.stored.items():
         # The camera sends some hundred a second.
@@ -363,7 +363,7 @@ def test_a_frame_of_a_film_is_not_taken_again():
     watcher = Acts(6, lambda: control.take_again(["film-000002"]))
     assert run.go(control, watcher).complete
     assert run.places == list(range(12))
-    assert any("cannot be taken again" in one for one in watcher.messages)
+    assert any("cannot be taken again" in message for message in watcher.messages)
 
 
 @pytest.mark.parametrize(
@@ -412,13 +412,13 @@ def test_a_metered_film_is_exposed_within_its_period():
     text = FILM.replace("exposure_s: 0.02", "exposure_s: auto").replace("rate: 10", "rate: 40")
     run = Run(text)
     assert run.go().complete
-    assert {one.exposure_s for one in run.lines} == {run.lines[0].exposure_s}
+    assert {line.exposure_s for line in run.lines} == {run.lines[0].exposure_s}
     assert run.lines[0].exposure_s <= 1 / 40
 
 
 def test_a_new_plan_shows_how_a_film_is_asked_for():
     text = new_plan("rgbw-bayer-1shot", find_camera("rgbw-bayer-1shot"))
-    line = next(one for one in text.splitlines() if one.startswith("# film:"))
+    line = next(text_line for text_line in text.splitlines() if text_line.startswith("# film:"))
     asked = Plan.model_validate(yaml.safe_load(text) | yaml.safe_load(line.removeprefix("# ")))
     assert asked.film is not None
     assert (asked.film.frames, asked.film.rate) == (200, 10)

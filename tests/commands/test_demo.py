@@ -1,4 +1,4 @@
-"""The whole loop, end to end: no step of it inverts the operator that made its data."""
+"""The whole loop, end to end: no step inverts the operator of the data."""
 
 import json
 import os
@@ -23,7 +23,7 @@ SIZE = (96, 128)
 
 
 class Recorder:
-    """A watcher that keeps what it is shown."""
+    """A watcher that keeps stages and steps."""
 
     def __init__(self):
         self.stages, self.steps = [], 0

@@ -1,4 +1,4 @@
-"""Files of another program become the session that the sequencer would have made of them."""
+"""Files of another program become a session equal to the sequencer's."""
 
 import csv
 import hashlib
@@ -13,7 +13,7 @@ import pytest
 import scipy.io
 import tifffile
 import yaml
-from programs import one_line, program
+from programs import done, one_line, program, refused
 
 from drivers.dng import Facts, encode_dng
 from emmc_rig.files.cameras import shipped_camera_files
@@ -165,8 +165,8 @@ def hdf5(path, mosaic):
 
 
 @pytest.mark.parametrize(
-    "form", [pytest.param(one, marks=[] if one == "npy" else pytest.mark.slow)
-             for one in FORMATS]
+    "form", [pytest.param(form, marks=[] if form == "npy" else pytest.mark.slow)
+             for form in FORMATS]
 )  # fmt: skip
 def test_shots_of_every_format_read_as_those_of_the_captured_session(shots_only, tmp_path, form):
     table = exported(Session(shots_only / "session"), tmp_path / "files", FORMATS[form])
@@ -478,7 +478,10 @@ IN_CHILDREN = ("no MAT", "ms for s of an OME-TIFF", "a folder")
 
 @pytest.mark.parametrize(
     "mistake",
-    [pytest.param(one, marks=pytest.mark.slow if one in IN_CHILDREN else []) for one in MISTAKES],
+    [
+        pytest.param(mistake, marks=pytest.mark.slow if mistake in IN_CHILDREN else [])
+        for mistake in MISTAKES
+    ],
 )
 def test_a_mistake_is_named_in_one_line_and_nothing_is_written(mistake, tmp_path, run):
     change, words = MISTAKES[mistake]
@@ -488,9 +491,7 @@ def test_a_mistake_is_named_in_one_line_and_nothing_is_written(mistake, tmp_path
     table = own if own.exists() else table_of(tmp_path, rows)
     camera = mine if mine.exists() else CAMERA
     before = sorted(tmp_path.rglob("*"))
-    code, _, err = run("import", table, "--camera", camera, "--out", tmp_path / "out")
-    assert code == 1
-    assert words in one_line(err)
+    assert words in refused(run("import", table, "--camera", camera, "--out", tmp_path / "out"))
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -520,8 +521,7 @@ def test_the_same_table_without_a_mistake_is_imported(way, tmp_path, run):
     WAYS[way](tmp_path, rows)
     own = tmp_path / "own.csv"
     table = own if own.exists() else table_of(tmp_path, rows)
-    code, out, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
-    assert code == 0, err
+    out = done(run("import", table, "--camera", CAMERA, "--out", tmp_path / "out"))
     assert "4 frames of 4 files imported and verified" in out
 
 
@@ -548,7 +548,7 @@ def test_pages_of_an_ome_tiff_are_shots_with_its_exposures_and_times(tmp_path, r
     assert np.array_equal(mosaics(session, "shot"), LIT[:2])
     assert np.array_equal(mosaics(session, "dark"), DARK)
     shots = [session.stored[frame.id] for frame in session.frames if frame.kind == "shot"]
-    assert [(one.exposure_s, one.host_time_s) for one in shots] == [(0.02, 0.5), (0.04, 2.0)]
+    assert [(shot.exposure_s, shot.host_time_s) for shot in shots] == [(0.02, 0.5), (0.04, 2.0)]
 
 
 @pytest.mark.slow
@@ -599,16 +599,14 @@ def test_milliseconds_that_only_the_light_shows_are_named(tmp_path, run):
     rows = world(tmp_path)
     all_rows(exposure_s=20)(tmp_path, rows)
     table = table_of(tmp_path, rows)
-    code, _, err = run("import", table, "--camera", "mine.yaml", "--out", "out")
-    assert code == 1
-    assert "ms for s in exposure_s?" in one_line(err)
+    assert "ms for s in exposure_s?" in refused(
+        run("import", table, "--camera", "mine.yaml", "--out", "out")
+    )
 
 
 def test_frames_cannot_be_added_to_an_imported_session(tmp_path, run):
     session, _ = imported(run, tmp_path, table_of(tmp_path, world(tmp_path)), "--camera", CAMERA)
-    code, _, err = run("capture", session.folder)
-    assert code == 1
-    assert "an imported session takes no further frames" in one_line(err)
+    assert "an imported session takes no further frames" in refused(run("capture", session.folder))
 
 
 def failing(fault):
@@ -627,9 +625,9 @@ def test_a_disk_that_is_full_leaves_nothing(where, tmp_path, run, monkeypatch):
         monkeypatch.setattr(Session, "store", fault)
     else:
         monkeypatch.setattr("emmc_rig.importing.session._reader", fault)
-    code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
-    assert code == 1
-    assert "No space left on device; nothing was imported" in one_line(err)
+    assert "No space left on device; nothing was imported" in refused(
+        run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
+    )
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -653,9 +651,7 @@ def test_a_file_that_goes_while_it_is_imported_is_named(then, words, tmp_path, r
         return write(*arguments)
 
     monkeypatch.setattr(importing, "write", later)
-    code, _, err = run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
-    assert code == 1
-    assert words in one_line(err)
+    assert words in refused(run("import", table, "--camera", CAMERA, "--out", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -671,9 +667,7 @@ OUTS = {
 def test_a_place_that_cannot_be_written_is_named(out, tmp_path, run):
     table = table_of(tmp_path, world(tmp_path))
     before = sorted(tmp_path.rglob("*"))
-    code, _, err = run("import", table, "--camera", CAMERA, "--out", out)
-    assert code == 1
-    assert OUTS[out] in one_line(err)
+    assert OUTS[out] in refused(run("import", table, "--camera", CAMERA, "--out", out))
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -689,9 +683,7 @@ def test_a_place_that_cannot_be_written_is_named(out, tmp_path, run):
 )
 def test_a_mistake_in_the_command_is_named(arguments, words, tmp_path, run):
     world(tmp_path)
-    code, _, err = run("import", *arguments, "--camera", CAMERA, "--out", "out")
-    assert code == 1
-    assert words in one_line(err)
+    assert words in refused(run("import", *arguments, "--camera", CAMERA, "--out", "out"))
     assert not (tmp_path / "out").exists()
 
 

@@ -41,7 +41,7 @@ def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     earlier: set[str] = set()
     for mode in MODES[command]:
-        own = next(one for one in COMMANDS[command].params if one.name == mode)
+        own = next(parameter for parameter in COMMANDS[command].params if parameter.name == mode)
         earlier.add(mode)
         for name, other, parameter in CASES:
             if (name, other) != (command, mode) or parameter.name in earlier:
@@ -57,7 +57,7 @@ def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):
 )
 def test_an_option_without_the_one_that_it_needs_is_refused(command, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    own = next(one for one in COMMANDS[command].params if one.name == name)
+    own = next(parameter for parameter in COMMANDS[command].params if parameter.name == name)
     code, _, err = program(command, *typed(own))
     assert code == 2
     assert "no effect without" in err.replace("\n", " ")

@@ -1,7 +1,7 @@
-"""No command deletes or overwrites what it did not make: every command against every bad place.
+"""No command deletes or overwrites the files of others: every command against every bad place.
 
-A command that writes needs its smallest arguments in WRITERS; one that writes nothing is named in
-READERS. A command in neither fails the first test.
+WRITERS holds the smallest arguments of each writing command, READERS the commands without files.
+A command in neither fails the first test.
 """
 
 import json
@@ -70,7 +70,10 @@ def commands(group, path=()):
         if hasattr(command, "commands"):
             yield from commands(command, (*path, name))
         else:
-            yield " ".join((*path, name)), [opt for one in command.params for opt in one.opts]
+            yield (
+                " ".join((*path, name)),
+                [opt for parameter in command.params for opt in parameter.opts],
+            )
 
 
 def test_every_command_is_known_here_and_those_that_name_a_place_to_write_are_tried():

@@ -1,4 +1,4 @@
-"""The set-up page: what it measures of a frame, what it does, and whom it refuses."""
+"""The set-up page: pictures and figures of a frame, moves and exposures, refused requests."""
 
 import http.client
 import json
@@ -466,7 +466,7 @@ def test_an_exposure_beyond_4_s_is_offered_and_not_taken_unasked():
         offered = until(watch, lambda state: state["hint"] and "values" in state["hint"])
         assert camera.exposure_s <= 4.0
         assert offered["hint"]["label"] == "expose for 20 s"
-        step = next(one for one in offered["steps"] if one["name"] == "exposure")
+        step = next(step for step in offered["steps"] if step["name"] == "exposure")
         assert step["label"] == "expose for 20 s"
         watch.auto_expose(**offered["hint"]["values"])
         done = until(watch, lambda state: max(state["figures"]["brightest"].values()) > 0.7)
@@ -667,13 +667,13 @@ def test_a_stop_is_carried_out_while_a_hundred_pages_follow():
             threading.Thread(target=ask, args=("GET", f"/{TOKEN}/events"), daemon=True)
             for _ in range(100)
         ]
-        for one in pages:
-            one.start()
+        for page in pages:
+            page.start()
         assert ask("POST", f"/{TOKEN}/do/stop", "{}")[0] == 200
         assert stage.stops
-        assert all(one.is_alive() for one in pages)
-    for one in pages:
-        one.join(PATIENCE_S)
+        assert all(page.is_alive() for page in pages)
+    for page in pages:
+        page.join(PATIENCE_S)
 
 
 @pytest.mark.parametrize(

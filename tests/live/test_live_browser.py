@@ -118,7 +118,7 @@ def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
     click(page, "#hint-do")
     wait(page, lambda: text(page, "hint") == "")
     wait(page, lambda: "\u00b0" in text(page, "rotation"))
-    shown = [float(one) for one in re.findall(r"-?[\d.]+", text(page, "rotation"))]
+    shown = [float(figure) for figure in re.findall(r"-?[\d.]+", text(page, "rotation"))]
     assert shown[0] == pytest.approx(-0.5, abs=0.1)
     stretched = float(re.findall(r"-?[\d.]+", text(page, "scale"))[0])
     assert stretched == pytest.approx(0.2, abs=0.1)

@@ -57,7 +57,7 @@ def test_autofocus_finds_where_the_simulated_lens_has_the_scene_sharp():
         assert found is not None
         assert found.place_um == pytest.approx(9000.0, abs=max(10.0, 4 * found.deviation_um))
         assert rig.stage.position_um("focus") == pytest.approx(found.place_um, abs=1)
-        step = next(one for one in ended["steps"] if one["name"] == "focus")
+        step = next(step for step in ended["steps"] if step["name"] == "focus")
         assert step["done"]
 
 
@@ -84,7 +84,7 @@ def test_without_a_focus_axis_it_is_said_why_and_what_to_do():
         state = until(watch, lambda state: state["steps"])
         with pytest.raises(AppError, match="no axis named focus"):
             watch.autofocus(100.0)
-        step = next(one for one in state["steps"] if one["name"] == "focus")
+        step = next(step for step in state["steps"] if step["name"] == "focus")
         assert "by hand" in step["text"]
         assert step["action"] == ""
 

@@ -1,4 +1,4 @@
-"""The page of a running capture, and what it does to it: pause, retake, finish."""
+"""The page of a running capture: pause, retake, finish."""
 
 import http.client
 import json
@@ -79,7 +79,7 @@ def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_wh
     session, outcome = page.run(plan)
     assert outcome.complete
     lines = [e for e in session.journal.entries if getattr(e, "id", "") == "shot-1-e0-r0"]
-    assert [one.kind for one in lines] == ["frame", "discarded", "frame"]
+    assert [line.kind for line in lines] == ["frame", "discarded", "frame"]
     assert page.reasons == [ALL_TAKEN, ALL_TAKEN]
     state = page.state()
     assert state["done"] == state["planned"] == len(session.needed)
@@ -91,9 +91,9 @@ def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan
     session, _ = page.run(plan)
     state = page.state()
     json.dumps(state, allow_nan=False)
-    shown = {one["id"]: one for one in state["frames"]}
+    shown = {frame["id"]: frame for frame in state["frames"]}
     assert set(shown) == set(session.stored)
-    assert all(one["stored"] for one in state["frames"])
+    assert all(frame["stored"] for frame in state["frames"])
     entry = session.stored["shot-1-e0-r0"]
     span = entry.white_level_dn - np.mean(entry.black_level_dn)
     assert shown["shot-1-e0-r0"]["level"] == pytest.approx(entry.figures.bright_dn / span)
@@ -120,7 +120,7 @@ def test_the_page_of_a_resumed_session_shows_what_was_taken_before(plan):
     Acting(folder).run(plan)
     page = Acting(folder)
     session, _ = page.run(folder)
-    assert {one["id"] for one in page.state()["frames"]} == set(session.stored)
+    assert {frame["id"] for frame in page.state()["frames"]} == set(session.stored)
     wanted = page.pictures["frame.jpg"]({"id": "shot-0-e0-r0"})
     assert wanted is not None
     assert wanted.make()[:2] == b"\xff\xd8"
@@ -154,7 +154,7 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
     assert wanted is not None
     given = json.loads(wanted.make())
     assert given["views"] == {"rows": 5, "columns": 5, "height": 32, "width": 40}
-    assert {one["key"] for one in given["overlays"]} >= {"disparity", "sigma"}
+    assert {overlay["key"] for overlay in given["overlays"]} >= {"disparity", "sigma"}
     assert page.state()["ended"]
 
 
@@ -192,7 +192,7 @@ def test_the_first_state_is_not_pushed_again_and_again(tmp_path):
 
 
 class Answering(SessionPage):
-    """A page on which somebody answers each wish, but for a last one at which the capture stops."""
+    """A page whose every wish is answered; stop_at: number of the wish at which it is stopped."""
 
     def __init__(self, folder, stop_at=None):
         self.control = Control()
@@ -224,19 +224,19 @@ def test_the_page_asks_for_a_hole_of_the_plate_and_says_which_one_it_was_instead
     page = Answering(tmp_path / "plan-session")
     capture_session(plan, rig, None, None, FrontEnd(page, page.ask, control=page.control))
     assert page.state()["by_hand"]
-    holes = [(one["hole"], last, one["refusal"]) for one, last in page.asks if one["hole"]]
+    holes = [(wish["hole"], last, wish["refusal"]) for wish, last in page.asks if wish["hole"]]
     assert holes == [
         ([0, 0], None, ""),
         ([1, 1], [0, 0], ""),
         ([1, 1], [1, 2], "That was hole 8 of 25 (row 2, column 3)."),
     ]
-    assert {tuple(one["views"]) for one, _ in page.asks if one["hole"]} == {(5, 5)}
-    others = [one for one, _ in page.asks if not one["hole"]]
-    assert "switch the white lamp on" in {one["text"] for one in others}
+    assert {tuple(wish["views"]) for wish, _ in page.asks if wish["hole"]} == {(5, 5)}
+    others = [wish for wish, _ in page.asks if not wish["hole"]]
+    assert "switch the white lamp on" in {wish["text"] for wish in others}
     # Nothing but the hole is asked for again.
-    assert not any(one["refusal"] for one in others)
-    assert [one["text"] for one in others].count("put the whiteboard before the camera") == 1
-    numbers = [one["number"] for one, _ in page.asks]
+    assert not any(wish["refusal"] for wish in others)
+    assert [wish["text"] for wish in others].count("put the whiteboard before the camera") == 1
+    numbers = [wish["number"] for wish, _ in page.asks]
     assert numbers == list(range(1, len(numbers) + 1))
 
 
@@ -247,7 +247,7 @@ def test_a_capture_that_somebody_finishes_instead_of_doing_what_is_asked_ends_at
     page = Answering(tmp_path / "plan-session", stop_at=1)
     with pytest.raises(StoppedError, match="stopped at once"):
         capture_session(plan, rig, None, None, FrontEnd(page, page.ask, control=page.control))
-    assert {one["text"] for one, _ in page.asks} == {"switch the lamp off"}
+    assert {wish["text"] for wish, _ in page.asks} == {"switch the lamp off"}
     assert not (tmp_path / "plan-session").exists()
 
 

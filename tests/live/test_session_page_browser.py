@@ -54,7 +54,7 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
             driver, PATIENCE_S, ignored_exceptions=[StaleElementReferenceException]
         )
 
-        def one(css):
+        def element(css):
             return driver.find_element(By.CSS_SELECTOR, css)
 
         def wait(holds):
@@ -62,22 +62,22 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
 
         page.start()
         run.start()
-        wait(lambda: "all frames are taken" in one("#waiting").text)
-        assert one("#title").text == PLAN["title"]
+        wait(lambda: "all frames are taken" in element("#waiting").text)
+        assert element("#title").text == PLAN["title"]
         tiles = driver.find_elements(By.CSS_SELECTOR, ".tile")
         assert len(tiles) == len(Session(folder).stored)
         assert "% of white" in tiles[0].text
-        assert not one("#field-stage").is_displayed()  # over a raw frame it would be misread
-        wait(lambda: one("[data-show=views]").is_displayed())
-        one("[data-show=views]").click()
-        wait(lambda: "adaptive-fast: " in one("#field-stage").text)
-        wait(lambda: one("#viewer").get_attribute("data-complete"))
-        assert one("#viewer-overlays").text.split("\n")[1:3] == ["nothing", "disparity"]
+        assert not element("#field-stage").is_displayed()  # over a raw frame it would be misread
+        wait(lambda: element("[data-show=views]").is_displayed())
+        element("[data-show=views]").click()
+        wait(lambda: "adaptive-fast: " in element("#field-stage").text)
+        wait(lambda: element("#viewer").get_attribute("data-complete"))
+        assert element("#viewer-overlays").text.split("\n")[1:3] == ["nothing", "disparity"]
         tiles[0].click()
-        assert one("#chosen").text == "1 chosen"
-        one("#retake").click()
-        wait(lambda: "taken once more: shot-0-e0-r0" in one("#messages").text)
-        wait(lambda: "all frames are taken" in one("#waiting").text)
+        assert element("#chosen").text == "1 chosen"
+        element("#retake").click()
+        wait(lambda: "taken once more: shot-0-e0-r0" in element("#messages").text)
+        wait(lambda: "all frames are taken" in element("#waiting").text)
         for width in (1600, 800, 390):
             driver.execute_cdp_cmd(
                 "Emulation.setDeviceMetricsOverride",
@@ -87,11 +87,11 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
                 "return [document.documentElement.scrollWidth, window.innerWidth]"
             )
             assert needed <= there
-        one("#finish").click()
+        element("#finish").click()
         run.join(PATIENCE_S)
         page.close()
-        wait(lambda: "Complete: every frame verified" in one("#end").text)
-        assert not one("#finish").is_displayed()
+        wait(lambda: "Complete: every frame verified" in element("#end").text)
+        assert not element("#finish").is_displayed()
         assert complaints(driver) == []
 
 
@@ -136,26 +136,29 @@ def test_a_person_with_a_phone_sees_the_hole_and_answers_with_finger_or_foot(tmp
         page.start()
         run.start()
 
-        def one(css):
+        def element(css):
             return driver.find_element(By.CSS_SELECTOR, css)
 
         def answer(asked):
-            wait_for(driver, lambda: one("#ask-text").text.lower() == asked["text"].lower())
-            wait_for(driver, lambda: one("#done").is_enabled())
+            wait_for(driver, lambda: element("#ask-text").text.lower() == asked["text"].lower())
+            wait_for(driver, lambda: element("#done").is_enabled())
             top, bottom, height = driver.execute_script(
                 "const box = document.getElementById('done').getBoundingClientRect();"
                 "return [box.top, box.bottom, innerHeight]"
             )
             assert 0 < top < bottom < height
-            assert one("#ask-refusal").text == asked["refusal"]
+            assert element("#ask-refusal").text == asked["refusal"]
             if asked["hole"]:
                 holes.append(
-                    (one("#plate text.wanted").text, one("#plate").get_attribute("aria-label"))
+                    (
+                        element("#plate text.wanted").text,
+                        element("#plate").get_attribute("aria-label"),
+                    )
                 )
             if asked["number"] % 3 == 0:
-                one("#done").click()
+                element("#done").click()
             else:
-                one("body").send_keys(Keys.SPACE if asked["number"] % 3 == 1 else Keys.ENTER)
+                element("body").send_keys(Keys.SPACE if asked["number"] % 3 == 1 else Keys.ENTER)
 
         holes = []
         while asked := page.wishes.get(timeout=PATIENCE_S):
@@ -166,11 +169,11 @@ def test_a_person_with_a_phone_sees_the_hole_and_answers_with_finger_or_foot(tmp
             ("7", plate + "7 is wanted, 1 was the last"),
             ("7", plate + "7 is wanted, 8 was the last"),
         ]
-        wait_for(driver, lambda: not one("#done").is_displayed())
-        one("#finish").click()
+        wait_for(driver, lambda: not element("#done").is_displayed())
+        element("#finish").click()
         run.join(PATIENCE_S)
         page.close()
-        wait_for(driver, lambda: "Complete: every frame verified" in one("#end").text)
+        wait_for(driver, lambda: "Complete: every frame verified" in element("#end").text)
         assert complaints(driver) == []
 
 
@@ -196,7 +199,7 @@ def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
         tiles = "return document.querySelectorAll('.tile').length"
         wait_for(driver, lambda: driver.execute_script(tiles) == 150)
         groups = driver.find_elements(By.CSS_SELECTOR, "#frames details")
-        assert [one.get_attribute("open") is not None for one in groups] == [True] + 4 * [False]
+        assert [group.get_attribute("open") is not None for group in groups] == [True] + 4 * [False]
         assert groups[0].text.startswith("Shots: the scene")
         assert "13, 70 % of white, 1 saturated" in groups[1].text
         tall = "return document.documentElement.scrollHeight"

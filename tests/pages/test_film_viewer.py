@@ -1,4 +1,4 @@
-"""The page of a film: every frame's light field on one scale, its size, and what it says first."""
+"""The page of a film: all light fields on one scale, size of the page, head."""
 
 import json
 import re
@@ -32,7 +32,7 @@ def page(film):
 def test_the_page_has_all_frames_and_loads_nothing(page):
     assert Page(page).foreign == []
     data = page_data(page)
-    assert [one is not None for one in data["frames"]] == [True] * 3 + [False] + [True] * 2
+    assert [frame is not None for frame in data["frames"]] == [True] * 3 + [False] + [True] * 2
     assert data["levels"] == ["doubt", "trust", "doubt", "", "trust", "trust"]
     assert data["rate"] == 8.0
     assert len(data["times_s"]) == 6
@@ -40,16 +40,16 @@ def test_the_page_has_all_frames_and_loads_nothing(page):
 
 
 def test_brightness_focus_and_colours_mean_the_same_in_all_frames(page):
-    frames = [one for one in page_data(page)["frames"] if one]
+    frames = [frame for frame in page_data(page)["frames"] if frame]
     for key in ("gamma", "scale", "views", "tile"):
-        assert all(one[key] == frames[0][key] for one in frames)
-    assert len({(one["focus"]["low"], one["focus"]["high"]) for one in frames}) == 1
-    for overlays in zip(*(one["overlays"] for one in frames), strict=True):
-        assert len({(one["key"], one["low"], one["high"]) for one in overlays}) == 1
+        assert all(frame[key] == frames[0][key] for frame in frames)
+    assert len({(frame["focus"]["low"], frame["focus"]["high"]) for frame in frames}) == 1
+    for overlays in zip(*(frame["overlays"] for frame in frames), strict=True):
+        assert len({(overlay["key"], overlay["low"], overlay["high"]) for overlay in overlays}) == 1
 
 
 def picture_bytes(text):
-    return sum(len(one["estimate"]) * 3 / 4 for one in page_data(text)["frames"] if one)
+    return sum(len(frame["estimate"]) * 3 / 4 for frame in page_data(text)["frames"] if frame)
 
 
 def test_a_long_film_has_smaller_pictures_of_fewer_bytes(film, page, monkeypatch):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from programs import done
 
 from calibration.boards import Board
 from calibration.locator import register
@@ -236,15 +237,16 @@ def test_the_command_writes_a_camera_a_mask_and_a_page_that_other_commands_take(
     monkeypatch.setattr("emmc_rig.study.design.expected.PLACES", 1)
     (tmp_path / "bench.yaml").write_text(yaml.safe_dump(BENCH))
     small = ("--scene", "near-planar", "--size", "32x40")
-    code, out, err = run("design", "bench.yaml", *small)
-    assert code == 0, err
+    out = done(run("design", "bench.yaml", *small))
     assert "best shipped camera" in out
     metrics = json.loads((tmp_path / "emmc-design/metrics.json").read_text())
     assert metrics["winner"]["family"] == "random_binary"
     assert len(metrics["tried"]) == 1
-    assert {one["name"] for one in metrics["simulated"]} >= {"this design", "rgbw-bayer-1shot"}
-    code, _, err = run("simulate", "--camera", "emmc-design/camera.yaml", *small)
-    assert code == 0, err
+    assert {camera["name"] for camera in metrics["simulated"]} >= {
+        "this design",
+        "rgbw-bayer-1shot",
+    }
+    done(run("simulate", "--camera", "emmc-design/camera.yaml", *small))
 
 
 @pytest.mark.parametrize(

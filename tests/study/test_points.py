@@ -156,8 +156,8 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(tmp_path, monkeypatch):
 
 
 def test_two_runs_may_share_a_folder(tmp_path):
-    one, other = (Squares(None, tmp_path) for _ in range(2))
-    assert one.run([1, 2], Silent()) == other.run([1, 2], Silent())
+    first, other = (Squares(None, tmp_path) for _ in range(2))
+    assert first.run([1, 2], Silent()) == other.run([1, 2], Silent())
     assert other.calls == []
 
 

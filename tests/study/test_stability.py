@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 from pages import Page
 from pools import Posting
+from programs import done
 from view_files import save_views
 
 from emmc_rig.files.results import METRICS
@@ -208,8 +209,8 @@ def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undraw
         lines = (tmp_path / name / StabilityStudy.journal).read_text().splitlines()
         assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
     assert list(found[0]) == list(found[1])
-    for point, one in found[0].items():
-        assert found[1][point]["psnr_db"] == pytest.approx(one["psnr_db"], abs=1e-3)
+    for point, figures in found[0].items():
+        assert found[1][point]["psnr_db"] == pytest.approx(figures["psnr_db"], abs=1e-3)
 
 
 def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path):
@@ -249,16 +250,14 @@ def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
 
 
 def test_the_command_prints_the_table(few_steps, run):
-    one = ("--scene", "dark", "--fault", "flicker", "--method", "tv", "--size", "24x32")
-    code, out, _ = run("stability", "--fast", *one)
-    assert code == 0
+    typed = ("--scene", "dark", "--fault", "flicker", "--method", "tv", "--size", "24x32")
+    out = done(run("stability", "--fast", *typed))
     assert "Lamp flicker" in out
     assert "stability.html" in out
 
 
 def test_the_command_lists_its_faults(run):
-    code, out, _ = run("stability", "--list")
-    assert code == 0
+    out = done(run("stability", "--list"))
     for name in FAULTS:
         assert name in out
 
