@@ -123,13 +123,9 @@ class _Frame:
         self.across, self.up = across, up
 
     def x(self, value: float) -> float:
-        low, high = self.across
-        share = (
-            (math.log(value) - math.log(low)) / (math.log(high) - math.log(low))
-            if self.log
-            else (value - low) / (high - low)
-        )
-        return self.left + share * (WIDTH - 24 - self.left)
+        scale = math.log if self.log else float
+        low, high, at = map(scale, (*self.across, value))
+        return self.left + (at - low) / (high - low) * (WIDTH - 24 - self.left)
 
     def y(self, value: float) -> float:
         low, high = self.up
