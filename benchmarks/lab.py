@@ -39,7 +39,7 @@ def arguments(
     parser.add_argument("--scene", action="append", help=f"may repeat; default: {scenes}")
     parser.add_argument("--group", choices="AB", help="of the real light fields, instead of scenes")
     parser.add_argument("--camera", default=camera)
-    parser.add_argument("--size", default=size, help="rows x columns of each scene's middle")
+    parser.add_argument("--size", default=size, help="rows x columns of the middle, or whole")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=RESULTS)
@@ -49,9 +49,10 @@ def arguments(
 
 
 def parsed(parser: argparse.ArgumentParser, given: Sequence[str] | None = None):
-    """Return the arguments, `size` as rows and columns, `scenes` as chosen."""
+    """Return the arguments, `size` as rows and columns or None, `scenes` as chosen."""
     args = parser.parse_args(given)
-    args.size = tuple(int(side) for side in args.size.lower().split("x"))
+    sides = args.size.lower().split("x")
+    args.size = None if sides == ["whole"] else tuple(map(int, sides))
     if args.group:
         folder = Path(os.environ["EMMC_LIGHTFIELDS"])
         args.scenes = [str(folder / name) for name in (GROUP_A if args.group == "A" else GROUP_B)]

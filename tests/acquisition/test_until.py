@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from capture_rigs import begun, still_rig
-from programs import done, one_line, program
+from programs import done, program
 from simulated_disk import SimulatedDisk
 
 from emmc_rig.acquisition.sequencer import Sequencer
@@ -229,30 +229,6 @@ def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_
     assert "1 taken" in out
     assert path.read_bytes() == good
     assert len(of_kind(Session(copy).journal.entries, DecidedEntry)) == 1
-
-
-@pytest.mark.parametrize(
-    ("changes", "until", "line"),
-    [
-        ({}, "much", "--until much: write a PSNR"),
-        ({}, "0", "--until 0: write a PSNR"),
-        ({}, "nan", "--until nan: write a PSNR"),
-        ({"shots": [{}]}, "30", "one shot"),
-        ({"whiteboards": None}, "30", "no whiteboards"),
-        ({"darks": None}, "30", "no darks"),
-        ({"whiteboards": {"views": [[1, 1]]}}, "30", "neither open whiteboards nor the pinhole"),
-        ({"whiteboards": {"shots": [0]}}, "30", "neither open whiteboards nor the pinhole"),
-        ({"whiteboards": {"open": [{}]}}, "30", "has `validation: true`"),
-    ],
-)
-def test_a_capture_that_cannot_spare_shots_says_why_and_makes_nothing(
-    tmp_path, changes, until, line
-):
-    path = plan_file(tmp_path, **changes)
-    code, _, err = program("capture", path, *RIG, "--until", until, "--out", tmp_path / "s")
-    assert code == (2 if "write a PSNR" in line else 1)
-    assert line in one_line(err)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["camera.yaml", "plan.yaml"]
 
 
 def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cost():

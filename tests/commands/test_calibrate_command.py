@@ -118,25 +118,6 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
     assert frames[1] > frames[0]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--target", "0.00001"], "cannot be reached: the best is"),
-        (["--target", "0.0015", "--frames", "70"], "cannot be reached with 70 frames: the best is"),
-        (["--frames", "12"], "a plan opens each of the 9 views at least once"),
-    ],
-)
-def test_a_plan_that_cannot_be_says_what_is_best_and_writes_nothing(
-    run, camera_file, tmp_path, arguments, message
-):
-    out = tmp_path / "plan"
-    code, _, error = run("calibrate", "--camera", camera_file, *SIZE, "--plan", *arguments,
-                         "--out", out)  # fmt: skip
-    assert code == 1
-    assert message in " ".join(error.split())
-    assert not out.exists()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("flaws", [(ORDINARY,), (TOGETHER,)])
 def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_the_bench(
@@ -160,27 +141,6 @@ def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_t
         for named in ("tilted", "bowed", "lamp drifted", "response loses", "uneven",
                       "colour filters"):  # fmt: skip
             assert named in found
-
-
-def test_a_size_that_is_none_is_wrong_usage(run, tmp_path):
-    code, _, error = run("calibrate", "--plan", "--size", "32", "--out", tmp_path / "result")
-    assert code == 2
-    assert "write ROWSxCOLUMNS" in " ".join(error.split())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--target", "2"], "a relative error lies between 0 and 1"),
-        (["--camera", "conventional"], "one mask between lens and sensor"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, arguments, message):
-    code, _, error = run("calibrate", "--plan", *SIZE, *arguments, "--out", tmp_path / "result")
-    assert code == 1
-    assert message in " ".join(error.split())
-    assert "Traceback" not in error
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_error_of_psi_leaves_bad_pixels_out_and_counts_colours_not_stored(coded_psi):

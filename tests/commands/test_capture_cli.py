@@ -251,42 +251,6 @@ def test_a_dry_run_reports_what_it_will_take_and_makes_nothing(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["capture", "nothing.yaml", *RIG], "no such file"),
-        (["capture", "plan.yaml"], "say which rig"),
-        (["capture", "plan.yaml", "--rig", "real"], "name of a YAML file of devices"),
-        (["capture", "plan.yaml", "--rig", "no.yaml"], "no.yaml: no such file"),
-        (["capture", "plan.yaml", "--rig", "simulated", "--size", "16x24"], "use 22x22 or more"),
-        (["capture", "plan.yaml", "--rig", "simulated", "--scene", "drak"], "did you mean 'dark'"),
-        (["capture", "--new", "rgbw"], "did you mean"),
-        (["capture", "plan.yaml", *RIG, "--out", "occupied"], "something else than a session"),
-        (["capture", "plan.yaml", *RIG, "--out", "plan.yaml"], "something else than a session"),
-        (["session", "show", "occupied"], "no session"),
-        (["session", "list", "occupied"], "holds no session"),
-        (["session", "export", "occupied", "--out", "x.h5"], "no session"),
-    ],
-)
-def test_bad_input_gives_one_line_and_makes_nothing(run, tmp_path, arguments, line):
-    plan_file(tmp_path)
-    (tmp_path / "occupied").mkdir()
-    (tmp_path / "occupied" / "thesis.txt").write_text("mine")
-    before = sorted(tmp_path.rglob("*"))
-    assert line in refused(run(*arguments))
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize(
-    ("option", "line"), [("--size", "write ROWSxCOLUMNS"), ("--until", "write a PSNR")]
-)
-def test_an_option_that_cannot_be_read_is_wrong_usage(run, tmp_path, option, line):
-    plan_file(tmp_path)
-    code, _, err = run("capture", "plan.yaml", "--rig", "simulated", option, "nan")
-    assert code == 2
-    assert line in one_line(err)
-
-
 def test_an_edited_plan_holds_for_what_is_not_taken_yet(captured, run, tmp_path):
     copy = tmp_path / "copy"
     subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
@@ -468,17 +432,3 @@ def test_sessions_are_listed_with_verdict_and_psnr_below_a_folder(captured, run,
     _, out, _ = run("session", "list", tmp_path)
     assert "a/one" in out
     assert "27.5" in out
-
-
-@pytest.mark.parametrize(
-    ("axis", "reported"),
-    [("lens", "the stage has no such axis, only mask_x"), ("mask_x", "give its zero_um instead")],
-)
-def test_a_place_for_an_axis_that_a_rig_cannot_keep_is_refused(run, tmp_path, axis, reported):
-    (tmp_path / "rig.yaml").write_text(
-        f"kind: simulated\nfocus_um: 9000\nstands_um: {{{axis}: 100}}\n"
-    )
-    plan_file(tmp_path)
-    rig = ("--rig", tmp_path / "rig.yaml", "--size", "24x32")
-    assert reported in refused(run("capture", tmp_path / "plan.yaml", *rig))
-    assert not (tmp_path / "plan-session").exists()

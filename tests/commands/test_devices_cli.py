@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from programs import done, one_line, refused, wait_until
+from programs import done, one_line, wait_until
 from serial.tools import list_ports
 
 from drivers.apt import ACTUATORS, AptAxis, AptStage
@@ -188,29 +188,6 @@ def test_ports_are_listed_with_their_holder(run, monkeypatch):
 def test_the_udev_rule_is_printed(run):
     code, out, _ = run("udev-rule")
     assert (code, out.splitlines()[-1]) == (0, 'LABEL="emmc_rig_end"')
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reported"),
-    [
-        (["info", "--stage", "zaber:/dev/no-such-port"], "does not exist"),
-        (["info", "--stage", "teapot:/dev/ttyUSB0"], "one of zaber, grbl, apt"),
-        (["info", "--stage", "zaber:"], "write PROTOCOL:PORT"),
-        (["info", "--stage", "nowhere.yaml"], "no such file"),
-        (["info", "--rig", "simulated:teapot"], "use one of zaber, grbl, apt"),
-        (["jog", "--rig", "simulated", "mask_z", "5"], "use one of mask_x"),
-        (["jog", "--rig", "simulated", "--home", "mask_x", "1e9"], "choose 10 to"),
-        (["jog", "--rig", "simulated", "mask_x", "5", "--speed", "0"], "cannot move at 0"),
-        (["probe", "/dev/no-such-port"], "does not exist"),
-    ],
-)
-def test_faults_are_one_line_that_says_what_to_do(run, arguments, reported):
-    assert reported in refused(run(*arguments))
-
-
-@pytest.mark.parametrize("arguments", [["info"], ["info", "--rig", "real"], ["jog", "x"]])
-def test_wrong_usage_is_exit_code_2(run, arguments):
-    assert run(*arguments)[0] == 2
 
 
 @pytest.mark.parametrize(

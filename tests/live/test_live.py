@@ -762,24 +762,6 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(tmp_path):
     assert err == ""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "reported"),
-    [
-        (("--camera", "nonsense:"), 1, "no such camera driver"),
-        (("--rig", "nowhere.yaml"), 1, "nowhere.yaml"),
-        (("--rig", "simulated", "--camera", "simulated"), 2, "either --rig"),
-        (("--rig", "simulated", "--host", "203.0.113.7"), 1, "cannot serve"),
-        (("--camera", "simulated", "--method", "tv"), 2, "needs --psi"),
-        (("--rig", "simulated", "--size", "32x48", "--psi", "nowhere"), 1, "no Psi"),
-    ],
-)
-def test_bad_arguments_are_reported_in_one_line(arguments, code, reported, capsys):
-    assert exit_code("live", *arguments) == code
-    shown = capsys.readouterr().err
-    assert reported in shown.replace("\n", " ")
-    assert "Traceback" not in shown
-
-
 def test_a_port_in_use_is_reported(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])

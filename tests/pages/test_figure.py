@@ -155,13 +155,6 @@ def test_the_command_writes_vectors_with_their_fonts_and_the_caption_inside(tmp_
     assert re.sub(r"\s", "", caption)[:40] in re.sub(r"\s", "", svg)
 
 
-@pytest.mark.parametrize("typed", [("--at", "3"), ("--view", "a,b"), ("--side", "2")])
-def test_a_place_that_is_no_place_is_wrong_usage(tmp_path, typed):
-    code, _, complaint = program("figure", "near-planar", *typed, "--out", tmp_path / "out")
-    assert code == 2, complaint
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_most_telling_piece_is_where_the_texture_is():
     picture = np.full((60, 80, 3), 0.5, np.float32)
     picture[30:42, 50:62] = np.random.default_rng(0).random((12, 12, 3))

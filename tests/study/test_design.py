@@ -247,29 +247,3 @@ def test_the_command_writes_a_camera_a_mask_and_a_page_that_other_commands_take(
         "rgbw-bayer-1shot",
     }
     done(run("simulate", "--camera", "emmc-design/camera.yaml", *small))
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"distance_mm": [0.12]}, "did you mean 'distances_mm'"),
-        ({"maker": {"smalest_cell_um": 24}}, "did you mean 'smallest_cell_um'"),
-        ({"cells_um": [12]}, "cannot be printed"),
-        ({"cells_um": [0.036, 36]}, "cannot be printed"),
-        ({"maker": {"smallest_cell_um": 24000}}, "are in um"),
-        ({"distances_mm": [120]}, "distances are in mm"),
-        ({"shots": 4, "stage_travel_um": [60, 60]}, "need 108 um"),
-        ({"open_shares": [50]}, "shares of the mask's area"),
-        ({"disparities_px": [1, -1]}, "the least, then the greatest"),
-        ({"families": ["random_rgbw"], "maker": {"colours": False}}, "cannot be printed"),
-        ({"sensor": {"cfa": "rggb", "binning": 2}}, "pixels of one sample"),
-        ({"size": "192x256"}, "size"),
-    ],
-)
-def test_a_bench_that_cannot_be_is_one_line(run, tmp_path, change, says):
-    (tmp_path / "bench.yaml").write_text(yaml.safe_dump({**BENCH, **change}))
-    code, _, err = run("design", "bench.yaml")
-    assert code == 1
-    assert says in err
-    assert len(err.strip().splitlines()) == 1
-    assert not (tmp_path / "emmc-design").exists()

@@ -260,30 +260,3 @@ def test_the_command_lists_its_faults(run):
     out = done(run("stability", "--list"))
     for name in FAULTS:
         assert name in out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("--fault", "flikker"), "fault flikker: did you mean 'flicker'?"),
-        (("--method", "tvv"), "no method 'tvv': did you mean 'tv'?"),
-        (("--size", "8x8"), "size 8x8: needs 16x16 or more"),
-        (("--camera", "rgbw-mono-1"), "rgbw-mono"),
-        (("--scene", "nowhere"), "nowhere"),
-        (("--scene", "dark", "--scene", "dark"), "two scenes are called 'dark'"),
-        (("--method", "dict-omp", "--dictionary", "none.h5"), "none.h5"),
-        (
-            ("--fault", "mask-shift", "--method", "tv", "--camera", "coded-aperture-random"),
-            "one mask",
-        ),
-    ],
-)
-def test_wrong_input_is_one_line_and_leaves_nothing_half_written(
-    few_steps, undrawn, run, tmp_path, arguments, line
-):
-    small = () if "--size" in arguments else ("--size", "24x32")
-    code, _, err = run("stability", "--fast", *small, *arguments)
-    assert code == 1
-    assert line in " ".join(err.split())
-    assert "Traceback" not in err
-    assert not (tmp_path / "emmc-stability" / "stability.html").exists()
