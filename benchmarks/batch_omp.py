@@ -155,14 +155,8 @@ def batch_omp(
             ) -> None:
                 inner = slice(*band)
                 outer = slice(start + band[0], start + band[1])
-                _pursue(
-                    gram,
-                    filled[inner],
-                    floors[inner],
-                    smallest_pivot,
-                    indices[outer],
-                    coefficients[outer],
-                )
+                codes = indices[outer], coefficients[outer]
+                _pursue(gram, filled[inner], floors[inner], smallest_pivot, *codes)
 
             list(pool.map(pursue, bands(len(batch))))
     return indices, coefficients

@@ -296,13 +296,10 @@ def _replace_atoms(
     poor = poor_atoms(state.atoms, uses, settings, fixed)
     if not poor.size:
         return state, 0
+    codes = state.indices, state.coefficients
     errors = np.concatenate(
         [
-            squared_norms(
-                _residuals(
-                    state.atoms, patches[part], state.indices[part], state.coefficients[part]
-                )
-            )
+            squared_norms(_residuals(state.atoms, patches[part], *(code[part] for code in codes)))
             for part in _parts(len(patches))
         ]
     )

@@ -17,6 +17,7 @@ from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
+from emmc_rig.processing import bench_check
 from emmc_rig.processing.bench_check import ability
 from emmc_rig.session.journal import RetryEntry, of_kind
 from emmc_rig.session.session import Session
@@ -34,6 +35,20 @@ PLAN = {
     },
     "darks": {"repeats": 2},
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _ways_once():
+    """The calibrations open to a camera depend on the camera alone: they are planned but once."""
+    with pytest.MonkeyPatch.context() as patch:
+        known, plan = {}, bench_check._ways
+
+        def ways(camera):
+            key = camera.model_dump_json()
+            return known[key] if key in known else known.setdefault(key, plan(camera))
+
+        patch.setattr(bench_check, "_ways", ways)
+        yield
 
 
 def bench_of(axes, hands_um=0.0, plan=PLAN, second=(), seed=0, rays=64):
