@@ -274,11 +274,18 @@ class SlowStage:
         return self.place_um
 
 
-def test_a_stop_by_hand_is_reported_as_one_and_a_second_move_is_refused():
-    stage = SlowStage()
+@contextmanager
+def moving(stage):
+    """Watch a camera, and the stage while a move of it is under way."""
     with watching(FakeCamera(), stage) as watch:
         watch.jog("mask_x", 1.0)
         assert stage.moving.wait(PATIENCE_S)
+        yield watch
+
+
+def test_a_stop_by_hand_is_reported_as_one_and_a_second_move_is_refused():
+    stage = SlowStage()
+    with moving(stage) as watch:
         with pytest.raises(AppError, match="busy"):
             watch.jog("mask_x", 1.0)
         watch.stop()
@@ -288,9 +295,7 @@ def test_a_stop_by_hand_is_reported_as_one_and_a_second_move_is_refused():
 
 def test_a_move_that_ends_short_by_itself_is_trouble_and_no_stop():
     stage = SlowStage()
-    with watching(FakeCamera(), stage) as watch:
-        watch.jog("mask_x", 1.0)
-        assert stage.moving.wait(PATIENCE_S)
+    with moving(stage) as watch:
         stage.stopped.set()
         ended = until(watch, lambda state: state["trouble"]["stage"])
         assert "mask_x" in ended["trouble"]["stage"]
@@ -299,9 +304,7 @@ def test_a_move_that_ends_short_by_itself_is_trouble_and_no_stop():
 
 def test_stopping_is_repeated_until_a_move_of_several_legs_has_ended():
     stage = SlowStage(legs=3)
-    with watching(FakeCamera(), stage) as watch:
-        watch.jog("mask_x", 1.0)
-        assert stage.moving.wait(PATIENCE_S)
+    with moving(stage) as watch:
         watch.stop()
         until(watch, lambda state: not state["busy"])
     assert stage.stops >= 3
@@ -353,9 +356,7 @@ def test_a_stop_that_the_stage_refuses_is_trouble():
             raise TransportTimeoutError("ttyUSB0", 0.5)
 
     stage = Deaf()
-    with watching(FakeCamera(), stage) as watch:
-        watch.jog("mask_x", 1.0)
-        assert stage.moving.wait(PATIENCE_S)
+    with moving(stage) as watch:
         watch.stop()
         reported = until(watch, lambda state: state["trouble"]["stage"])
         assert reported["trouble"]["stage"].startswith("not stopped")
@@ -364,9 +365,8 @@ def test_a_stop_that_the_stage_refuses_is_trouble():
 
 def test_the_end_stops_a_moving_stage():
     stage = SlowStage()
-    with watching(FakeCamera(), stage) as watch:
-        watch.jog("mask_x", 1.0)
-        assert stage.moving.wait(PATIENCE_S)
+    with moving(stage):
+        assert not stage.stops
     assert stage.stops
 
 
@@ -578,9 +578,16 @@ def served(watch, **options):
         yield ask
 
 
-def test_the_page_its_state_and_its_pictures_are_served():
-    with watching(FakeCamera()) as watch, served(watch) as ask:
+@contextmanager
+def fake_page(camera=None, **options):
+    """Serve the page of a camera of which a frame is there; yield the watch and `ask`."""
+    with watching(camera or FakeCamera()) as watch, served(watch, **options) as ask:
         until(watch, lambda state: state["frame"])
+        yield watch, ask
+
+
+def test_the_page_its_state_and_its_pictures_are_served():
+    with fake_page() as (_, ask):
         status, headers, page = ask("GET", f"/{TOKEN}/")
         assert (status, headers["Referrer-Policy"]) == (200, "no-referrer")
         assert b"emmc-rig live" in page
@@ -600,8 +607,7 @@ def test_the_page_its_state_and_its_pictures_are_served():
 def test_strangers_are_refused():
     camera = FakeCamera()
     good = json.dumps({"seconds": 0.05})
-    with watching(camera) as watch, served(watch) as ask:
-        until(watch, lambda state: state["frame"])
+    with fake_page(camera) as (watch, ask):
         assert ask("GET", "/")[0] == 403
         assert ask("GET", "/wrong/state")[0] == 403
         assert ask("POST", "/wrong/do/exposure", good)[0] == 403
@@ -618,8 +624,7 @@ def test_strangers_are_refused():
 
 
 def test_values_that_make_no_sense_are_refused_in_one_line():
-    with watching(FakeCamera()) as watch, served(watch) as ask:
-        until(watch, lambda state: state["frame"])
+    with fake_page() as (_, ask):
         for path, body in (
             ("exposure", "not json"),
             ("exposure", "[1]"),
@@ -645,8 +650,7 @@ def test_values_that_make_no_sense_are_refused_in_one_line():
 
 def test_read_only_shows_and_does_nothing():
     camera = FakeCamera()
-    with watching(camera) as watch, served(watch, read_only=True) as ask:
-        until(watch, lambda state: state["frame"])
+    with fake_page(camera, read_only=True) as (_, ask):
         status, _, reported = ask("POST", f"/{TOKEN}/do/exposure", '{"seconds": 0.05}')
         assert status == 403
         assert b"read-only" in reported
@@ -689,14 +693,14 @@ def test_a_stop_is_carried_out_while_a_hundred_pages_follow():
     ],
 )
 def test_only_the_page_itself_by_scheme_host_and_port_may_act(origin, status):
-    with watching(FakeCamera()) as watch, served(watch) as ask:
+    with fake_page() as (_, ask):
         given = {"Origin": origin.format(port=ask.port)}
         body = json.dumps({"seconds": 0.05})
         assert ask("POST", f"/{TOKEN}/do/exposure", body, given)[0] == status
 
 
 def test_who_goes_in_the_middle_of_a_request_leaves_no_traceback(capfd):
-    with watching(FakeCamera()) as watch, served(watch) as ask:
+    with fake_page() as (_, ask):
         for half in (
             b"",
             b"GET /secret/st",
@@ -720,8 +724,7 @@ def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
 
     monkeypatch.setattr(page_module, "picture", counted)
     camera = FakeCamera()
-    with watching(camera) as watch, served(watch) as ask:
-        until(watch, lambda state: state["frame"])
+    with fake_page(camera) as (watch, ask):
         camera.fault = RawFrameError("no newer frame")
         until(watch, lambda state: state["trouble"]["camera"])
         for _ in range(5):
@@ -731,7 +734,7 @@ def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
 
 
 def test_there_are_no_views_without_a_light_field():
-    with watching(FakeCamera()) as watch, served(watch) as ask:
+    with fake_page() as (_, ask):
         assert ask("GET", f"/{TOKEN}/light-field.json")[0] == 503
 
 
