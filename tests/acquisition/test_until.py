@@ -164,8 +164,7 @@ def test_shots_follow_in_the_order_of_the_plan_while_the_target_is_not_stated(ev
 
 
 def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(enough, copy)
+    copy = shutil.copytree(enough, tmp_path / "copy")
     out = done(program("capture", copy))
     assert "0 taken" in out
     _, _, err = program("capture", copy, "--until", "70", "--dry-run")
@@ -196,8 +195,7 @@ def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(ev
 
 
 def test_a_stop_while_the_light_field_is_judged_keeps_what_was_taken(every, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(every, copy)
+    copy = shutil.copytree(every, tmp_path / "copy")
     whole = (copy / JOURNAL).read_bytes().splitlines(keepends=True)
     last = next(n for n, line in enumerate(whole) if b'"kind":"decided"' in line)
     (copy / JOURNAL).write_bytes(b"".join(whole[:last]))
@@ -219,8 +217,7 @@ def test_a_stop_while_the_light_field_is_judged_keeps_what_was_taken(every, tmp_
 
 
 def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(enough, copy)
+    copy = shutil.copytree(enough, tmp_path / "copy")
     session = Session(copy)
     path = session.path_of(session.stored["shot-0-e0-r0"])
     good = path.read_bytes()

@@ -56,6 +56,12 @@ def captured(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def copy(captured, tmp_path):
+    """A copy of the complete session, for tests that change it."""
+    return shutil.copytree(captured / "plan-session", tmp_path / "copy")
+
+
 def capture(*arguments):
     """Capture without a terminal; returns standard output and standard error."""
     code, out, err = program("capture", *arguments, *RIG)
@@ -97,9 +103,7 @@ def test_a_session_is_listed_shown_and_verified(captured, run):
     assert "complete: 62 frames" in out
 
 
-def test_a_damaged_frame_fails_the_verification_and_is_taken_again(captured, run, tmp_path):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_a_damaged_frame_fails_the_verification_and_is_taken_again(copy, run):
     session = Session(copy)
     path = session.path_of(session.stored["shot-1-e0-r1"])
     good = path.read_bytes()
@@ -134,11 +138,7 @@ def test_an_export_that_is_killed_leaves_no_part_after_the_next_one(captured, ru
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(
-    captured, run, tmp_path, monkeypatch
-):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(copy, run, monkeypatch):
     monkeypatch.setattr("simulators.zaber.FIRST_SERIAL_NUMBER", 900)
     journal = (copy / "journal.jsonl").read_bytes()
     code, _, err = run("capture", copy)
@@ -251,9 +251,7 @@ def test_a_dry_run_reports_what_it_will_take_and_makes_nothing(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
 
 
-def test_an_edited_plan_holds_for_what_is_not_taken_yet(captured, run, tmp_path):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_an_edited_plan_holds_for_what_is_not_taken_yet(copy, run, tmp_path):
     taken = {path.name: path.read_bytes() for path in (copy / "frames").iterdir()}
     shots = [{"exposure_s": [0.02, 0.06]}, {"exposure_s": 0.03, "repeats": 3}]
     plan_file(tmp_path, shots=shots, settle_s=0.25)
@@ -281,9 +279,7 @@ def test_an_edited_plan_holds_for_what_is_not_taken_yet(captured, run, tmp_path)
     assert run("capture", copy)[1].count("0 taken in") == 1
 
 
-def test_a_plan_edited_inside_the_session_is_reported(captured, run, tmp_path):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_a_plan_edited_inside_the_session_is_reported(copy, run):
     (copy / "plan.yaml").write_text("camera: conventional\nshots: [{}]\n")
     assert "was changed after the session began" in refused(run("capture", copy))
     code, out, _ = run("session", "verify", copy)
