@@ -127,10 +127,6 @@ def test_what_cannot_be_learned_is_refused_by_name(edited, tmp_path, change, nam
     assert not out.exists()
 
 
-def decibels(mean_square):
-    return -10 * math.log10(mean_square)
-
-
 def random_aperture(camera):
     rng = np.random.default_rng(5)
     for name in camera.masks:
@@ -142,7 +138,7 @@ def test_the_shipped_aperture_is_better_than_a_random_one_by_the_moments_of_othe
     moments = patch_moments(3, 1, (5, 5))
     shipped = find_camera("learned-aperture")
     learned, random = (
-        decibels(aperture.error(aperture.cells(), moments))
+        -10 * math.log10(aperture.error(aperture.cells(), moments))
         for aperture in map(aperture_of, (shipped, random_aperture(shipped)))
     )
     assert learned > random + 1
@@ -155,7 +151,8 @@ def test_the_shipped_aperture_is_better_where_neither_worlds_nor_a_linear_decode
     grey = np.repeat(coloured.mean(axis=-1, keepdims=True), 3, axis=-1)
     shipped = find_camera("learned-aperture")
     learned, random = (
-        decibels(
+        -10
+        * math.log10(
             np.mean(
                 np.square(
                     reconstruct(

@@ -91,11 +91,9 @@ def captured(tmp_path_factory):
     """A session that the sequencer captured, and the same frames imported."""
     folder = tmp_path_factory.mktemp("captured")
     (folder / "plan.yaml").write_text(yaml.safe_dump(PLAN))
-    done = program("capture", folder / "plan.yaml", *RIG, "--out", folder / "session")
-    assert done[0] == 0, done
+    done(program("capture", folder / "plan.yaml", *RIG, "--out", folder / "session"))
     table = exported(Session(folder / "session"), folder / "files", npy)
-    done = program("import", table, "--camera", CAMERA, "--out", folder / "imported")
-    assert done[0] == 0, done
+    done(program("import", table, "--camera", CAMERA, "--out", folder / "imported"))
     return folder
 
 
@@ -134,8 +132,7 @@ def shots_only(tmp_path_factory):
     (folder / "mine.yaml").write_text(yaml.safe_dump(camera))
     plan = {**PLAN, "camera": "mine.yaml", "whiteboards": None}
     (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
-    done = program("capture", folder / "plan.yaml", *RIG, "--out", folder / "session")
-    assert done[0] == 0, done
+    done(program("capture", folder / "plan.yaml", *RIG, "--out", folder / "session"))
     return folder
 
 
@@ -171,8 +168,7 @@ def hdf5(path, mosaic):
 def test_shots_of_every_format_read_as_those_of_the_captured_session(shots_only, tmp_path, form):
     table = exported(Session(shots_only / "session"), tmp_path / "files", FORMATS[form])
     out = tmp_path / "imported"
-    done = program("import", table, "--camera", shots_only / "mine.yaml", "--out", out)
-    assert done[0] == 0, done
+    done(program("import", table, "--camera", shots_only / "mine.yaml", "--out", out))
     (psi, frames), (own_psi, own_frames) = map(open_frames, (shots_only / "session", out))
     assert np.array_equal(psi.weights, own_psi.weights)
     assert np.array_equal(frames.readings, own_frames.readings)

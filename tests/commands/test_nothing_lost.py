@@ -13,7 +13,7 @@ import pytest
 import typer
 import yaml
 from placed import files_of, listed
-from programs import program
+from programs import done, program
 
 from emmc_rig import cli
 from emmc_rig.commands import output
@@ -92,12 +92,10 @@ def world(tmp_path_factory):
     (folder / "plan.yaml").write_text(yaml.safe_dump(shots))
     (folder / "other.yaml").write_text(yaml.safe_dump({**shots, "camera": "rgbw-mono"}))
     (folder / "held").mkdir()
-    done = program("capture", folder / "plan.yaml", *RIG, "--out", folder / "held/session")
-    assert done[0] == 0, done
+    done(program("capture", folder / "plan.yaml", *RIG, "--out", folder / "held/session"))
     shutil.copytree(folder / "held/session", folder / "made-session")
     (folder / "link").symlink_to(folder / "held/session")
-    done = program("simulate", *SIZE, "--scene", "near-planar", "--out", folder / "frames")
-    assert done[0] == 0, done
+    done(program("simulate", *SIZE, "--scene", "near-planar", "--out", folder / "frames"))
     field = np.random.default_rng(0).uniform(0, 1, (5, 5, 16, 16, 3)).astype(np.float32)
     save_hdf5(folder / "scene.h5", field, {})
     np.save(folder / "shot.npy", np.random.default_rng(1).integers(256, 9000, SHAPE, np.uint16))
