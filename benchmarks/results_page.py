@@ -213,7 +213,9 @@ def films() -> Section:
     of = {motion: [row for row in rows if row["motion"] == motion] for motion in words}
     pans, rests = (average(of[motion], "gain_db") for motion in ("pans", "rests"))
     cost, flicker = average(rows, "cost"), average(of["rests"], "flicker")
-    table = [("motion", "mean gain", "least gain", "processor time", "flicker", "inside")]
+    table: list[tuple[str, ...]] = [
+        ("motion", "mean gain", "least gain", "processor time", "flicker", "inside")
+    ]
     for motion, text in words.items():
         gains = [number(row, "gain_db") for row in of[motion]]
         shares = (percent(average(of[motion], key)) for key in ("cost", "flicker", "inside"))
