@@ -47,11 +47,7 @@ def main() -> None:
     """Measure every part on every scene."""
     args = lab.parsed(lab.arguments(__doc__, size="128x160"))
     names = ["the whole", "momentum", ORACLE] if args.smallest else [*PARTS, ORACLE]
-    points = [
-        {"scene": s, "camera": args.camera, "size": args.size, "seed": args.seed, "without": name}
-        for s in args.scenes
-        for name in names
-    ]
+    points = lab.points(args, ({"without": name} for name in names))
     rows = lab.measured(points, measure, "ablation", args)
     table = rows.pivot_table("psnr_db", "without", "scene", sort=False)
     lost = (table.loc["the whole"] - table).drop("the whole")

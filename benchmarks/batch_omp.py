@@ -30,7 +30,7 @@ _BATCH_BYTES = 24 << 20
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _largest(values):
-    """Return the place of the value largest in size: a fast scan for it, a short one to find it."""
+    """Return the place of the value largest in size: by blocks, then in the best block."""
     block = 512
     best = np.float32(-1)
     begin = 0
@@ -155,14 +155,8 @@ def batch_omp(
             ) -> None:
                 inner = slice(*band)
                 outer = slice(start + band[0], start + band[1])
-                _pursue(
-                    gram,
-                    filled[inner],
-                    floors[inner],
-                    smallest_pivot,
-                    indices[outer],
-                    coefficients[outer],
-                )
+                codes = indices[outer], coefficients[outer]
+                _pursue(gram, filled[inner], floors[inner], smallest_pivot, *codes)
 
             list(pool.map(pursue, bands(len(batch))))
     return indices, coefficients

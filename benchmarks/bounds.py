@@ -24,7 +24,7 @@ KNOWN = (
     "disparity+colours+occlusion",
 )  # fmt: skip
 COLOURS_OF = {"scenario-ii-cfa": "scenario-i-rgb"}
-"""Cameras whose one shot sees one colour a pixel, and the same that see three."""
+"""Camera with three colours a pixel, by the camera of the same mask behind a CFA."""
 
 
 def measure(scene: str, camera: str, size: tuple[int, int], seed: int, known: str) -> dict:
@@ -39,7 +39,7 @@ def measure(scene: str, camera: str, size: tuple[int, int], seed: int, known: st
     psi, readings = given.psi, given.readings
     if "occlusion" in of:
         psi, readings = _without(given, hidden)
-    # Of one shot, with or without its colours: no sparse patches.
+    # Sparse patches would hide the bound of a single shot.
     settings = AdaptiveSettings(patches=None)
     frames = even_frames(readings, given.noise_sigma, given.usable)
     known = disparity if "disparity" in of else None
@@ -60,11 +60,8 @@ def _without(given: Trial, hidden: np.ndarray):
 def main() -> None:
     """Measure every scene with each known."""
     args = lab.parsed(lab.arguments(__doc__, size="128x160"))
-    points = [
-        {"scene": s, "camera": args.camera, "size": args.size, "seed": args.seed, "known": known}
-        for s in args.scenes
-        for known in (KNOWN[:4:3] if args.smallest else KNOWN)
-    ]
+    chosen = KNOWN[:4:3] if args.smallest else KNOWN
+    points = lab.points(args, ({"known": known} for known in chosen))
     rows = lab.measured(points, measure, "bounds", args)
     table = rows.assign(known=rows.known.replace("", "nothing")).pivot_table(
         "psnr_db", "known", "scene", sort=False

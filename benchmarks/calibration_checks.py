@@ -5,7 +5,7 @@ one is; the truth is what the bench's own rays integrate to. One line runs it, f
 
     python benchmarks/calibration_checks.py psi hands few effects session cost drift streamed
 
-It writes docs/results/calibration_checks.csv and .png, and needs the extra `lab`. On the bench of
+It writes docs/results/calibration_checks.csv and .svg, and needs the extra `lab`. On the bench of
 `--smallest` the limits do not hold: it shows that every check runs.
 """
 
@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import lab
 import numpy as np
 import pandas
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from simulated_calibration import (
     CalibrateSettings,
@@ -72,7 +72,6 @@ from reconstruction.tv import TVSettings, reconstruct_tv
 from simulators.effects import EFFECTS, ORDINARY, TOGETHER, Flaws, flawed
 
 Array = NDArray[np.floating]
-RESULTS = Path(__file__).parents[1] / "docs" / "results"
 CAMERA = "rgbw-bayer-1shot"
 REAL_SCENES = ("dragons", "buttercup", "antinous")
 BUILT_IN = ("deep-occlusions", "near-planar", "non-lambertian")
@@ -247,10 +246,12 @@ def check_session(size: Size, seed: int) -> Iterator[Row]:
 
 
 def scenes(count: int) -> Sequence[str]:
-    """Return the real scenes in the folder EMMC_LIGHTFIELDS, or built-in scenes without it."""
+    """Return names of scenes: REAL_SCENES of EMMC_LIGHTFIELDS if present, else BUILT_IN."""
     folder = os.environ.get("EMMC_LIGHTFIELDS")
     real = [str(Path(folder) / name) for name in REAL_SCENES] if folder else []
-    return (real if real and all(Path(name).is_dir() for name in real) else list(BUILT_IN))[:count]
+    return (real if real and all(Path(folder).is_dir() for folder in real) else list(BUILT_IN))[
+        :count
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,8 +399,8 @@ def drawn(
 def draw_session(folder: Path, settings: CalibrateSettings, channels: NDArray[np.uint8]) -> Shadow:
     """Write a session of every view as a mask off its design draws it; return that mask's shadow.
 
-    Rays through 24 megapixels would take days. This check alone therefore inverts the model that
-    made its data: it measures memory and time. With shot and read noise.
+    Rays through 24 megapixels would take days: this check of memory and time inverts the model that
+    made its data. With shot and read noise.
     """
     camera, noise = settings.camera, settings.camera.sensor.noise
     mask = shadow_mask(camera, settings.size)
@@ -468,19 +469,6 @@ CHECKS = {
 }
 
 
-def draw(table: pandas.DataFrame, path: Path) -> None:
-    """Draw every figure of which something is asked, over what is asked at most."""
-    asked = table[table.at_most.notna() & (table.at_most > 0)]
-    figure = Figure(figsize=(8, 1 + 0.22 * len(asked)), layout="constrained")
-    axes = figure.subplots()
-    colours = ["tab:green" if met else "tab:red" for met in asked.met]
-    axes.scatter(asked.measured / asked.at_most, asked.what, c=colours)
-    axes.axvline(1, color="black", linewidth=0.8)
-    axes.set_xlabel("measured / at most asked")
-    axes.invert_yaxis()
-    figure.savefig(path, dpi=120)
-
-
 def main() -> None:
     """Run the checks named, and write table and picture."""
     known = ", ".join(CHECKS)
@@ -489,7 +477,7 @@ def main() -> None:
     parser.add_argument("--size", help="ROWSxCOLUMNS of all checks in place of their own")
     parser.add_argument("--rays", type=int, help="per view and pixel, in place of their own")
     parser.add_argument("--smallest", action="store_true", help="only whether every check runs")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path, default=lab.RESULTS)
     given = parser.parse_args()
     if wrong := [name for name in given.checks if name not in CHECKS]:
         parser.error(f"no check {wrong[0]}: use some of {known}")
@@ -500,20 +488,16 @@ def main() -> None:
             size, pixels=parse_size(given.size) or size.pixels, rays=given.rays or size.rays
         )
         for row in CHECKS[name](size, SEED):
-            verdict = row.met if (row.at_most, row.at_least) != (None, None) else None
-            rows.append(
-                {
-                    "check": name,
-                    **vars(row),
-                    "met": verdict,
-                    "size": "x".join(map(str, size.pixels)),
-                }
-            )
-            print(f"{row.what}: {row.measured:.4g}{'' if verdict in (None, True) else ', MISSED'}")
+            met = row.met if (row.at_most, row.at_least) != (None, None) else None
+            pixels = "x".join(map(str, size.pixels))
+            rows.append({"check": name, **vars(row), "met": met, "size": pixels})
+            print(f"{row.what}: {row.measured:.4g}{'' if met in (None, True) else ', MISSED'}")
     given.out.mkdir(parents=True, exist_ok=True)
     table = pandas.DataFrame(rows)
     table.to_csv(given.out / "calibration_checks.csv", index=False)
-    draw(table, given.out / "calibration_checks.png")
+    asked = table[table.at_most.notna() & (table.at_most > 0)].set_index("what")
+    axes = (asked.measured / asked.at_most).plot.barh(xlabel="measured / at most asked", ylabel="")
+    lab.finished(table, axes, "calibration_checks", given)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 In a folder as the README beside them describes: `tsa`, `smem` (CASSI: a binary mask, then a prism;
 monochrome sensor; Meng et al. 2020) and `colour-aperture` (one opening in the lens for each colour;
-Bando, Chen, Nishita 2008). What is said of each camera is its description, `CAMERAS`, and its Psi,
-as docs/real-captures.md has them; all else is `emmc-rig import` and the Python API.
+Bando, Chen, Nishita 2008). Each camera has a description in `CAMERAS` and a Psi, both explained in
+docs/real-captures.md; `emmc-rig import` and the Python API do the rest.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def coded_capture(
     """
     kind = name.split("/")[0]
     with TemporaryDirectory(prefix="captures-") as work:
-        camera, session, psi_file = (Path(work) / one for one in ("mine.yaml", "s", "psi.h5"))
+        camera, session, psi_file = (Path(work) / name for name in ("mine.yaml", "s", "psi.h5"))
         camera.write_text(CAMERAS[kind], "utf-8")
         if kind in BANDS:
             shots = folder / f"{name}.mat@{ARRAYS[kind]}"

@@ -95,7 +95,7 @@ def scaled(name: str, factor: float) -> Iterator[AdaptiveSettings]:
 def measure(
     scene: str, camera: str, size: tuple[int, int], seed: int, constant: str, factor: float
 ) -> dict:
-    """Return the PSNR of a scene with a constant scaled; empty where it may not be."""
+    """Return the PSNR of a scene with a scaled constant; empty for a value that settings refuse."""
     given = trial_of(Capture(scene, camera, size, seed))
     try:
         with scaled(constant, factor) as settings:
@@ -111,14 +111,8 @@ def main() -> None:
     parser.add_argument("--constant", action="append", help="may repeat; default: all")
     args = lab.parsed(parser)
     names = args.constant or list(constants())[: 1 if args.smallest else None]
-    points = [
-        {
-            "scene": scene, "camera": args.camera, "size": args.size, "seed": args.seed,
-            "constant": name, "factor": factor,
-        }
-        for scene in args.scenes
-        for name, factor in [(UNCHANGED, 1.0), *((n, f) for n in names for f in (2.0, 0.5))]
-    ]  # fmt: skip
+    choices = [(UNCHANGED, 1.0), *((name, factor) for name in names for factor in (2.0, 0.5))]
+    points = lab.points(args, ({"constant": name, "factor": by} for name, by in choices))
     rows = lab.measured(points, measure, "constants", args)
     rows["psnr_db"] = rows["psnr_db"].replace("", None).astype(float)
     table = rows.pivot_table("psnr_db", ["constant", "factor"], "scene")

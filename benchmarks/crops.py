@@ -54,14 +54,12 @@ def main() -> None:
     parser.add_argument("--crops", type=int, default=CROPS)
     parser.add_argument("--store", action="store_true", help="keep the figures as those to reach")
     args = lab.parsed(parser)
+    shared = {"camera": args.camera, "size": args.size, "shots": args.shots}
     points = [
-        {
-            "scene": args.scenes[crop % len(args.scenes)], "camera": args.camera,
-            "size": args.size, "crop": crop, "shots": args.shots, "method": method,
-        }
+        {"scene": args.scenes[crop % len(args.scenes)], **shared, "crop": crop, "method": method}
         for method in (args.method or METHODS)
         for crop in range(1 if args.smallest else args.crops)
-    ]  # fmt: skip
+    ]
     rows = lab.measured(points, measure, "crops-now", args)
     keyed = rows.astype(dict.fromkeys(KEYS, str))
     stored = pd.read_csv(STORED).astype(dict.fromkeys(KEYS, str)) if STORED.is_file() else keyed

@@ -55,11 +55,7 @@ def main() -> None:
     """Compare the cameras on every scene."""
     args = lab.parsed(lab.arguments(__doc__, ("near-planar", "deep-occlusions"), size="96x96"))
     names = list(cameras(args.seed))[: 2 if args.smallest else None]
-    points = [
-        {"camera": name, "scene": scene, "size": args.size, "seed": args.seed}
-        for name in names
-        for scene in args.scenes
-    ]
+    points = lab.points(args, ({"camera": name} for name in names))
     rows = lab.measured(points, measure, "design-check", args)
     means = rows.groupby("camera")[["expected_db", "psnr_db"]].mean()
     axes = means.plot.scatter("expected_db", "psnr_db")

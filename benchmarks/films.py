@@ -137,15 +137,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     args = lab.parsed(parser)
     motions = args.motion or (PAN_PX if not args.smallest else [PANS])
-    points = [
-        {
-            "scene": scene, "other": args.scenes[(at + 1) % len(args.scenes)], "motion": motion,
-            "camera": args.camera, "size": args.size, "seed": args.seed,
-            "frames": 4 if args.smallest else args.frames,
-        }
-        for at, scene in enumerate(args.scenes)
-        for motion in motions
-    ]  # fmt: skip
+    frames = 4 if args.smallest else args.frames
+    following = dict(zip(args.scenes, (*args.scenes[1:], args.scenes[0]), strict=True))
+    points = lab.points(args, ({"motion": motion, "frames": frames} for motion in motions))
+    for point in points:
+        point["other"] = following[point["scene"]]
     rows = lab.measured(points, measure, "films", args)
     axes = rows.pivot_table(index="scene", columns="motion", values="gain_db").plot.bar()
     axes.set(ylabel="dB over frames alone")

@@ -21,7 +21,7 @@ WHOLE = (*lab.GROUP_A, *lab.GROUP_B[:2])
 
 
 def measure(scene: str, camera: str, size: tuple[int, int] | None, seed: int, method: str) -> dict:
-    """Return PSNR of a method and of the baseline, and what it took, of one light field.
+    """Return size, PSNR of a method and of the baseline, and processor and wall time.
 
     As `emmc-rig simulate` and `reconstruct` do it: frames are cleaned up, and the result is judged.
     """
@@ -49,18 +49,11 @@ def main() -> None:
     args = lab.parsed(parser)
     if not args.smallest and not args.scene:
         args.scenes = [str(Path(os.environ["EMMC_LIGHTFIELDS"]) / name) for name in WHOLE]
-    size = args.size if args.smallest else None
-    every = []
-    for method in args.method or METHODS:
-        points = [
-            {
-                "scene": scene, "camera": args.camera, "size": size, "seed": args.seed,
-                "method": method,
-            }
-            for scene in args.scenes
-        ]  # fmt: skip
-        every.append(lab.measured(points, measure, f"full-frames-{method}", args))
-    rows = pd.concat(every)
+    args.size = args.size if args.smallest else None
+    rows = pd.concat(
+        lab.measured(lab.points(args, [{"method": m}]), measure, f"full-frames-{m}", args)
+        for m in args.method or METHODS
+    )
     table = rows.pivot_table(index="scene", columns="method", values="psnr_db")
     lab.finished(rows, table.plot.barh(), "full-frames", args)
 

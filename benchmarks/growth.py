@@ -24,7 +24,7 @@ METHODS = {
     "tv": {"tv": {"max_steps": 30, "rtol": 1e-12}},
     "dict-omp": {"sparse": {"solver": {"atoms": 10, "tolerance_factor": 0}}},
 }
-"""With settings whose work does not depend on how soon they converge, where there are such."""
+"""Settings with a fixed number of steps, where a method has any."""
 
 
 def measure(
@@ -59,16 +59,14 @@ def main() -> None:
     }
     if args.smallest:
         varied = {"views": varied["views"][:2]}
-    points = [
-        {
-            "scene": args.scenes[0], "camera": args.camera, "seed": args.seed, "method": method,
-            "axis": axis, **base, **change,
-        }
+    args.scenes = args.scenes[:1]
+    choices = [
+        {"method": method, "axis": axis, **base, **change}
         for method in (["tv"] if args.smallest else METHODS)
         for axis, changes in varied.items()
         for change in changes
-    ]  # fmt: skip
-    rows = lab.measured(points, measure, "growth", args)
+    ]
+    rows = lab.measured(lab.points(args, choices), measure, "growth", args)
     _, panels = plt.subplots(1, len(varied), figsize=(4 * len(varied), 3.2), squeeze=False)
     exponents = []
     for (axis, changes), panel in zip(varied.items(), panels[0], strict=True):

@@ -7,7 +7,7 @@ import csv
 import datetime
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import joblib
@@ -15,7 +15,6 @@ import matplotlib
 import pandas as pd
 
 import emmc_rig
-from emmc_rig.study.trial import Capture
 
 matplotlib.use("Agg")
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
@@ -40,7 +39,7 @@ def arguments(
     parser.add_argument("--scene", action="append", help=f"may repeat; default: {scenes}")
     parser.add_argument("--group", choices="AB", help="of the real light fields, instead of scenes")
     parser.add_argument("--camera", default=camera)
-    parser.add_argument("--size", default=size, help="rows x columns of each scene's middle")
+    parser.add_argument("--size", default=size, help="rows x columns of the middle, or whole")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=RESULTS)
@@ -50,9 +49,10 @@ def arguments(
 
 
 def parsed(parser: argparse.ArgumentParser, given: Sequence[str] | None = None):
-    """Return the arguments, `size` as rows and columns, `scenes` as chosen."""
+    """Return the arguments, `size` as rows and columns or None, `scenes` as chosen."""
     args = parser.parse_args(given)
-    args.size = tuple(int(side) for side in args.size.lower().split("x"))
+    sides = args.size.lower().split("x")
+    args.size = None if sides == ["whole"] else tuple(map(int, sides))
     if args.group:
         folder = Path(os.environ["EMMC_LIGHTFIELDS"])
         args.scenes = [str(folder / name) for name in (GROUP_A if args.group == "A" else GROUP_B)]
@@ -63,19 +63,17 @@ def parsed(parser: argparse.ArgumentParser, given: Sequence[str] | None = None):
     return args
 
 
-def captures(args, **changed: object) -> list[Capture]:
-    """Return each scene through the camera."""
-    return [
-        Capture(scene, args.camera, args.size, args.seed, **changed)  # pyright: ignore
-        for scene in args.scenes
-    ]
+def points(args, choices: Iterable[Mapping]) -> list[dict]:
+    """Return each scene with each choice: keywords of a `measure`, beside camera, size and seed."""
+    shared, choices = {"camera": args.camera, "size": args.size, "seed": args.seed}, list(choices)
+    return [{"scene": scene, **shared, **choice} for scene in args.scenes for choice in choices]
 
 
 def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, args) -> pd.DataFrame:
-    """Return a row for each point: the point's values and what `measure(**point)` returns.
+    """Return a row for each point: the point's values and those of `measure(**point)`.
 
-    Rows are kept in NAME.csv as they are done; those that it holds are not measured again. Delete
-    the file after a change of the program. The run's command and date go into RUNS.
+    NAME.csv keeps each finished row, and a later run skips it: delete the file after a change of
+    the program. The run's command and date go into RUNS.
     """
     points = list(points)
     path = args.out / f"{name}.csv"

@@ -2,8 +2,8 @@
 
 Aharon, Elad, Bruckstein 2006, "K-SVD: an algorithm for designing overcomplete dictionaries for
 sparse representation", with the batch pursuit and the rank-1 updates by alternating projections
-of Rubinstein, Zibulevsky, Elad 2008. Patches keep their mean, as they must describe measurements;
-the first atoms may be flat ones, one per opponent colour, which stay as they are.
+of Rubinstein, Zibulevsky, Elad 2008. Patches keep their mean, as they must describe measurements.
+With `flat_atoms` the first atoms are flat, one per opponent colour, and never change.
 
 Operations of one step for N patches of n samples, K atoms, k of them per code: 2 N K n + K^2 n +
 N K (k^2 + 3 k) for the pursuits, 4 N k n for the residuals, 4 (p + 1) N k n for the updates with p
@@ -200,7 +200,7 @@ def check_patches(patches: Array, settings: LearningSettings, patch_shape: tuple
 
 
 def _parts(count: int) -> list[slice]:
-    """Return slices over so many patches, of which one is in memory beside them at a time."""
+    """Return slices over `count` patches, short enough for one copy in memory beside them."""
     return [slice(first, first + _ROWS_AT_ONCE) for first in range(0, count, _ROWS_AT_ONCE)]
 
 
@@ -260,7 +260,7 @@ def _update_atoms(
     power_iterations: int,
     fixed: int,
 ) -> None:
-    """Fit every atom and its coefficients to what the others leave of its patches, in place.
+    """Fit every atom and its coefficients to the residuals of its patches, in place.
 
     With residuals E of an atom's patches (others' and its own share removed), the best atom is
     the leading right singular vector of E + g d^T. It is found by alternating projections from
@@ -296,13 +296,10 @@ def _replace_atoms(
     poor = poor_atoms(state.atoms, uses, settings, fixed)
     if not poor.size:
         return state, 0
+    codes = state.indices, state.coefficients
     errors = np.concatenate(
         [
-            squared_norms(
-                _residuals(
-                    state.atoms, patches[part], state.indices[part], state.coefficients[part]
-                )
-            )
+            squared_norms(_residuals(state.atoms, patches[part], *(code[part] for code in codes)))
             for part in _parts(len(patches))
         ]
     )

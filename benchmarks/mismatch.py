@@ -66,16 +66,12 @@ def measure(
 def main() -> None:
     """Measure every error on every scene, by every method."""
     args = lab.parsed(lab.arguments(__doc__, camera="rgbw-bayer-1shot", size="32x40"))
-    points = [
-        {
-            "scene": scene, "camera": args.camera, "size": args.size, "seed": args.seed,
-            "method": method, "error": error, "by": by,
-        }
-        for scene in args.scenes
+    choices = [
+        {"method": method, "error": error, "by": by}
         for error, by in (ERRORS[:1] if args.smallest else ERRORS)
         for method in (["tv"] if args.smallest else installed_methods())
-    ]  # fmt: skip
-    rows = lab.measured(points, measure, "mismatch", args)
+    ]
+    rows = lab.measured(lab.points(args, choices), measure, "mismatch", args)
     scenarios = ["ideal_db", "assumed_db", "oracle_db", "mended_db"]
     axes = rows.groupby("method")[scenarios].mean().plot.barh(ylabel="", xlabel="dB")
     axes.set_xlim(left=rows[scenarios].min().min() - 1)

@@ -60,14 +60,14 @@ def _at_rest(scene: str, camera: str, shots: int, size: tuple[int, int], seed: i
     psi, rest = _captured(scene, camera, shots, size, seed, 0.0)
     truth = _seen(scene, size, 0.0, 0)
 
-    def one(shot: int, film: Film | None = None):
+    def solved(shot: int, film: Film | None = None):
         seen = rest.of_one_deviation().cut(np.s_[shot : shot + 1,])
         return reconstruct("adaptive", psi.of_shots([shot]), seen, film=film)
 
-    last = one(0, Film())
+    last = solved(0, Film())
     alone = last.light_field
     for shot in range(1, shots):
-        last = one(shot, last.film)
+        last = solved(shot, last.film)
     together = reconstruct("adaptive", psi, rest, None, WITHOUT_PATCHES)
     at_rest, _, cpu_s = _judged(psi, rest)
     return {
@@ -86,8 +86,8 @@ def measure(
 
     moved_db, moved_cpu_s: of shots as they moved, and the time of their reconstruction; moved_px:
     what it states; verdict, inside: whether it is trusted, and its PSNR in the interval stated.
-    rest_db, cpu_s: of shots at rest; alone_db: of the first alone; film_db: of the last, of a film
-    of the shots at rest; together_db: of all these without patches, which films do not have.
+    rest_db, cpu_s: of shots at rest; alone_db: of the first alone; film_db: of the last frame
+    of a film of the shots at rest; together_db: of all shots at rest, without patches as in films.
     """
     psi, moved = _captured(scene, camera, shots, size, seed, step_px)
     result, verdict, cpu_s = _judged(psi, moved)
@@ -110,14 +110,7 @@ def main() -> None:
     parser.add_argument("--step", action="append", type=float, help=f"default: {STEPS_PX}")
     args = lab.parsed(parser)
     steps = args.step or (STEPS_PX[:1] if args.smallest else STEPS_PX)
-    points = [
-        {
-            "scene": scene, "camera": args.camera, "shots": args.shots, "size": args.size,
-            "seed": args.seed, "step_px": step,
-        }
-        for scene in args.scenes
-        for step in steps
-    ]  # fmt: skip
+    points = lab.points(args, ({"shots": args.shots, "step_px": step} for step in steps))
     rows = lab.measured(points, measure, "moving-shots", args)
     rows["loss_db"] = rows.moved_db - rows.rest_db
     axes = rows.pivot_table(index="step_px", columns="scene", values="loss_db").plot()

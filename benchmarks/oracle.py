@@ -19,7 +19,7 @@ TRIMMED_PERCENT = 0.5
 BOX, MEDIAN = 3, 5
 HALF_PLANES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
 FEWEST_VIEWS = 3
-"""In a half plane that see a sample, below which it has no say there."""
+"""Views of a half plane that must see a sample, or the half plane is left out there."""
 
 
 def matched_disparity(light_field: Array, furthest_px: float = 24.0) -> Array:

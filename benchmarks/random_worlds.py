@@ -1,6 +1,6 @@
 """Random worlds to train on: cards and balls of random textures, places, slopes and depths.
 
-Unlike the built-in scenes they picture nothing, so that no scene that is scored is among them.
+Built-in scenes are no random worlds: no evaluated scene is in the training data.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ DEEPEST_PX = 0.2, 4.0
 """Range from which the largest disparity of a world is drawn, log-uniformly, as quoted."""
 
 WORLD_SIZE = 128, 160
-"""Rows and columns of a rendered world: its disparities are 5/8 of those quoted."""
+"""Rows and columns of a rendered world, with 5/8 of the quoted disparities."""
 WORLDS_AT_HAND = 32
 DARKEST = 0.3
 """Least factor on a world's light, drawn log-uniformly up to 1."""
 
 
 def with_pattern(camera: Camera, mask: str, **changes: object) -> Camera:
-    """Return a camera with other settings of one mask's pattern, which are not checked."""
+    """Return a camera with changed, unchecked settings of the pattern of a mask."""
     changed = camera.masks[mask]
     pattern = changed.pattern.model_copy(update=changes)
     masks = {**camera.masks, mask: changed.model_copy(update={"pattern": pattern})}

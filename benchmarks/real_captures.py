@@ -4,7 +4,6 @@ interpolation, and a Psi that is not the camera's is refused.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from functools import partial
@@ -62,23 +61,16 @@ def measure(
 
 def main() -> None:
     """Measure, and draw how much better than interpolation."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = lab.arguments(__doc__, (), size="x".join(map(str, WINDOW)))
     peers = Path(os.environ.get("EMMC_PEER_FILES", "."))
     parser.add_argument("--captures", type=Path, default=peers / "captures")
     parser.add_argument("--method", action="append", help="default: adaptive-fast and tv")
-    parser.add_argument("--size", default="x".join(map(str, WINDOW)),
-                        help="rows x columns of the middle, or whole")  # fmt: skip
     parser.add_argument("--mask", action="append", choices=MASKS, help="default: all")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=lab.RESULTS)
-    parser.add_argument("--smallest", action="store_true", help="to see that it runs: seconds")
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    names = available(args.captures)
-    size = None if args.size == "whole" else tuple(map(int, args.size.split("x")))
+    args = lab.parsed(parser)
+    names, size = available(args.captures), args.size
     methods, masks = args.method or ["adaptive-fast", "tv"], args.mask or MASKS
     if args.smallest:
-        names, size, methods, masks = names[:1], (32, 40), ["tv"], MASKS[:1]
+        names, methods, masks = names[:1], ["tv"], MASKS[:1]
     if not names:
         raise SystemExit(f"no captures in {args.captures}: name their folder by --captures")
     points = [

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import csv
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
+from typing import Any
 
 import svg_charts
 
@@ -54,41 +56,57 @@ def number(row: Row, key: str) -> float:
     return float(row[key])
 
 
+def average(rows: Iterable[Row], key: str) -> float:
+    """Return the mean of a figure."""
+    return mean(number(row, key) for row in rows)
+
+
+def figures(rows: Iterable[Row], key: str, *names: str) -> dict[Any, float]:
+    """Return a figure of each row by a name, or by several as a tuple."""
+    return {
+        row[names[0]] if len(names) == 1 else tuple(row[name] for name in names): number(row, key)
+        for row in rows
+    }
+
+
+def leads(dots: Mapping[str, Sequence[float]], better: str, worse: str) -> list[float]:
+    """Return by how much a series exceeds another, in each row."""
+    return [a - b for a, b in zip(dots[better], dots[worse], strict=True)]
+
+
+def percent(share: float) -> str:
+    """Return a share as "90 %"."""
+    return f"{100 * share:.0f} %"
+
+
 def share(rows: Sequence[Row], counts: Callable[[Row], bool]) -> str:
     """Return how many of the rows count, as "9 of 10 (90 %)"."""
     found = sum(map(counts, rows))
-    return f"{found} of {len(rows)} ({found / len(rows):.0%})".replace("%", " %")
+    return f"{found} of {len(rows)} ({percent(found / len(rows))})"
 
 
 def whole_frames() -> Section:
     """One shot of whole real light fields."""
     files = "full-frames-adaptive", "full-frames-tv-dict"
     rows = [row for file in files for row in rows_of(file)]
-    of: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        of.setdefault(row["scene"], {})[row["method"]] = row
-    scenes = sorted(of, key=lambda scene: -number(of[scene]["adaptive"], "psnr_db"))
+    own = {row["scene"]: row for row in rows if row["method"] == "adaptive"}
+    psnr_db = figures(rows, "psnr_db", "scene", "method")
+    scenes = sorted(own, key=lambda scene: -psnr_db[scene, "adaptive"])
+    methods = "tv-dict", "adaptive"
     dots = {
-        "baseline: centre view in all places": [
-            number(of[scene]["adaptive"], "baseline_db") for scene in scenes
-        ],
-        **{
-            method: [number(of[scene][method], "psnr_db") for scene in scenes]
-            for method in ("tv-dict", "adaptive")
-        },
+        "baseline: centre view in all places": [number(own[s], "baseline_db") for s in scenes],
+        **{method: [psnr_db[scene, method] for scene in scenes] for method in methods},
     }
-    lead = mean(a - b for a, b in zip(dots["adaptive"], dots["tv-dict"], strict=True))
+    lead = mean(leads(dots, "adaptive", "tv-dict"))
     reached = f"{min(dots['adaptive']):.1f} to {max(dots['adaptive']):.1f} dB"
     answer = f"One frame each: adaptive is {lead:.1f} dB above tv-dict"
-    methods = "tv-dict", "adaptive"
     table: list[tuple[str, ...]] = [
         ("light field", "size", *(f"`{method}`" for method in methods), "processor seconds")
     ]
     for scene in scenes:
-        first = of[scene]["adaptive"]
-        cells = (f"{number(of[scene][method], 'psnr_db'):.2f} dB" for method in methods)
-        size = f"{first['rows']}x{first['columns']}"
-        table.append((scene, size, *cells, f"{number(first, 'cpu_s'):.0f}"))
+        cells = (f"{psnr_db[scene, method]:.2f} dB" for method in methods)
+        size = f"{own[scene]['rows']}x{own[scene]['columns']}"
+        table.append((scene, size, *cells, f"{number(own[scene], 'cpu_s'):.0f}"))
     return Section(
         "How good is one shot?",
         f"From one frame of the paper's Bayer camera `adaptive` reaches {reached}, {lead:.1f} dB "
@@ -116,10 +134,7 @@ def speed() -> Section:
     for shots, camera in CAMERAS.items():
         for method in sorted({row["method"] for row in rows}):
             of = [row for row in rows if (row["camera"], row["method"]) == (camera, method)]
-            named.setdefault(shots, {})[method] = (
-                mean(number(row, "cpu_seconds") for row in of),
-                mean(number(row, "psnr_db") for row in of),
-            )
+            named.setdefault(shots, {})[method] = average(of, "cpu_seconds"), average(of, "psnr_db")
     best = named["one shot"]["adaptive"]
     second = max(
         (db, method)
@@ -136,7 +151,7 @@ def speed() -> Section:
         "Which method, for how much time?",
         f"`adaptive` leads `{second[1]}` by {best[1] - second[0]:.1f} dB with one shot; "
         f"`adaptive-fast` is {best[1] - fast[1]:.1f} dB below `adaptive`, in "
-        f"{fast[0] / best[0]:.0%} of the time.".replace("%", " %"),
+        f"{percent(fast[0] / best[0])} of the time.",
         f"Up is better, left is faster. Each point is the mean of {len(scenes)} light fields of "
         "group B, cropped to 64x80; time is on one core.",
         ("chart-group-b-64x80", "chart-group-a-64x80"),
@@ -154,19 +169,14 @@ def whole_speed() -> Section:
     """Accuracy and processor time of whole frames, and what bounds the accuracy."""
     rows = rows_of("chart-full-frames")
     means: dict[str, dict[str, tuple[float, float]]] = {}
-    levels = {(row["method"], row["level"]): [] for row in rows}
-    for row in rows:
-        levels[row["method"], row["level"]].append(row)
-    for (method, level), of in levels.items():
-        means.setdefault(method, {})[level] = (
-            mean(number(row, "cpu_seconds") for row in of),
-            mean(number(row, "psnr_db") for row in of),
-        )
+    for method, level in dict.fromkeys((row["method"], row["level"]) for row in rows):
+        of = [row for row in rows if (row["method"], row["level"]) == (method, level)]
+        means.setdefault(method, {})[level] = average(of, "cpu_seconds"), average(of, "psnr_db")
     scenes = {row["scene"] for row in rows}
     best, fast = means["adaptive"]["default"], means["adaptive-fast"]["default"]
-    known: dict[str, list[float]] = {}
+    known: dict[str, list[float]] = defaultdict(list)
     for row in rows_of("bounds"):
-        known.setdefault(row["known"], []).append(number(row, "psnr_db"))
+        known[row["known"]].append(number(row, "psnr_db"))
     table = [("truth given to `adaptive`, 128x128", "PSNR")]
     table += [(words or "nothing", f"{mean(of):.2f} dB") for words, of in known.items()]
     return Section(
@@ -198,31 +208,22 @@ def films() -> Section:
         "passes": "an object passes",
     }
     scenes = sorted({row["scene"] for row in rows})
-    gain = {(row["scene"], row["motion"]): number(row, "gain_db") for row in rows}
+    gain = figures(rows, "gain_db", "scene", "motion")
     dots = {text: [gain[scene, motion] for scene in scenes] for motion, text in words.items()}
     of = {motion: [row for row in rows if row["motion"] == motion] for motion in words}
-    pans, rests = (
-        mean(number(row, "gain_db") for row in of[motion]) for motion in ("pans", "rests")
-    )
-    cost = mean(number(row, "cost") for row in rows)
-    flicker = mean(number(row, "flicker") for row in of["rests"])
-    table = [("motion", "mean gain", "least gain", "processor time", "flicker", "inside")]
+    pans, rests = (average(of[motion], "gain_db") for motion in ("pans", "rests"))
+    cost, flicker = average(rows, "cost"), average(of["rests"], "flicker")
+    table: list[tuple[str, ...]] = [
+        ("motion", "mean gain", "least gain", "processor time", "flicker", "inside")
+    ]
     for motion, text in words.items():
-        columns = {
-            key: [number(row, key) for row in of[motion]]
-            for key in ("gain_db", "cost", "flicker", "inside")
-        }
-        table.append(
-            (
-                text, f"{mean(columns['gain_db']):+.2f} dB", f"{min(columns['gain_db']):+.2f} dB",
-                *(f"{100 * mean(columns[key]):.0f} %" for key in ("cost", "flicker", "inside")),
-            )
-        )  # fmt: skip
+        gains = [number(row, "gain_db") for row in of[motion]]
+        shares = (percent(average(of[motion], key)) for key in ("cost", "flicker", "inside"))
+        table.append((text, f"{mean(gains):+.2f} dB", f"{min(gains):+.2f} dB", *shares))
     return Section(
         "What does a film gain over its frames?",
         f"{pans:+.1f} dB if the camera pans and {rests:+.1f} dB at rest. A film takes "
-        f"{100 * cost:.0f} % of the time, and a scene at rest flickers {100 * flicker:.0f} % as "
-        "much.",
+        f"{percent(cost)} of the time, and a scene at rest flickers {percent(flicker)} as much.",
         "Right of 0 is better. The gain is the mean PSNR of frames 3 to 8 minus that of the same "
         "frames reconstructed singly. The table lists time and flicker relative to single frames; "
         "inside: share of frames whose true PSNR lies in the stated interval.",
@@ -248,7 +249,7 @@ def moving_shots() -> Section:
     for step in steps:
         of = [row for row in rows if number(row, "step_px") == step]
         own = [over[row["scene"], step] for row in of]
-        alone = mean(number(row, "moved_db") - number(row, "alone_db") for row in of)
+        alone = average(of, "moved_db") - average(of, "alone_db")
         trusted = sum(row["verdict"] == "trust" for row in of)
         inside = sum(row["inside"] == "True" for row in of)
         table.append(
@@ -278,15 +279,15 @@ def moving_shots() -> Section:
 def three_shots() -> Section:
     """Three shots of a moved mask."""
     rows = rows_of("three-shots")
-    by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in rows}
+    by = figures(rows, "psnr_db", "scene", "method")
     scenes = sorted({row["scene"] for row in rows}, key=lambda scene: -by[scene, "adaptive"])
     dots = {method: [by[scene, method] for scene in scenes] for method in ("tv-dict", "adaptive")}
-    leads = [a - b for a, b in zip(dots["adaptive"], dots["tv-dict"], strict=True)]
-    answer = f"Three shots: adaptive is {mean(leads):.1f} dB above tv-dict"
+    over = leads(dots, "adaptive", "tv-dict")
+    answer = f"Three shots: adaptive is {mean(over):.1f} dB above tv-dict"
     return Section(
         "What do three shots give?",
         f"With the mask moved between three shots `adaptive` leads `tv-dict` by "
-        f"{min(leads):.1f} to {max(leads):.1f} dB.",
+        f"{min(over):.1f} to {max(over):.1f} dB.",
         f"Right is better. {len(scenes)} light fields, cropped to 256x256; the last ones have "
         "disparities beyond the search range.",
         ("three-shots",),
@@ -299,9 +300,9 @@ def noise_and_shots() -> Section:
     rows = rows_of("noise-and-shots")
 
     def curves(key: str, kept: Callable[[Row], bool]) -> list[list[tuple[float, float]]]:
-        by: dict[str, list[tuple[float, float]]] = {}
+        by: dict[str, list[tuple[float, float]]] = defaultdict(list)
         for row in filter(kept, rows):
-            by.setdefault(row["scene"], []).append((number(row, key), number(row, "psnr_db")))
+            by[row["scene"]].append((number(row, key), number(row, "psnr_db")))
         most = max(map(len, by.values()))
         return [sorted(line) for line in by.values() if len(line) == most]
 
@@ -338,21 +339,13 @@ def noise_and_shots() -> Section:
 def stated() -> Section:
     """How well the accuracy that a result states holds."""
     rows = rows_of("stated-groups")
-    table = [
-        (
-            "captures of group",
-            "number",
-            "error of the estimated accuracy, rms",
-            "truth within interval",
-        )
-    ]
+    error = "error of the estimated accuracy, rms"
+    table = [("captures of group", "number", error, "truth within interval")]
     for row in rows:
-        within = (
-            f"{number(row, 'in_interval'):.0%}".replace("%", " %") if row["in_interval"] else ""
-        )
+        within = percent(number(row, "in_interval")) if row["in_interval"] else ""
         table.append((row["group"], row["captures"], f"{number(row, 'rms_db'):.1f} dB", within))
     other = next(row for row in rows if row["group"] == "B")
-    held = f"{number(other, 'in_interval'):.0%}".replace("%", " %")
+    held = percent(number(other, "in_interval"))
     return Section(
         "Can the estimated accuracy be believed?",
         f"The interval of the estimated accuracy contains the true PSNR in {held} of the captures "
@@ -433,18 +426,18 @@ def wrong_psi() -> Section:
     # It has become part of `adaptive`.
     rows = [row for row in rows if row["method"] != "adaptive-dict"]
     rows.sort(key=lambda row: -number(row, "oracle"))
-    dots = {
-        "Psi before the shift": [number(row, "mismatched") for row in rows],
-        "Psi fitted to the frames": [number(row, "blind") for row in rows],
-        "the true Psi": [number(row, "oracle") for row in rows],
-    }
-    lost = [number(row, "oracle") - number(row, "mismatched") for row in rows]
+    names = {
+        "Psi before the shift": "mismatched", "Psi fitted to the frames": "blind",
+        "the true Psi": "oracle",
+    }  # fmt: skip
+    dots = {words: [number(row, key) for row in rows] for words, key in names.items()}
+    lost = leads(dots, "the true Psi", "Psi before the shift")
     won = min(number(row, "recovered_of_oracle") for row in rows)
     answer = "A mask shifted by half a pixel costs every method; the frames correct Psi"
     return Section(
         "What if the mask has moved?",
         f"A shift by half a pixel costs {min(lost):.1f} to {max(lost):.1f} dB; fitting Psi to the "
-        f"frames alone recovers {won:.0%} or more of this loss.".replace("%", " %"),
+        f"frames alone recovers {percent(won)} or more of this loss.",
         "The grey bar is the loss by the wrong Psi. One scene, 32x40: the order counts, not the "
         "absolute values.",
         ("mismatch",),
@@ -481,21 +474,14 @@ def breaking() -> Section:
             cells.append(of)
         most = f"{median(cells[0]):.2g} ({min(cells[0]):.2g}, {max(cells[0]):.2g})"
         table.append((words, _plain(most), _plain(f"{median(cells[1]):.2g}")))
-    shifts = {
-        row["scene"]: number(row, "below_best_to")
-        for row in rows
-        if (row["fault"], row["method"]) == ("mask-shift", "adaptive-fast")
-    }
+    moved = [r for r in rows if (r["fault"], r["method"]) == ("mask-shift", "adaptive-fast")]
+    shifts = figures(moved, "below_best_to", "scene")
     strict, mild = min(shifts, key=shifts.__getitem__), max(shifts, key=shifts.__getitem__)
-    points: dict[str, list[tuple[float, float]]] = {}
+    points: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for row in rows_of("stability-real"):
-        if (row["fault"], row["method"], row["screened"]) == (
-            "mask-shift",
-            "adaptive-fast",
-            "True",
-        ):
-            at = number(row, "strength")
-            points.setdefault(row["scene"], []).append((at, number(row, "psnr_db")))
+        kind = row["fault"], row["method"], row["screened"]
+        if kind == ("mask-shift", "adaptive-fast", "True"):
+            points[row["scene"]].append((number(row, "strength"), number(row, "psnr_db")))
     every = [sorted(line) for line in points.values()]
     shared = sorted(set.intersection(*({x for x, _ in line} for line in every)))
     middle = [(x, mean(dict(line)[x] for line in every)) for x in shared]
@@ -529,7 +515,7 @@ def _plain(words: str) -> str:
 def calibration() -> Section:
     """How well Psi is measured."""
     rows = rows_of("calibration_checks")
-    by = {row["what"]: number(row, "measured") for row in rows}
+    by = figures(rows, "measured", "what")
     names = [
         row["what"].split(":")[0] for row in rows if row["what"].endswith(": true error of Psi")
     ]
@@ -577,11 +563,9 @@ def mask_design() -> Section:
     """What a designed mask gains over the shipped ones."""
     rows = rows_of("design")
     names = [f"{row['sensor']}, {row['shots']} shot{'s' * (row['shots'] != '1')}" for row in rows]
-    dots = {
-        "best shipped camera": [number(row, "shipped_db") for row in rows],
-        "designed": [number(row, "design_db") for row in rows],
-    }
-    gains = [number(row, "design_db") - number(row, "shipped_db") for row in rows]
+    keys = {"best shipped camera": "shipped_db", "designed": "design_db"}
+    dots = {words: [number(row, key) for row in rows] for words, key in keys.items()}
+    gains = leads(dots, "designed", "best shipped camera")
     table = [("sensor", "designed mask", "best shipped", "gain")]
     for name, row, gain in zip(names, rows, gains, strict=True):
         table.append((name, row["design"], f"`{row['best_shipped']}`", f"{gain:+.2f} dB"))
@@ -606,7 +590,7 @@ def learning() -> Section:
     """What a trained network gains."""
     rows = [*rows_of("group-b-chart"), *rows_of("group-b-unrolled")]
     kept = [row for row in rows if row["camera"] == "scenario-ii-cfa" and row["level"] == "default"]
-    by = {(row["scene"], row["method"]): number(row, "psnr_db") for row in kept}
+    by = figures(kept, "psnr_db", "scene", "method")
     scenes = sorted({row["scene"] for row in kept}, key=lambda scene: -by[scene, "adaptive"])
     dots = {
         words: [by[scene, method] for scene in scenes]
@@ -614,10 +598,8 @@ def learning() -> Section:
             ("tv", "tv"), ("unrolled, a network", "unrolled"), ("adaptive", "adaptive"),
         )
     }  # fmt: skip
-    over, under = (
-        mean(a - b for a, b in zip(dots[better], dots[worse], strict=True))
-        for better, worse in (("unrolled, a network", "tv"), ("adaptive", "unrolled, a network"))
-    )
+    over = mean(leads(dots, "unrolled, a network", "tv"))
+    under = mean(leads(dots, "adaptive", "unrolled, a network"))
     return Section(
         "What does training gain?",
         f"A small network, trained on random worlds, gains {over:.1f} dB over total "

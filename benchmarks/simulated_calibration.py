@@ -18,7 +18,6 @@ from emmc_rig.acquisition.expand import expand, mask_offsets_um
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.bench.hardware import ALL_FITTED, Fitted, Rig, simulated_rig
 from emmc_rig.demo import simulated_session
-from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import (
@@ -214,27 +213,12 @@ def calibrate_simulated(
     metrics = {
         **found.metrics,
         "camera": settings.camera_name,
-        "psi_relative_error": {
-            name: true_error(found.psi, true, good) for name, found in known.items()
-        },
-        "psi_stated_error": {name: stated_error(found, good) for name, found in known.items()},
-        "psi_coverage": {name: coverage(found, true, good) for name, found in known.items()},
+        "psi_relative_error": {k: true_error(v.psi, true, good) for k, v in known.items()},
+        "psi_stated_error": {k: stated_error(v, good) for k, v in known.items()},
+        "psi_coverage": {k: coverage(v, true, good) for k, v in known.items()},
         "design_relative_error": true_error(design, true, good),
         "held_out_frames": held_out,
         "capture_seconds": captured_s,
         "seed": settings.seed,
     }
     return SimulatedCalibration(replace(found, metrics=metrics), true)
-
-
-def run_calibrate(
-    settings: CalibrateSettings, folder: Path, watcher: Watcher | None = None
-) -> dict:
-    """Calibrate the simulated rig into an existing folder and return the metrics.
-
-    Writes what `SessionCalibration.write` does.
-    """
-    found = calibrate_simulated(settings, watcher).found
-    found.write(folder)
-    write_metrics(folder, found.metrics)
-    return found.metrics

@@ -34,10 +34,10 @@ not fitted to is foretold no better."""
 def measure(
     scene: str, cut: int, camera: str, size: tuple[int, int], seed: int, method: str, noise: float
 ) -> dict:
-    """Return what is stated of one capture and what is true, and the features it rests on.
+    """Return the stated and the true accuracy of a capture, and the features of `foretold_db`.
 
-    cut: 0 the middle of a scene, 1 about the middle of its first quarter; of a built-in scene
-    another one. error_db, deviation_db: what `foretold_db` should return.
+    cut: 0 the middle of a scene, 1 about the middle of its first quarter; a built-in scene is drawn
+    anew instead. error_db, deviation_db: the values that `foretold_db` should return.
     """
     capture = Capture(scene, camera, size, seed + cut, noise=noise)
     given = trial_of(capture, scene=None if capture.is_built_in or not cut else _cut(scene, size))
@@ -142,19 +142,14 @@ def main() -> None:
     parser.add_argument("--method", default="adaptive")
     parser.add_argument("--fit", action="store_true", help="print constants from all rows kept")
     args = lab.parsed(parser)
-    points = [
-        {
-            "scene": scene, "cut": cut, "camera": camera, "size": args.size, "seed": args.seed,
-            "method": args.method, "noise": noise,
-        }
-        for scene in args.scenes
+    choices = [
+        {"cut": cut, "camera": camera, "method": args.method, "noise": noise}
         for cut in (0, 1)
         for camera in ([args.camera] if args.camera else CAMERAS)
         for noise in NOISES
-    ]  # fmt: skip
-    if args.smallest:
-        points = points[:1]
-    rows = lab.measured(points, measure, "stated", args)
+    ]
+    points = lab.points(args, choices)
+    rows = lab.measured(points[:1] if args.smallest else points, measure, "stated", args)
     if args.fit:
         fit(pd.read_csv(args.out / "stated.csv"))
         return

@@ -10,7 +10,7 @@ from html import escape
 WIDTH, TEXT_PX = 560, 14
 """Of the drawing: at this size its words are readable on a phone 390 pixels wide, too."""
 CHARACTER_PX = 7.6
-"""Width of a character, for what must not run into each other."""
+"""Width of a character, to keep labels apart."""
 ROW_PX, PLOT_PX = 26, 250
 STYLE = """
 svg{--paper:#fff;--ink:#1d2730;--soft:#55626d;--grid:#dfe5ea;--c0:#0b63c4;--c1:#c2570c;--c2:#2b8a4b;
@@ -44,8 +44,8 @@ def dots(
 
     def parts() -> Iterator[str]:
         yield from frame.vertical(_ticks(low, high), unit)
-        for one in marks:
-            yield _line(frame.x(one), frame.top, frame.x(one), bottom, "var(--soft)", 2)
+        for at in map(frame.x, marks):
+            yield _line(at, frame.top, at, bottom, "var(--soft)", 2)
         for row, name in enumerate(rows):
             y = frame.top + (row + 0.5) * ROW_PX
             yield _text(left - 10, y + 5, name, "end")
@@ -84,7 +84,9 @@ def points(
     title: str, axes: tuple[str, str], series: Mapping[str, Mapping[str, tuple[float, float]]]
 ) -> str:
     """Return named points over a logarithmic x, in a colour for each series."""
-    frame = _plot(title, axes, [list(one.values()) for one in series.values()], list(series), True)
+    frame = _plot(
+        title, axes, [list(named.values()) for named in series.values()], list(series), True
+    )
 
     def parts() -> Iterator[str]:
         taken: list[tuple[float, float, float]] = []
@@ -121,20 +123,16 @@ class _Frame:
         self.across, self.up = across, up
 
     def x(self, value: float) -> float:
-        low, high = self.across
-        share = (
-            (math.log(value) - math.log(low)) / (math.log(high) - math.log(low))
-            if self.log
-            else (value - low) / (high - low)
-        )
-        return self.left + share * (WIDTH - 24 - self.left)
+        scale = math.log if self.log else float
+        low, high, at = map(scale, (*self.across, value))
+        return self.left + (at - low) / (high - low) * (WIDTH - 24 - self.left)
 
     def y(self, value: float) -> float:
         low, high = self.up
         return self.top + self.height * (1 - (value - low) / (high - low))
 
     def vertical(self, ticks: Sequence[float], name: str) -> Iterator[str]:
-        """Yield the grid of x with its figures and what it is, below the plot."""
+        """Yield the grid of x, with its figures and its name below the plot."""
         bottom = self.top + self.height
         for tick in ticks:
             yield _line(self.x(tick), self.top, self.x(tick), bottom, "var(--grid)")

@@ -3,7 +3,6 @@
 import csv
 import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,14 +16,12 @@ OWN = [
     for path in sorted(LAB.glob("*.py"))
     if 'add_argument("--smallest"' in path.read_text("utf-8")
 ]
-"""Scripts that take their arguments from `lab`, and those that have their own."""
+"""Scripts with the arguments of `lab`, and scripts with their own."""
 SCRIPTS = [path for path in (*SHARED, *OWN) if path.stem not in ("lab", "test_lab")]
-KEEPING = [*SHARED, LAB / "calibration_checks.py", LAB / "real_captures.py"]
+KEEPING = [*SHARED, LAB / "calibration_checks.py"]
 """Scripts that write into docs/results unless told otherwise."""
 NEEDS = {"train_network": "torch"}
 """By script, a package beyond the extra `lab`."""
-ALONE = ("compile_times",)
-"""Scripts that need a process of their own: this one keeps no machine code that others made."""
 
 
 @pytest.mark.filterwarnings("default")
@@ -36,17 +33,9 @@ def test_a_script_runs_at_its_smallest_size(script, tmp_path, monkeypatch):
         pytest.importorskip(NEEDS[script.stem])
     typed = [str(script), "--smallest", *(("--out", ".") if script in KEEPING else ())]
     monkeypatch.chdir(tmp_path)
-    if script.stem in ALONE:
-        paths = os.pathsep.join([str(LAB.parent), os.environ.get("PYTHONPATH", "")])
-        environment = {**os.environ, "PYTHONPATH": paths}
-        done = subprocess.run(
-            [sys.executable, *typed], env=environment, capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
-    else:
-        monkeypatch.setattr(sys, "argv", typed)
-        runpy.run_path(str(script), run_name="__main__")
-        pyplot.close("all")
+    monkeypatch.setattr(sys, "argv", typed)
+    runpy.run_path(str(script), run_name="__main__")
+    pyplot.close("all")
     assert any(tmp_path.iterdir()), "wrote nothing"
     if "lab.measured(" in script.read_text("utf-8"):
         with (tmp_path / "runs.csv").open(newline="", encoding="utf-8") as opened:

@@ -1,4 +1,4 @@
-"""The learned aperture: what is learned, what the error is, and what is refused."""
+"""The learned aperture: learned cells, error of the decoder, refused cameras."""
 
 import math
 
@@ -79,7 +79,6 @@ def test_learning_beats_every_random_aperture_and_leaves_little_light_out(moment
 
 
 def test_one_view_of_no_noise_is_known_and_nothing_else_of_independent_views():
-    """Views that say nothing of each other: a shot's error is what it does not see."""
     aperture = aperture_of(find_camera("learned-aperture"))
     size = VIEWS * PATCH_PX**2
     alone = Moments(np.full(VIEWS, 1e-9), np.eye(size).reshape(2 * (VIEWS, PATCH_PX**2)) * 1e6)
@@ -128,10 +127,6 @@ def test_what_cannot_be_learned_is_refused_by_name(edited, tmp_path, change, nam
     assert not out.exists()
 
 
-def decibels(mean_square):
-    return -10 * math.log10(mean_square)
-
-
 def random_aperture(camera):
     rng = np.random.default_rng(5)
     for name in camera.masks:
@@ -143,8 +138,8 @@ def test_the_shipped_aperture_is_better_than_a_random_one_by_the_moments_of_othe
     moments = patch_moments(3, 1, (5, 5))
     shipped = find_camera("learned-aperture")
     learned, random = (
-        decibels(one.error(one.cells(), moments))
-        for one in map(aperture_of, (shipped, random_aperture(shipped)))
+        -10 * math.log10(aperture.error(aperture.cells(), moments))
+        for aperture in map(aperture_of, (shipped, random_aperture(shipped)))
     )
     assert learned > random + 1
 
@@ -156,14 +151,17 @@ def test_the_shipped_aperture_is_better_where_neither_worlds_nor_a_linear_decode
     grey = np.repeat(coloured.mean(axis=-1, keepdims=True), 3, axis=-1)
     shipped = find_camera("learned-aperture")
     learned, random = (
-        decibels(
+        -10
+        * math.log10(
             np.mean(
                 np.square(
-                    reconstruct(one.psi(size), one.expose(grey, seed=0), "tv").light_field.mean(-1)
+                    reconstruct(
+                        camera.psi(size), camera.expose(grey, seed=0), "tv"
+                    ).light_field.mean(-1)
                     - grey[..., 0]
                 )
             )
         )
-        for one in (shipped, random_aperture(shipped))
+        for camera in (shipped, random_aperture(shipped))
     )
     assert learned > random + 1

@@ -134,7 +134,7 @@ def contrast(picture: NDArray[np.float32]) -> float:
 
 
 def with_drawn_masks(camera: Camera, rng: np.random.Generator) -> Camera:
-    """Return a camera with other random patterns of the same kinds; made ones stay as they are."""
+    """Return a camera with new seeds of its random patterns; other patterns stay."""
     for name, mask in camera.masks.items():
         if hasattr(mask.pattern, "seed"):
             camera = with_pattern(camera, name, seed=int(rng.integers(2**31)))
@@ -182,7 +182,7 @@ class Learner:
             torch.save(state, partial)
 
     def load(self, path: Path, recipe: str) -> None:
-        """Go on from a checkpoint; raises AppError for one of another training."""
+        """Go on from a checkpoint; raises AppError for the checkpoint of another training."""
         state = torch.load(path, weights_only=True)
         if state["recipe"] != recipe:
             raise AppError(f"{path}: of a training with other settings; give the same or delete it")

@@ -10,7 +10,7 @@ with the flat patches in place of the one mean). The weight is put into the patc
 times sqrt(w) has the same code times sqrt(w). Systematic sampling in the order of the places
 spreads the kept ones over all scenes.
 
-Two passes over the scenes, so that one scene and the kept patches are all that is in memory.
+Two passes over the scenes keep one scene and the chosen patches in memory.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def _candidates(
     settings: PatchSettings,
     wanted: NDArray[np.int64] | None = None,
 ) -> Iterator[Array]:
-    """Yield a scene's candidates in batches, in their order; all of them, or the wanted ones."""
+    """Yield a scene's candidates, or the wanted ones among them, in batches in their order."""
     rng = np.random.default_rng([settings.seed, number])
     count = int(edges[number + 1] - edges[number])
     size = settings.rows, settings.columns

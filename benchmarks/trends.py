@@ -1,8 +1,7 @@
 """A better capture never costs accuracy: PSNR against noise and shots, beside other methods.
 
 Every number of shots at every noise: deviations of readings of 0.008 to 0.0005, those of brightness
-0.25 where a reading of 1 is worth 4,000 to 10^6 electrons. Hours for a group; it goes on where it
-stopped.
+0.25 where a reading of 1 is worth 4,000 to 10^6 electrons. A group takes hours.
 """
 
 from __future__ import annotations
@@ -71,16 +70,13 @@ def main() -> None:
     captures = list(product(args.shots or SHOTS, args.noise or NOISES))
     if args.smallest:
         captures = [(1, 0.004), (1, 0.001)]
-    points = [
-        {
-            "scene": scene, "camera": args.camera, "size": args.size, "seed": args.seed,
-            "method": method, "shots": shots, "noise": noise,
-        }
+    choices = [
+        {"method": method, "shots": shots, "noise": noise}
         for shots, noise in captures
-        for scene in args.scenes
         for method in METHODS[: 1 if args.smallest else None]
-    ]  # fmt: skip
-    rows = lab.measured(points, measure, "trends", args).dropna(subset="psnr_db")
+    ]
+    rows = lab.measured(lab.points(args, choices), measure, "trends", args)
+    rows = rows.dropna(subset="psnr_db")
     _, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5))
     for (scene, method), some in rows.groupby(["scene", "method"]):
         by_noise = some[some.shots == some.shots.min()].sort_values("noise")

@@ -1,9 +1,9 @@
 """Verdicts flag what a fault broke and pass what is good: rates over faults of capture and Psi.
 
 A result is broken when it lost more than 3 dB against the same capture without the fault, good when
-it lost 1 dB at most. It is poor when it had little to lose: without the fault it was within 5 dB of
-a picture of one even colour, or another method of those measured was 2 dB better. The first reason
-of what is flagged should name the fault, where there are words for it.
+it lost 1 dB at most. A result is poor when its PSNR without the fault is within 5 dB of the PSNR of
+a uniform picture, or 2 dB below another method. The first reason of a flagged result should name
+the fault (NAMED).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def measure(
 
 
 def kinds(rows):
-    """Return the rows with what each is, whatever its verdict, and whether it was flagged."""
+    """Return the rows with the columns `kind`, by the loss, and `flagged`, by the verdict."""
     rows = rows.dropna(subset="psnr_db").copy()
     one_trial = ["scene", "camera", "fault", "seed"]
     harmless = {fault.name: f"{fault.quick[0]:g}" for fault in FAULTS.values()}
@@ -78,17 +78,13 @@ def main() -> None:
     shots = len(Capture(args.scenes[0], args.camera).described.shots)
     faults = [f for f in FAULTS.values() if f.kind in (SENSOR, MASK, SHOTS) and f.shots <= shots]
     faults = [f for f in faults if f.name in (args.fault or FAULTS)]
-    points = [
-        {
-            "scene": scene, "camera": args.camera, "size": args.size, "seed": args.seed,
-            "method": method, "fault": fault.name, "strength": float(strength),
-        }
-        for scene in args.scenes
+    choices = [
+        {"method": method, "fault": fault.name, "strength": float(strength)}
         for fault in (faults[:1] if args.smallest else faults)
         for strength in fault.quick
         for method in (["tv"] if args.smallest else args.method or ["tv", "adaptive-fast"])
-    ]  # fmt: skip
-    rows = kinds(lab.measured(points, measure, "verdicts", args))
+    ]
+    rows = kinds(lab.measured(lab.points(args, choices), measure, "verdicts", args))
     summary = rows.groupby("kind").flagged.agg(["sum", "count"])
     _, axes = plt.subplots()
     (100 * summary["sum"] / summary["count"]).plot.bar(ax=axes, ylabel="flagged, %")
@@ -97,7 +93,7 @@ def main() -> None:
         ((rows.kind == "broken") & (rows.level == "trust")) | ((rows.kind == "good") & rows.flagged)
     ]
     named = rows[rows.flagged & rows.fault.isin(NAMED)]
-    right = [NAMED[one.fault] in one.reasons.split("; ")[0] for one in named.itertuples()]
+    right = [NAMED[row.fault] in row.reasons.split("; ")[0] for row in named.itertuples()]
     print(f"first reason right: {sum(right)} of {len(right)}")
     print(wrong[["scene", "method", "fault", "strength", "kind", "level", "reasons"]].to_string())
 

@@ -91,14 +91,8 @@ def measure(
 def main() -> None:
     """Measure every method on every scene."""
     args = lab.parsed(lab.arguments(__doc__, camera="rgbw-bayer-3shots", size="24x32"))
-    points = [
-        {
-            "scene": scene, "camera": args.camera, "size": args.size, "seed": args.seed,
-            "method": method, "rounds": 1 if args.smallest else ROUNDS,
-        }
-        for scene in args.scenes
-        for method in (["tv"] if args.smallest else installed_methods())
-    ]  # fmt: skip
+    methods, rounds = (["tv"], 1) if args.smallest else (installed_methods(), ROUNDS)
+    points = lab.points(args, ({"method": method, "rounds": rounds} for method in methods))
     rows = lab.measured(points, measure, "worst", args)
     axes = rows.groupby("method").lost_db.max().plot.barh(xlabel="dB lost to the worst direction")
     lab.finished(rows, axes, "worst", args)

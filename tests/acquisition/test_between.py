@@ -66,11 +66,11 @@ def test_a_hook_is_called_before_every_frame_and_after_the_last():
 
     Sequencer(session, plan, rig, between=Between("lab:hook", hook)).run()
     ids = [frame.id for frame in session.frames]
-    assert [one[0] for one in called] == [*ids, None]
+    assert [call[0] for call in called] == [*ids, None]
     # Every frame before is on the disk, and the bench is lit as the next one asks.
-    assert [one[1] for one in called] == list(range(len(ids) + 1))
-    assert {one[2] for one in called} == {"white"}
-    assert [one.id for one in noted(session)] == [*ids, ""]
+    assert [call[1] for call in called] == list(range(len(ids) + 1))
+    assert {call[2] for call in called} == {"white"}
+    assert [entry.id for entry in noted(session)] == [*ids, ""]
     assert noted(session)[0].notes == {"power_w": 0.5, "spectrum": [0, 1, 2], "bad": "NaN"}
     assert "between" in session.stored[ids[0]].spans_s
 
@@ -347,5 +347,5 @@ def test_ctrl_c_ends_a_hook_that_hangs_and_nothing_is_lost(tmp_path):
     run_lines = [
         json.loads(line) for line in (session.folder / "journal.jsonl").read_text().splitlines()
     ]
-    digests = [one["between"]["sha256"] for one in run_lines if one["kind"] == "run"]
+    digests = [line["between"]["sha256"] for line in run_lines if line["kind"] == "run"]
     assert len(set(digests)) == 2

@@ -1,4 +1,4 @@
-"""The sequencer: frames taken, retries, refusals, and the bench at the end."""
+"""The sequencer: frames, retries, refusals, resumption, and the bench after a capture."""
 
 import errno
 import os
@@ -242,7 +242,7 @@ def test_a_resume_refuses_another_stage_unless_it_is_meant():
     with pytest.raises(AppError, match=r"begun with mask_y on .*, now it is on .* 999") as refused:
         refuse_other_devices(session, of_serial("999"))
     assert refused.value.advice == "other-devices"
-    # Other devices that are meant go on, and later runs are compared with these devices.
+    # Later runs are compared with the stage that was meant.
     refuse_other_devices(session, of_serial("999"), meant=True)
     again = Session(session.folder, session.disk)
     again.discard(next(iter(again.stored)), "wanted once more")
@@ -320,34 +320,18 @@ def test_ctrl_c_stops_after_the_frame_and_the_second_one_now():
 
 
 CAMERA_FAULTS = (
-    "torn_raw",
-    "wrong_size",
-    "drop_event",
-    "drop_complete",
-    "unplug_in_download",
-    "stall_in_download",
-    "lost_bytes",
-    "garbled_header",
-    "silent",
-    "stuck_exposure",
-)
+    "torn_raw", "wrong_size", "drop_event", "drop_complete", "unplug_in_download",
+    "stall_in_download", "lost_bytes", "garbled_header", "silent", "stuck_exposure",
+)  # fmt: skip
 STAGE_FAULTS = ("drop_reply", "garble_reply", "late_reply", "unplug", "stall")
 
 
-@pytest.mark.parametrize("fault", CAMERA_FAULTS)
-def test_a_fault_of_the_camera_costs_a_try_and_no_frame(undisturbed, fault):
+@pytest.mark.parametrize("fault", [*CAMERA_FAULTS, *STAGE_FAULTS])
+def test_a_fault_of_camera_or_stage_costs_a_try_and_no_frame(undisturbed, fault):
     rig, _ = bench_rig()
     session, plan = started(rig)
-    rig.still.faults.inject(fault, skip=5)
-    assert Sequencer(session, plan, rig).run().complete
-    assert contents(session) == contents(undisturbed[0])
-
-
-@pytest.mark.parametrize("fault", STAGE_FAULTS)
-def test_a_fault_of_the_stage_costs_a_try_and_no_frame(undisturbed, fault):
-    rig, _ = bench_rig()
-    session, plan = started(rig)
-    rig.chain.faults.inject(fault, skip=5 if fault == "stall" else 30)
+    device = rig.still if fault in CAMERA_FAULTS else rig.chain
+    device.faults.inject(fault, skip=5 if fault in (*CAMERA_FAULTS, "stall") else 30)
     assert Sequencer(session, plan, rig).run().complete
     assert contents(session) == contents(undisturbed[0])
 
@@ -370,14 +354,19 @@ def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
     assert contents(session) == contents(undisturbed[0])
 
 
-def test_a_stage_that_moves_for_ever_stops_the_capture_with_a_reason():
+@pytest.mark.parametrize(
+    ("fault", "skip", "reason", "attempts"),
+    [("busy_forever", 5, "still moves after", 99), ("emergency_stop", 40, "emergency", 1)],
+)
+def test_a_stage_that_cannot_go_on_stops_the_capture_with_a_reason(fault, skip, reason, attempts):
     rig, _ = bench_rig()
     session, plan = started(rig)
-    rig.chain.faults.inject("busy_forever", skip=5)
-    with pytest.raises(GaveUpError, match="still moves after"):
+    rig.chain.faults.inject(fault, skip=skip)
+    with pytest.raises(GaveUpError, match=reason):
         Sequencer(session, plan, rig).run()
     assert session.journal.entries[-1].kind == "stopped"
     assert not verify(session).damaged
+    assert all(e.attempt <= attempts for e in of_kind(session.journal.entries, RetryEntry))
 
 
 def test_a_fault_that_stays_stops_the_capture_with_everything_kept():
@@ -402,28 +391,11 @@ def test_the_budget_of_the_session_ends_it_too():
     assert session.stored
 
 
-def test_an_emergency_stop_is_never_argued_with():
-    rig, _ = bench_rig()
-    session, plan = started(rig)
-    rig.chain.faults.inject("emergency_stop", skip=40)
-    with pytest.raises(GaveUpError, match="emergency"):
-        Sequencer(session, plan, rig).run()
-    assert not any(e.attempt > 1 for e in of_kind(session.journal.entries, RetryEntry))
-
-
 def test_what_has_to_be_mended_follows_from_the_fault():
     found = [mending(DriverError("x"), attempt) for attempt in range(1, 8)]
     assert found[0] == Mending(wait_s=0.1)
-    assert [mending.wait_s for mending in found] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
-    assert [mending.reopen_camera for mending in found] == [
-        False,
-        False,
-        True,
-        False,
-        False,
-        True,
-        False,
-    ]
+    assert [step.wait_s for step in found] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
+    assert [step.reopen_camera for step in found] == [False, False, True, False, False, True, False]
 
 
 def planned(kind):
@@ -562,19 +534,18 @@ def test_a_disk_that_is_too_small_is_reported_before_anything_is_made():
         refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1000))
 
 
-def test_an_axis_out_of_reach_is_reported_before_anything_moves():
+@pytest.mark.parametrize(
+    ("text", "mask_um", "line"),
+    [
+        (SMALL, 99_990.0, "mask_x cannot go 270 um"),
+        (ONE_SHOT.replace("0.05", "7200"), 20_000.0, "the camera exposes from"),
+    ],
+)
+def test_a_plan_beyond_stage_or_camera_is_reported_before_anything_moves(text, mask_um, line):
     rig = still_rig()
-    rig = replace(rig, zero_um={**rig.zero_um, "mask_x": 99_990.0})
-    session, plan = started(rig)
-    with pytest.raises(AppError, match="mask_x cannot go 270 um"):
-        Sequencer(session, plan, rig).run()
-    assert rig.stage.moves == 0
-
-
-def test_an_exposure_beyond_the_camera_is_reported_before_anything_moves():
-    rig = still_rig()
-    session, plan = started(rig, ONE_SHOT.replace("0.05", "7200"))
-    with pytest.raises(AppError, match="the camera exposes from"):
+    rig = replace(rig, zero_um={**rig.zero_um, "mask_x": mask_um})
+    session, plan = started(rig, text)
+    with pytest.raises(AppError, match=line):
         Sequencer(session, plan, rig).run()
     assert rig.stage.moves == 0
 

@@ -22,7 +22,7 @@ import pytest
 import typer
 import yaml
 from capture_rigs import BLACK, WHITE, NamedFrames, still_rig
-from programs import one_line
+from programs import done, one_line
 
 import drivers.errors
 import emmc_rig
@@ -116,7 +116,7 @@ class Light(NamedFrames):
     """Frames of their own name again, whose brightness is the exposure's, and what goes wrong.
 
     factor: by the beginning of a frame's name, what its light is multiplied with. faults: errors to
-    be raised by the beginning of the frame's name. swapped: a frame that shows what another does.
+    be raised by the beginning of the frame's name. swapped: names of the frames shown, by name.
     """
 
     def __init__(self):
@@ -284,8 +284,7 @@ WALKS |= {text: partial(plan_that_is_mended, wrong=a, right=b) for text, (a, b) 
 
 
 def accepted_with_a_target(bench):
-    code, _, err = bench.run(*CAPTURE, "--until", "30dB", "--dry-run")
-    assert code == 0, err
+    done(bench.run(*CAPTURE, "--until", "30dB", "--dry-run"))
 
 
 @walk("the plan has one shot, so that no shot can be saved")
@@ -322,8 +321,7 @@ def calibration_plan(bench):
     """Take the whiteboards of the plan that `emmc-rig calibrate --plan` writes, as advised."""
     if not WRITTEN:
         arguments = ("calibrate", "--plan", "--camera", "camera.yaml", "--size", "16x20")
-        code, _, err = bench.run(*arguments)
-        assert code == 0, err
+        done(bench.run(*arguments))
         path = bench.folder / "emmc-calibration" / "plan.yaml"
         WRITTEN.update(yaml.safe_load(path.read_text()))
     bench.small_camera(whiteboards=WRITTEN["whiteboards"], darks=WRITTEN["darks"])
@@ -344,20 +342,28 @@ def an_exposure_beyond_the_camera(bench):
     bench.plan(shots=[{"exposure_s": 0.02}])
 
 
-@walk(": the camera's gain goes from ")
-def a_gain_beyond_the_camera(bench):
-    bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.01, "gain": 8}])
+BEYOND = {
+    ": the camera's gain goes from ": (
+        "change shots.1.gain in the plan",
+        {"shots": [ONE, {**ONE, "gain": 8}]}, {"shots": [ONE, {**ONE, "gain": 1}]},
+    ),
+    " um from its zero (": (
+        "mask_x", {"shots": [{**ONE, "mask_um": [90_000, 0]}]},
+        {"shots": [{**ONE, "mask_um": [9_000, 0]}]},
+    ),
+}  # fmt: skip
+
+
+def plan_beyond_a_device(bench, words, wrong, right):
+    bench.plan(**wrong)
     line = bench.refused(*CAPTURE, "--dry-run")
-    assert "change shots.1.gain in the plan" in line
+    assert words in line
     yield line
-    bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.01, "gain": 1}])
+    bench.plan(**right)
 
 
-@walk(" um from its zero (")
-def a_place_beyond_the_stage(bench):
-    bench.plan(shots=[{"exposure_s": 0.01, "mask_um": [90_000, 0]}])
-    yield bench.refused(*CAPTURE, "--dry-run")
-    bench.plan(shots=[{"exposure_s": 0.01, "mask_um": [9_000, 0]}])
+WALKS |= {text: partial(plan_beyond_a_device, words=w, wrong=a, right=b)
+          for text, (w, a, b) in BEYOND.items()}  # fmt: skip
 
 
 @walk(" needs a stage axis '")
@@ -397,11 +403,35 @@ def a_shot_that_is_too_bright(bench):
     assert all(after.stored[name] == entry for name, entry in before.stored.items())
 
 
-@walk("is black, its brightest pixels ")
-def a_lens_cap(bench):
-    bench.light.factor = {AGAIN: 0.0}
+def attribute_that_is_put_back(bench, place, name, value):
+    """Change an attribute of a device; value: made of the honest one."""
+    honest = getattr(place(bench), name)
+    setattr(place(bench), name, value(honest))
     yield bench.refused()
-    bench.light.factor = {}
+    setattr(place(bench), name, honest)
+
+
+def light(bench):
+    return bench.light
+
+
+DEVICES = {
+    "is black, its brightest pixels ": (light, "factor", lambda _: {AGAIN: 0.0}),
+    "is identical to the frame before it": (light, "repeats", lambda _: True),
+    "would be exposed for ": (
+        lambda bench: bench.rig.camera, "set_exposure_s",
+        lambda honest: lambda exposure_s: honest(4 * exposure_s),
+    ),
+    "was exposed while ": (
+        lambda bench: bench.rig.stage, "position_um",
+        lambda honest: lambda axis: honest(axis) + 9.0,
+    ),
+}  # fmt: skip
+"""Attributes of camera, stage and light while something is wrong with them."""
+WALKS |= {
+    text: partial(attribute_that_is_put_back, place=place, name=name, value=value)
+    for text, (place, name, value) in DEVICES.items()
+}
 
 
 @walk("is not dark, on average ")
@@ -410,31 +440,6 @@ def a_lamp_left_on(bench):
     yield bench.refused()
     assert not bench.session.exists()
     bench.light.factor = {}
-
-
-@walk("is identical to the frame before it")
-def a_camera_that_repeats_itself(bench):
-    bench.light.repeats = True
-    yield bench.refused()
-    bench.light.repeats = False
-
-
-@walk("would be exposed for ")
-def a_camera_on_automatic_exposure(bench):
-    camera = bench.rig.camera
-    honest = camera.set_exposure_s
-    camera.set_exposure_s = lambda exposure_s: honest(4 * exposure_s)
-    yield bench.refused()
-    camera.set_exposure_s = honest
-
-
-@walk("was exposed while ")
-def a_stage_that_is_pushed(bench):
-    stage = bench.rig.stage
-    honest = stage.position_um
-    stage.position_um = lambda axis: honest(axis) + 9.0
-    yield bench.refused()
-    stage.position_um = honest
 
 
 @walk("gave up after ")
@@ -548,21 +553,25 @@ def raises(code):
     return refuse
 
 
-@walk("); correct that")
-def a_journal_that_cannot_be_read(bench):
-    bench.begun()
+def disk_that_fails(bench, name, refuse, begun=False):
+    if begun:
+        bench.begun()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Disk, "read", raises(errno.EIO))
+        patch.setattr(Disk, name, refuse)
         line = bench.refused()
+    assert begun or not bench.session.exists()
     yield line
 
 
-@walk("); correct that, or name another folder")
-def a_folder_that_cannot_be_made(bench):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Disk, "make_folder", raises(errno.EROFS))
-        line = bench.refused()
-    yield line
+WALKS |= {
+    "); correct that": partial(disk_that_fails, name="read", refuse=raises(errno.EIO), begun=True),
+    "); correct that, or name another folder": partial(
+        disk_that_fails, name="make_folder", refuse=raises(errno.EROFS)
+    ),
+    " are free; make room, or name another folder": partial(
+        disk_that_fails, name="free_bytes", refuse=lambda disk, folder: 1000
+    ),
+}
 
 
 @walk("make that possible, or name another folder")
@@ -585,15 +594,6 @@ def another_program_at_work(bench):
     with held(bench.session):
         line = bench.refused()
     assert f"(process {os.getpid()} on " in line
-    yield line
-
-
-@walk(" are free; make room, or name another folder")
-def a_small_disk(bench):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Disk, "free_bytes", lambda disk, folder: 1000)
-        line = bench.refused()
-    assert not bench.session.exists()
     yield line
 
 
@@ -760,12 +760,12 @@ def test_repeats_that_an_edit_made_different_are_averaged_where_most_are_alike(b
 def sample(kind):
     """An error of the drivers, made of values that its signature takes."""
     values = {str: "x", int: 1, float: 1.0, bytes: b"x", tuple[float, float]: (0.0, 1.0)}
-    taken = [
-        values.get(one.annotation, ("x",))
-        for one in inspect.signature(kind).parameters.values()
-        if one.kind == one.POSITIONAL_OR_KEYWORD and one.default is one.empty
+    values_taken = [
+        values.get(taken.annotation, ("x",))
+        for taken in inspect.signature(kind).parameters.values()
+        if taken.kind == taken.POSITIONAL_OR_KEYWORD and taken.default is taken.empty
     ]
-    return kind(*taken)
+    return kind(*values_taken)
 
 
 def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
@@ -794,15 +794,15 @@ def texts():
     """Every text that the scanned modules raise: its place, and its constant parts."""
     whole = [(path, ast.parse(path.read_text())) for path in SCANNED if path.name not in NO_CAPTURE]
     folders = ast.parse(FOLDERS.read_text())
-    new_plan = [one for one in folders.body if getattr(one, "name", "") in WRITING_A_PLAN]
-    for path, tree in [*whole, *((FOLDERS, one) for one in new_plan)]:
+    new_plan = [node for node in folders.body if getattr(node, "name", "") in WRITING_A_PLAN]
+    for path, tree in [*whole, *((FOLDERS, node) for node in new_plan)]:
         for node in ast.walk(tree):
             said = node.exc if isinstance(node, ast.Raise) else node
             of_error = said is not node or ast.unparse(node).startswith("super().__init__(")
             if isinstance(said, ast.Call) and of_error:
-                raised = [one for one in ast.walk(said) if isinstance(one, ast.Constant)]
-                parts = [one.value for one in raised if isinstance(one.value, str)]
-                yield f"{path.name}:{said.lineno}", [one for one in parts if " " in one.strip()]
+                raised = [part for part in ast.walk(said) if isinstance(part, ast.Constant)]
+                parts = [part.value for part in raised if isinstance(part.value, str)]
+                yield f"{path.name}:{said.lineno}", [part for part in parts if " " in part.strip()]
 
 
 def test_every_text_has_a_walk_and_every_walk_its_text():
@@ -810,7 +810,7 @@ def test_every_text_has_a_walk_and_every_walk_its_text():
     used = set()
     for place, parts in texts():
         if parts:
-            found = {one for one in known if any(one in part for part in [*parts, "".join(parts)])}
+            found = {text for text in known if any(text in p for p in [*parts, "".join(parts)])}
             assert found, f"{place}: no walk for {parts}"
             used |= found
     assert set(known) - used == set()
@@ -823,8 +823,7 @@ def test_advice_carried_out_ends_in_a_complete_session(bench, text):
     line = next(steps)
     assert text in line
     assert next(steps, None) is None
-    code, out, err = bench.run(*bench.finish)
-    assert code == 0, err
+    out = done(bench.run(*bench.finish))
     assert "complete: " in out
     verdict = verify(Session(bench.session))
     assert verdict.is_complete

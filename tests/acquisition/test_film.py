@@ -114,7 +114,7 @@ def test_a_film_of_a_still_mask_comes_from_the_cameras_stream_at_its_rate():
     np.testing.assert_allclose(film_s, np.arange(12) / 10, atol=1e-6)
     np.testing.assert_allclose(np.diff(camera_s), 0.1, atol=1e-6)
     assert [int(line.metadata["block_id"]) for line in run.lines] == list(range(12))
-    assert [(line.segment, line.id, line.rate_hz) for line in run.segments] == [
+    assert [(segment.segment, segment.id, segment.rate_hz) for segment in run.segments] == [
         (0, "film-000000", 10.0)
     ]
     assert not run.dropped
@@ -211,7 +211,7 @@ def test_after_a_power_cut_what_is_stored_stays_and_the_rest_is_another_segment(
     assert run.go(rig=rig).complete
     assert run.lines[: len(before)] == before
     assert run.places == list(range(12))
-    assert {line.segment for line in run.lines[len(before) :]} == {run.segments[-1].segment}
+    assert {segment.segment for segment in run.lines[len(before) :]} == {run.segments[-1].segment}
     assert verify(run.session).is_complete
 
 
@@ -243,7 +243,7 @@ def test_frames_for_which_the_stage_comes_too_late_are_dropped_with_their_places
     session, plan = begun(ROOT, SimulatedDisk(), rig, text)
     assert Sequencer(session, plan, rig).run().complete
     gone = of_kind(session.journal.entries, DroppedEntry)
-    assert {line.reason for line in gone} == {films.LATE}
+    assert {entry.reason for entry in gone} == {films.LATE}
     taken = [name for name in session.stored if name.startswith("film")]
     names = sorted([*taken, *(name for entry in gone for name in entry.ids)])
     assert names == [f"film-{place:06d}" for place in range(9)]
@@ -277,7 +277,7 @@ class Stream(PreparedCamera):
 
 
 def arrived(ring):
-    return [arrived for arrived in ring if arrived is not None]
+    return [frame for frame in ring if frame is not None]
 
 
 def test_frames_take_the_place_nearest_in_time_and_those_of_a_faster_camera_are_passed_over():
@@ -418,7 +418,7 @@ def test_a_metered_film_is_exposed_within_its_period():
 
 def test_a_new_plan_shows_how_a_film_is_asked_for():
     text = new_plan("rgbw-bayer-1shot", find_camera("rgbw-bayer-1shot"))
-    line = next(line for line in text.splitlines() if line.startswith("# film:"))
+    line = next(text_line for text_line in text.splitlines() if text_line.startswith("# film:"))
     asked = Plan.model_validate(yaml.safe_load(text) | yaml.safe_load(line.removeprefix("# ")))
     assert asked.film is not None
     assert (asked.film.frames, asked.film.rate) == (200, 10)

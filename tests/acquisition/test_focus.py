@@ -52,9 +52,9 @@ def test_the_axis_goes_to_where_the_scene_is_sharpest_before_the_shots(tmp_path)
 
 def test_it_focuses_again_when_so_many_frames_were_taken(tmp_path):
     session = captured(tmp_path, "{every: 2, span_um: 300}")
-    assert [one.id for one in focused(session)] == ["shot-0-e0-r0", "shot-0-e0-r2"]
+    assert [entry.id for entry in focused(session)] == ["shot-0-e0-r0", "shot-0-e0-r2"]
     again = focused(session)[1]
-    # It begins where it was left.
+    # A later run begins at the last position.
     assert again.from_um == pytest.approx(focused(session)[0].place_um, abs=1)
 
 

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import yaml
+from programs import done
 
 from emmc_rig.session.session import Session
 
@@ -20,7 +21,7 @@ AXES = {
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory):
-    """Plans with the pinhole before every view: with a mask that stands, and one that moves."""
+    """Plans with the pinhole before every view, for a fixed and for a moving mask."""
     from programs import program
 
     found = {}
@@ -58,8 +59,7 @@ def test_a_bench_comes_to_a_light_field(axes, camera, planned, tmp_path, run):
     rig.write_text(yaml.safe_dump(described))
 
     def did(*words):
-        code, out, err = run(*words)
-        assert code == 0, err
+        out = done(run(*words))
         return out
 
     did("capture", plan, "--rig", rig, *SIZE, "--out", folder)
@@ -79,7 +79,7 @@ def test_a_bench_comes_to_a_light_field(axes, camera, planned, tmp_path, run):
         assert by_hand & {"aperture_x", "aperture_y"} == lacking
     did("calibrate", folder)
     told = json.loads((folder / "calibration" / "metrics.json").read_text())["findings"]
-    assert any("hands put pinholes" in one for one in told) == bool(by_hand)
+    assert any("hands put pinholes" in finding for finding in told) == bool(by_hand)
     did("reconstruct", folder, "--method", "adaptive-fast")
     verdict = json.loads((folder / "reconstruction" / "metrics.json").read_text())["verdict"]
     assert verdict["level"] != "do not use", verdict["reasons"]

@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
@@ -46,14 +47,17 @@ def string_literals(path):
             yield node.lineno, node.value
 
 
+@cache
 def mentions():
-    """Yield file, line and text of strings outside the command line that name a command or flag."""
+    """Return file, line and text of strings of the library that name a command or flag."""
+    found = []
     for path in (path for folder in PRODUCT for path in sorted((ROOT / folder).rglob("*.py"))):
         name = path.relative_to(ROOT).as_posix()
         if not name.startswith(OURS):
             for line, text in string_literals(path):
                 if TYPED.search(OF_OTHERS.sub("", text)):
-                    yield name, line, text
+                    found.append((name, line, text))
+    return found
 
 
 def test_no_text_of_the_library_names_a_command_or_a_flag():

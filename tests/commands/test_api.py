@@ -234,7 +234,7 @@ WAY_IN = """
 
 
 def test_the_page_for_those_with_a_pipeline_of_their_own_has_each_line_of_the_way_in():
-    typed = [one.source for one in doctest.DocTestParser().get_examples(PAGE.read_text())]
+    typed = [example.source for example in doctest.DocTestParser().get_examples(PAGE.read_text())]
     for line in WAY_IN.strip().splitlines():
         assert any(source.startswith(line.strip()) for source in typed), line
     for name in ("light_field", "sigma", "disparity", "verdict"):

@@ -1,4 +1,4 @@
-"""`emmc-rig calibrate`: what it writes, what it says, and what it refuses."""
+"""`emmc-rig calibrate`: written files, plans, refusals, drift."""
 
 import json
 
@@ -6,11 +6,11 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from programs import done
 from simulated_calibration import (
     CalibrateSettings,
     calibrate_simulated,
     in_three_colours,
-    run_calibrate,
     true_error,
 )
 from whiteboard_bench import BenchTruth, WhiteboardBench, moved_truth
@@ -20,7 +20,7 @@ from calibration.placement import SCALARS
 from calibration.planning import DARK_FRAMES, REFERENCE_FRAMES
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.results import save_frames
+from emmc_rig.files.results import save_frames, write_metrics
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -55,10 +55,17 @@ def camera_file(tmp_path_factory):
     return path
 
 
+def calibrate_into(folder, camera, size=(48, 64), **settings):
+    """Write the calibration of a simulated session into an existing folder."""
+    found = calibrate_simulated(CalibrateSettings("small", camera, size, **settings)).found
+    found.write(folder)
+    write_metrics(folder, found.metrics)
+
+
 @pytest.mark.slow
 def test_calibrate_writes_psi_its_uncertainty_and_a_page(camera_file, tmp_path):
     out = tmp_path
-    run_calibrate(CalibrateSettings("small", find_camera(str(camera_file)), (32, 40), rays=64), out)
+    calibrate_into(out, find_camera(str(camera_file)), (32, 40), rays=64)
     psi = ImagingMatrix.load(out / "psi.h5")
     metrics = json.loads((out / "metrics.json").read_text())
     assert psi.size == (32, 40)
@@ -85,14 +92,23 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
     frames = []
     for target in ("0.05", "0.0019"):
         out = tmp_path / target
-        code, said, _ = run(
-            "calibrate", "--camera", camera_file, *SIZE, "--plan", "--target", target, "--out", out
+        said = done(
+            run(
+                "calibrate",
+                "--camera",
+                camera_file,
+                *SIZE,
+                "--plan",
+                "--target",
+                target,
+                "--out",
+                out,
+            )
         )
-        assert code == 0
         assert "frames; expected calibration error 0." in said
         plan = json.loads((out / "metrics.json").read_text())
         assert plan["expected_relative_error"] <= float(target)
-        opened = {tuple(one["pinhole"]) for one in plan["whiteboards"] if one["pinhole"]}
+        opened = {tuple(board["pinhole"]) for board in plan["whiteboards"] if board["pinhole"]}
         assert opened == set(np.ndindex(3, 3))
         written = yaml.safe_load((out / "plan.yaml").read_text())
         # As many as the estimate assumes: darks of each exposure before and after, references.
@@ -100,25 +116,6 @@ def test_the_plan_opens_every_view_and_takes_more_frames_where_psi_must_be_surer
         assert written["whiteboards"].get("references", 4) == REFERENCE_FRAMES
         frames.append(plan["frames"])
     assert frames[1] > frames[0]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--target", "0.00001"], "cannot be reached: the best is"),
-        (["--target", "0.0015", "--frames", "70"], "cannot be reached with 70 frames: the best is"),
-        (["--frames", "12"], "a plan opens each of the 9 views at least once"),
-    ],
-)
-def test_a_plan_that_cannot_be_says_what_is_best_and_writes_nothing(
-    run, camera_file, tmp_path, arguments, message
-):
-    out = tmp_path / "plan"
-    code, _, error = run("calibrate", "--camera", camera_file, *SIZE, "--plan", *arguments,
-                         "--out", out)  # fmt: skip
-    assert code == 1
-    assert message in " ".join(error.split())
-    assert not out.exists()
 
 
 @pytest.mark.slow
@@ -146,27 +143,6 @@ def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_t
             assert named in found
 
 
-def test_a_size_that_is_none_is_wrong_usage(run, tmp_path):
-    code, _, error = run("calibrate", "--plan", "--size", "32", "--out", tmp_path / "result")
-    assert code == 2
-    assert "write ROWSxCOLUMNS" in " ".join(error.split())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--target", "2"], "a relative error lies between 0 and 1"),
-        (["--camera", "conventional"], "one mask between lens and sensor"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, arguments, message):
-    code, _, error = run("calibrate", "--plan", *SIZE, *arguments, "--out", tmp_path / "result")
-    assert code == 1
-    assert message in " ".join(error.split())
-    assert "Traceback" not in error
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_error_of_psi_leaves_bad_pixels_out_and_counts_colours_not_stored(coded_psi):
     psi = coded_psi(binning=2, size=(8, 8))
     true = in_three_colours(psi.weights, psi)
@@ -187,7 +163,7 @@ def calibrated(camera_file, tmp_path_factory):
     camera = find_camera(str(camera_file))
     folder = tmp_path_factory.mktemp("known")
     truth = BenchTruth(rays_per_view=256)
-    run_calibrate(CalibrateSettings("small", camera, (48, 64), route="mixed", rays=256), folder)
+    calibrate_into(folder, camera, route="mixed", rays=256)
     return folder, camera, truth
 
 
@@ -231,7 +207,7 @@ def test_a_free_psi_is_taken_too_and_a_mask_far_off_is_refused_with_nothing_writ
     _, camera, truth = calibrated
     known = tmp_path / "free"
     known.mkdir()
-    run_calibrate(CalibrateSettings("small", camera, (48, 64), route="free", rays=256), known)
+    calibrate_into(known, camera, route="free", rays=256)
     moved = moved_truth(truth, 40.0, -8.0)
     out = tmp_path / "mended"
     out.mkdir()

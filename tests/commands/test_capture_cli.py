@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from programs import one_line, program, wait_until
+from programs import done, one_line, program, refused, wait_until
 
 from drivers.raw import decode_raw
 from emmc_rig.session.listing import sessions_in
@@ -56,6 +56,12 @@ def captured(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def copy(captured, tmp_path):
+    """A copy of the complete session, for tests that change it."""
+    return shutil.copytree(captured / "plan-session", tmp_path / "copy")
+
+
 def capture(*arguments):
     """Capture without a terminal; returns standard output and standard error."""
     code, out, err = program("capture", *arguments, *RIG)
@@ -87,21 +93,17 @@ def test_running_a_complete_session_again_takes_nothing(captured, run):
 
 def test_a_session_is_listed_shown_and_verified(captured, run):
     os.chdir(captured)
-    code, out, _ = run("session", "list")
-    assert code == 0
+    out = done(run("session", "list"))
     assert "plan-session" in out
     assert "62/62" in out
-    code, out, _ = run("session", "show", "plan-session")
+    _, out, _ = run("session", "show", "plan-session")
     assert "two shots, one of them a bracket" in out
     assert "whiteboard   50 of 50" in out
-    code, out, _ = run("session", "verify", "plan-session")
-    assert code == 0
+    out = done(run("session", "verify", "plan-session"))
     assert "complete: 62 frames" in out
 
 
-def test_a_damaged_frame_fails_the_verification_and_is_taken_again(captured, run, tmp_path):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_a_damaged_frame_fails_the_verification_and_is_taken_again(copy, run):
     session = Session(copy)
     path = session.path_of(session.stored["shot-1-e0-r1"])
     good = path.read_bytes()
@@ -110,8 +112,7 @@ def test_a_damaged_frame_fails_the_verification_and_is_taken_again(captured, run
     assert code == 1
     assert "shot-1-e0-r1" in out
     assert "61 of 62 frames are good" in one_line(err)
-    code, out, err = run("capture", copy)
-    assert code == 0, err
+    out = done(run("capture", copy))
     assert "1 taken" in out
     assert path.read_bytes() == good
 
@@ -135,16 +136,11 @@ def test_an_export_that_is_killed_leaves_no_part_after_the_next_one(captured, ru
     typed = [sys.executable, "-c", KILLED_EXPORT, str(session), str(path)]
     assert subprocess.run(typed, check=False).returncode == -signal.SIGKILL
     assert not path.exists()
-    code, _, err = run("session", "export", session, "--out", path)
-    assert code == 0, err
+    done(run("session", "export", session, "--out", path))
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(
-    captured, run, tmp_path, monkeypatch
-):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(copy, run, monkeypatch):
     monkeypatch.setattr("simulators.zaber.FIRST_SERIAL_NUMBER", 900)
     journal = (copy / "journal.jsonl").read_bytes()
     code, _, err = run("capture", copy)
@@ -159,23 +155,21 @@ def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(
 def test_frames_are_exported_as_dng_files_by_the_command(captured, run, tmp_path):
     session, out = captured / "plan-session", tmp_path / "dng"
     for _ in range(2):  # what an earlier export wrote is replaced
-        code, told, err = run("session", "export", session, "--dng", "--out", out)
-        assert code == 0, err
+        told = done(run("session", "export", session, "--dng", "--out", out))
         assert "wrote 62 DNG files" in told
     assert len(list(out.glob("*.dng"))) == 62
-    code, _, err = run("session", "export", session, "--dng", "--compress", "--out", tmp_path / "x")
+    code, _, _ = run("session", "export", session, "--dng", "--compress", "--out", tmp_path / "x")
     assert code == 2
     assert not (tmp_path / "x").exists()
 
 
 def test_an_export_has_the_names_of_nexus_and_the_frames_of_the_camera(captured, run):
     os.chdir(captured)
-    code, _, err = run("session", "export", "plan-session", "--out", "x.h5", "--compress")
-    assert code == 0, err
+    done(run("session", "export", "plan-session", "--out", "x.h5", "--compress"))
     with h5py.File("x.h5") as file:
         entry: Any = file[file.attrs["default"]]
         kinds = {}
-        entry.visititems(lambda name, group: kinds.update({name: group.attrs.get("NX_class")}))
+        entry.visititems(lambda name, node: kinds.update({name: node.attrs.get("NX_class")}))
         assert entry.attrs["NX_class"] == "NXentry"
         assert kinds["instrument/detector"] == "NXdetector"
         assert kinds["instrument/mask"] == "NXpositioner"
@@ -224,8 +218,7 @@ def test_a_session_is_reconstructed_as_it_is(captured, run, tmp_path):
     settings = tmp_path / "s.yaml"
     settings.write_text("tv: {max_steps: 3}")
     session = captured / "plan-session"
-    code, _, err = run("reconstruct", session, "--settings", settings, "--out", "r")
-    assert code == 0, err
+    done(run("reconstruct", session, "--settings", settings, "--out", "r"))
     metrics = json.loads(Path("r/metrics.json").read_text())
     assert metrics["shots"] == 2
     assert 0 < metrics["noise_sigma"] < 0.1
@@ -246,13 +239,10 @@ def test_the_psi_of_a_session_is_that_of_the_demo_s_road(captured):
 
 
 def test_a_plan_for_a_camera_is_written_once(run, tmp_path):
-    code, out, _ = run("capture", "--new", "rgbw-bayer-3shots")
-    assert code == 0
+    out = done(run("capture", "--new", "rgbw-bayer-3shots"))
     assert "wrote plan.yaml" in out
     assert yaml.safe_load((tmp_path / "plan.yaml").read_text())["camera"] == "rgbw-bayer-3shots"
-    code, _, err = run("capture", "--new", "rgbw-bayer-3shots")
-    assert code == 1
-    assert "exists already" in one_line(err)
+    assert "exists already" in refused(run("capture", "--new", "rgbw-bayer-3shots"))
 
 
 def test_a_dry_run_reports_what_it_will_take_and_makes_nothing(run, tmp_path):
@@ -263,47 +253,7 @@ def test_a_dry_run_reports_what_it_will_take_and_makes_nothing(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["capture", "nothing.yaml", *RIG], "no such file"),
-        (["capture", "plan.yaml"], "say which rig"),
-        (["capture", "plan.yaml", "--rig", "real"], "name of a YAML file of devices"),
-        (["capture", "plan.yaml", "--rig", "no.yaml"], "no.yaml: no such file"),
-        (["capture", "plan.yaml", "--rig", "simulated", "--size", "16x24"], "use 22x22 or more"),
-        (["capture", "plan.yaml", "--rig", "simulated", "--scene", "drak"], "did you mean 'dark'"),
-        (["capture", "--new", "rgbw"], "did you mean"),
-        (["capture", "plan.yaml", *RIG, "--out", "occupied"], "something else than a session"),
-        (["capture", "plan.yaml", *RIG, "--out", "plan.yaml"], "something else than a session"),
-        (["session", "show", "occupied"], "no session"),
-        (["session", "list", "occupied"], "holds no session"),
-        (["session", "export", "occupied", "--out", "x.h5"], "no session"),
-    ],
-)
-def test_bad_input_gives_one_line_and_makes_nothing(run, tmp_path, arguments, line):
-    plan_file(tmp_path)
-    (tmp_path / "occupied").mkdir()
-    (tmp_path / "occupied" / "thesis.txt").write_text("mine")
-    before = sorted(tmp_path.rglob("*"))
-    code, _, err = run(*arguments)
-    assert code == 1
-    assert line in one_line(err)
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize(
-    ("option", "line"), [("--size", "write ROWSxCOLUMNS"), ("--until", "write a PSNR")]
-)
-def test_an_option_that_cannot_be_read_is_wrong_usage(run, tmp_path, option, line):
-    plan_file(tmp_path)
-    code, _, err = run("capture", "plan.yaml", "--rig", "simulated", option, "nan")
-    assert code == 2
-    assert line in one_line(err)
-
-
-def test_an_edited_plan_holds_for_what_is_not_taken_yet(captured, run, tmp_path):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_an_edited_plan_holds_for_what_is_not_taken_yet(copy, run, tmp_path):
     taken = {path.name: path.read_bytes() for path in (copy / "frames").iterdir()}
     shots = [{"exposure_s": [0.02, 0.06]}, {"exposure_s": 0.03, "repeats": 3}]
     plan_file(tmp_path, shots=shots, settle_s=0.25)
@@ -331,23 +281,17 @@ def test_an_edited_plan_holds_for_what_is_not_taken_yet(captured, run, tmp_path)
     assert run("capture", copy)[1].count("0 taken in") == 1
 
 
-def test_a_plan_edited_inside_the_session_is_reported(captured, run, tmp_path):
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", captured / "plan-session", copy], check=True)
+def test_a_plan_edited_inside_the_session_is_reported(copy, run):
     (copy / "plan.yaml").write_text("camera: conventional\nshots: [{}]\n")
-    code, _, err = run("capture", copy)
-    assert code == 1
-    assert "was changed after the session began" in one_line(err)
-    code, out, err = run("session", "verify", copy)
+    assert "was changed after the session began" in refused(run("capture", copy))
+    code, out, _ = run("session", "verify", copy)
     assert code == 1
     assert "was changed after the session began" in out
 
 
 def test_a_session_that_another_program_holds_is_left_to_it(captured, run):
     with held(captured / "plan-session"):
-        code, _, err = run("capture", captured / "plan-session")
-        assert code == 1
-        assert f"(process {os.getpid()} on " in one_line(err)
+        assert f"(process {os.getpid()} on " in refused(run("capture", captured / "plan-session"))
         assert run("session", "show", captured / "plan-session")[0] == 0
 
 
@@ -371,9 +315,9 @@ def test_work_by_hand_without_a_terminal_is_reported(run, tmp_path, monkeypatch)
     axes = dict.fromkeys(("mask_x", "mask_y", "aperture_x", "aperture_y"), 12_700.0)
     rig = {"stage": "simulated", "camera": "simulated", "zero_um": axes, "window_um": 1000.0}
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
-    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
-    assert code == 1
-    assert "somebody has to switch the lamp off" in one_line(err)
+    assert "somebody has to switch the lamp off" in refused(
+        run("capture", "plan.yaml", "--rig", "rig.yaml")
+    )
 
 
 SHOTS = ("shot-0-e0-r0", "shot-0-e1-r0")
@@ -397,8 +341,7 @@ def recorded(captured, tmp_path):
 @pytest.mark.parametrize("more", ["", PAGE])
 def test_a_recorded_session_is_replayed_as_the_page_says(captured, recorded, run, tmp_path, more):
     (tmp_path / "rig.yaml").write_text(BARE + more)
-    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
-    assert code == 0, err
+    done(run("capture", "plan.yaml", "--rig", "rig.yaml"))
     again = Session(tmp_path / "plan-session")
     assert {f.id: again.read(f.id) for f in again.needed} == contents(captured / "plan-session")
 
@@ -412,8 +355,7 @@ def test_a_file_that_is_missing_is_named_and_the_session_goes_on(captured, recor
     assert "recorded: no file is known to be shot-0-e1-r0 (0.08 s)" in err
     assert "1 of 62 frames are still to be taken" in one_line(err)
     (recorded / "shot-0-e1-r0.dng").write_bytes(data)
-    code, _, err = run("capture", "plan.yaml")
-    assert code == 0, err
+    done(run("capture", "plan.yaml"))
     again = Session(tmp_path / "plan-session")
     assert {f.id: again.read(f.id) for f in again.needed} == contents(captured / "plan-session")
 
@@ -429,19 +371,18 @@ def test_files_of_any_name_are_taken_in_order_where_all_exposures_agree(
     }
     for path in recorded.glob("*-*.dng"):
         path.unlink()
-    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml")
-    assert code == 0, err
+    done(run("capture", "plan.yaml", "--rig", "rig.yaml"))
     again = Session(tmp_path / "plan-session")
     assert [again.read(name) for name in SHOTS] == [theirs[name] for name in SHOTS]
     (recorded / "0.dng").unlink()
-    code, _, err = run("capture", "plan.yaml", "--rig", "rig.yaml", "--out", "other")
-    assert code == 1
-    assert "name them after the frames" in one_line(err)
+    assert "name them after the frames" in refused(
+        run("capture", "plan.yaml", "--rig", "rig.yaml", "--out", "other")
+    )
     assert not (tmp_path / "other").exists()
 
 
 def started_capture(folder):
-    """Start a long capture; return its process after a few frames."""
+    """Start a long capture; return its process once some frames are taken."""
     plan_file(folder, darks={"repeats": 300})
     command = [*PROGRAM, "capture", "plan.yaml", *RIG, "--real-time"]
     process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
@@ -482,26 +423,10 @@ def test_sessions_are_listed_with_verdict_and_psnr_below_a_folder(captured, run,
     reported = {"verdict": {"level": "doubt"}, "stated_db": 27.5}
     (results / "metrics.json").write_text(json.dumps(reported))
     _, out, _ = run("session", "list", tmp_path, "--json")
-    first, two = json.loads(out.splitlines()[-1])["sessions"]
+    first, second = json.loads(out.splitlines()[-1])["sessions"]
     assert (first["name"], first["verdict"], first["stated_db"]) == ("one", "doubt", 27.5)
-    assert (two["name"], two["verdict"], two["stated_db"]) == ("two", "", None)
+    assert (second["name"], second["verdict"], second["stated_db"]) == ("two", "", None)
     assert first["camera"] == PLAN["camera"]
     _, out, _ = run("session", "list", tmp_path)
     assert "a/one" in out
     assert "27.5" in out
-
-
-@pytest.mark.parametrize(
-    ("axis", "reported"),
-    [("lens", "the stage has no such axis, only mask_x"), ("mask_x", "give its zero_um instead")],
-)
-def test_a_place_for_an_axis_that_a_rig_cannot_keep_is_refused(run, tmp_path, axis, reported):
-    (tmp_path / "rig.yaml").write_text(
-        f"kind: simulated\nfocus_um: 9000\nstands_um: {{{axis}: 100}}\n"
-    )
-    plan_file(tmp_path)
-    rig = ("--rig", tmp_path / "rig.yaml", "--size", "24x32")
-    code, _, err = run("capture", tmp_path / "plan.yaml", *rig)
-    assert code == 1
-    assert reported in one_line(err)
-    assert not (tmp_path / "plan-session").exists()

@@ -1,4 +1,4 @@
-"""The whole loop, end to end, without inverting the operator that made the data."""
+"""The whole loop, end to end: no step inverts the operator of the data."""
 
 import json
 import os

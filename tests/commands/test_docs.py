@@ -16,7 +16,7 @@ import pytest
 import typer
 from matplotlib import pyplot
 from placed import files_of, listed
-from programs import program
+from programs import done, program
 
 from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
@@ -149,11 +149,11 @@ def test_the_readmes_animation_turns_a_view_beside_the_frame():
     light_field = np.random.default_rng(0).random((5, 5, 16, 20, 3)).astype(np.float32)
     pictures = script["animation"](light_field[0, 0, ..., 0], light_field, np.ones((16, 20)))
     left, right = (
-        np.stack([np.asarray(one)[:30, part] for one in pictures])
+        np.stack([np.asarray(picture)[:30, part] for picture in pictures])
         for part in (slice(0, 37), slice(54, None))
     )
     assert (left == left[0]).all()
-    assert all((one != other).any() for one, other in itertools.pairwise(right))
+    assert all((view != other).any() for view, other in itertools.pairwise(right))
     assert 1e5 < (ROOT / "docs" / "pictures" / "parallax.webp").stat().st_size < 1.5e6
 
 
@@ -167,7 +167,7 @@ def test_the_worked_hooks_run_and_note_what_they_are_for(name):
         degrees = {frame.bench.shot: notes[frame.id]["degrees"] for frame in session.frames}
         assert degrees == {0: 0.0, 1: 0.0, 2: 30.0, 3: 30.0}
     else:
-        power_w = [one["power_w"] for one in notes.values() if one]
+        power_w = [noted["power_w"] for noted in notes.values() if noted]
         assert len(power_w) == 12
         assert power_w == sorted(power_w, reverse=True)
 
@@ -186,7 +186,7 @@ def _fitted_once():
     fit, known = measured_psi.session_outcome, {}
 
     def remembered(session, routes=None, *more):
-        key = routes, *sorted((name, one.sha256) for name, one in session.stored.items())
+        key = routes, *sorted((name, entry.sha256) for name, entry in session.stored.items())
         if key not in known:
             known[key] = fit(session, routes, *more)
         return known[key]
@@ -206,8 +206,7 @@ def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
     for why, found in blocks(document):
         for words in found if why is None else ():
             before, ours = files_of(Path()), listed(Path())
-            code, out, err = program(*words)
-            assert code == 0, f"emmc-rig {' '.join(words)}\n{out}\n{err}"
+            done(program(*words))
             after = files_of(Path())
             lost = [path for path in before if after.get(path) != before[path]]
             grown = [path for path in lost if path.name == "journal.jsonl"]

@@ -17,7 +17,7 @@ SLEEPS = "import time; time.sleep(600)"
 
 @pytest.fixture
 def started(monkeypatch):
-    """Processes that other cores would help by, which sleep in their place; four cores."""
+    """Sleeping processes in place of the helpers on other cores; four cores."""
     real, processes = subprocess.Popen, []
 
     def start(typed, **options):

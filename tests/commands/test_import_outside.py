@@ -13,6 +13,7 @@ import tifffile
 import yaml
 from outside_bench import Bench, Optics, Sensor
 from outside_boards import agreement, camera_of
+from programs import done
 
 from calibration.shadow import shadow_mask
 from emmc_rig.model.json_text import parse_json
@@ -46,7 +47,7 @@ def scene(size, views=(5, 5), disparity=0.6):
     """Return a textured plane of pale colours, (v, u, y, x, colour)."""
     rng = np.random.default_rng(5)
     drawn = [cv2.GaussianBlur(rng.random((size[0] + 24, size[1] + 24)), (0, 0), 2) for _ in "rgb"]
-    drawn = np.stack([(one - one.min()) / np.ptp(one) * 0.8 + 0.1 for one in drawn], -1)
+    drawn = np.stack([(plane - plane.min()) / np.ptp(plane) * 0.8 + 0.1 for plane in drawn], -1)
     drawn = 0.75 * drawn[..., 1:2] + 0.25 * drawn
     field = np.empty((*views, *size, 3))
     for v, u in np.ndindex(views):
@@ -82,10 +83,9 @@ def verdict(session):
 
 def test_a_photograph_of_the_mask_and_four_files_become_the_light_field(tmp_path, run):
     truth = filmed(tmp_path, Sensor(bayer=False, electrons_per_s=800_000))[..., 1]
-    assert [one[0] for one in COMMANDS] == ["mask", "import", "reconstruct"]
+    assert [command[0] for command in COMMANDS] == ["mask", "import", "reconstruct"]
     for command in COMMANDS:
-        code, _, err = run(*command)
-        assert code == 0, err
+        done(run(*command))
     with h5py.File(tmp_path / "bench/reconstruction/light_field.h5") as file:
         field = np.array(file["light_field"]).mean(-1)
     field *= np.sum(field * truth) / np.sum(field**2)
@@ -127,11 +127,10 @@ def test_a_mistake_that_no_file_shows_is_named_by_the_verdict(mistake, tmp_path,
     camera_changed(tmp_path, described)
     mask, imported, reconstruct = COMMANDS
     for command in (mask, imported, [*reconstruct, "--method", "tv"]):
-        code, _, err = run(*command)
-        assert code == 0, err
+        done(run(*command))
     found = verdict(tmp_path / "bench")
     assert found["level"] != "trust"
-    assert any(words in one["what"] for one in found["reasons"]), found["reasons"]
+    assert any(words in reason["what"] for reason in found["reasons"]), found["reasons"]
 
 
 PHASES = {"rggb": ("trust", "doubt"), "bggr": ("doubt", "do not use"), "grbg": ("do not use",)}
@@ -147,8 +146,7 @@ def test_another_phase_of_the_filters_is_another_mask_to_the_verdict(cfa, tmp_pa
     camera_changed(tmp_path, lambda camera: camera["sensor"].update(cfa=cfa))
     _, imported, reconstruct = COMMANDS
     for command in (imported, [*reconstruct, "--method", "tv"]):
-        code, _, err = run(*command)
-        assert code == 0, err
+        done(run(*command))
     found = verdict(tmp_path / "bench")
     assert found["level"] in PHASES[cfa], found["reasons"]
     assert (found["features"]["strengths"][0] > 0.95) == (cfa == "rggb")
@@ -210,8 +208,7 @@ def test_psi_of_whiteboards_of_another_bench_errs_as_much_as_it_says(tmp_path, r
         ("calibrate", "bench"),
         ("reconstruct", "bench", "--method", "tv"),
     ):
-        code, _, err = run(*command)
-        assert code == 0, err
+        done(run(*command))
     psi, _ = open_frames(tmp_path / "bench")
     with h5py.File(tmp_path / "bench/calibration/calibration.h5") as file:
         found = agreement(bench, psi.weights, np.array(file["deviation"]), np.array(file["good"]))

@@ -1,7 +1,7 @@
-"""No command deletes or overwrites what it did not make: every command against every bad place.
+"""No command deletes or overwrites the files of others: every command against every bad place.
 
-A command that writes needs its smallest arguments in WRITERS; one that writes nothing is named in
-READERS. A command in neither fails the first test.
+WRITERS holds the smallest arguments of each writing command, READERS the commands without files.
+A command in neither fails the first test.
 """
 
 import json
@@ -13,7 +13,7 @@ import pytest
 import typer
 import yaml
 from placed import files_of, listed
-from programs import program
+from programs import done, program
 
 from emmc_rig import cli
 from emmc_rig.commands import output
@@ -70,7 +70,10 @@ def commands(group, path=()):
         if hasattr(command, "commands"):
             yield from commands(command, (*path, name))
         else:
-            yield " ".join((*path, name)), [opt for one in command.params for opt in one.opts]
+            yield (
+                " ".join((*path, name)),
+                [opt for parameter in command.params for opt in parameter.opts],
+            )
 
 
 def test_every_command_is_known_here_and_those_that_name_a_place_to_write_are_tried():
@@ -89,12 +92,10 @@ def world(tmp_path_factory):
     (folder / "plan.yaml").write_text(yaml.safe_dump(shots))
     (folder / "other.yaml").write_text(yaml.safe_dump({**shots, "camera": "rgbw-mono"}))
     (folder / "held").mkdir()
-    done = program("capture", folder / "plan.yaml", *RIG, "--out", folder / "held/session")
-    assert done[0] == 0, done
+    done(program("capture", folder / "plan.yaml", *RIG, "--out", folder / "held/session"))
     shutil.copytree(folder / "held/session", folder / "made-session")
     (folder / "link").symlink_to(folder / "held/session")
-    done = program("simulate", *SIZE, "--scene", "near-planar", "--out", folder / "frames")
-    assert done[0] == 0, done
+    done(program("simulate", *SIZE, "--scene", "near-planar", "--out", folder / "frames"))
     field = np.random.default_rng(0).uniform(0, 1, (5, 5, 16, 16, 3)).astype(np.float32)
     save_hdf5(folder / "scene.h5", field, {})
     np.save(folder / "shot.npy", np.random.default_rng(1).integers(256, 9000, SHAPE, np.uint16))

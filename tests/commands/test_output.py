@@ -5,7 +5,7 @@ import json
 
 import pytest
 import typer
-from programs import program
+from programs import done, program
 from rich.console import Console
 
 from emmc_rig import cli
@@ -46,8 +46,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for command in ("simulate", "capture"):
-            code, _, err = program(*RESULTS[command])
-            assert code == 0, err
+            done(program(*RESULTS[command]))
     return folder
 
 
@@ -57,7 +56,9 @@ def test_every_command_takes_json():
             yield from all_of(command) if hasattr(command, "commands") else [command]
 
     for command in all_of(typer.main.get_command(cli.app)):
-        assert "--json" in [name for one in command.params for name in one.opts], command.name
+        assert "--json" in [name for parameter in command.params for name in parameter.opts], (
+            command.name
+        )
 
 
 @pytest.mark.slow
@@ -87,10 +88,10 @@ def test_with_json_what_fails_says_so_in_an_event_and_in_the_exit_code(tmp_path,
 def test_steps_of_a_solver_are_events_that_count_to_the_last(folder, monkeypatch):
     monkeypatch.chdir(folder)
     _, out, _ = program(*RESULTS["reconstruct"], "--json")
-    steps = [one for one in map(json.loads, out.splitlines()) if one["event"] == "step"]
-    counted = [one["done"] for one in steps]
+    steps = [event for event in map(json.loads, out.splitlines()) if event["event"] == "step"]
+    counted = [step["done"] for step in steps]
     assert counted == sorted(counted)
-    assert {one["stage"] for one in steps} == {"tv"}
+    assert {step["stage"] for step in steps} == {"tv"}
 
 
 @pytest.mark.parametrize("terminal", [False, True])

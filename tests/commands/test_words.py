@@ -12,7 +12,7 @@ SAYS = (
     "emmc_rig", "drivers", "calibration", "reconstruction", "simulators", "docs", "README.md",
 )  # fmt: skip
 MADE = ("docs/_build", "docs/gallery", "docs/command-line.md")
-"""Folders and files that are searched, and those among them that are not: made from others."""
+"""Folders and files in SAYS that a script makes: not searched."""
 REPLACED = {
     r"copied (true )?(centre|middle)": "baseline: centre view in all places",
     r"readings missed": "residual 5 sigma",
@@ -67,14 +67,14 @@ def texts(path: Path) -> Iterator[tuple[int, str]]:
     elif path.suffix in SAID:
         text = path.read_text(encoding="utf-8")
         text = TEMPLATE.sub(lambda code: "\n" * code[0].count("\n"), text)
-        for one in re.finditer(SAID[path.suffix], text):
-            yield text.count("\n", 0, one.start()) + 1, " ".join(one[0].strip('<>`"').split())
+        for found in re.finditer(SAID[path.suffix], text):
+            yield text.count("\n", 0, found.start()) + 1, " ".join(found[0].strip('<>`"').split())
 
 
 def docstrings(tree: ast.Module) -> set[ast.Constant]:
     """Return the strings that stand alone: docstrings, and those of constants."""
     alone = (node.value for node in ast.walk(tree) if isinstance(node, ast.Expr))
-    return {one for one in alone if isinstance(one, ast.Constant)}
+    return {node for node in alone if isinstance(node, ast.Constant)}
 
 
 def returned(path: Path) -> list[str]:
@@ -91,16 +91,18 @@ def returned(path: Path) -> list[str]:
 def files(name: str) -> list[Path]:
     """Return the files of a folder, or the file."""
     place = ROOT / name
-    return [one for one in sorted(place.rglob("*")) if one.is_file()] if place.is_dir() else [place]
+    return (
+        [path for path in sorted(place.rglob("*")) if path.is_file()] if place.is_dir() else [place]
+    )
 
 
 @pytest.mark.parametrize("name", SAYS)
 def test_no_word_that_was_replaced_is_said_again(name):
-    skipped = [ROOT / one for one in MADE]
+    skipped = [ROOT / place for place in MADE]
     found = [
         line
         for path in files(name)
-        if not any(path.is_relative_to(one) for one in skipped)
+        if not any(path.is_relative_to(folder) for folder in skipped)
         for line in returned(path)
     ]
     assert not found, "\n".join(found)

@@ -36,7 +36,7 @@ HARMLESS = ("software WebGL", "GPU stall due to ReadPixels", "WebGL contexts")
 def complaints(driver):
     """Return what the browser's console complained of since it was last asked."""
     reported = [entry["message"] for entry in driver.get_log("browser")]
-    return [one for one in reported if not any(words in one for words in HARMLESS)]
+    return [message for message in reported if not any(words in message for words in HARMLESS)]
 
 
 @contextmanager

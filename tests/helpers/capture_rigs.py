@@ -1,6 +1,6 @@
 """A rig without time or light: what crash tests run by the hundred.
 
-Every frame is made from its own name, so that two runs of a plan are equal.
+The bytes of a frame follow from its name: two runs of a plan are equal.
 """
 
 import hashlib
@@ -82,7 +82,7 @@ class PreparedCamera:
 
 
 class QuietAttendant:
-    """Keeps every request."""
+    """Carries out requests at once, and keeps their list."""
 
     def __init__(self):
         self.asked = []
@@ -104,7 +104,7 @@ class QuietAttendant:
 
     @property
     def lamp(self):
-        return [asked[1] for asked in self.asked if asked[0] == "lamp"][-1]
+        return [call[1] for call in self.asked if call[0] == "lamp"][-1]
 
 
 def stops_after(frame_id, control):

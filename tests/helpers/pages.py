@@ -1,4 +1,4 @@
-"""What tests ask of a written page: its parts, and that it loads nothing from elsewhere."""
+"""Parts of a written page, and files that it would load from elsewhere."""
 
 import html.parser
 

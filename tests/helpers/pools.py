@@ -30,7 +30,7 @@ class Here(Pool):
 
 
 class Posting(Here):
-    """A pool that computes in this process, to which and from which all goes as bytes."""
+    """A pool that computes in this process and pickles tasks and results."""
 
     def run(self, task, items):
         def posted(item):
@@ -47,4 +47,4 @@ def held_bytes(count):
 def children(process):
     """Return the processes that a process of this machine started, the latest last."""
     task = Path(f"/proc/{process}/task/{process}/children")
-    return [int(one) for one in task.read_text().split()] if task.exists() else []
+    return [int(child) for child in task.read_text().split()] if task.exists() else []

@@ -33,15 +33,28 @@ def program(*arguments):
 
 
 def one_line(text):
-    """Return the one line that the program said last, on standard error."""
+    """Return the single line with an error on standard error."""
     lines = [line for line in text.strip().splitlines() if line.startswith("emmc-rig:")]
     assert len(lines) == 1, text
     assert "Traceback" not in text
     return lines[0]
 
 
+def done(ended):
+    """Return the standard output of a run, (code, out, err), that succeeded."""
+    code, out, err = ended
+    assert code == 0, err
+    return out
+
+
+def refused(ended, code=1):
+    """Return the one line of a run that ended with an exit code other than 0."""
+    assert ended[0] == code, ended
+    return one_line(ended[2])
+
+
 def wait_until(condition, limit_s=20.0):
-    """Return when the condition holds, which another process or thread makes true."""
+    """Wait until another process or thread makes the condition true."""
     deadline_s = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < deadline_s
@@ -50,10 +63,12 @@ def wait_until(condition, limit_s=20.0):
 
 @contextmanager
 def line_server(script):
-    """Start a script beside this file; yield what writes a line to it and returns its answer."""
+    """Start a script beside this file; yield a function from a line to the line that answers."""
     program = [sys.executable, str(Path(__file__).with_name(script))]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as one:
-        lines, answers = one.stdin, one.stdout
+    with subprocess.Popen(
+        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as server:
+        lines, answers = server.stdin, server.stdout
         assert lines is not None
         assert answers is not None
 

@@ -22,7 +22,7 @@ WITHOUT_SHADOW = sorted(CAMERAS.keys() - set(WITH_SHADOW))
 
 
 def with_pattern(**pattern):
-    """The camera of one colour mask with another pattern in it."""
+    """Return the camera rgbw-bayer-1shot with another pattern in its mask."""
     described = CAMERAS["rgbw-bayer-1shot"].model_dump(mode="json")
     (mask,) = described["masks"].values()
     mask["pattern"] = pattern

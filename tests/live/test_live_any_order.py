@@ -29,7 +29,7 @@ CLICKS = {
     "focus": (("autofocus", {"span_um": 400.0}), ("stop", {})),
     "save": (("preview", {"what": ["exposure"]}), ("preview", {"what": []})),
 }
-"""The action of the button of each step, and an action that interrupts it."""
+"""By step: action of the button, action of an interruption."""
 MOST_CLICKS = 15
 ORDERS = list(permutations(CLICKS))[:: 1 if os.environ.get("EMMC_FUZZ") else 29]
 

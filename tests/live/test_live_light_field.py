@@ -118,7 +118,7 @@ def test_the_disparity_of_small_views_is_that_of_the_scene_and_unknown_where_it_
             for v in range(3)
         ]
     )
-    views = np.stack([np.stack([_softened(one) for one in row]) for row in views])
+    views = np.stack([np.stack([_softened(view) for view in row]) for row in views])
     found = disparity_of(views)
     assert np.nanmedian(found[8:-8, 8:22]) == pytest.approx(0.3, abs=0.05)
     assert np.isnan(found[:, 40:]).all()
@@ -297,9 +297,9 @@ def test_a_solver_that_fails_is_reported(one_shot):
 
 
 class Solver:
-    """In place of a solver: it notes what it is given, and ends a frame when `end` is called.
+    """A solver that notes its arguments and ends a frame when the test calls `end`.
 
-    Each frame becomes the same light field; what it leaves to the next one is its number, from 1.
+    Each frame becomes the same light field; the film that it returns is the frame's number, from 1.
     """
 
     def __init__(self, light_field, clock):
@@ -332,7 +332,7 @@ class Solver:
 
 
 def threads_at_work():
-    return [one for one in threading.enumerate() if one.name == "live reconstruction"]
+    return [thread for thread in threading.enumerate() if thread.name == "live reconstruction"]
 
 
 @pytest.fixture(scope="module")

@@ -78,10 +78,10 @@ def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
 
             def click(css):
                 def clicked():
-                    one = driver.find_element(By.CSS_SELECTOR, css)
-                    able = one.is_enabled()
+                    element = driver.find_element(By.CSS_SELECTOR, css)
+                    able = element.is_enabled()
                     if able:
-                        one.click()
+                        element.click()
                     return able
 
                 wait(clicked)

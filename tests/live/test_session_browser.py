@@ -8,24 +8,11 @@ from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.pages.session_sheet import write_sheet
 from emmc_rig.session.session import REPORT
 
-webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: extra `browser`")
-from browsers import CHROMEDRIVER, CHROMIUM, MARKS  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
+pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
+from browsers import MARKS, complaints
+from selenium.webdriver.common.by import By
 
 pytestmark = MARKS
-
-
-@pytest.fixture
-def browser(tmp_path):
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM or ""
-    for option in ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"):
-        options.add_argument(option)
-    options.add_argument(f"--user-data-dir={tmp_path / 'profile'}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
-    yield driver
-    driver.quit()
 
 
 def test_the_report_of_a_session_shows_everything_and_asks_for_nothing(browser, tmp_path):
@@ -39,7 +26,7 @@ def test_the_report_of_a_session_shows_everything_and_asks_for_nothing(browser, 
     assert all(int(picture.get_property("naturalWidth")) > 0 for picture in pictures)
     stored = browser.find_element(By.CSS_SELECTOR, ".card .value").text
     assert stored == f"{len(session.frames)} of {len(session.frames)}"
-    assert browser.get_log("browser") == []
+    assert complaints(browser) == []
     for width in (1280, 420):
         browser.set_window_size(width, 900)
         wide = browser.execute_script("return document.documentElement.scrollWidth")

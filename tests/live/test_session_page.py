@@ -1,4 +1,4 @@
-"""The page of a running capture, and its actions: pause, retake, finish."""
+"""The page of a running capture: pause, retake, finish."""
 
 import http.client
 import json
@@ -195,7 +195,7 @@ def test_the_first_state_is_not_pushed_again_and_again(tmp_path):
 
 
 class Answering(SessionPage):
-    """A page on which somebody answers each request, and stops the capture at the last."""
+    """A page whose every wish is answered; stop_at: number of the wish at which it is stopped."""
 
     def __init__(self, folder, stop_at=None):
         self.control = Control()
@@ -228,19 +228,19 @@ def test_the_page_asks_for_a_hole_of_the_plate_and_says_which_one_it_was_instead
     page = Answering(tmp_path / "plan-session")
     capture_session(plan, rig, None, None, FrontEnd(page, page.ask, control=page.control))
     assert page.state()["by_hand"]
-    holes = [(asked["hole"], last, asked["refusal"]) for asked, last in page.asks if asked["hole"]]
+    holes = [(wish["hole"], last, wish["refusal"]) for wish, last in page.asks if wish["hole"]]
     assert holes == [
         ([0, 0], None, ""),
         ([1, 1], [0, 0], ""),
         ([1, 1], [1, 2], "That was hole 8 of 25 (row 2, column 3)."),
     ]
-    assert {tuple(asked["views"]) for asked, _ in page.asks if asked["hole"]} == {(5, 5)}
-    others = [asked for asked, _ in page.asks if not asked["hole"]]
-    assert "switch the white lamp on" in {asked["text"] for asked in others}
+    assert {tuple(wish["views"]) for wish, _ in page.asks if wish["hole"]} == {(5, 5)}
+    others = [wish for wish, _ in page.asks if not wish["hole"]]
+    assert "switch the white lamp on" in {wish["text"] for wish in others}
     # Nothing but the hole is asked for again.
-    assert not any(asked["refusal"] for asked in others)
-    assert [asked["text"] for asked in others].count("put the whiteboard before the camera") == 1
-    numbers = [asked["number"] for asked, _ in page.asks]
+    assert not any(wish["refusal"] for wish in others)
+    assert [wish["text"] for wish in others].count("put the whiteboard before the camera") == 1
+    numbers = [wish["number"] for wish, _ in page.asks]
     assert numbers == list(range(1, len(numbers) + 1))
 
 
@@ -251,7 +251,7 @@ def test_a_capture_that_somebody_finishes_instead_of_doing_what_is_asked_ends_at
     page = Answering(tmp_path / "plan-session", stop_at=1)
     with pytest.raises(StoppedError, match="stopped at once"):
         capture_session(plan, rig, None, None, FrontEnd(page, page.ask, control=page.control))
-    assert {asked["text"] for asked, _ in page.asks} == {"switch the lamp off"}
+    assert {wish["text"] for wish, _ in page.asks} == {"switch the lamp off"}
     assert not (tmp_path / "plan-session").exists()
 
 

@@ -1,4 +1,4 @@
-"""The calibration's page: what it says first, and what each figure is worth."""
+"""The calibration's page: its first figures, their limits, its maps."""
 
 import re
 from types import SimpleNamespace
@@ -14,7 +14,10 @@ from emmc_rig.pages.calibration_page import PARAMETERS, write_calibration_report
 
 SIZE = (24, 32)
 FITTED = {
-    **{name: {"value": one.design or 0.0, "deviation": 0.01} for name, one in PARAMETERS.items()},
+    **{
+        name: {"value": parameter.design or 0.0, "deviation": 0.01}
+        for name, parameter in PARAMETERS.items()
+    },
     "distance_share": {"value": -0.042, "deviation": 0.003},
 }
 

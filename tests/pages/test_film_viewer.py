@@ -1,4 +1,4 @@
-"""The page of a film: light fields of all frames on a common scale, its size, its head."""
+"""The page of a film: all light fields on one scale, size of the page, head."""
 
 import json
 import re
@@ -45,7 +45,7 @@ def test_brightness_focus_and_colours_mean_the_same_in_all_frames(page):
         assert all(frame[key] == frames[0][key] for frame in frames)
     assert len({(frame["focus"]["low"], frame["focus"]["high"]) for frame in frames}) == 1
     for overlays in zip(*(frame["overlays"] for frame in frames), strict=True):
-        assert len({(frame["key"], frame["low"], frame["high"]) for frame in overlays}) == 1
+        assert len({(overlay["key"], overlay["low"], overlay["high"]) for overlay in overlays}) == 1
 
 
 def picture_bytes(text):

@@ -1,4 +1,4 @@
-"""The viewer in a browser: its pictures are those of numpy, and hand, keys and screens reach it."""
+"""The viewer in a browser: pictures as numpy computes them; hand, keys and screens."""
 
 import base64
 import json
@@ -186,7 +186,7 @@ def test_keys_reach_everything(page):
     state(page)
     assert (value(page, "aperture"), value(page, "wipe")) == (0.25, 0.5)
     chosen = page.find_elements(By.CSS_SELECTOR, "#viewer-overlays input:checked")
-    assert [one.get_attribute("value") for one in chosen] == ["1"]
+    assert [choice.get_attribute("value") for choice in chosen] == ["1"]
     assert page.find_element(By.ID, "viewer-legend").is_displayed()
     picture.send_keys("r")
     assert state(page).startswith("View v 2.00, u 2.00")

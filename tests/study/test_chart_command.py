@@ -36,17 +36,6 @@ def settings(**more):
     return chart_settings(True, scenes, cameras, SIZE, 1, **chosen)
 
 
-@pytest.fixture
-def command(run):
-    """Run the program: exit code, standard output, and standard error on one line."""
-
-    def call(*arguments):
-        code, out, err = run(*arguments)
-        return code, out, " ".join(err.split())
-
-    return call
-
-
 @pytest.mark.slow
 def test_a_chart_holds_every_point(quick, tmp_path):
     measured_scene = tmp_path / "shed"
@@ -100,27 +89,6 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
     with pytest.raises(AppError, match=r"nothing could be measured: .*not enough memory"):
         run_chart(settings(), tmp_path / "out", Watcher())
     assert not (tmp_path / "out" / ChartStudy.journal).read_text()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reported", "expected"),
-    [
-        (["--method", "tv-dic"], "did you mean 'tv-dict'", 1),
-        (["--scene", "nowhere"], "no scene 'nowhere'", 1),
-        (["--scene", "dark", "--scene", "./dark"], "two scenes are called 'dark'", 1),
-        (["--camera", "no-camera"], "no-camera", 1),
-        (["--size", "big"], "write ROWSxCOLUMNS", 2),
-        (["--size", "8x8"], "needs 16x16", 1),
-        (["--out", "mine"], "something else than an earlier chart", 1),
-    ],
-)
-def test_what_cannot_be_charted_is_one_line(command, tmp_path, arguments, reported, expected):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "letter.txt").write_text("dear")
-    code, _, err = command("chart", "--fast", "--method", "tv", *arguments)
-    assert code == expected
-    assert reported in err
-    assert "Traceback" not in err
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from programs import done
 
 from calibration.boards import Board
 from calibration.locator import register
@@ -116,8 +117,7 @@ def test_less_light_and_more_noise_is_a_larger_expected_error():
         camera = Candidate("random_binary", share, 36.0, 0.12).camera(bench)
         return expected(camera, printed_psi(camera, SIZE, PLAIN), (-1, 1)).psnr_db
 
-    assert expect(0.5, 0.05) > expect(0.5, 0.0005)
-    assert expect(0.5, 0.05) > expect(0.1, 0.05)
+    assert expect(0.5, 0.05) > max(expect(0.5, 0.0005), expect(0.1, 0.05))
 
 
 def test_shots_stay_within_the_stage_s_travel():
@@ -236,38 +236,13 @@ def test_the_command_writes_a_camera_a_mask_and_a_page_that_other_commands_take(
     monkeypatch.setattr("emmc_rig.study.design.expected.PLACES", 1)
     (tmp_path / "bench.yaml").write_text(yaml.safe_dump(BENCH))
     small = ("--scene", "near-planar", "--size", "32x40")
-    code, out, err = run("design", "bench.yaml", *small)
-    assert code == 0, err
+    out = done(run("design", "bench.yaml", *small))
     assert "best shipped camera" in out
     metrics = json.loads((tmp_path / "emmc-design/metrics.json").read_text())
     assert metrics["winner"]["family"] == "random_binary"
     assert len(metrics["tried"]) == 1
-    assert {one["name"] for one in metrics["simulated"]} >= {"this design", "rgbw-bayer-1shot"}
-    code, _, err = run("simulate", "--camera", "emmc-design/camera.yaml", *small)
-    assert code == 0, err
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"distance_mm": [0.12]}, "did you mean 'distances_mm'"),
-        ({"maker": {"smalest_cell_um": 24}}, "did you mean 'smallest_cell_um'"),
-        ({"cells_um": [12]}, "cannot be printed"),
-        ({"cells_um": [0.036, 36]}, "cannot be printed"),
-        ({"maker": {"smallest_cell_um": 24000}}, "are in um"),
-        ({"distances_mm": [120]}, "distances are in mm"),
-        ({"shots": 4, "stage_travel_um": [60, 60]}, "need 108 um"),
-        ({"open_shares": [50]}, "shares of the mask's area"),
-        ({"disparities_px": [1, -1]}, "the least, then the greatest"),
-        ({"families": ["random_rgbw"], "maker": {"colours": False}}, "cannot be printed"),
-        ({"sensor": {"cfa": "rggb", "binning": 2}}, "pixels of one sample"),
-        ({"size": "192x256"}, "size"),
-    ],
-)
-def test_a_bench_that_cannot_be_is_one_line(run, tmp_path, change, says):
-    (tmp_path / "bench.yaml").write_text(yaml.safe_dump({**BENCH, **change}))
-    code, _, err = run("design", "bench.yaml")
-    assert code == 1
-    assert says in err
-    assert len(err.strip().splitlines()) == 1
-    assert not (tmp_path / "emmc-design").exists()
+    assert {camera["name"] for camera in metrics["simulated"]} >= {
+        "this design",
+        "rgbw-bayer-1shot",
+    }
+    done(run("simulate", "--camera", "emmc-design/camera.yaml", *small))

@@ -1,4 +1,4 @@
-"""Faults: each does what its name says, no more the weaker it is, and nothing at zero strength."""
+"""Faults: effect on readings and Psi, vanishing with the strength."""
 
 import numpy as np
 import pytest
@@ -31,9 +31,9 @@ def made(name, strength, **more):
     return Point(Capture(**chosen), name, strength).trial()
 
 
-def spanned(one):
-    assert one.disparity_px is not None
-    return np.ptp(one.disparity_px)
+def spanned(trial):
+    assert trial.disparity_px is not None
+    return np.ptp(trial.disparity_px)
 
 
 @pytest.fixture(scope="module")
@@ -79,19 +79,19 @@ def test_a_vanishing_fault_vanishes(name, clean):
 @pytest.mark.parametrize("name", [*MISPLACED, "vignetting", "repeated-shot"])
 def test_a_stronger_fault_moves_psi_further(name):
     errors = [
-        one.psi.relative_difference(one.true_psi)
-        for one in (made(name, strength) for strength in FAULTS[name].quick)
+        trial.psi.relative_difference(trial.true_psi)
+        for trial in (made(name, strength) for strength in FAULTS[name].quick)
     ]
     assert errors[0] == 0
     assert (np.diff(errors) > 0).all()
 
 
 def test_the_method_is_given_the_design_and_the_readings_are_the_real_camera_s():
-    one = made("mask-shift", 2)
+    trial = made("mask-shift", 2)
     design = build_imaging_matrix(CAMERA, SIZE)
-    assert one.psi.checksum() == design.checksum()
-    real = np.abs(one.readings - one.true_psi.forward(one.truth)).mean()
-    assumed = np.abs(one.readings - one.psi.forward(one.truth)).mean()
+    assert trial.psi.checksum() == design.checksum()
+    real = np.abs(trial.readings - trial.true_psi.forward(trial.truth)).mean()
+    assumed = np.abs(trial.readings - trial.psi.forward(trial.truth)).mean()
     assert real < 0.1 * assumed
 
 
@@ -101,18 +101,18 @@ def test_the_placement_of_a_camera_as_designed_is_its_psi():
 
 
 def test_noise_follows_the_photons():
-    one = made("exposure", 300)
-    clean = one.psi.forward(one.truth)
+    trial = made("exposure", 300)
+    clean = trial.psi.forward(trial.truth)
     noise = CAMERA.sensor.noise
     per_shot = 300 / len(CAMERA.shots)
     variance = clean.mean() / per_shot + (noise.read_noise_electrons**2 + 0.13) / per_shot**2
-    assert np.std(one.readings - clean) == pytest.approx(np.sqrt(variance), rel=0.1)
-    assert one.noise_sigma == pytest.approx(np.sqrt(variance), rel=0.1)
+    assert np.std(trial.readings - clean) == pytest.approx(np.sqrt(variance), rel=0.1)
+    assert trial.noise_sigma == pytest.approx(np.sqrt(variance), rel=0.1)
 
 
 def test_read_noise_is_not_clipped_at_black():
-    one = made("read-noise", 3000)
-    missed = one.readings - one.psi.forward(one.truth)
+    trial = made("read-noise", 3000)
+    missed = trial.readings - trial.psi.forward(trial.truth)
     per_shot = 15_500 / len(CAMERA.shots)
     assert missed.std() == pytest.approx(3000 / per_shot, rel=0.05)
     assert abs(missed.mean()) < 3 * missed.std() / np.sqrt(missed.size)
@@ -120,10 +120,10 @@ def test_read_noise_is_not_clipped_at_black():
 
 @pytest.mark.parametrize("percent", [10, 60])
 def test_so_many_readings_saturate(percent):
-    one = made("saturation", percent)
-    assert 1 - one.usable.mean() == pytest.approx(percent / 100, abs=0.02)
-    brightest = one.psi.forward(one.truth)
-    assert brightest[~one.usable].mean() > brightest[one.usable].mean()
+    trial = made("saturation", percent)
+    assert 1 - trial.usable.mean() == pytest.approx(percent / 100, abs=0.02)
+    brightest = trial.psi.forward(trial.truth)
+    assert brightest[~trial.usable].mean() > brightest[trial.usable].mean()
 
 
 def test_bad_pixels_are_bad_in_every_shot_and_known_only_when_masked(clean):
@@ -164,11 +164,11 @@ def test_jpeg_of_a_lower_quality_is_further_off(clean):
 
 
 def test_the_lamp_flickers_between_shots_alone(clean):
-    one = made("flicker", 30)
+    trial = made("flicker", 30)
     gains = flicker_gains(3, 30, 0)
     assert gains.mean() == pytest.approx(1)
     assert np.std(np.log(gains)) == pytest.approx(0.3)
-    ratio = one.readings.mean(axis=(1, 2)) / clean.readings.mean(axis=(1, 2))
+    ratio = trial.readings.mean(axis=(1, 2)) / clean.readings.mean(axis=(1, 2))
     assert ratio == pytest.approx(gains, rel=0.01)
 
 
@@ -185,11 +185,11 @@ def test_missing_shots_are_dark_and_repeated_ones_alike(clean):
 
 @pytest.mark.parametrize("name", ["scene-motion", "camera-motion"])
 def test_the_first_shot_sees_the_truth_and_later_ones_do_not(name, clean):
-    one = made(name, 3)
-    off = np.abs(one.readings - clean.readings).mean(axis=(1, 2))
+    trial = made(name, 3)
+    off = np.abs(trial.readings - clean.readings).mean(axis=(1, 2))
     assert off[0] < 0.005
     assert off[2] > off[1] > 2 * off[0]
-    assert np.array_equal(one.truth, clean.truth)
+    assert np.array_equal(trial.truth, clean.truth)
 
 
 def test_a_measured_scene_moves_as_a_built_in_one_does(measured):
@@ -217,33 +217,33 @@ def test_the_background_stands_while_things_move():
 
 @pytest.mark.parametrize("px", [2, 8])
 def test_disparities_span_what_is_asked(px):
-    one = made("disparity-range", px)
-    assert spanned(one) == pytest.approx(px, rel=0.05)
+    trial = made("disparity-range", px)
+    assert spanned(trial) == pytest.approx(px, rel=0.05)
 
 
 @pytest.mark.parametrize("percent", [20, 60])
 def test_leaves_hide_the_share_asked_for(percent, clean):
-    one = made("occlusion", percent)
-    hidden = (one.disparity_px > clean.disparity_px.max() + 1e-3).mean()
+    trial = made("occlusion", percent)
+    hidden = (trial.disparity_px > clean.disparity_px.max() + 1e-3).mean()
     assert hidden == pytest.approx(percent / 100, abs=0.08)
 
 
 def test_mirrors_show_other_things_in_every_view(clean):
-    def spread(one):
-        return np.abs(one.truth - one.truth[2, 2]).mean()
+    def spread(trial):
+        return np.abs(trial.truth - trial.truth[2, 2]).mean()
 
-    one = made("specularity", 60)
-    assert 0.5 < one.truth.mean() / clean.truth.mean() < 1.5
-    assert spread(one) > 1.2 * spread(clean)
+    trial = made("specularity", 60)
+    assert 0.5 < trial.truth.mean() / clean.truth.mean() < 1.5
+    assert spread(trial) > 1.2 * spread(clean)
 
 
 def test_contrast_fades_towards_the_mean_and_the_peak_with_it(clean):
-    one = made("contrast", 10)
-    assert one.truth.std(axis=(0, 1, 2, 3)) == pytest.approx(
+    trial = made("contrast", 10)
+    assert trial.truth.std(axis=(0, 1, 2, 3)) == pytest.approx(
         0.1 * clean.truth.std(axis=(0, 1, 2, 3)), rel=1e-3
     )
-    assert one.truth.mean() == pytest.approx(clean.truth.mean(), rel=1e-3)
-    assert one.peak == 0.1
+    assert trial.truth.mean() == pytest.approx(clean.truth.mean(), rel=1e-3)
+    assert trial.peak == 0.1
 
 
 @pytest.mark.parametrize("name", ["disparity-range", "occlusion", "specularity", "scene-motion"])
@@ -258,9 +258,9 @@ def test_what_a_camera_cannot_have_is_reported():
 
 
 def test_equal_seeds_make_equal_trials():
-    one, same, other = (made("bad-pixels", 10, seed=seed) for seed in (1, 1, 2))
-    assert np.array_equal(one.readings, same.readings)
-    assert not np.array_equal(one.readings, other.readings)
+    trial, same, other = (made("bad-pixels", 10, seed=seed) for seed in (1, 1, 2))
+    assert np.array_equal(trial.readings, same.readings)
+    assert not np.array_equal(trial.readings, other.readings)
 
 
 def test_a_misspelt_fault_names_the_nearest():

@@ -101,7 +101,7 @@ def captured(
 class ViewMixing(nn.Module):
     """Every channel's views as mixtures of all its views.
 
-    At first it adds to every other channel its mean over the views, and to the rest nothing.
+    Before training, every second channel gains its mean over the views; the rest gain nothing.
     """
 
     def __init__(self, views: int, channels: int) -> None:

@@ -1,4 +1,4 @@
-"""The weights of a network in a file: what they are for, where they come from, their SHA-256."""
+"""The weights of a network in a file: architecture, provenance, SHA-256."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REMEDY = "`benchmarks/train_network.py` makes one"
 
 
 class Architecture(Settings):
-    """How large a network is. views: rows and columns of the views that it is for."""
+    """Size of a network. views: rows and columns of views."""
 
     views: tuple[int, int] = (5, 5)
     channels: int = Field(default=32, ge=1, le=256)

@@ -1,4 +1,4 @@
-"""The method `unrolled`: its data step, its file, its training, and how it is refused.
+"""The method `unrolled`: data step, file, training, refusals.
 
 Needs PyTorch, and the plug-in installed: pip install --no-deps ./benchmarks/unrolled_plugin
 """
@@ -102,13 +102,13 @@ def test_readings_that_are_not_usable_do_not_matter(untrained):
     usable[0, 3, 4] = False
     wrong = frames.copy()
     wrong[0, 3, 4] = 7
-    one, other = (
+    first, other = (
         reconstruct(
             "unrolled", psi, even_frames(y, 1e-3, usable), settings=using(untrained)
         ).light_field
         for y in (frames, wrong)
     )
-    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(first, other)
 
 
 def test_a_network_for_other_views_is_refused(untrained):
