@@ -64,7 +64,7 @@ session = emmc.capture(folder / "plan.yaml", rig)
 power_w = {name: notes["power_w"] for name, notes in session.notes.items() if notes}
 levels = [session.stored[name].level for name in power_w]
 figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
-axes.plot([1e3 * one for one in power_w.values()], label="power, mW")
+axes.plot([1e3 * item for item in power_w.values()], label="power, mW")
 axes.plot(levels, label="brightest readings of the frame, 1 at white")
 axes.set(xlabel="frame", ylim=(0, None))
 axes.legend()

@@ -28,9 +28,9 @@ Array = NDArray[np.floating]
 def _pictures(titles: tuple[str, ...]) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(INCH_WIDE, 4.6 / len(titles) + 0.4), layout="constrained")
     axes = [figure.add_subplot(1, len(titles), number + 1) for number in range(len(titles))]
-    for one, title in zip(axes, titles, strict=True):
-        one.set(xticks=[], yticks=[])
-        one.set_title(title, fontsize=11)
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(title, fontsize=11)
     return figure, axes
 
 
@@ -92,14 +92,14 @@ def figures(size: tuple[int, int] = SIZE) -> dict[str, Figure]:
     _map(depth, right, disparity_sigma, "pixels per view", cmap="magma", vmax=1)
 
     chosen, axes = _pictures(MODELS)
-    for one, share in zip(axes, mean.shares, strict=True):
-        shown = one.imshow(share, cmap="viridis", vmin=0, vmax=1)
+    for axis, share in zip(axes, mean.shares, strict=True):
+        shown = axis.imshow(share, cmap="viridis", vmin=0, vmax=1)
     chosen.colorbar(shown, ax=axes, label="share of the mean", shrink=0.7)
 
     sure, (left, right) = _pictures(("deviation stated", "true error"))
     error = np.sqrt(np.square(mean.light_field[2, 2] - truth[2, 2]).mean(axis=-1))
-    for one, values in ((left, mean.sigma[2, 2]), (right, error)):
-        _map(sure, one, values, "of white", cmap="magma", vmin=0, vmax=0.2)
+    for item, values in ((left, mean.sigma[2, 2]), (right, error)):
+        _map(sure, item, values, "of white", cmap="magma", vmin=0, vmax=0.2)
     return {
         "frame": begun, "evidence": _evidence(survey.volume, scene.disparity_px),
         "disparity": depth, "models": chosen, "deviation": sure,

@@ -78,7 +78,9 @@ def lens_camera(openings: Sequence[str], rays: Sequence[str]) -> Parts:
 def coded_aperture() -> Parts:
     """A mask in the lens: a view is open or closed for all pixels."""
     code = (1, 0, 1, 1, 0)
-    yield from lens_camera(["#fff" if one else INK for one in code], [RAY * one for one in code])
+    yield from lens_camera(
+        ["#fff" if item else INK for item in code], [RAY * item for item in code]
+    )
     yield words(LENS, "code in the lens, another in each shot")
 
 
@@ -86,7 +88,7 @@ def sensor_mask() -> Parts:
     """A mask before the sensor: a pixel sees each view through another cell."""
     yield from lens_camera(["#fff"] * CELLS, [RAY] * CELLS)
     cells = (1, 0, 0, 1, 1, 0, 1, 0, 1, 1, 0)
-    yield from column(MASK, [INK if one else "#fff" for one in cells], 9, 5)
+    yield from column(MASK, [INK if cell else "#fff" for cell in cells], 9, 5)
     yield words(LENS, "lens: views are its parts")
     yield words(MASK - 30, "mask")
 
@@ -94,7 +96,7 @@ def sensor_mask() -> Parts:
 def coloured_openings() -> Parts:
     """Openings of one colour each: each colour plane of the picture is a shot."""
     seen = [SPECTRUM[0], INK, SPECTRUM[2], INK, SPECTRUM[3]]
-    yield from lens_camera(seen, [one if one != INK else "" for one in seen])
+    yield from lens_camera(seen, [item if item != INK else "" for item in seen])
     yield words(LENS, "openings behind colour filters")
 
 

@@ -140,8 +140,8 @@ def mask_places() -> Parts:
         for k in range(5):
             yield line(left, 90 + (k - 2) * 24, right, 90, RAY, 1.2)
         count, high = (5, 24) if name == "D" else (15, 8.8)
-        for k, one in enumerate(cells[:count]):
-            yield box(at - 4, 90 + (k - count / 2) * high, 6, high, "#fff" if one else INK)
+        for k, cell in enumerate(cells[:count]):
+            yield box(at - 4, 90 + (k - count / 2) * high, 6, high, "#fff" if cell else INK)
         yield box(right + 3, 22, 7, 136, "#d9dee3")
         yield box(right + 3, 86, 7, 8, RAY)
         yield words((left + right) / 2, 184, f"mask at {name}")

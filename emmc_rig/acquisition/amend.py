@@ -127,14 +127,14 @@ def _seen(camera: Mapping[str, Any], shot: int) -> dict[str, Any]:
 
 def _difference(edited: PlannedFrame, taken: PlannedFrame) -> str:
     """Return in what two frames differ that shows in the picture, "" in nothing but exposure."""
-    for name, one, other in (
+    for name, item, other in (
         ("lamp", edited.bench.lamp, taken.bench.lamp),
         ("gain", edited.gain, taken.gain),
         ("view", edited.view, taken.view),
         ("place", dict(edited.bench.offsets_um), dict(taken.bench.offsets_um)),
     ):
-        if one != other:
-            return f"its {name} as {one}, not {other}"
+        if item != other:
+            return f"its {name} as {item}, not {other}"
     same = replace(edited.bench, fitting=0) == replace(taken.bench, fitting=0)
     return "" if same else "another bench for it"
 

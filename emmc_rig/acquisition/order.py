@@ -65,7 +65,7 @@ def _open_before_holes(groups: list[list[PlannedFrame]]) -> list[list[PlannedFra
     ]
     found = list(groups)
     for place, other in zip(
-        boards, sorted(boards, key=lambda one: groups[one][0].view is not None), strict=True
+        boards, sorted(boards, key=lambda item: groups[item][0].view is not None), strict=True
     ):
         found[place] = groups[other]
     return found
@@ -77,11 +77,11 @@ def spread(frames: Sequence[PlannedFrame], checks: Sequence[PlannedFrame]) -> li
     Frames of one whiteboard, which are averaged, stay together.
     """
     found = list(frames)
-    for place, one in reversed(list(enumerate(checks))):
+    for place, check in reversed(list(enumerate(checks))):
         at = round(place * len(frames) / max(len(checks) - 1, 1))
         while 0 < at < len(frames) and frames[at].repeat:
             at += 1
-        found.insert(at, one)
+        found.insert(at, check)
     return found
 
 

@@ -68,7 +68,9 @@ class Ability:
     @property
     def best(self) -> Calibration:
         """Return the surest way that is possible."""
-        return next(one for one in self.calibrations if one.name in self.possible)
+        return next(
+            calibration for calibration in self.calibrations if calibration.name in self.possible
+        )
 
     def hands(self, way: Calibration) -> int:
         """Return how often somebody moves something for a way."""

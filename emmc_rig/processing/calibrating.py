@@ -138,7 +138,7 @@ def _of_arrays(
     required(poses, (list, tuple), "poses", POSES_TAKE)
     if len(whiteboards) != len(poses):
         raise AppError(f"{len(whiteboards)} whiteboards, and {len(poses)} poses: give one for each")
-    stood = [validated(Pose, one, f"poses[{place}]", AppError) for place, one in enumerate(poses)]
+    stood = [validated(Pose, pose, f"poses[{place}]", AppError) for place, pose in enumerate(poses)]
     if darks is None:
         raise refusal(darks, "darks", DARKS_TAKE)
     _refuse_millimetres(stood, camera)
@@ -149,7 +149,7 @@ def _of_arrays(
         _mean(frames, float(exposure_s), camera, f"darks at {exposure_s:g}", lit=False)
         for exposure_s, frames in exposed.items()
     )
-    sizes = {one.mean_dn.shape for one in dark}
+    sizes = {item.mean_dn.shape for item in dark}
     if len(sizes) != 1:
         raise AppError(f"darks: of {len(sizes)} sizes, {', '.join(map(str, sorted(sizes)))} pixels")
     references: dict[tuple[int, str], MeanFrame] = {}

@@ -307,12 +307,12 @@ def _noise_line(
     level, mean_squares = blocks.T
     groups = _by_level(level)
     x = np.array([level[group].mean() for group in groups])
-    columns = [one for one, known in ((x, slope), (np.ones_like(x), floor)) if known is None]
+    columns = [item for item, known in ((x, slope), (np.ones_like(x), floor)) if known is None]
     line, expected = (slope or 0.0, floor or 0.0), np.ones_like(level)
     for _ in range(ROUNDS if columns else 0):
         # Within a group the smoothest are not to be the darkest: against what each has to have.
-        low = [np.quantile(mean_squares[one] / expected[one], SMOOTHEST) for one in groups]
-        y = np.array(low) / SMOOTHEST_READS * [expected[one].mean() for one in groups]
+        low = [np.quantile(mean_squares[group] / expected[group], SMOOTHEST) for group in groups]
+        y = np.array(low) / SMOOTHEST_READS * [expected[group].mean() for group in groups]
         # A variance is sure to a share of itself.
         weight = 1 / np.maximum(y, 1e-12 + 1e-6 * y.max())
         left = np.maximum(y - (slope or 0) * x - (floor or 0), 0)
@@ -331,7 +331,7 @@ def _looks_coded(dn: Array, usable: NDArray[np.bool_], eight_bits: bool) -> str:
     values, counts = np.unique(flat[:: 1 + flat.size // MOST_LOOKED_AT], return_counts=True)
     whole, top = not np.mod(values, 1).any(), float(values[-1])
     steps = [256, 257] if whole else [1 / 255]
-    on_steps = any(np.abs(values / one - np.round(values / one)).max() < 1e-3 for one in steps)
+    on_steps = any(np.abs(values / step - np.round(values / step)).max() < 1e-3 for step in steps)
     if eight_bits or (on_steps and len(values) > FEW_CODES and top <= 255 * steps[-1]):
         return "these are codes of 8 bits"
     # Linear values of a sensor, turned into codes, lie ever closer towards white.
@@ -351,7 +351,7 @@ def _looks_coded(dn: Array, usable: NDArray[np.bool_], eight_bits: bool) -> str:
     if len(level) < LEVELS * FEWEST_BLOCKS // 2:
         return ""
     groups = _by_level(level)
-    low = np.array([np.quantile(mean_squares[one], SMOOTHEST) for one in groups])
+    low = np.array([np.quantile(mean_squares[group], SMOOTHEST) for group in groups])
     between = level[groups[-1]].mean() - level[groups[0]].mean()
     if low.min() <= whole * QUANTISED or between < BETWEEN * np.sqrt(low[-1]):
         return ""

@@ -116,7 +116,7 @@ def _planes_as_boards(
     stages: Stages,
 ) -> list[Board]:
     """Return every view's coefficients as the whiteboard that measured them."""
-    values, spread = (_pixel_coefficients(psi, one) for one in (psi.weights, deviation))
+    values, spread = (_pixel_coefficients(psi, item) for item in (psi.weights, deviation))
     stored = values.shape[2]
     if colour is not None and stored > 1:
         # Three colours by crosstalk: what white light gives is their sum.

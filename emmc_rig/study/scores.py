@@ -59,7 +59,7 @@ def scored(
     low, high = float(disparity_px.min()), float(disparity_px.max())
     edge = inner(truth.shape, max(abs(low), abs(high)))
     found, floor = (
-        np.abs(swept_disparity(one, low, high) - disparity_px)[edge] for one in (estimate, truth)
+        np.abs(swept_disparity(item, low, high) - disparity_px)[edge] for item in (estimate, truth)
     )
     own = None
     if own_disparity_px is not None and own_disparity_px.shape == disparity_px.shape:

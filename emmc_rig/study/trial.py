@@ -152,7 +152,7 @@ def _sums(
     spec: str, size: tuple[int, int] | None, views: tuple[int, int], seed: int, zoom: int
 ) -> list[float]:
     seen = _opened(spec, size, views, seed, zoom).light_field
-    return [float(np.sum(one, dtype=np.float64)) for one in (seen, np.square(seen))]
+    return [float(np.sum(item, dtype=np.float64)) for item in (seen, np.square(seen))]
 
 
 @lru_cache(maxsize=4)

@@ -21,13 +21,12 @@ from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
 from reconstruction.adaptive.stacks import (
     CELL,
-    COSINES,
-    INVERSE,
     SIDE,
     STACK,
+    add_block,
     cells_apart,
     shrink_stack,
-    transform,
+    stack_block,
 )
 
 Array = NDArray[np.floating]
@@ -40,15 +39,34 @@ _OPPONENT = OPPONENT.astype(np.float32)
 
 
 @njit(forceinline=True)
+def _row_apart(guide, y, cells, reach, wide, apart):
+    """Set apart (cell, displacement) for the cells that begin at columns `cells` of row y.
+
+    guide: flat, `wide` numbers a row, with `reach` rows and columns before the picture's first.
+    """
+    height = 2 * reach + 1
+    for n in range(cells.size):
+        first = y * wide + cells[n]
+        own, vectors = first + reach * (wide + 1), _vectors(reach)
+        cells_apart(guide, own, first, wide, apart, n * height * vectors * SIDE, height, vectors)
+
+
+@njit(forceinline=True)
+def _vectors(reach):
+    """Return how many vectors hold the displacements along a row."""
+    return (2 * reach + SIDE) // SIDE
+
+
+@njit(forceinline=True)
 def _most_alike(squares, limit, reach, top, bottom, left, right, distances, found):
     """Set found (STACK,) to the displacements of the blocks most like one, its own first.
 
-    squares: of how far blocks displaced by -reach to reach rows and columns are from it; found:
-    counted alike. limit: squared distance that excludes a block. top to right:
-    the displacements along both axes, counted from -reach, whose blocks lie in the picture. Returns
-    how many are found, a power of two.
+    squares: distances of the block to blocks displaced by up to reach rows and columns, squared,
+    rows of whole vectors; found: counted alike. limit: squared distance that excludes a block. top
+    to right: the displacements along both axes, counted from -reach, whose blocks lie in the
+    picture. Returns the number of blocks found, a power of two.
     """
-    wide = 2 * reach + 1
+    wide = _vectors(reach) * SIDE
     own = reach * wide + reach
     number, worst = 1, limit
     distances[0], found[0] = -1, own
@@ -75,57 +93,44 @@ def _most_alike(squares, limit, reach, top, bottom, left, right, distances, foun
 def _shrink(picture, guide, cuts, unlike, reach, starts_y, starts_x, cells, corners, total, weight):
     """Add the blocks' estimates of a picture to total (c, y, x), and their weights to weight.
 
-    guide: padded by `reach` on all sides. cells: the columns
+    guide: with `reach` rows and columns before the picture's, and more behind. cells: the columns
     where cells begin; corners (2, block): the number of the left and of the right ones of each
-    block of starts_x. weight (c, y, x): where blocks begin.
+    block of starts_x. weight: flat, where blocks begin.
 
     What two rows of blocks share of their distances, a row of cells, is computed once.
     """
     colours, length, wide = picture.shape
-    row = 2 * reach + 1
-    size = row * row
-    above = np.empty((cells.size, row, row), np.float32)
-    below = np.empty_like(above)
+    flat, flat_total, flat_guide = picture.reshape(-1), total.reshape(-1), guide.reshape(-1)
+    guide_wide, row = guide.shape[1], _vectors(reach) * SIDE
+    size = (2 * reach + 1) * row
+    above, below = np.empty(cells.size * size, np.float32), np.empty(cells.size * size, np.float32)
     known = np.int64(-1)
-    stack = np.empty((SIDE, STACK * SIDE), np.float32)
-    room = np.empty_like(stack)
-    squares = np.empty(size, np.float32)
+    stack, squares = np.empty(STACK * SIDE * SIDE, np.float32), np.empty(size, np.float32)
     distances, found = np.empty(STACK, np.float32), np.empty(STACK, np.int64)
     limit = unlike * SIDE * SIDE
     for y in starts_y:
         above, below = below, above
-        for begin, apart in ((y, above), (y + CELL, below)):
-            for n in range(cells.size if begin != known else 0):
-                cells_apart(guide, begin, cells[n], reach, apart[n])
+        if known != y:
+            _row_apart(flat_guide, y, cells, reach, guide_wide, above)
         known = y + CELL
+        _row_apart(flat_guide, known, cells, reach, guide_wide, below)
         top, bottom = max(0, reach - y), min(2 * reach, length - SIDE - y + reach)
         for block in range(starts_x.size):
-            x, (left, right) = starts_x[block], corners[:, block]
-            p, q = above[left].reshape(-1), above[right].reshape(-1)
-            r, s = below[left].reshape(-1), below[right].reshape(-1)
+            x, left, right = starts_x[block], corners[0, block] * size, corners[1, block] * size
             for n in range(size):
-                squares[n] = p[n] + q[n] + r[n] + s[n]
+                squares[n] = above[left + n] + above[right + n] + below[left + n] + below[right + n]
             first, last = max(0, reach - x), min(2 * reach, wide - SIDE - x + reach)
             count = _most_alike(squares, limit, reach, top, bottom, first, last, distances, found)
-            width = count * SIDE
+            for k in range(count):
+                found[k] = (y + found[k] // row - reach) * wide + x + found[k] % row - reach
             for c in range(colours):
+                plane = c * length * wide
                 for k in range(count):
-                    at_y, at_x = y + found[k] // row - reach, x + found[k] % row - reach
-                    for i in range(SIDE):
-                        line, block = picture[c, at_y + i, at_x:], stack[i, k * SIDE :]
-                        for n in range(SIDE):
-                            block[n] = line[n]
-                transform(COSINES, stack, room, width)
-                share = np.float32(1.0) / (1 + shrink_stack(room, width, cuts[c]))
-                transform(INVERSE, room, stack, width)
-                scale = share / np.float32(count)
+                    stack_block(flat, plane + found[k], wide, stack, k)
+                share = np.float32(1.0) / (1 + shrink_stack(stack, count, cuts[c]))
                 for k in range(count):
-                    at_y, at_x = y + found[k] // row - reach, x + found[k] % row - reach
-                    weight[c, at_y, at_x] += share
-                    for i in range(SIDE):
-                        line, block = total[c, at_y + i, at_x:], stack[i, k * SIDE :]
-                        for n in range(SIDE):
-                            line[n] += scale * block[n]
+                    add_block(stack, k, share, flat_total, plane + found[k], wide)
+                    weight[plane + found[k]] += share
 
 
 def _starts(length: int, step: int, first: int) -> NDArray[np.int64]:
@@ -166,7 +171,7 @@ def denoised(
     mixing = _OPPONENT if len(picture) == 3 else np.eye(len(picture), dtype=np.float32)
     opponent = np.ascontiguousarray(np.einsum("oc,cyx->oyx", mixing, picture, optimize=True))
     luminance = np.ascontiguousarray(np.einsum("c,cyx->yx", mixing[0], guide, optimize=True))
-    around = np.pad(luminance, reach)
+    around = np.pad(luminance, ((reach, reach), (reach, reach + SIDE)))
     rows = _starts(picture.shape[1], step, first)
     columns = _starts(picture.shape[2], step, first)
     cuts = np.array([1, chroma, chroma], dtype=np.float32) * np.float32(threshold * sigma)
@@ -177,7 +182,7 @@ def denoised(
     unlike = np.float32(ALIKE * sigma**2)
 
     def work(which: int, begin: int, end: int) -> None:
-        added = totals[which], weights[which]
+        added = totals[which], weights[which].reshape(-1)
         starts = rows[begin:end], columns, cells, corners
         _shrink(opponent, around, cuts, unlike, reach, *starts, *added)
 

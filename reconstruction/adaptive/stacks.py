@@ -1,118 +1,236 @@
-"""Stacks of like blocks: their distances, cosines within a block, Walsh-Hadamard across a stack.
+"""Vector instructions of blocks: which are alike, cosines in one, Walsh-Hadamard across a stack.
 
-A block is SIDE x SIDE numbers, a quarter of it is a cell. A stack of up to STACK blocks side by
-side is an array (row, block column), as wide as STACK blocks, of which `width` numbers are used.
-
-Kernels cut slices and count from 0 within them: only where no index can be negative does the
-compiler make vectors of a loop. Written in vector instructions by hand these loops take half the
-time, which is a tenth of a reconstruction's (96x128, one shot, one thread).
+A block is SIDE x SIDE numbers. It lies in SIDE vectors, so that its transforms never leave the
+registers; a quarter of it is a cell. Stacks, (block, row, column) of up to STACK blocks, and
+pictures are flat float32 arrays. No index is checked.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.fft import dct
+from collections.abc import Sequence
+from typing import Any
 
-from emmc_rig.model.compiling import njit
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+
+from reconstruction.adaptive.vectors import FLOAT, LANE, Code, function, intrinsic
 
 SIDE = 8
 CELL = SIDE // 2
 STACK = 16
-"""A power of two."""
-COSINES = np.asarray(dct(np.eye(SIDE), axis=0, norm="ortho"), dtype=np.float32)
-"""The matrix C of the orthonormal cosine transform, a frequency a row; its inverse is C^T."""
-INVERSE = np.ascontiguousarray(COSINES.T)
+"""A power of two: a vector of each block fits the registers of AVX2."""
+_C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
+    float(0.5 * np.cos(k * np.pi / (2 * SIDE))) for k in range(1, SIDE)
+)
+_ROW = ir.VectorType(FLOAT, SIDE)
+_COUNTS = ir.VectorType(LANE, SIDE)
+_INDEX = ir.IntType(64)
+_FUSED = ("contract",)
+"""Sums stay in the order written: a butterfly is no sum of all it spans."""
 
 
-@njit(forceinline=True, fastmath=True)
-def cells_apart(guide, y, x, reach, squares):
-    """Set squares (row, column) to the squared distances of a picture's cells from one of its own.
+class _Row:
+    """A vector of which sums and products can be written as formulas."""
 
-    y, x: where the cell begins in the picture without the margin of `reach` that guide (y, x) has.
-    The other cells are displaced by -reach to reach rows and columns.
+    def __init__(self, builder: Any, values: Any) -> None:
+        self.builder, self.values = builder, values
+
+    def __add__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fadd(self.values, other.values, flags=_FUSED))
+
+    def __sub__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fsub(self.values, other.values, flags=_FUSED))
+
+    def __rmul__(self, number: float) -> _Row:
+        by = ir.Constant(_ROW, [number] * SIDE)
+        return _Row(self.builder, self.builder.fmul(self.values, by, flags=_FUSED))
+
+
+def _analysed(rows: Sequence[_Row]) -> list[_Row]:
+    """Return the eight cosine coefficients of eight values."""
+    a, b, c, d, e, f, g, h = rows
+    a, h, b, g, c, f, d, e = a + h, a - h, b + g, b - g, c + f, c - f, d + e, d - e
+    return [
+        _C4 * (a + d + b + c),
+        _C1 * h + _C3 * g + _C5 * f + _C7 * e,
+        _C2 * (a - d) + _C6 * (b - c),
+        _C3 * h - _C7 * g - _C1 * f - _C5 * e,
+        _C4 * (a + d - b - c),
+        _C5 * h - _C1 * g + _C7 * f + _C3 * e,
+        _C6 * (a - d) - _C2 * (b - c),
+        _C7 * h - _C5 * g + _C3 * f - _C1 * e,
+    ]
+
+
+def _synthesised(rows: Sequence[_Row]) -> list[_Row]:
+    """Return the eight values of eight cosine coefficients: the inverse of `_analysed`."""
+    a, b, c, d, e, f, g, h = rows
+    outer, inner = _C4 * (a + e), _C4 * (a - e)
+    p, q = _C2 * c + _C6 * g, _C6 * c - _C2 * g
+    k = _C1 * b + _C3 * d + _C5 * f + _C7 * h
+    m = _C3 * b - _C7 * d - _C1 * f - _C5 * h
+    n = _C5 * b - _C1 * d + _C7 * f + _C3 * h
+    o = _C7 * b - _C5 * d + _C3 * f - _C1 * h
+    return [
+        outer + p + k, inner + q + m, inner - q + n, outer - p + o,
+        outer - p - o, inner - q - n, inner + q - m, outer + p - k,
+    ]  # fmt: skip
+
+
+class _Code(Code):
+    """Writes transforms of blocks and stacks."""
+
+    def row_starts(self, at: Any, wide: Any, count: int = SIDE) -> list[Any]:
+        """Return the indices of rows `wide` numbers apart, the first one's first."""
+        return [self.builder.add(at, self.builder.mul(wide, _INDEX(row))) for row in range(count)]
+
+    def rows(self, flat: Any, indices: Sequence[Any]) -> list[_Row]:
+        return [_Row(self.builder, self.load(flat, at, SIDE)) for at in indices]
+
+    def transposed(self, rows: Sequence[_Row]) -> list[_Row]:
+        """Return a block with rows and columns exchanged: halves, quarters, and numbers of it."""
+        out, lanes = [row.values for row in rows], range(SIDE)
+        for apart in (4, 2, 1):
+            upper = [n + SIDE - apart if n & apart else n for n in lanes]
+            lower = [n + SIDE if n & apart else n + apart for n in lanes]
+            for row in (n for n in lanes if not n & apart):
+                pair = out[row], out[row + apart]
+                out[row], out[row + apart] = (
+                    self.builder.shuffle_vector(*pair, ir.Constant(_COUNTS, which))
+                    for which in (upper, lower)
+                )
+        return [_Row(self.builder, row) for row in out]
+
+    def across(self, rows: Sequence[_Row]) -> list[_Row]:
+        """Return the Walsh-Hadamard transform of a power of two of rows, not normalised."""
+        if len(rows) == 1:
+            return list(rows)
+        half = len(rows) // 2
+        pairs = list(zip(rows[:half], rows[half:], strict=True))
+        sums, differences = [a + b for a, b in pairs], [a - b for a, b in pairs]
+        return [*self.across(sums), *self.across(differences)]
+
+    def dropped(self, row: _Row, least: Any, kept: Any) -> tuple[_Row, Any]:
+        """Return a row with values below `least` set to 0, and the counts of the other values."""
+        kind = ir.FunctionType(_ROW, [_ROW])
+        name = f"llvm.fabs.v{SIDE}f32"
+        size = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        drop = self.builder.fcmp_ordered("<", self.builder.call(size, [row.values]), least)
+        values = self.builder.select(drop, ir.Constant(_ROW, [0.0] * SIDE), row.values)
+        stays = self.builder.zext(self.builder.not_(drop), _COUNTS)
+        return _Row(self.builder, values), self.builder.add(kept, stays)
+
+
+def _block(code: _Code, number: Any) -> list[Any]:
+    """Return the indices of the rows of a stack's block."""
+    return code.row_starts(code.builder.mul(number, _INDEX(SIDE * SIDE)), _INDEX(SIDE))
+
+
+@intrinsic
+def cells_apart(context, guide, own, first, wide, squares, at, height, vectors):
+    """Set squares[at] and on to the squared distances of a cell to displaced cells of a picture.
+
+    own: start of the cell, first: start of the first displaced cell, in the flat picture `guide`,
+    whose rows are `wide` numbers apart. Displaced cells start at `height` rows of `vectors` * SIDE.
     """
-    cell = guide[y + reach : y + reach + CELL, x + reach : x + reach + CELL]
-    for row in range(CELL):
-        p, q, r, s = cell[row, 0], cell[row, 1], cell[row, 2], cell[row, 3]
-        for down in range(2 * reach + 1):
-            out, other = squares[down], guide[y + down + row, x:]
-            for n in range(out.size):
-                a, b, c, d = other[n] - p, other[n + 1] - q, other[n + 2] - r, other[n + 3] - s
-                square = a * a + b * b + c * c + d * d
-                out[n] = square if row == 0 else out[n] + square
+
+    def write(code, guide, own, first, wide, squares, at, height, vectors):
+        builder, steps = code.builder, range(CELL)
+        cell = [
+            [code.spread(builder.load(code.place(guide, row, n)), SIDE) for n in steps]
+            for row in code.row_starts(own, wide, CELL)
+        ]
+        with cgutils.for_range(builder, height) as down, cgutils.for_range(builder, vectors) as to:
+            begin = builder.add(first, builder.mul(to.index, _INDEX(SIDE)))
+            begin = builder.add(begin, builder.mul(down.index, wide))
+            total = ir.Constant(_ROW, [0.0] * SIDE)
+            for row, numbers in zip(code.row_starts(begin, wide, CELL), cell, strict=True):
+                for n, number in enumerate(numbers):
+                    apart = builder.fsub(code.load(guide, row, SIDE, n), number, flags=_FUSED)
+                    square = builder.fmul(apart, apart, flags=_FUSED)
+                    total = builder.fadd(total, square, flags=_FUSED)
+            vector = builder.add(builder.mul(down.index, vectors), to.index)
+            code.store(total, squares, builder.add(at, builder.mul(vector, _INDEX(SIDE))))
+
+    kinds = guide, own, first, wide, squares, at, height, vectors
+    return function(types.void, kinds, write, _Code)
 
 
-@njit(forceinline=True, fastmath=True)
-def _multiply(matrix, stack, out, width):
-    """Set out to matrix @ stack: each block B of the stack becomes matrix @ B."""
-    a, b, c, d, e, f, g, h = (
-        stack[0], stack[1], stack[2], stack[3], stack[4], stack[5], stack[6], stack[7]
-    )  # fmt: skip
-    for row in range(SIDE):
-        m, line = matrix[row], out[row]
-        for n in range(width):
-            line[n] = (
-                m[0] * a[n] + m[1] * b[n] + m[2] * c[n] + m[3] * d[n]
-                + m[4] * e[n] + m[5] * f[n] + m[6] * g[n] + m[7] * h[n]
-            )  # fmt: skip
+@intrinsic
+def stack_block(context, picture, at, wide, stack, number):
+    """Set a block of a stack to the cosine coefficients of a picture's from picture[at] on.
 
-
-@njit(forceinline=True, fastmath=True)
-def transform(matrix, stack, out, width):
-    """Set out to (matrix B matrix^T)^T for each block B of a stack, which is overwritten.
-
-    By COSINES B becomes the transpose K of its coefficients, by INVERSE K becomes B again.
+    wide: numbers from row to row of the picture.
     """
-    _multiply(matrix, stack, out, width)
-    for row in range(SIDE):
-        for column in range(SIDE):
-            source, target = out[row, column:], stack[column, row:]
-            for block in range(0, width, SIDE):
-                target[block] = source[block]
-    _multiply(matrix, stack, out, width)
+
+    def write(code, picture, at, wide, stack, number):
+        rows = _analysed(code.rows(picture, code.row_starts(at, wide)))
+        rows = _analysed(code.transposed(rows))
+        for row, to in zip(rows, _block(code, number), strict=True):
+            code.store(row.values, stack, to)
+
+    return function(types.void, (picture, at, wide, stack, number), write, _Code)
 
 
-@njit(forceinline=True, fastmath=True)
-def _across(stack, width):
-    """Replace a stack by its Walsh-Hadamard transform across the blocks, not normalised.
+@intrinsic
+def add_block(context, stack, number, share, picture, at, wide):
+    """Add a share of the block whose coefficients `stack_block` set to a picture."""
 
-    Two steps of it at a time, which halves the passes over the stack, then a last one.
+    def write(code, stack, number, share, picture, at, wide):
+        rows = _synthesised(code.rows(stack, _block(code, number)))
+        rows = _synthesised(code.transposed(rows))
+        share = code.spread(share, SIDE)
+        for row, to in zip(rows, code.row_starts(at, wide), strict=True):
+            added = code.builder.fmul(row.values, share, flags=_FUSED)
+            before = code.load(picture, to, SIDE)
+            code.store(code.builder.fadd(before, added, flags=_FUSED), picture, to)
+
+    return function(types.void, (stack, number, share, picture, at, wide), write, _Code)
+
+
+@intrinsic
+def shrink_stack(context, stack, count, least):
+    """Drop what is nearer zero than `least` of the transform across a stack; return what is kept.
+
+    count: of its blocks, a power of two. The stack's mean (0, 0, 0) stays, and counts where it is
+    not nearer zero.
     """
-    part = width // 4
-    while part >= SIDE:
-        for first in range(0, width, 4 * part):
-            for row in range(SIDE):
-                line = stack[row, first : first + 4 * part]
-                p, q, r, s = line[:part], line[part:], line[2 * part :], line[3 * part :]
-                for n in range(p.size):
-                    a, b, c, d = p[n] + r[n], q[n] + s[n], p[n] - r[n], q[n] - s[n]
-                    p[n], q[n], r[n], s[n] = a + b, a - b, c + d, c - d
-        part //= 4
-    if part == SIDE // 2:
-        for row in range(SIDE):
-            for first in range(0, width, 2 * SIDE):
-                p, q = stack[row, first : first + SIDE], stack[row, first + SIDE :]
-                for n in range(SIDE):
-                    p[n], q[n] = p[n] + q[n], p[n] - q[n]
+
+    def write(code, stack, count, least):
+        builder = code.builder
+        total = cgutils.alloca_once(builder, LANE)
+        builder.store(LANE(0), total)
+        sizes = [2**power for power in range(STACK.bit_length())]
+        for size in sizes:
+            with builder.if_then(builder.icmp_signed("==", count, count.type(size))):
+                # Transformed twice, a stack is `size` times as large.
+                cut = builder.fmul(least, ir.Constant(FLOAT, float(np.sqrt(size))))
+                _shrink_rows(code, stack, size, code.spread(cut, SIDE), total)
+        return builder.load(total)
+
+    return function(types.int32, (stack, count, least), write, _Code)
 
 
-@njit(forceinline=True, fastmath=True)
-def shrink_stack(stack, width, least):
-    """Drop coefficients nearer zero than `least` across a stack; return how many are kept.
-
-    With H the Walsh-Hadamard matrix of n blocks, H H = n: the coefficients H stack / sqrt(n) are
-    compared with `least`, and the stack becomes H (kept), n times what is left of it. n is a power
-    of two. The stack's mean (0, 0) stays, and counts where it is not nearer zero.
-    """
-    _across(stack, width)
-    cut = least * np.float32(np.sqrt(width // SIDE))
-    kept, mean = np.int32(0), stack[0, 0]
-    for row in range(SIDE):
-        line = stack[row, :width]
-        for n in range(line.size):
-            stays = abs(line[n]) >= cut
-            kept += np.int32(stays)
-            line[n] = line[n] if stays else np.float32(0)
-    stack[0, 0] = mean
-    _across(stack, width)
-    return kept
+def _shrink_rows(code: _Code, stack: Any, size: int, least: Any, total: Any) -> None:
+    builder = code.builder
+    kept = cgutils.alloca_once(builder, _COUNTS)
+    builder.store(ir.Constant(_COUNTS, [0] * SIDE), kept)
+    with cgutils.for_range(builder, _INDEX(SIDE)) as loop:
+        first = builder.mul(loop.index, _INDEX(SIDE))
+        places = [builder.add(first, _INDEX(SIDE * SIDE * block)) for block in range(size)]
+        seen, counts = code.across(code.rows(stack, places)), builder.load(kept)
+        left = []
+        for row in seen:
+            row, counts = code.dropped(row, least, counts)
+            left.append(row)
+        builder.store(counts, kept)
+        mean = builder.extract_element(seen[0].values, LANE(0))
+        with_mean = builder.insert_element(left[0].values, mean, LANE(0))
+        is_first = builder.icmp_signed("==", loop.index, _INDEX(0))
+        left[0] = _Row(builder, builder.select(is_first, with_mean, left[0].values))
+        for row, place in zip(code.across(left), places, strict=True):
+            code.store((1 / size * row).values, stack, place)
+    for lane in range(SIDE):
+        of_lane = builder.extract_element(builder.load(kept), LANE(lane))
+        builder.store(builder.add(builder.load(total), of_lane), total)

@@ -140,6 +140,6 @@ def test_every_frame_keeps_what_was_read_beside_it_and_when(tmp_path):
 
 
 def test_two_sources_of_one_name_are_refused(tmp_path):
-    one = {"name": "lab", "file": "x"}
+    source = {"name": "lab", "file": "x"}
     with pytest.raises(emmc.ERRORS, match="two sources are named lab"):
-        captured(tmp_path, [one, one])
+        captured(tmp_path, [source, source])

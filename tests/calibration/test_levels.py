@@ -36,6 +36,7 @@ def checks(drift=0.0, bend=0.0, noise=0.0, seed=0):
 
 def test_drift_and_bend_are_separated_and_taken_out():
     levels = fit_levels(checks(drift=0.02, bend=0.01, noise=5e-5))
+    assert levels is not None
     assert levels.drifting
     assert levels.bent
     assert levels.bend_per_dn * 50_000 == pytest.approx(0.01, rel=0.1)
@@ -52,6 +53,7 @@ def test_drift_and_bend_are_separated_and_taken_out():
 
 def test_a_steady_lamp_and_a_straight_response_are_left_alone():
     levels = fit_levels(checks(noise=1e-4))
+    assert levels is not None
     assert not levels.drifting
     assert not levels.bent
     frame = MeanFrame(np.full((2, 2), 30_000, np.float32), 1.0, 1, 0.1, 100.0)
@@ -65,6 +67,7 @@ def test_boards_seen_once_tell_nothing():
 
 def test_one_exposure_leaves_the_response_unknown():
     levels = fit_levels([check for check in checks(bend=0.05) if check.exposure_s == 0.1])
+    assert levels is not None
     assert not levels.bend_known
     assert not levels.bent
 
@@ -174,6 +177,7 @@ def test_crosstalk_is_what_a_filter_sees_of_other_lamps():
 
     good = np.ones((8, 8), bool)
     found = crosstalk(set_of(through), channels, good)
+    assert found is not None
     np.testing.assert_allclose(found.seen, through, atol=1e-5)
     assert found.largest == pytest.approx(0.05)
     assert crosstalk(set_of(np.eye(3)), channels, good) is None
@@ -183,4 +187,5 @@ def test_crosstalk_is_what_a_filter_sees_of_other_lamps():
         crosstalk(set_of(swapped), channels, good)
     leaking = np.array([[0.999, 0.001, 0.0], [0.0, 1.0, 0.0], [0.0, 0.04, 0.96]])
     found = crosstalk(set_of(leaking), channels, good)
+    assert found is not None
     assert found.largest == pytest.approx(0.04)

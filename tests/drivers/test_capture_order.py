@@ -13,7 +13,7 @@ IN_TIME = ["IMG_9998.dng", "IMG_9999.dng", "IMG_0001.dng", "IMG_0002.dng"]
 
 def ordered(names, seconds, start=NOON):
     """Return names in the order found, and the notes; seconds: after the start, None not stated."""
-    times = [None if one is None else start + timedelta(seconds=one) for one in seconds]
+    times = [None if second is None else start + timedelta(seconds=second) for second in seconds]
     order = capture_order(names, times)
     return [names[place] for place in order.places], order.notes
 

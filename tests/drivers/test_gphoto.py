@@ -139,7 +139,7 @@ def test_a_setting_without_a_value_is_left_out_and_does_not_end_the_process():
 
 
 def test_a_camera_without_any_settings_is_refused_in_one_line():
-    every = [int(one) for one in Property]
+    every = [int(item) for item in Property]
     with served(hidden=every) as (name, _):
         with closing(GphotoCamera(name)) as camera:
             assert camera.gain_limits == (1.0, 1.0)

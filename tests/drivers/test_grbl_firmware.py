@@ -38,7 +38,9 @@ def firmware(peer_files, tmp_path):
         time.sleep(0.3)
         return [float(number) for number in steps.read_text().splitlines()[-1].split()[1:4]]
 
-    with subprocess.Popen([program], env=settings, cwd=tmp_path, stdout=subprocess.DEVNULL) as one:
+    with subprocess.Popen(
+        [program], env=settings, cwd=tmp_path, stdout=subprocess.DEVNULL
+    ) as process:
         try:
             while not link.exists():
                 time.sleep(0.05)
@@ -51,7 +53,7 @@ def firmware(peer_files, tmp_path):
                         pass
             yield link, true_mm
         finally:
-            one.kill()
+            process.kill()
 
 
 def opened(link):

@@ -68,7 +68,7 @@ def demo_stage(axes=None, **setup):
 def places_in(frame):
     """Where the SequenceTester's devices were while its camera exposed the frame."""
     reported = decode_image(frame.mosaic.astype(np.uint8))
-    return {(one.device, one.property): one.value for one in reported.current_state}
+    return {(item.device, item.property): item.value for item in reported.current_state}
 
 
 @pytest.fixture

@@ -74,7 +74,7 @@ def test_what_is_written_comes_back_as_a_scene(written, export, name):
 
 
 def test_every_format_that_can_be_read_is_tried():
-    assert {one.name for one in FORMATS.values() if one.read} | {
+    assert {format.name for format in FORMATS.values() if format.read} | {
         "png8",
         "png16",
         "tiff",

@@ -147,7 +147,7 @@ class Bench:
         self.passing = np.atleast_3d(cells)
         self.filtered = self.colour if self.passing.shape[2] == 3 else np.zeros(self.size, int)
         # What the mask's shadow depends on; benches that differ in the rest share it.
-        traced = {one: getattr(optics, one) for one in GEOMETRY}
+        traced = {item: getattr(optics, item) for item in GEOMETRY}
         drawn = cells.tobytes(), self.astray.tobytes()
         self.known = TRACED.setdefault((repr(traced), self.size, sensor.bayer, *drawn), {})
 

@@ -36,7 +36,7 @@ def quick_rig(description, camera, ask):
 
 def read_whiteboards(session, *rest):
     """Stand in for `session_outcome`: read all that it reads, and stop before the fit."""
-    count = len([one.frame for one in whiteboards(session).frames])
+    count = len([frame.frame for frame in whiteboards(session).frames])
     raise AppError(f"{count} pinholes read")
 
 
@@ -79,7 +79,7 @@ def main():
             _forked(arguments, folder, place, place * offset_s)
             for place, arguments in enumerate(json.loads((folder / "commands.json").read_text()))
         ]
-        codes = [os.waitstatus_to_exitcode(os.waitpid(one, 0)[1]) for one in processes]
+        codes = [os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes]
         took_s = time.monotonic() - began
         print(json.dumps({"pids": processes, "codes": codes, "seconds": took_s}), flush=True)
 

@@ -205,7 +205,7 @@ class WhiteboardBench:
         def exposed_s(setting: Setting) -> float:
             return board_s * float(np.prod(views) / setting.views_open(views).sum())
 
-        exposures = {exposed_s(one) for one in settings}
+        exposures = {exposed_s(setting) for setting in settings}
         series = [board_s * share for share in SERIES_SHARES]
         darks = {t: self._dark(t) for t in sorted({board_s, *exposures, *series})}
         checks: list[Check] = []
@@ -266,7 +266,9 @@ class WhiteboardBench:
             return frame
 
         shots = self.camera.shots
-        for shot, lamp in product(range(len(shots)), sorted({one.lamp for one in settings})):
+        for shot, lamp in product(
+            range(len(shots)), sorted({setting.lamp for setting in settings})
+        ):
             alike = [
                 frame
                 for (other, named), frame in references.items()

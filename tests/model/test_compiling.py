@@ -245,12 +245,12 @@ def test_of_two_processes_that_need_a_kernel_one_compiles_it(own_kernel, tmp_pat
     typed = [sys.executable, "-c", CALL, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     both: list[Any] = [subprocess.Popen(typed, cwd=ROOT, **pipes) for _ in range(2)]
-    for one in both:
-        assert one.stdout.readline() == "ready\n"
-    for one in both:
-        one.stdin.write("\n")
-        one.stdin.flush()
-    missed = [int(one.communicate(timeout=100)[0]) for one in both]
+    for item in both:
+        assert item.stdout.readline() == "ready\n"
+    for item in both:
+        item.stdin.write("\n")
+        item.stdin.flush()
+    missed = [int(item.communicate(timeout=100)[0]) for item in both]
     assert sorted(missed) == [0, 1]
 
 

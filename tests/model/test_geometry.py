@@ -224,4 +224,4 @@ def test_weights_of_views_are_summed_as_the_matrices_they_stand_for():
     places = ([-90.0, 3.0], [-40.0, -60.0], [90.0, 0.0])
     views = [cell_weights(np.array(at), footprint, 24.0, 10) for at in places]
     summed = CellWeights.summed(views).toarray()
-    np.testing.assert_allclose(summed, sum(one.toarray() for one in views), rtol=1e-12)
+    np.testing.assert_allclose(summed, sum(view.toarray() for view in views), rtol=1e-12)

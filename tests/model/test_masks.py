@@ -57,8 +57,8 @@ def test_a_redrawn_mask_differs_in_every_shot_and_a_fixed_one_is_drawn_once(kind
     redrawn = pattern(kind, redraw=True)
     assert redrawn.frame_count(3) == 3
     cells = redrawn.draw(3, 50, 60, CELL_UM)
-    for one, other in [(0, 1), (0, 2), (1, 2)]:
-        assert (cells[one] != cells[other]).mean() > 0.4
+    for item, other in [(0, 1), (0, 2), (1, 2)]:
+        assert (cells[item] != cells[other]).mean() > 0.4
     np.testing.assert_array_equal(cells[:2], redrawn.draw(2, 50, 60, CELL_UM))
 
 

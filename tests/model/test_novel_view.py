@@ -37,8 +37,8 @@ def layered(v, u, far_px=-1.0, near_px=2.0):
 @pytest.fixture(scope="module")
 def scene():
     seen = [[layered(v, u) for u in range(5)] for v in range(5)]
-    light_field = np.array([[one[0] for one in row] for row in seen])
-    disparities = np.array([[one[1] for one in row] for row in seen])
+    light_field = np.array([[item[0] for item in row] for row in seen])
+    disparities = np.array([[item[1] for item in row] for row in seen])
     return light_field, disparities
 
 

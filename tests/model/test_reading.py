@@ -131,10 +131,10 @@ def keys_of(schema):
     """Every key that a kind of settings knows, anywhere."""
     found = set(schema.get("properties", {}))
     for part in schema.values():
-        for one in part if isinstance(part, list) else [part]:
-            if isinstance(one, dict):
-                found |= keys_of(one)
-                found |= {key for value in one.values() if isinstance(value, dict)
+        for item in part if isinstance(part, list) else [part]:
+            if isinstance(item, dict):
+                found |= keys_of(item)
+                found |= {key for value in item.values() if isinstance(value, dict)
                           for key in keys_of(value)}  # fmt: skip
     return found
 

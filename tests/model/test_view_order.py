@@ -79,8 +79,8 @@ def test_a_folder_in_another_order_is_told_and_put_right_by_its_option(
     assert np.abs(as_named.light_field - stored).max() <= 0.5 / 255 + 1e-6
     scene = emmc.scene(f"{tmp_path / 'views'}@by-parallax")
     assert scene.name == "views"
-    for one in (as_named, scene):
-        assert order.words in one.provenance
+    for item in (as_named, scene):
+        assert order.words in item.provenance
     assert np.abs(scene.light_field - truth).max() <= 0.5 / 255 + 1e-6
     assert np.abs(load_views(tmp_path / "views") - stored).max() <= 0.5 / 255 + 1e-6
 
@@ -105,7 +105,7 @@ def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 @pytest.mark.real_data
 @pytest.mark.filterwarnings("ignore::emmc_rig.model.errors.ViewOrderWarning")
 def test_real_views_move_along_their_rows_by_optical_flow() -> None:
-    folders = [one for one in Path(os.environ["EMMC_LIGHTFIELDS"]).iterdir() if one.is_dir()]
+    folders = [path for path in Path(os.environ["EMMC_LIGHTFIELDS"]).iterdir() if path.is_dir()]
     for folder in folders:
         lf = emmc.scene(f"{folder}@by-parallax", views=(5, 5)).light_field
         along_row, along_column = _flow(lf[2, 2], lf[2, 4]), _flow(lf[2, 2], lf[4, 2])

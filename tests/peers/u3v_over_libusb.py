@@ -117,7 +117,7 @@ def with_driver():
         frames += [camera.snap(), *itertools.islice(camera.stream(), FRAMES)]
         camera.close()
     return {
-        "listed": [(one.maker, one.model, one.serial) for one in listings],
+        "listed": [(listing.maker, listing.model, listing.serial) for listing in listings],
         "exposure_s": camera.exposure_s,
         "frames": [bool((frame.mosaic == MOSAIC).all()) for frame in frames],
         "streaming": simulator.streaming,

@@ -85,9 +85,9 @@ def test_arrays_make_the_same_psi_as_the_board_sets_that_a_session_makes(taken, 
         (BoardFrame.held(m, p.get("mask_um", (0.0, 0.0)), 0, p.get("view")), p)
         for m, p in list(zip(means, poses, strict=True))[1:]
     ]
-    fitted = [one for one, pose in frames if not pose.get("validation")]
-    fitted.sort(key=lambda one: one.pinhole is not None)
-    held_out = every.with_frames([one for one, pose in frames if pose.get("validation")])
+    fitted = [frame for frame, pose in frames if not pose.get("validation")]
+    fitted.sort(key=lambda item: item.pinhole is not None)
+    held_out = every.with_frames([frame for frame, pose in frames if pose.get("validation")])
     layout = psi_layout(CAMERA, SIZE)
     few = every.with_frames(fitted)
     outcome = calibrate(CAMERA, layout, ("parametric", "mixed"), held_out, few)

@@ -49,7 +49,7 @@ def test_the_plan_written_is_one_that_captures(captured):
     assert True in kinds
     assert False in kinds
     metrics = json.loads((captured / "plan" / "metrics.json").read_text())
-    planned = [one["frames"] for one in metrics["whiteboards"] if not one["pinhole"]]
+    planned = [metric["frames"] for metric in metrics["whiteboards"] if not metric["pinhole"]]
     assert [b.repeats for b in plan.whiteboards.open if not b.validation] == planned
     assert plan.whiteboards.views == "all"
 
@@ -62,7 +62,7 @@ def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captu
     metrics = json.loads((out / "metrics.json").read_text())
     judged = metrics["held_out"][metrics["chosen"]]
     assert judged["relative_error"] < 0.01
-    found = {name: one["value"] for name, one in metrics["parameters"].items()}
+    found = {name: metric["value"] for name, metric in metrics["parameters"].items()}
     errors = MountingErrors()
     assert (found["offset_x_um"], found["offset_y_um"]) == pytest.approx(errors.offset_um, abs=0.2)
     assert np.degrees(found["rotation_rad"]) == pytest.approx(errors.rotation_deg, abs=0.01)
@@ -86,7 +86,7 @@ def test_the_method_free_takes_the_same_session(captured):
     assert exit_code("calibrate", captured / "session", "--method", "free", "--out", out) == 0
     surest = json.loads((captured / "calibration" / "metrics.json").read_text())
     assert surest["chosen"] in ("combined", "free")
-    free, both = (ImagingMatrix.load(one / "psi.h5") for one in (out, captured / "calibration"))
+    free, both = (ImagingMatrix.load(item / "psi.h5") for item in (out, captured / "calibration"))
     assert free.relative_difference(both) < 0.01
 
 

@@ -76,13 +76,13 @@ def peaks_mib(process):
 
     def look():
         while not ended.wait(0.02):
-            for one in [process.pid, *children(process.pid)]:
+            for item in [process.pid, *children(process.pid)]:
                 try:
-                    status = Path(f"/proc/{one}/status").read_text()
+                    status = Path(f"/proc/{item}/status").read_text()
                 except OSError:
                     continue
                 if found := re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE):
-                    peaks[one] = int(found[1]) / 1024
+                    peaks[item] = int(found[1]) / 1024
 
     watch = threading.Thread(target=look)
     watch.start()
@@ -97,7 +97,7 @@ def children(process):
         text = Path(f"/proc/{process}/task/{process}/children").read_text()
     except OSError:
         return []
-    return [int(one) for one in text.split()]
+    return [int(word) for word in text.split()]
 
 
 @pytest.mark.slow

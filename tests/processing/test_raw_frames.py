@@ -141,8 +141,8 @@ def test_shots_of_other_exposures_read_alike_and_as_surely_as_their_light_says(e
     truth = np.stack([GAIN * electrons[0] / (WHITE - BLACK)] * 2)
     assert (frames.readings - truth).mean() == pytest.approx(0, abs=1e-4)
     for shot in range(2):
-        one = frames.usable[shot] & (truth[shot] > 0.002)
-        scaled = (frames.readings[shot] - truth[shot])[one] / frames.deviation[shot][one]
+        bright = frames.usable[shot] & (truth[shot] > 0.002)
+        scaled = (frames.readings[shot] - truth[shot])[bright] / frames.deviation[shot][bright]
         assert scaled.std() == pytest.approx(1, abs=0.03)
     assert frames.deviation[1].mean() < 0.6 * frames.deviation[0].mean()
 

@@ -350,10 +350,10 @@ def test_what_a_capture_foretells_does_not_depend_on_its_brightness():
     assert dim == pytest.approx(of)
     # Further from total variation, or less sure of disparities: more errors, and larger ones.
     further = of | {"apart": of["apart"] + 1}, of | {"disparity": -2.0}
-    for one, more in ((of, further[0]), (of | {"disparity": -3.0}, further[1])):
-        assert all(b > a for a, b in zip(foretold_db(one), foretold_db(more), strict=True))
+    for item, more in ((of, further[0]), (of | {"disparity": -3.0}, further[1])):
+        assert all(b > a for a, b in zip(foretold_db(item), foretold_db(more), strict=True))
     # Nothing is foretold from beyond the captures that were fitted.
-    least = {name: one.lowest for name, one in FEATURES.items()}
+    least = {name: feature.lowest for name, feature in FEATURES.items()}
     assert foretold_db({name: value - 5 for name, value in least.items()}) == foretold_db(least)
 
 
@@ -371,9 +371,9 @@ def test_a_mask_that_treats_all_views_alike_decides_nothing():
 
 
 def test_weak_textures_that_prefer_no_disparity_do_not_make_the_evidence_flat():
-    kind, one = np.full((4, 5), 1), np.zeros(1, np.float32)
+    kind, unit = np.full((4, 5), 1), np.zeros(1, np.float32)
     kind[0] = 3
-    volume = Volume(np.zeros(1), (one, one), one[None, None], one[None, None], kind, kind == 3)
+    volume = Volume(np.zeros(1), (unit, unit), unit[None, None], unit[None, None], kind, kind == 3)
     assert method._decided(volume) == 1
     assert method._decided(replace(volume, decisive=kind < 0)) == 0
     assert method._decided(replace(volume, kind=np.ones((4, 5), int))) is None
@@ -454,7 +454,7 @@ def test_labels_evaluated_have_those_possible_between_them():
     possible[0, 0, 3] = possible[0, 1, 4] = True
     np.testing.assert_array_equal(_asked(possible, 1), possible)
     found = _asked(possible, 2)
-    assert [np.flatnonzero(one).tolist() for one in found[0]] == [[1, 2], [2]]
+    assert [np.flatnonzero(item).tolist() for item in found[0]] == [[1, 2], [2]]
     assert np.flatnonzero(_spanned(found[0, 0], 2)).tolist() == [2, 3, 4]
     assert np.flatnonzero(_spanned(np.array([1, 0, 1, 1], bool), 2)).tolist() == [0, 4, 5, 6]
 
@@ -530,7 +530,7 @@ def test_the_disparity_of_every_pixel_is_sharpened_towards_the_planted_one(bayer
     picture = centre_view(light_field)
     found = solve(bayer, begun, 1, frames, precision, picture, TextureSettings(sweeps=()))
     # Flat at the left: there nothing tells the disparity.
-    before, after = (one[6:-6, 26:-6] - 0.7 for one in (begun, found.centre))
+    before, after = (item[6:-6, 26:-6] - 0.7 for item in (begun, found.centre))
     assert abs(np.median(after)) < 0.02
     assert np.abs(after).mean() < 0.5 * np.abs(before).mean()
 

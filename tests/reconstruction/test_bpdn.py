@@ -22,9 +22,9 @@ def solve_bpdn(atoms, data, noise_sigma=0.0, settings=None):
     """The sparse code of one patch's measurements."""
     wide = np.zeros((len(atoms), padded(data.size)), np.float32)
     wide[:, : data.size] = atoms
-    one = np.zeros((1, wide.shape[1]), np.float32)
-    one[0, : data.size] = data
-    return prepared(wide, one, noise_sigma, settings or BPDNSettings())(one[0], data.size)
+    row = np.zeros((1, wide.shape[1]), np.float32)
+    row[0, : data.size] = data
+    return prepared(wide, row, noise_sigma, settings or BPDNSettings())(row[0], data.size)
 
 
 def objective(atoms, data, eta, code):

@@ -266,5 +266,5 @@ def test_a_sweep_does_not_depend_on_how_the_rows_are_shared(coded_psi, order, bi
     whole = swept(psi, usable, frames, light_field, dual, order, 1)
     for bands in (2, 3, psi.frames_shape[1]):
         shared = swept(psi, usable, frames, light_field, dual, order, bands)
-        for one, other in zip(shared, whole, strict=True):
-            np.testing.assert_array_equal(one, other)
+        for item, other in zip(shared, whole, strict=True):
+            np.testing.assert_array_equal(item, other)

@@ -119,15 +119,15 @@ def test_a_film_is_more_accurate_than_its_frames_alone(followed):
 def _last_psnr_db(psi, followed, of_earlier):
     """Return the PSNR of the last frame, with the earlier frames that it goes on from changed."""
     film = followed[-2][1].film
-    known = replace(film.known, earlier=tuple(of_earlier(one) for one in film.known.earlier))
+    known = replace(film.known, earlier=tuple(of_earlier(item) for item in film.known.earlier))
     shown = _readings(psi, followed[-1][0], len(followed) - 1)
     given = "adaptive", psi, shown
     result = reconstruct(*given, film=replace(film, known=known))
     return psnr_db(result.light_field, followed[-1][0])
 
 
-def _unused(one):
-    return replace(one, used=np.zeros_like(one.used))
+def _unused(known):
+    return replace(known, used=np.zeros_like(known.used))
 
 
 def test_earlier_frames_themselves_make_the_next_one_more_accurate(psi, followed):
@@ -136,9 +136,9 @@ def test_earlier_frames_themselves_make_the_next_one_more_accurate(psi, followed
 
 
 def test_earlier_frames_of_something_else_do_next_to_no_harm(psi, followed):
-    def of_something_else(one):
-        frames = np.ascontiguousarray(one.readings.frames[:, ::-1, ::-1])
-        return replace(one, readings=replace(one.readings, frames=frames))
+    def of_something_else(known):
+        frames = np.ascontiguousarray(known.readings.frames[:, ::-1, ::-1])
+        return replace(known, readings=replace(known.readings, frames=frames))
 
     alone_db = _last_psnr_db(psi, followed, _unused)
     assert _last_psnr_db(psi, followed, of_something_else) > alone_db - MOST_LOSS_DB

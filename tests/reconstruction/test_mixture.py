@@ -23,7 +23,7 @@ def held():
 
 def misses(*deviations):
     rng = np.random.default_rng(1)
-    return [rng.normal(0, (one**2 + NOISE) ** 0.5, SHAPE) for one in deviations]
+    return [rng.normal(0, (deviation**2 + NOISE) ** 0.5, SHAPE) for deviation in deviations]
 
 
 def noise():
@@ -77,14 +77,14 @@ def test_the_mean_of_light_fields_follows_the_shares_of_pixels():
 def test_the_spread_is_the_weighted_variance_of_light_fields():
     rng = np.random.default_rng(3)
     fields = rng.random((2, 3, 3, 4, 6, 3)).astype(np.float32)
-    one, other = fields
+    first, other = fields
     first = rng.random((2, 3)).astype(np.float32)
     models = [stored(field) for field in fields]
     together = averaged(models, np.stack([first, 1 - first]), 2, models[1])
     share = first.repeat(2, axis=0).repeat(2, axis=1)
-    square = np.square(one - other).mean(axis=-1)
+    square = np.square(first - other).mean(axis=-1)
     np.testing.assert_allclose(
-        together.light_field, share[..., None] * one + (1 - share[..., None]) * other, atol=1e-5
+        together.light_field, share[..., None] * first + (1 - share[..., None]) * other, atol=1e-5
     )
     np.testing.assert_allclose(together.spread, share * (1 - share) * square, atol=2e-5)
     np.testing.assert_allclose(together.apart, np.square(share) * square, atol=2e-5)

@@ -53,8 +53,8 @@ def _second_row(tiles, values, least):
 @njit
 def _entries(tiles, mix, spots, out):
     """Combine a tile and its product with another; add to its diagonal; scatter its vectors."""
-    one = load_tile(tiles, 0)
-    tile = combined(one, multiplied(one, load_tile(tiles, SIZE)), mix)
+    loaded = load_tile(tiles, 0)
+    tile = combined(loaded, multiplied(loaded, load_tile(tiles, SIZE)), mix)
     scatter_tile(plus_diagonal(tile, mix, 0), out, LANES, SIDE * LANES, spots, 1)
 
 
@@ -105,8 +105,8 @@ def test_tiles_of_a_matrix_make_its_cholesky_factor_and_solve_with_it():
     roots = rng.normal(size=(LANES, 2 * SIDE, 3 * SIDE))
     matrices = roots @ roots.transpose(0, 2, 1)
     given = rng.normal(size=(2 * SIDE, LANES)).astype(np.float32)
-    one, two = slice(0, SIDE), slice(SIDE, 2 * SIDE)
-    parts = [(one, one), (two, one), (two, two)]
+    first, two = slice(0, SIDE), slice(SIDE, 2 * SIDE)
+    parts = [(first, first), (two, first), (two, two)]
     tiles = np.empty((3, SIDE, SIDE, LANES), np.float32)
     for tile, part in zip(tiles, parts, strict=True):
         tile[:] = matrices[:, *part].transpose(1, 2, 0)

@@ -21,8 +21,8 @@ def made(name, strength, camera=CAMERA, scene="near-planar"):
     return Point(Capture(scene, camera, SIZE, zoom=3), name, strength).trial()
 
 
-def screen(one):
-    return screened(one.psi, one.frames)
+def screen(trial):
+    return screened(trial.psi, trial.frames)
 
 
 def test_the_range_of_neighbours_is_that_of_numpy():
@@ -59,9 +59,9 @@ def test_a_picture_in_all_views_is_seen_as_psi_sees_it(random_psi, stored, binni
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "rgbw-mono"])
 def test_good_frames_pass_as_they_are(camera):
-    one = made("bad-pixels", 0, find_camera(camera))
-    seen = screen(one)
-    assert seen.frames.readings is one.readings
+    trial = made("bad-pixels", 0, find_camera(camera))
+    seen = screen(trial)
+    assert seen.frames.readings is trial.readings
     assert not seen.dark
     assert not seen.double
     assert (seen.gains == 1).all()
@@ -92,22 +92,24 @@ def test_masks_that_show_weakly_do_not_make_shots_repeat(fault, strength):
 
 @pytest.mark.parametrize("percent", [3, 30])
 def test_flicker_is_measured_and_evened(percent):
-    one = made("flicker", percent)
-    seen = screen(one)
-    real = one.readings.mean(axis=(1, 2)) / made("flicker", 0).readings.mean(axis=(1, 2))
+    trial = made("flicker", percent)
+    seen = screen(trial)
+    real = trial.readings.mean(axis=(1, 2)) / made("flicker", 0).readings.mean(axis=(1, 2))
     assert seen.gains == pytest.approx(real / np.median(real), rel=0.01)
-    assert seen.frames.readings == pytest.approx(one.readings / seen.gains[:, None, None], rel=1e-5)
+    assert seen.frames.readings == pytest.approx(
+        trial.readings / seen.gains[:, None, None], rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "scenario-ii-cfa"])
 @pytest.mark.parametrize("percent", [3, 10])
 def test_bad_pixels_are_found_and_good_ones_kept(camera, percent):
     described = find_camera(camera)
-    one, reported = (made(name, percent, described) for name in ("bad-pixels", "masked-pixels"))
+    trial, reported = (made(name, percent, described) for name in ("bad-pixels", "masked-pixels"))
     bad = ~reported.usable[0]
     # A dead pixel in the shade, or one that hardly glows, does no harm.
-    harmful = np.abs(one.readings - one.psi.forward(one.truth)).mean(axis=0) > 0.1
-    found = bad_pixels(one.psi, one.readings, one.usable)
+    harmful = np.abs(trial.readings - trial.psi.forward(trial.truth)).mean(axis=0) > 0.1
+    found = bad_pixels(trial.psi, trial.readings, trial.usable)
     assert harmful[bad].mean() > 0.5
     assert found[bad & harmful].mean() > 0.7
     assert found[~bad].mean() < 0.05
@@ -130,14 +132,14 @@ def test_pixels_that_are_known_to_be_bad_do_not_spoil_their_neighbours():
     ],
 )
 def test_screening_mends_what_would_break_a_method(name, strength, least_db):
-    one = made(name, strength)
+    trial = made(name, strength)
     reported, levels = [], []
     for screening in (True, False):
         settings = MethodSettings(screening=screening)
         result = reconstruct(
-            "tv", one.psi, even_frames(one.readings, one.noise_sigma), None, settings
+            "tv", trial.psi, even_frames(trial.readings, trial.noise_sigma), None, settings
         )
-        levels.append(psnr_db(result.light_field, one.truth))
+        levels.append(psnr_db(result.light_field, trial.truth))
         reported.append(result.screening)
     assert levels[0] > levels[1] + least_db
     assert reported[0]
@@ -147,17 +149,17 @@ def test_screening_mends_what_would_break_a_method(name, strength, least_db):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["tv", "adaptive-fast"])
 def test_screening_costs_good_frames_next_to_nothing(method):
-    one = made("flicker", 0)
+    trial = made("flicker", 0)
     levels = [
         psnr_db(
             reconstruct(
                 method,
-                one.psi,
-                even_frames(one.readings, one.noise_sigma),
+                trial.psi,
+                even_frames(trial.readings, trial.noise_sigma),
                 None,
                 MethodSettings(screening=on),
             ).light_field,
-            one.truth,
+            trial.truth,
         )
         for on in (True, False)
     ]
@@ -165,8 +167,8 @@ def test_screening_costs_good_frames_next_to_nothing(method):
 
 
 def test_nothing_is_found_where_nothing_is_to_be_seen():
-    one = made("flicker", 0)
-    dark = dataclasses.replace(one, readings=np.zeros_like(one.readings))
+    trial = made("flicker", 0)
+    dark = dataclasses.replace(trial, readings=np.zeros_like(trial.readings))
     assert screen(dark).notes == ()
 
 
@@ -177,49 +179,49 @@ def test_shots_so_dim_that_most_pixels_read_nothing_tell_no_gain():
 
 
 def test_a_glint_behind_masks_that_differ_is_no_hot_pixel():
-    one = made(None, 0.0)
-    plain = bad_pixels(one.psi, one.readings, one.usable)
+    trial = made(None, 0.0)
+    plain = bad_pixels(trial.psi, trial.readings, trial.usable)
     glint, hot = (20, 30), (30, 20)
     assert not plain[glint]
     assert not plain[hot]
-    frames = one.readings.copy()
+    frames = trial.readings.copy()
     frames[(slice(None), *glint)] *= 8
     frames[(slice(None), *hot)] += 0.5
-    found = bad_pixels(one.psi, frames, one.usable)
+    found = bad_pixels(trial.psi, frames, trial.usable)
     assert not found[glint]
     assert found[hot]
-    alone = one.usable.copy()
+    alone = trial.usable.copy()
     alone[1:] = False
-    assert bad_pixels(one.psi, frames, alone)[glint], "one shot cannot tell"
+    assert bad_pixels(trial.psi, frames, alone)[glint], "one shot cannot tell"
 
 
 def test_dark_outermost_lines_are_an_edge_of_the_light_field_and_no_dead_lines():
-    one = made("bad-pixels", 0, find_camera("rgbw-bayer-1shot"))
-    frames = one.readings.copy()
+    trial = made("bad-pixels", 0, find_camera("rgbw-bayer-1shot"))
+    frames = trial.readings.copy()
     frames[:, -1] = frames[:, :, :2] = 0.01 * frames.mean()
-    assert not screened(one.psi, even_frames(frames, 0.0, one.usable)).lines.any()
+    assert not screened(trial.psi, even_frames(frames, 0.0, trial.usable)).lines.any()
     frames[:, :, -1] = 2 * frames.mean()
     stuck = np.zeros(SIZE, bool)
     stuck[:, -1] = True
     np.testing.assert_array_equal(
-        screened(one.psi, even_frames(frames, 0.0, one.usable)).lines, stuck
+        screened(trial.psi, even_frames(frames, 0.0, trial.usable)).lines, stuck
     )
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-mono", "conventional"])
 @pytest.mark.parametrize("response", [0.02, 0.0])
 def test_dead_lines_are_left_out_though_their_neighbours_are_dead_as_well(camera, response):
-    one = made("bad-pixels", 0, find_camera(camera))
-    assert not screen(one).lines.any()
-    stuck = 0.3 * float(one.readings.mean())
-    frames, dead = one.readings.copy(), np.zeros(SIZE, bool)
+    trial = made("bad-pixels", 0, find_camera(camera))
+    assert not screen(trial).lines.any()
+    stuck = 0.3 * float(trial.readings.mean())
+    frames, dead = trial.readings.copy(), np.zeros(SIZE, bool)
     dead[:, 20:22] = dead[31] = True
     frames[:, dead] = stuck + response * frames[:, dead]
-    found = screened(one.psi, even_frames(frames, 0.0, one.usable))
+    found = screened(trial.psi, even_frames(frames, 0.0, trial.usable))
     np.testing.assert_array_equal(found.lines, dead)
     assert not found.frames.usable[:, dead].any()
     assert any("rows 31 and columns 20, 21" in note for note in found.notes)
     # Said to be unusable they are not looked for, nor are the lines beside them blamed.
-    listed = screened(one.psi, even_frames(frames, 0.0, one.usable & ~dead))
+    listed = screened(trial.psi, even_frames(frames, 0.0, trial.usable & ~dead))
     assert not listed.lines.any()
     np.testing.assert_array_equal(listed.frames.usable, found.frames.usable)

@@ -187,7 +187,9 @@ def test_what_does_not_fit_is_refused(random_psi, scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name, one in METHODS.items() if one.package is None])
+@pytest.mark.parametrize(
+    "name", [name for name, method in METHODS.items() if method.package is None]
+)
 def test_every_method_runs_by_its_name_and_says_so(random_psi, scene, name):
     dictionary, truth = scene
     psi = random_psi(2, VIEWS, truth.shape[2:4])

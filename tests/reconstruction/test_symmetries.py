@@ -68,6 +68,7 @@ def mirrored(array, how, views, places):
 @pytest.mark.parametrize("how", MIRRORS)
 def test_a_mirrored_camera_gives_the_mirrored_light_field(method, how):
     psi, light_field = three_shots(), scene()
+    assert psi.colour is not None
     turned = ImagingMatrix(
         mirrored(psi.weights, how, (1, 2), (3, 5)),
         np.stack([mirrored(map_[None, None], how, (0, 1), (2, 3))[0, 0] for map_ in psi.colour]),

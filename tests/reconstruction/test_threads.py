@@ -115,7 +115,7 @@ def test_every_route_of_calibration_gives_the_same_psi_with_any_number_of_thread
 
 
 def blas_threads():
-    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+    return {item["num_threads"] for item in threadpool_info() if item["user_api"] == "blas"}
 
 
 def test_blas_keeps_one_thread_until_the_last_of_overlapping_calls_ends():

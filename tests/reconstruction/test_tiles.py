@@ -149,8 +149,8 @@ def test_psi_is_read_from_its_file_window_by_window(random_psi, tmp_path):
     part, expected = (source.window(slice(4, 20), slice(10, 30)) for source in (saved, psi))
     np.testing.assert_array_equal(part.weights, expected.weights)
     np.testing.assert_array_equal(part.colour, expected.colour)
-    one, other = (in_blocks("tv", source, frames, SMALL)[0] for source in (psi, saved))
-    np.testing.assert_array_equal(one.light_field, other.light_field)
+    first, other = (in_blocks("tv", source, frames, SMALL)[0] for source in (psi, saved))
+    np.testing.assert_array_equal(first.light_field, other.light_field)
 
 
 def test_a_damaged_psi_is_found_out_without_holding_it(random_psi, tmp_path):
@@ -231,11 +231,11 @@ def test_the_verdict_on_equal_blocks_is_that_of_one(blocks):
     verdict, _ = blocks
     together = judged_together([JudgedBlock(verdict, 0, at, 100) for at in (0, 80)])
     assert together.level == "trust"
-    one, two = verdict.evidence, together.evidence
-    assert two.kept == 2 * one.kept
-    assert two.explained == pytest.approx(one.explained)
-    assert two.strengths == pytest.approx(one.strengths)
-    assert two.strength_errors == pytest.approx(np.array(one.strength_errors) / 2**0.5)
+    first, two = verdict.evidence, together.evidence
+    assert two.kept == 2 * first.kept
+    assert two.explained == pytest.approx(first.explained)
+    assert two.strengths == pytest.approx(first.strengths)
+    assert two.strength_errors == pytest.approx(np.array(first.strength_errors) / 2**0.5)
     json.dumps(together.as_dict(), allow_nan=False)
 
 

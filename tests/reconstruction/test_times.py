@@ -109,7 +109,7 @@ def test_shots_of_another_scene_do_next_to_no_harm(psi):
     other = _window(0, "near-planar")
     shown = _captured(psi, [_window(0), other, other])
     alone, result = _first_alone(psi, shown), reconstruct(*_given(psi, shown), moving=True)
-    found_db, alone_db = (psnr_db(one.light_field, _window(0)) for one in (result, alone))
+    found_db, alone_db = (psnr_db(item.light_field, _window(0)) for item in (result, alone))
     assert found_db > alone_db - 0.3
 
 

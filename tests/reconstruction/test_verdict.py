@@ -161,8 +161,8 @@ def spoilt(frames, fault, size):
     assert fault == "jpeg"
     peak = frames.max()
     codes = np.clip(frames / peak * 255, 0, 255).round().astype(np.uint8)
-    packed = [cv2.imencode(".jpg", one, [cv2.IMWRITE_JPEG_QUALITY, size])[1] for one in codes]
-    read = [cv2.imdecode(one, cv2.IMREAD_GRAYSCALE) for one in packed]
+    packed = [cv2.imencode(".jpg", code, [cv2.IMWRITE_JPEG_QUALITY, size])[1] for code in codes]
+    read = [cv2.imdecode(item, cv2.IMREAD_GRAYSCALE) for item in packed]
     return np.asarray(read, np.float32) / 255 * peak
 
 
@@ -360,7 +360,7 @@ def judged_trial(
 def test_a_fault_is_reported_with_its_reason_and_a_remedy(fault, strength, reason):
     verdict = judged_trial(fault, strength, screening=fault not in SCREENED)
     assert verdict.level != "trust"
-    reported = [one for one in verdict.reasons if reason in one.what]
+    reported = [item for item in verdict.reasons if reason in item.what]
     assert reported, verdict.words
     assert reported[0].remedy
 
@@ -452,7 +452,7 @@ def test_the_gravest_reason_comes_first_and_makes_the_verdict(three):
     worse = dataclasses.replace(evidence, off=0.03, displaced_px=2.0)
     verdict = verdict_from(worse)
     assert verdict.level == "do not use"
-    assert [LEVELS.index(one.level) for one in verdict.reasons] == [3, 2]
+    assert [LEVELS.index(reason.level) for reason in verdict.reasons] == [3, 2]
 
 
 def test_readings_missed_far_beyond_their_noise_are_doubted_and_placed(three):
@@ -541,8 +541,8 @@ def test_a_slight_error_of_psi_counts_where_surfaces_hardly_explain_the_readings
 def test_noise_is_doubted_where_it_leaves_disparities_open(three):
     clean = dataclasses.replace(clean_evidence(three), method="adaptive")
     for noise, decided, level in ((0.1, 0.5, "doubt"), (0.1, 0.9, "trust"), (0.03, 0.5, "trust")):
-        one = dataclasses.replace(clean, noise=noise, parameters={"decided": decided})
-        assert verdict_from(one).level == level
+        noisier = dataclasses.replace(clean, noise=noise, parameters={"decided": decided})
+        assert verdict_from(noisier).level == level
 
 
 CAUSES = (
@@ -754,7 +754,7 @@ def test_a_shot_is_left_out_where_something_moved_in_it_and_the_place_is_doubted
     blind = reconstruct_tv(three, even_frames(frames, 0.003), QUICK.tv)
     still, _ = with_moved_object(three, 1, 0)
     best = reconstruct_tv(three, even_frames(still, 0.003), QUICK.tv)
-    after, before, without = (psnr_db(one.light_field, truth) for one in (result, blind, best))
+    after, before, without = (psnr_db(item.light_field, truth) for item in (result, blind, best))
     assert after > before + 2
     assert after > without - 2
     assert any("saw another scene" in note for note in result.screening)
@@ -767,8 +767,8 @@ def test_the_place_of_a_block_where_something_moved_is_that_of_the_whole(three):
     moved = dataclasses.replace(still, motion=3.0, moved_at=(1, 5, 6), moved_px=(9, 8))
     verdict = judged_together(
         [
-            JudgedBlock(verdict_from(one), row, 60, 100)
-            for one, row in ((moved, 50), (still, 0), (still, 0))
+            JudgedBlock(verdict_from(item), row, 60, 100)
+            for item, row in ((moved, 50), (still, 0), (still, 0))
         ]
     )
     assert verdict.level == "doubt"

@@ -41,7 +41,7 @@ def session(tmp_path_factory):
 def exported(session, folder):
     """Return by frame the DNG files of a session, written into a folder."""
     export_dng(session, folder)
-    return {one.id: folder / session.stored[one.id].file for one in session.needed}
+    return {item.id: folder / session.stored[item.id].file for item in session.needed}
 
 
 def test_every_frame_is_a_dng_of_the_same_mosaic_and_levels(session, tmp_path):
@@ -106,6 +106,6 @@ def test_frames_are_not_written_where_something_else_lies(session, tmp_path):
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(AppError, match="holds something else"):
         export_dng(session, tmp_path)
-    assert [one.name for one in tmp_path.iterdir()] == ["note.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(AppError, match="session"):
         export_dng(session, session.folder / "dng")

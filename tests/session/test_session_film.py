@@ -69,8 +69,8 @@ def test_a_films_frames_read_what_shots_of_their_exposure_do_to_their_deviation(
 def test_the_time_of_a_streamed_frame_is_that_of_the_cameras_stamps():
     session = captured(STREAMED)
     frames = film_places(session)
-    stamps = np.array([one.entry.camera_time_s for one in frames])
-    np.testing.assert_allclose([one.time_s for one in frames], stamps - stamps[0], atol=1e-9)
+    stamps = np.array([frame.entry.camera_time_s for frame in frames])
+    np.testing.assert_allclose([frame.time_s for frame in frames], stamps - stamps[0], atol=1e-9)
 
 
 def test_a_second_segment_goes_on_in_time_at_its_place():
@@ -80,8 +80,8 @@ def test_a_second_segment_goes_on_in_time_at_its_place():
         entry = session.stored[f"film-00000{place}"]
         session.note(entry.model_copy(update={"segment": 1, "film_s": (place - 4) / 2 + 0.0}))
     frames = film_places(session)
-    np.testing.assert_allclose([one.time_s for one in frames], np.arange(6) / 2, atol=1e-6)
-    assert [one.segment for one in frames] == [0, 0, 0, 0, 1, 1]
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(6) / 2, atol=1e-6)
+    assert [frame.segment for frame in frames] == [0, 0, 0, 0, 1, 1]
 
 
 def altered(place, **changes):

@@ -37,12 +37,12 @@ def entry(name, run=1, **spans_s):
 
 def test_the_times_of_runs_are_kept_apart(tmp_path):
     session, _ = begun(tmp_path, SYSTEM_DISK, still_rig())
-    for one in (
+    for item in (
         entry("a", 1, move=(0, 1), expose=(1, 2), write=(2, 5)),
         entry("b", 1, move=(2.5, 4), expose=(4, 4.5), write=(5, 6)),
         entry("c", 2, write=(0, 1)),
     ):
-        session.note(one)
+        session.note(item)
     first, second = run_times(session)
     assert first == {
         "frames": 2, "seconds": 6, "moving_s": 2.5, "exposing_s": 1.5, "writing_s": 4,

@@ -20,8 +20,8 @@ STANDING = CameraMotion()
 
 
 def world(*things: Card | Ball, camera: CameraMotion = STANDING) -> World:
-    cards = tuple(one for one in things if isinstance(one, Card))
-    balls = tuple(one for one in things if isinstance(one, Ball))
+    cards = tuple(thing for thing in things if isinstance(thing, Card))
+    balls = tuple(thing for thing in things if isinstance(thing, Ball))
     return World(cards, balls, UNLIT, ambient=1.0, camera=camera)
 
 

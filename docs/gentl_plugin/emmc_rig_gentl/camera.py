@@ -88,7 +88,9 @@ class GenTlCamera:
                 if (node := self._node(name)) is not None:
                     node.value = value
         offered = self._nodes.PixelFormat.symbolics
-        whole = [one for one in FORMATS if one.name in offered and one.stored_bits in (8, 16)]
+        whole = [
+            format for format in FORMATS if format.name in offered and format.stored_bits in (8, 16)
+        ]
         if not whole:
             raise CameraSettingError("PixelFormat", f"offers {', '.join(offered)}, none to read")
         self._format = whole[0]

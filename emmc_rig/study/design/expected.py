@@ -165,9 +165,9 @@ class Block:
         near, far = self.matrix(disparity), self.matrix(other)
         covariance = np.diag(self.noise + self.apart(texture))
         crossed = []
-        for size, one, two in zip(texture.variances, near, far, strict=True):
-            first, second = size * (one @ prior), size * (two @ prior)
-            covariance += first @ one.T + second @ two.T
+        for size, item, two in zip(texture.variances, near, far, strict=True):
+            first, second = size * (item @ prior), size * (two @ prior)
+            covariance += first @ item.T + second @ two.T
             crossed.append((first, second))
         factor = cho_factor(covariance)
         both = self._turned_to(disparity - other)

@@ -60,7 +60,7 @@ def camera_motion(capture: Capture, px: float) -> Trial:
     across, down = px * np.array(DIRECTION)
     inside = np.s_[:, :, margin:-margin, margin:-margin]
     seen = [
-        np.stack([[shifted(one, -down * i, -across * i) for one in row] for row in wide])[inside]
+        np.stack([[shifted(item, -down * i, -across * i) for item in row] for row in wide])[inside]
         for i in range(shots)
     ]
     return trial_of(capture, scene=truth, shot_scenes=[truth.light_field, *seen[1:]])
