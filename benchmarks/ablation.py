@@ -10,9 +10,9 @@ import time
 import lab
 from oracle import matched_disparity
 
+from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.settings import AdaptiveSettings
 
 PARTS = {
     "the whole": {},

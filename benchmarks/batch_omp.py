@@ -21,7 +21,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import njit
-from reconstruction.errors import DictionaryError
+from emmc_rig.reconstruction.errors import DictionaryError
 
 Array = NDArray[np.float32]
 NO_ATOM = -1

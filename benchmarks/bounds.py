@@ -14,10 +14,10 @@ import numpy as np
 from oracle import matched_disparity
 
 from emmc_rig.model.frames import even_frames
+from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.visibility import carried
 from emmc_rig.study.trial import Capture, Trial, trial_of
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.visibility import carried
 
 KNOWN = (
     "", "disparity", "colours", "occlusion", "disparity+colours", "disparity+occlusion",

@@ -37,21 +37,21 @@ from simulated_calibration import (
 )
 
 import emmc_rig as emmc
-from calibration.boards import channels_of
-from calibration.drift import DriftSettings, drifted, find_drift
-from calibration.frames import bands
-from calibration.openings import views_open
-from calibration.parametric import psi_at, shot_stages
-from calibration.planning import Kind, PlannedFrames
-from calibration.routes import Outcome
-from calibration.shadow import Shadow, shadow_mask
-from calibration.whiteboard import LAMP_COLOURS, Calibration
-from drivers.dng import encode_dng
-from drivers.raw import decode_raw
 from emmc_rig.acquisition.expand import expand
 from emmc_rig.acquisition.plan import Checks, Plan, PlannedShot
 from emmc_rig.bench.hardware import Fitted
+from emmc_rig.calibration.boards import channels_of
+from emmc_rig.calibration.drift import DriftSettings, drifted, find_drift
+from emmc_rig.calibration.frames import bands
+from emmc_rig.calibration.openings import views_open
+from emmc_rig.calibration.parametric import psi_at, shot_stages
+from emmc_rig.calibration.planning import Kind, PlannedFrames
+from emmc_rig.calibration.routes import Outcome
+from emmc_rig.calibration.shadow import Shadow, shadow_mask
+from emmc_rig.calibration.whiteboard import LAMP_COLOURS, Calibration
 from emmc_rig.demo import simulated_session
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import StoredPsi
 from emmc_rig.files.results import parse_size
@@ -62,14 +62,14 @@ from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD
+from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry, frame_file
 from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import session_frames, shot_readings
 from emmc_rig.session.session import Frozen, Session
-from reconstruction.methods import DEFAULT_METHOD
-from reconstruction.tv import TVSettings, reconstruct_tv
-from simulators.effects import EFFECTS, ORDINARY, TOGETHER, Flaws, flawed
+from emmc_rig.simulators.effects import EFFECTS, ORDINARY, TOGETHER, Flaws, flawed
 
 Array = NDArray[np.floating]
 CAMERA = "rgbw-bayer-1shot"

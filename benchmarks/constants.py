@@ -17,10 +17,9 @@ from types import ModuleType
 import lab
 from pydantic import ValidationError
 
-import reconstruction.adaptive
+from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.settings import AdaptiveSettings
 
 NO_EFFECT = ("method", "models", "planning", "uncertainty")
 """Modules whose constants change advice, maps and deviation, but not the light field."""
@@ -29,7 +28,7 @@ UNCHANGED = "as it is"
 
 def modules() -> dict[str, ModuleType]:
     """Return the modules whose constants are scaled, by their short names."""
-    package = reconstruction.adaptive
+    package = import_module("emmc_rig.reconstruction.adaptive")
     names = [found.name for found in pkgutil.iter_modules(package.__path__)]
     return {n: import_module(f"{package.__name__}.{n}") for n in names if n not in NO_EFFECT}
 

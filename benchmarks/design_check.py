@@ -9,12 +9,12 @@ from scipy.stats import spearmanr
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD, reconstruct
 from emmc_rig.study.design.bench import DesignBench
 from emmc_rig.study.design.designing import shipped_like
 from emmc_rig.study.design.expected import SIZE, expected
 from emmc_rig.study.design.printed import Print, printed_psi
 from emmc_rig.study.design.search import candidates
-from reconstruction.methods import DEFAULT_METHOD, reconstruct
 
 RANDOM = 8
 """Masks drawn at random, beside the shipped cameras of the same sensor."""

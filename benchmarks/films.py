@@ -20,9 +20,9 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.film import Film
-from reconstruction.verdict.run import reconstruct_judged
-from simulators.scenes import MOVING_SCENES, SCENES, render
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.simulators.scenes import MOVING_SCENES, SCENES, render
 
 RESTS, CREEPS, PANS, PASSES = "rests", "creeps", "pans", "passes"
 PAN_PX = {RESTS: (0.0, 0.0), CREEPS: (0.03, 0.1), PANS: (0.45, 1.4), PASSES: (0.2, -0.6)}

@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.settings import Settings
-from reconstruction.errors import DictionaryError
+from emmc_rig.reconstruction.errors import DictionaryError
 
 _ROWS_AT_ONCE = 2048
 

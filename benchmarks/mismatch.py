@@ -12,16 +12,16 @@ from dataclasses import replace
 import lab
 import numpy as np
 
-from calibration.drift import DriftSettings, find_drift
-from calibration.parametric import psi_at, shot_stages
-from calibration.placement import designed_placement
-from calibration.shadow import Shadow, shadow_mask
+from emmc_rig.calibration.drift import DriftSettings, find_drift
+from emmc_rig.calibration.parametric import psi_at, shot_stages
+from emmc_rig.calibration.placement import designed_placement
+from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.reconstruction.methods import installed_methods
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture, Trial
-from reconstruction.methods import installed_methods
 
 ERRORS = (("mask-shift", 0.5), ("mask-rotation", 0.5), ("mask-distance-error", 25.0))
 QUICK = DriftSettings(blocks=60, coarse_blocks=24, block_px=6, disparity_steps=7)

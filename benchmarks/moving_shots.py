@@ -16,11 +16,11 @@ from films import frame_of, opened, window
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.film import Film
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.methods import MethodSettings, reconstruct
-from reconstruction.verdict.run import reconstruct_judged
-from simulators.scenes import MOVING_SCENES
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.simulators.scenes import MOVING_SCENES
 
 STEPS_PX = (0.3, 1.0, 2.5, 5.0)
 """By which a shot's content moves on from the one before."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.camera import Camera
-from simulators import textures
-from simulators.raycaster import Ball, Card, World, tabulated
-from simulators.scenes import rendered
+from emmc_rig.simulators import textures
+from emmc_rig.simulators.raycaster import Ball, Card, World, tabulated
+from emmc_rig.simulators.scenes import rendered
 
 SIDE = 256
 """Texels along a texture: enough for pictures of some 200 pixels."""

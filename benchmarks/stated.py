@@ -12,15 +12,15 @@ import numpy as np
 import pandas as pd
 
 from emmc_rig.files.scenes import Scene, open_scene
-from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive.uncertainty import (
+from emmc_rig.reconstruction.adaptive.uncertainty import (
     EVEN_DECIDED,
     FEATURES,
     WITHIN_ONE,
     foretold_db,
 )
-from reconstruction.verdict.run import reconstruct_judged
-from simulators.scenes import STILL_SCENES
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.simulators.scenes import STILL_SCENES
+from emmc_rig.study.trial import Capture, trial_of
 
 CAMERAS = "rgbw-bayer-1shot", "scenario-ii-cfa", "rgbw-bayer-2shots", "rgbw-bayer-3shots"
 NOISES = 0.003, 0.01

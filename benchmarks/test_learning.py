@@ -20,7 +20,7 @@ from training_patches import (
 )
 
 from emmc_rig.model.settings import validated
-from reconstruction.errors import DictionaryError
+from emmc_rig.reconstruction.errors import DictionaryError
 
 SHAPE = (2, 2, 3, 4, 1)
 SAMPLES = 48

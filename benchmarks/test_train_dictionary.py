@@ -9,7 +9,7 @@ from training_patches import PatchSettings
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import save_hdf5
-from reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.dictionary import Dictionary
 
 PATCHING = PatchSettings(rows=4, columns=4, count=120)
 LEARNING = LearningSettings(atoms=24, sparsity=3, iterations=3)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from reconstruction.errors import DictionaryError
+from emmc_rig.reconstruction.errors import DictionaryError
 
 Array = NDArray[np.float32]
 _BATCH_BYTES = 48 << 20

@@ -13,12 +13,12 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 from emmc_rig.model.errors import ModelError
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.fault import MASK, SENSOR, SHOTS
 from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.trial import Capture
-from reconstruction.errors import ReconstructionError
-from reconstruction.verdict.run import reconstruct_judged
 
 NAMED = {
     "mask-shift": "shadow lies", "mask-distance-error": "further from", "edge-blur": "blurred",

@@ -14,8 +14,8 @@ import lab
 import numpy as np
 
 from emmc_rig.model.frames import even_frames
+from emmc_rig.reconstruction.methods import installed_methods, reconstruct
 from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.methods import installed_methods, reconstruct
 
 TILE_PX, DIRECTIONS, ROUNDS = 8, 6, 2
 

@@ -20,13 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board
-from calibration.choice import white_by_view
-from calibration.fit import Fit
-from calibration.placement import SCALARS
-from calibration.robust import deviation_of
-from calibration.shadow import Shadow, ShadowMask
-from calibration.whiteboard import Calibration
+from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.choice import white_by_view
+from emmc_rig.calibration.fit import Fit
+from emmc_rig.calibration.placement import SCALARS
+from emmc_rig.calibration.robust import deviation_of
+from emmc_rig.calibration.shadow import Shadow, ShadowMask
+from emmc_rig.calibration.whiteboard import Calibration
 from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]

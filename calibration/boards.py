@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, bands, dark_at, photon_transfer
-from calibration.levels import Check, Levels
-from calibration.openings import CENTRED, Window, views_open
-from calibration.robust import deviation_of
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import MeanFrame, SensorGain, bands, dark_at, photon_transfer
+from emmc_rig.calibration.levels import Check, Levels
+from emmc_rig.calibration.openings import CENTRED, Window, views_open
+from emmc_rig.calibration.robust import deviation_of
 from emmc_rig.model.sensing import PsiLayout
 
 Array = NDArray[np.floating]

@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import CalibrationError
-from calibration.frames import (
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import (
     DARK_ELECTRONS_PER_S,
     MeanFrame,
     SensorGain,

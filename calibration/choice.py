@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board
-from calibration.errors import CalibrationError
-from calibration.frames import bands
-from calibration.shadow import Shadow
+from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import bands
+from emmc_rig.calibration.shadow import Shadow
 from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]

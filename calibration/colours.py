@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import BoardSet
-from calibration.defects import mask_with_losses
-from calibration.errors import CalibrationError
-from calibration.parametric import Parametric, Stages, psi_at
-from calibration.robust import deviation_of
-from calibration.shadow import Shadow, ShadowMask
-from calibration.whiteboard import LAMP_COLOURS, Calibration
+from emmc_rig.calibration.boards import BoardSet
+from emmc_rig.calibration.defects import mask_with_losses
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.parametric import Parametric, Stages, psi_at
+from emmc_rig.calibration.robust import deviation_of
+from emmc_rig.calibration.shadow import Shadow, ShadowMask
+from emmc_rig.calibration.whiteboard import LAMP_COLOURS, Calibration
 from emmc_rig.model.sensing import PsiLayout
 
 Array = NDArray[np.floating]

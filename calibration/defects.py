@@ -18,10 +18,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from calibration.boards import Board, Opening
-from calibration.placement import Placement
-from calibration.robust import deviation_of
-from calibration.shadow import Shadow, ShadowMask
+from emmc_rig.calibration.boards import Board, Opening
+from emmc_rig.calibration.placement import Placement
+from emmc_rig.calibration.robust import deviation_of
+from emmc_rig.calibration.shadow import Shadow, ShadowMask
 from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]

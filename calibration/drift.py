@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import chdtrc
 
-from calibration.boards import Board
-from calibration.colours import mixing
-from calibration.errors import CalibrationError
-from calibration.evidence import Prior, averaged, log_evidence, plane_prior
-from calibration.locator import over_local_level, search
-from calibration.parametric import Stages
-from calibration.placement import Placement
-from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
+from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.colours import mixing
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.evidence import Prior, averaged, log_evidence, plane_prior
+from emmc_rig.calibration.locator import over_local_level, search
+from emmc_rig.calibration.parametric import Stages
+from emmc_rig.calibration.placement import Placement
+from emmc_rig.calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.settings import Settings

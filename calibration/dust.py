@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from calibration.boards import Board
-from calibration.choice import predicted_by_shadow
-from calibration.robust import deviation_of
-from calibration.shadow import Shadow
+from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.choice import predicted_by_shadow
+from emmc_rig.calibration.robust import deviation_of
+from emmc_rig.calibration.shadow import Shadow
 
 FEWEST_BOARDS = 3
 SURE, LEAST_SHARE = 6.0, 0.01

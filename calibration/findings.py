@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import BoardAngle, Leaning
-from calibration.boards import Board
-from calibration.choice import HeldOut
-from calibration.fit import MOST_MORE_BOARDS, Fit
-from calibration.levels import Levels
-from calibration.placement import Placement
-from calibration.planning import PinholeWorth
-from calibration.shadow import ShadowMask
+from emmc_rig.calibration.board_angle import BoardAngle, Leaning
+from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.choice import HeldOut
+from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
+from emmc_rig.calibration.levels import Levels
+from emmc_rig.calibration.placement import Placement
+from emmc_rig.calibration.planning import PinholeWorth
+from emmc_rig.calibration.shadow import ShadowMask
 
 LARGEST_FLICKER = 0.01
 LARGEST_MOVE_UM = 1.0

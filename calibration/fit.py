@@ -36,18 +36,18 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import correlate1d
 
-from calibration.boards import Board, Opening, Sample, unsteadiness2
-from calibration.errors import CalibrationError
-from calibration.locator import register, starting_placement
-from calibration.placement import (
+from emmc_rig.calibration.boards import Board, Opening, Sample, unsteadiness2
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.locator import register, starting_placement
+from emmc_rig.calibration.placement import (
     SCALARS,
     Placement,
     Tolerances,
     labels,
     with_aperture_mean_one,
 )
-from calibration.robust import correlation, deviation_of, tukey_loss, tukey_weights
-from calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, ShadowMask
+from emmc_rig.calibration.robust import correlation, deviation_of, tukey_loss, tukey_weights
+from emmc_rig.calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, ShadowMask
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings

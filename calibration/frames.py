@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.errors import CalibrationError
+from emmc_rig.calibration.errors import CalibrationError
 
 Frame = NDArray[np.floating] | NDArray[np.integer]
 BAND_PIXELS = 2**20

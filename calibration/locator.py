@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board, Opening, Sample
-from calibration.errors import CalibrationError
-from calibration.placement import SCALARS, Placement, Tolerances, designed_placement
-from calibration.repeats import vertex
-from calibration.robust import correlation, deviation_of, tukey_weights
-from calibration.shadow import SEARCH_UM, Shadow, ShadowMask
+from emmc_rig.calibration.boards import Board, Opening, Sample
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.placement import SCALARS, Placement, Tolerances, designed_placement
+from emmc_rig.calibration.repeats import vertex
+from emmc_rig.calibration.robust import correlation, deviation_of, tukey_weights
+from emmc_rig.calibration.shadow import SEARCH_UM, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.local_mean import local_mean
 

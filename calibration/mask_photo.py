@@ -23,7 +23,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import fminbound, least_squares
 from scipy.special import ndtr
 
-from calibration.errors import CalibrationError
+from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.model.masks import fiducial_marks
 
 FEWEST_PX = 5.0

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from calibration.whiteboard import Calibration
+from emmc_rig.calibration.whiteboard import Calibration
 
 Array = NDArray[np.floating]
 LIKE_SLOPES = 6

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.defects import Defects
-from calibration.fit import Fit
-from calibration.misfit import Misfit
-from calibration.openings import views_open
-from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
+from emmc_rig.calibration.defects import Defects
+from emmc_rig.calibration.fit import Fit
+from emmc_rig.calibration.misfit import Misfit
+from emmc_rig.calibration.openings import views_open
+from emmc_rig.calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 

@@ -23,12 +23,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board, unsteadiness2
-from calibration.fit import shares_of_prior
-from calibration.openings import CENTRED, Window, views_open
-from calibration.parametric import SAMPLED, Parametric, drawn_pixels, psi_information
-from calibration.placement import SCALARS, Placement, Tolerances
-from calibration.shadow import Shadow, ShadowMask
+from emmc_rig.calibration.boards import Board, unsteadiness2
+from emmc_rig.calibration.fit import shares_of_prior
+from emmc_rig.calibration.openings import CENTRED, Window, views_open
+from emmc_rig.calibration.parametric import SAMPLED, Parametric, drawn_pixels, psi_information
+from emmc_rig.calibration.placement import SCALARS, Placement, Tolerances
+from emmc_rig.calibration.shadow import Shadow, ShadowMask
 from emmc_rig.model.noise import SensorNoise
 
 Array = NDArray[np.floating]

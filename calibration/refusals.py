@@ -10,17 +10,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_angle import BoardAngle
-from calibration.boards import Board, BoardSet, Sample
-from calibration.choice import HeldOut
-from calibration.errors import CalibrationError
-from calibration.fit import Fit
-from calibration.frames import MeanFrame
-from calibration.locator import register
-from calibration.placement import SCALARS, Placement, Tolerances, designed_placement
-from calibration.robust import correlation, deviation_of
-from calibration.shadow import Shadow, ShadowMask
-from calibration.whiteboard import DARKEST_REFERENCE_DN
+from emmc_rig.calibration.board_angle import BoardAngle
+from emmc_rig.calibration.boards import Board, BoardSet, Sample
+from emmc_rig.calibration.choice import HeldOut
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.fit import Fit
+from emmc_rig.calibration.frames import MeanFrame
+from emmc_rig.calibration.locator import register
+from emmc_rig.calibration.placement import SCALARS, Placement, Tolerances, designed_placement
+from emmc_rig.calibration.robust import correlation, deviation_of
+from emmc_rig.calibration.shadow import Shadow, ShadowMask
+from emmc_rig.calibration.whiteboard import DARKEST_REFERENCE_DN
 from emmc_rig.model.camera import Camera
 
 Array = NDArray[np.floating]

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import findings as words
-from calibration import refusals
-from calibration.board_angle import add_error, board_over_angle, leaning, take_out
-from calibration.boards import (
+from emmc_rig.calibration import findings as words
+from emmc_rig.calibration import refusals
+from emmc_rig.calibration.board_angle import add_error, board_over_angle, leaning, take_out
+from emmc_rig.calibration.boards import (
     Board,
     BoardSet,
     as_readings,
@@ -21,7 +21,7 @@ from calibration.boards import (
     sensor_blemishes,
     unsteadiness2,
 )
-from calibration.choice import (
+from emmc_rig.calibration.choice import (
     LARGEST_CHI2,
     HeldOut,
     choose,
@@ -31,17 +31,23 @@ from calibration.choice import (
     prediction_variance,
     worst,
 )
-from calibration.colours import Crosstalk, crosstalk, in_three_colours, mixing, other_colours
-from calibration.defects import find_defects, loss_variance
-from calibration.dust import moved_dust
-from calibration.errors import CalibrationError
-from calibration.fit import OFFSETS, fit_placement
-from calibration.frames import MeanFrame
-from calibration.levels import Levels, fit_levels
-from calibration.locator import SOFT_EDGES
-from calibration.misfit import Misfit, beyond_chance, combined, measured_misfit
-from calibration.openings import views_open
-from calibration.parametric import (
+from emmc_rig.calibration.colours import (
+    Crosstalk,
+    crosstalk,
+    in_three_colours,
+    mixing,
+    other_colours,
+)
+from emmc_rig.calibration.defects import find_defects, loss_variance
+from emmc_rig.calibration.dust import moved_dust
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.fit import OFFSETS, fit_placement
+from emmc_rig.calibration.frames import MeanFrame
+from emmc_rig.calibration.levels import Levels, fit_levels
+from emmc_rig.calibration.locator import SOFT_EDGES
+from emmc_rig.calibration.misfit import Misfit, beyond_chance, combined, measured_misfit
+from emmc_rig.calibration.openings import views_open
+from emmc_rig.calibration.parametric import (
     Parametric,
     Stages,
     coefficient_plane,
@@ -50,9 +56,9 @@ from calibration.parametric import (
     psi_deviation,
     shot_stages,
 )
-from calibration.planning import pinhole_worth
-from calibration.shadow import Shadow, ShadowMask, shadow_mask
-from calibration.whiteboard import (
+from emmc_rig.calibration.planning import pinhole_worth
+from emmc_rig.calibration.shadow import Shadow, ShadowMask, shadow_mask
+from emmc_rig.calibration.whiteboard import (
     LAMP_COLOURS,
     Calibration,
     NewArray,

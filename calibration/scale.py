@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.bracket import fuse
-from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, dark_at
+from emmc_rig.calibration.bracket import fuse
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import MeanFrame, SensorGain, dark_at
 from emmc_rig.model.camera import camera_of, json_of_shots, pixel_light
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import Exposure, Frames

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import CalibrationError
-from calibration.robust import deviation_of
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.robust import deviation_of
 
 Array = NDArray[np.floating]
 Frame = NDArray[np.uint16]

@@ -18,9 +18,9 @@ from numba import prange
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from calibration.errors import CalibrationError
-from calibration.placement import SCALARS, Placement
-from calibration.repeats import Repeats, repeats_of
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.placement import SCALARS, Placement
+from emmc_rig.calibration.repeats import Repeats, repeats_of
 from emmc_rig.model.camera import Camera, Plate, draw_plates
 from emmc_rig.model.compiling import njit
 

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import (
+from emmc_rig.calibration.boards import (
     DARKEST_REFERENCE_DN,
     LAMP_COLOURS,
     BoardFrame,
     BoardSet,
     signal_of,
 )
-from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 Array = NDArray[np.floating]

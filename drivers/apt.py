@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from drivers import apt_codec as codec
-from drivers.apt_codec import Id, Message, StatusBit
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import (
+from emmc_rig.drivers import apt_codec as codec
+from emmc_rig.drivers.apt_codec import Id, Message, StatusBit
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import (
     AxisFaultError,
     CommandRefusedError,
     DriverError,
@@ -20,7 +20,7 @@ from drivers.errors import (
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import (
+from emmc_rig.drivers.stage import (
     DEFAULT_SETTINGS,
     HostStage,
     Reading,
@@ -28,7 +28,7 @@ from drivers.stage import (
     StageSettings,
     check_tolerance,
 )
-from drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
+from emmc_rig.drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
 

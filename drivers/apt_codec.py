@@ -11,7 +11,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
-from drivers.errors import GarbledReplyError
+from emmc_rig.drivers.errors import GarbledReplyError
 
 HEADER_SIZE = 6
 LONGEST_DATA = 255

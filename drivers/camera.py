@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import CameraClosedError, CameraSettingError, RawFrameError
-from drivers.raw import RawFrame, decode_raw
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import CameraClosedError, CameraSettingError, RawFrameError
+from emmc_rig.drivers.raw import RawFrame, decode_raw
 
 EXPOSURE_AGREEMENT = 0.1
 """Shutter times are nominal: a marked 1/30 s is 1/32 s, 7 per cent off."""

@@ -30,11 +30,11 @@ class CameraProtocol:
 
 
 CAMERAS = {
-    "ptp": CameraProtocol("drivers.ptp", "SERIAL", (0x06, 0x01, 0x01)),
-    "u3v": CameraProtocol("drivers.u3v", "SERIAL", (0xEF, 0x05, 0x00), b"U3VL"),
-    "gphoto2": CameraProtocol("drivers.gphoto", "PORT"),
-    "mm": CameraProtocol("drivers.micromanager", "CONFIG.cfg"),
-    "folder": CameraProtocol("drivers.folder", "DIR"),
+    "ptp": CameraProtocol("emmc_rig.drivers.ptp", "SERIAL", (0x06, 0x01, 0x01)),
+    "u3v": CameraProtocol("emmc_rig.drivers.u3v", "SERIAL", (0xEF, 0x05, 0x00), b"U3VL"),
+    "gphoto2": CameraProtocol("emmc_rig.drivers.gphoto", "PORT"),
+    "mm": CameraProtocol("emmc_rig.drivers.micromanager", "CONFIG.cfg"),
+    "folder": CameraProtocol("emmc_rig.drivers.folder", "DIR"),
 }
 CAMERA_HELP = ", ".join(f"{name}:{camera.address}" for name, camera in CAMERAS.items())
 """What `--camera` takes, for help texts and refusals."""

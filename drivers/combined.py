@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 
-from drivers.errors import UnknownAxisError
-from drivers.stage import Stage, StageIdentity, check_within_limits
+from emmc_rig.drivers.errors import UnknownAxisError
+from emmc_rig.drivers.stage import Stage, StageIdentity, check_within_limits
 
 
 class CombinedStage(Stage):

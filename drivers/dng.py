@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from drivers.camera import CameraIdentity
-from drivers.errors import RawFrameError
-from drivers.raw import (
+from emmc_rig.drivers.camera import CameraIdentity
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.raw import (
     BLACK_COLUMNS_TAG,
     BLACK_REPEAT_TAG,
     BLACK_ROWS_TAG,

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from drivers.camera import EXPOSURE_AGREEMENT, CameraIdentity, Limits, check_frame
-from drivers.capture_order import capture_order
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import CameraSettingError, FolderCameraError, RawFrameError
-from drivers.raw import RawFrame, decode_raw, exposure_and_time, has_raw_suffix
+from emmc_rig.drivers.camera import EXPOSURE_AGREEMENT, CameraIdentity, Limits, check_frame
+from emmc_rig.drivers.capture_order import capture_order
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import CameraSettingError, FolderCameraError, RawFrameError
+from emmc_rig.drivers.raw import RawFrame, decode_raw, exposure_and_time, has_raw_suffix
 
 _log = logging.getLogger(__name__)
 

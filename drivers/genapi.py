@@ -20,8 +20,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from drivers.errors import CameraDescriptionError, CameraSettingError
-from drivers.genapi_formula import Formula, Number
+from emmc_rig.drivers.errors import CameraDescriptionError, CameraSettingError
+from emmc_rig.drivers.genapi_formula import Formula, Number
 
 XML_LIMIT = 32 << 20
 TEXT_LIMIT = 4096

@@ -16,10 +16,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import CameraClosedError, CameraSettingError, CaptureError, GphotoError
-from drivers.raw import RawFrame, decode_raw, has_raw_suffix
+from emmc_rig.drivers.camera import (
+    CameraIdentity,
+    Limits,
+    ShapeFromFrames,
+    check_frame,
+    check_setting,
+)
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import CameraClosedError, CameraSettingError, CaptureError, GphotoError
+from emmc_rig.drivers.raw import RawFrame, decode_raw, has_raw_suffix
 
 PTP_IP = "PTP/IP Camera"
 PAIR_LIMIT_S = 2.0

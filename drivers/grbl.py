@@ -5,9 +5,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
-from drivers import grbl_codec as codec
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import (
+from emmc_rig.drivers import grbl_codec as codec
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import (
     AxisFaultError,
     CommandRefusedError,
     FirmwareError,
@@ -18,7 +18,7 @@ from drivers.errors import (
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import (
+from emmc_rig.drivers.stage import (
     DEFAULT_SETTINGS,
     HostStage,
     Reading,
@@ -26,7 +26,7 @@ from drivers.stage import (
     StageSettings,
     check_tolerance,
 )
-from drivers.transport import Transport, repeated, turns
+from emmc_rig.drivers.transport import Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.errors import FirmwareError, GarbledReplyError
+from emmc_rig.drivers.errors import FirmwareError, GarbledReplyError
 
 TERMINATOR = b"\n"
 LINE_LENGTH = 80

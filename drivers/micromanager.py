@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import Field
 
-from drivers.camera import CameraIdentity, Limits, check_setting
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.dng import BAYER_PATTERNS, SMALLEST_SIDE_PX, frame_of_array
-from drivers.errors import (
+from emmc_rig.drivers.camera import CameraIdentity, Limits, check_setting
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.dng import BAYER_PATTERNS, SMALLEST_SIDE_PX, frame_of_array
+from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,
     CaptureError,
@@ -29,8 +29,14 @@ from drivers.errors import (
     PortGoneError,
     SpeedFixedError,
 )
-from drivers.raw import RawFrame
-from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageIdentity, StageSettings
+from emmc_rig.drivers.raw import RawFrame
+from emmc_rig.drivers.stage import (
+    DEFAULT_SETTINGS,
+    HostStage,
+    Reading,
+    StageIdentity,
+    StageSettings,
+)
 
 if TYPE_CHECKING:
     from pymmcore_plus import CMMCorePlus

@@ -15,7 +15,7 @@ from pathlib import Path
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from drivers.errors import PortNotFoundError
+from emmc_rig.drivers.errors import PortNotFoundError
 
 UDEV_RULE = "99-emmc-rig.rules"
 BY_SERIAL_NUMBER = "usb:"

@@ -16,10 +16,16 @@ from datetime import UTC, datetime
 from enum import IntEnum
 from typing import Any
 
-from drivers import ptp_codec as codec
-from drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_frame, check_setting
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import (
+from emmc_rig.drivers import ptp_codec as codec
+from emmc_rig.drivers.camera import (
+    CameraIdentity,
+    Limits,
+    ShapeFromFrames,
+    check_frame,
+    check_setting,
+)
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import (
     CameraBusyError,
     CameraClosedError,
     CameraFormatError,
@@ -33,11 +39,19 @@ from drivers.errors import (
     UsbStalledError,
     UsbTimeoutError,
 )
-from drivers.ptp_codec import Code, EventCode, Format, Message, ObjectInfo, Operation, Property
-from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.raw import RawFrame, decode_raw, has_raw_suffix
-from drivers.transport import repeated
-from drivers.usb import open_device
+from emmc_rig.drivers.ptp_codec import (
+    Code,
+    EventCode,
+    Format,
+    Message,
+    ObjectInfo,
+    Operation,
+    Property,
+)
+from emmc_rig.drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from emmc_rig.drivers.raw import RawFrame, decode_raw, has_raw_suffix
+from emmc_rig.drivers.transport import repeated
+from emmc_rig.drivers.usb import open_device
 
 _log = logging.getLogger(__name__)
 

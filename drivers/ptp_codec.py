@@ -13,7 +13,7 @@ from enum import IntEnum
 from functools import cache
 from typing import Annotated, Any, Self, get_type_hints
 
-from drivers.errors import CameraFormatError
+from emmc_rig.drivers.errors import CameraFormatError
 
 HEADER = struct.Struct("<IHHI")
 HEADER_SIZE = HEADER.size

@@ -13,9 +13,14 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import CameraBusyError, CameraFormatError, UsbStalledError, UsbTimeoutError
-from drivers.ptp_codec import (
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import (
+    CameraBusyError,
+    CameraFormatError,
+    UsbStalledError,
+    UsbTimeoutError,
+)
+from emmc_rig.drivers.ptp_codec import (
     HEADER_SIZE,
     Code,
     Header,
@@ -26,7 +31,7 @@ from drivers.ptp_codec import (
     encode_data,
     encode_message,
 )
-from drivers.usb import BULK, INTERRUPT, UsbDevice, UsbPipe
+from emmc_rig.drivers.usb import BULK, INTERRUPT, UsbDevice, UsbPipe
 
 _log = logging.getLogger(__name__)
 

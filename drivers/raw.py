@@ -16,7 +16,7 @@ import numpy as np
 import rawpy
 import tifffile
 
-from drivers.errors import RawFrameError
+from emmc_rig.drivers.errors import RawFrameError
 
 Array = np.ndarray
 

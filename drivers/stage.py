@@ -14,8 +14,8 @@ from functools import partial
 from itertools import chain
 from typing import NamedTuple, Protocol, Self, TypeVar
 
-from drivers.clock import Clock
-from drivers.errors import (
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import (
     AxisFaultError,
     DriverError,
     GarbledReplyError,

@@ -10,8 +10,8 @@ from typing import TypeVar
 
 import serial
 
-from drivers.clock import Clock
-from drivers.errors import (
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import (
     DriverError,
     GarbledReplyError,
     PortBusyError,
@@ -21,7 +21,13 @@ from drivers.errors import (
     PortPermissionError,
     TransportTimeoutError,
 )
-from drivers.ports import BY_SERIAL_NUMBER, find_port, holder_of, udev_rule_path, usb_serial_number
+from emmc_rig.drivers.ports import (
+    BY_SERIAL_NUMBER,
+    find_port,
+    holder_of,
+    udev_rule_path,
+    usb_serial_number,
+)
 
 try:
     from termios import error as _TermiosError  # noqa: N812

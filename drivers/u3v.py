@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers import u3v_codec as codec
-from drivers.camera import CameraIdentity, Limits, check_setting
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import (
+from emmc_rig.drivers import u3v_codec as codec
+from emmc_rig.drivers.camera import CameraIdentity, Limits, check_setting
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import (
     CameraDescriptionError,
     CameraFormatError,
     CameraRefusedError,
@@ -34,13 +34,20 @@ from drivers.errors import (
     DriverError,
     RawFrameError,
 )
-from drivers.genapi import Features
-from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, PixelFormat, image_bytes, unpack
-from drivers.raw import RawFrame, hashed
-from drivers.transport import repeated
-from drivers.u3v_control import U3vControl
-from drivers.u3v_stream import U3vStream
-from drivers.usb import BULK, UsbDevice, open_device
+from emmc_rig.drivers.genapi import Features
+from emmc_rig.drivers.pixel_formats import (
+    BY_CODE,
+    BY_NAME,
+    FORMATS,
+    PixelFormat,
+    image_bytes,
+    unpack,
+)
+from emmc_rig.drivers.raw import RawFrame, hashed
+from emmc_rig.drivers.transport import repeated
+from emmc_rig.drivers.u3v_control import U3vControl
+from emmc_rig.drivers.u3v_stream import U3vStream
+from emmc_rig.drivers.usb import BULK, UsbDevice, open_device
 
 _log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from drivers.errors import CameraFormatError
+from emmc_rig.drivers.errors import CameraFormatError
 
 CONTROL = (0xEF, 0x05, 0x00)
 """Class, subclass and protocol of the interface that takes commands."""

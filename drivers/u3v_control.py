@@ -12,17 +12,17 @@ from collections.abc import Callable
 from functools import partial
 from itertools import cycle
 
-from drivers import u3v_codec as codec
-from drivers.clock import Clock
-from drivers.errors import (
+from emmc_rig.drivers import u3v_codec as codec
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import (
     CameraBusyError,
     CameraFormatError,
     CameraRefusedError,
     UsbStalledError,
     UsbTimeoutError,
 )
-from drivers.transport import FOREIGN_MESSAGES_TOLERATED, repeated
-from drivers.usb import UsbPipe
+from emmc_rig.drivers.transport import FOREIGN_MESSAGES_TOLERATED, repeated
+from emmc_rig.drivers.usb import UsbPipe
 
 BUSY_LIMIT_S = 30.0
 """Longest that a camera may ask for by pending acknowledges, for one command."""

@@ -11,9 +11,9 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers import u3v_codec as codec
-from drivers.clock import Clock
-from drivers.errors import (
+from emmc_rig.drivers import u3v_codec as codec
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import (
     CameraDescriptionError,
     CameraFormatError,
     CaptureError,
@@ -21,8 +21,8 @@ from drivers.errors import (
     UsbStalledError,
     UsbTimeoutError,
 )
-from drivers.u3v_control import U3vControl
-from drivers.usb import TRANSFER_BYTES, UsbDevice, UsbPipe
+from emmc_rig.drivers.u3v_control import U3vControl
+from emmc_rig.drivers.usb import TRANSFER_BYTES, UsbDevice, UsbPipe
 
 PAYLOAD_LIMIT = 1 << 30
 PACKET_LIMIT = 1 << 16

@@ -21,7 +21,7 @@ import libusb_package
 import usb.core
 import usb.util
 
-from drivers.errors import (
+from emmc_rig.drivers.errors import (
     DriverError,
     UsbClaimedError,
     UsbGoneError,
@@ -32,7 +32,7 @@ from drivers.errors import (
     UsbTransferError,
     UsbUnavailableError,
 )
-from drivers.ports import PROC, pids_with_open_file
+from emmc_rig.drivers.ports import PROC, pids_with_open_file
 
 Kind = tuple[int, int, int]
 """Class, subclass and protocol of an interface."""

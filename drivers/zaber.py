@@ -8,9 +8,9 @@ from functools import partial
 from itertools import cycle
 from typing import Any
 
-from drivers import zaber_codec as codec
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import (
+from emmc_rig.drivers import zaber_codec as codec
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import (
     AxisFaultError,
     CommandRefusedError,
     DriverError,
@@ -22,7 +22,7 @@ from drivers.errors import (
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import (
+from emmc_rig.drivers.stage import (
     DEFAULT_SETTINGS,
     HostStage,
     Reading,
@@ -30,7 +30,7 @@ from drivers.stage import (
     StageSettings,
     check_tolerance,
 )
-from drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
+from emmc_rig.drivers.transport import FOREIGN_MESSAGES_TOLERATED, Transport, repeated, turns
 
 _log = logging.getLogger(__name__)
 

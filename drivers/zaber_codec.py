@@ -10,7 +10,7 @@ of other models. A rotary stage is listed to be named in the refusal.
 import re
 from dataclasses import dataclass
 
-from drivers.errors import GarbledReplyError
+from emmc_rig.drivers.errors import GarbledReplyError
 
 TERMINATOR = b"\n"
 MESSAGE_IDS = range(1, 100)

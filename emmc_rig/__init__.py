@@ -21,6 +21,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from emmc_rig import moved_packages as moved_packages
 from emmc_rig.version import __version__
 
 if TYPE_CHECKING:

@@ -13,12 +13,12 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.plan import Boards, Checks, Darks, Plan, PlannedShot
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.bench.rig_config import SIMULATED
+from emmc_rig.calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from emmc_rig.files.dictionaries import open_dictionary
 from emmc_rig.files.results import write_metrics
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
@@ -27,18 +27,18 @@ from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.result import Result
 from emmc_rig.progress import Event, Watcher
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
+from emmc_rig.reconstruction.result import Progress, Reconstruction
+from emmc_rig.reconstruction.verdict.rules import Verdict
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.session.board_sets import whiteboards
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import shot_frames, shot_readings
 from emmc_rig.session.session import Session
-from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
-from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.rules import Verdict
-from reconstruction.verdict.run import reconstruct_judged
-from simulators.bench import Bench
-from simulators.scenes import SCENES
+from emmc_rig.simulators.bench import Bench
+from emmc_rig.simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
 SIZE = (108, 144)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from calibration.errors import CalibrationError
-from drivers.errors import DriverError
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.model.advice import AdvisedError
 from emmc_rig.model.errors import ModelError
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 
 class AppError(AdvisedError):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from reconstruction.result import Progress
+    from emmc_rig.reconstruction.result import Progress
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from reconstruction import bpdn_solvers as solvers
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction import bpdn_solvers as solvers
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 Array32 = NDArray[np.float32]
 Method = Literal["admm", "omp", "lars", "ista", "fista", "sl0"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction import bpdn_kernels as kernels
+from emmc_rig.reconstruction import bpdn_kernels as kernels
 
 Array = NDArray[np.floating]
 Array32 = NDArray[np.float32]

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.colour import coloured
-from reconstruction.differences import norm_squared
-from reconstruction.problem import PatchTerm
+from emmc_rig.reconstruction.colour import coloured
+from emmc_rig.reconstruction.differences import norm_squared
+from emmc_rig.reconstruction.problem import PatchTerm
 
 Array = NDArray[np.floating]
 SMALLEST_RELATIVE_MU = 2e-5

@@ -19,7 +19,7 @@ from scipy.special import erf
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.reading import one_line, stored_arrays
-from reconstruction.errors import DictionaryError
+from emmc_rig.reconstruction.errors import DictionaryError
 
 KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
 FORMAT = "emmc-rig dictionary 1"

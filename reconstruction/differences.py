@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigvals_banded
 
-from reconstruction import kernels
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction import kernels
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 MultiIndex = tuple[int, int, int, int]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 WHITER = 2.0

@@ -11,12 +11,12 @@ import numpy as np
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
-from reconstruction.adaptive.film import Film
-from reconstruction.dictionary import Dictionary
-from reconstruction.errors import ReconstructionError
-from reconstruction.result import Progress, Reconstruction
-from reconstruction.settings import ShippedSettings
-from reconstruction.sparse import PatchEstimates, SparseSettings
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.result import Progress, Reconstruction
+from emmc_rig.reconstruction.settings import ShippedSettings
+from emmc_rig.reconstruction.sparse import PatchEstimates, SparseSettings
 
 
 @dataclass(frozen=True, eq=False)

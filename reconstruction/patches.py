@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 LANES = 16
 """Patches are padded to a multiple of this many float32 values, a vector register."""

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.choices import choose_mu
-from reconstruction.inputs import checked_inputs
-from reconstruction.tv import Sweeps
+from emmc_rig.reconstruction.choices import choose_mu
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.tv import Sweeps
 
 Array = NDArray[np.floating]
 PICTURE_NOISE, COARSE_NOISE = 0.1, 0.06

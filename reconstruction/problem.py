@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
-from reconstruction.differences import planar_variation
+from emmc_rig.reconstruction.differences import planar_variation
 
 Array = NDArray[np.floating]
 

@@ -7,10 +7,10 @@ from typing import TypeVar
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from reconstruction.adaptive.film import FilmSettings
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.sparse import SparseSettings
-from reconstruction.tv import TVSettings
+from emmc_rig.reconstruction.adaptive.film import FilmSettings
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.sparse import SparseSettings
+from emmc_rig.reconstruction.tv import TVSettings
 
 Part = TypeVar("Part", bound=Settings)
 

@@ -27,11 +27,11 @@ from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
-from reconstruction import bpdn
-from reconstruction.dictionary import Dictionary
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import checked_inputs
-from reconstruction.patches import (
+from emmc_rig.reconstruction import bpdn
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.patches import (
     PatchGrid,
     PatchSensing,
     overlap_add,
@@ -41,7 +41,7 @@ from reconstruction.patches import (
     sense_atoms,
     sense_patches,
 )
-from reconstruction.result import Progress, Reconstruction, Status
+from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 FLAT = 1e-3

@@ -22,21 +22,21 @@ from numpy.typing import NDArray
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
-from reconstruction.adaptive.settings import SIDES, Side
-from reconstruction.adaptive.survey import contrast_of
-from reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
-from reconstruction.dictionary import Dictionary
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import check_frames
-from reconstruction.methods import MethodSettings, find_method, reconstruct
-from reconstruction.methods.variational import patched_weights
-from reconstruction.result import Progress, Reconstruction, Status
-from reconstruction.screening import screened
-from reconstruction.settings import BlockSettings
-from reconstruction.sparse import SparseSettings
-from reconstruction.verdict.blocks import JudgedBlock, judged_together
-from reconstruction.verdict.rules import Verdict
-from reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.reconstruction.adaptive.settings import SIDES, Side
+from emmc_rig.reconstruction.adaptive.survey import contrast_of
+from emmc_rig.reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import check_frames
+from emmc_rig.reconstruction.methods import MethodSettings, find_method, reconstruct
+from emmc_rig.reconstruction.methods.variational import patched_weights
+from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
+from emmc_rig.reconstruction.screening import screened
+from emmc_rig.reconstruction.settings import BlockSettings
+from emmc_rig.reconstruction.sparse import SparseSettings
+from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, judged_together
+from emmc_rig.reconstruction.verdict.rules import Verdict
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 
 REACH = 48
 """Samples of halo for methods that carry information from sample to sample: steps of the

@@ -31,19 +31,19 @@ from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from emmc_rig.model.settings import Settings
-from reconstruction import kernels
-from reconstruction.choices import (
+from emmc_rig.reconstruction import kernels
+from emmc_rig.reconstruction.choices import (
     choose_mu,
     choose_primal_step,
     contrast,
     first_light_field,
     smooth_guess,
 )
-from reconstruction.differences import norm_squared as norm_squared_of
-from reconstruction.differences import stencils
-from reconstruction.inputs import checked_inputs
-from reconstruction.problem import PatchTerm, Problem, colour_metric
-from reconstruction.result import Progress, Reconstruction, Status
+from emmc_rig.reconstruction.differences import norm_squared as norm_squared_of
+from emmc_rig.reconstruction.differences import stencils
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.problem import PatchTerm, Problem, colour_metric
+from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 

@@ -14,12 +14,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
-from drivers import apt_codec as codec
-from drivers.apt_codec import Id, Message, StatusBit
-from drivers.clock import Clock
-from drivers.errors import GarbledReplyError
-from simulators.firmware import SimulatedController, earliest_s
-from simulators.motion import AxisSpec, End, Motor
+from emmc_rig.drivers import apt_codec as codec
+from emmc_rig.drivers.apt_codec import Id, Message, StatusBit
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import GarbledReplyError
+from emmc_rig.simulators.firmware import SimulatedController, earliest_s
+from emmc_rig.simulators.motion import AxisSpec, End, Motor
 
 COUNTS_PER_UM = 34.304
 Z825 = AxisSpec(

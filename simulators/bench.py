@@ -24,7 +24,7 @@ from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.geometry import centred_grid
-from simulators.flaws import (
+from emmc_rig.simulators.flaws import (
     EVEN_BOARD,
     PERFECT_OPTICS,
     PERFECT_SENSOR,
@@ -34,7 +34,7 @@ from simulators.flaws import (
     OpticsFlaws,
     SensorFlaws,
 )
-from simulators.sobol import sobol_points
+from emmc_rig.simulators.sobol import sobol_points
 
 Array = NDArray[np.floating]
 LAMPS = {

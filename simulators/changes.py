@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from simulators import textures
-from simulators.moving import moved_card
-from simulators.raycaster import Card, World
+from emmc_rig.simulators import textures
+from emmc_rig.simulators.moving import moved_card
+from emmc_rig.simulators.raycaster import Card, World
 
 LEAF_LAYERS = 4
 LEAF_TEXTURE = 1024

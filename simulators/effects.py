@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from simulators.bench import MountingErrors
-from simulators.flaws import (
+from emmc_rig.simulators.bench import MountingErrors
+from emmc_rig.simulators.flaws import (
     EVEN_BOARD,
     PERFECT_OPTICS,
     PERFECT_SENSOR,

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.clock import Clock
+from emmc_rig.drivers.clock import Clock
 
 Condition = Callable[[Any], bool]
 

@@ -6,10 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from drivers.clock import Clock
-from simulators.faults import Faults
-from simulators.motion import Motor
-from simulators.wire import MemoryTransport
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.simulators.faults import Faults
+from emmc_rig.simulators.motion import Motor
+from emmc_rig.simulators.wire import MemoryTransport
 
 WIRE_FAULTS = (
     "drop_command",

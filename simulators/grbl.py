@@ -16,10 +16,10 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from drivers import grbl_codec as codec
-from drivers.clock import Clock
-from simulators.firmware import SimulatedController, earliest_s
-from simulators.motion import AxisSpec, End, Motor
+from emmc_rig.drivers import grbl_codec as codec
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.simulators.firmware import SimulatedController, earliest_s
+from emmc_rig.simulators.motion import AxisSpec, End, Motor
 
 LETTERS = "XYZABC"
 SMALL_AXIS = AxisSpec(microstep_um=0.3125, max_speed_um_s=8_000.0, backlash_um=3.0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from functools import cached_property
 
-from drivers.clock import Clock
+from emmc_rig.drivers.clock import Clock
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.raycaster import (
+from emmc_rig.simulators.raycaster import (
     QUOTED,
     Ball,
     Card,

@@ -17,10 +17,10 @@ from datetime import UTC, datetime, timedelta
 import cv2
 import numpy as np
 
-from drivers.clock import Clock
-from drivers.dng import encode_dng
-from drivers.errors import CameraFormatError
-from drivers.ptp_codec import (
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import CameraFormatError
+from emmc_rig.drivers.ptp_codec import (
     EVERYTHING,
     HEADER,
     HEADER_SIZE,
@@ -43,9 +43,9 @@ from drivers.ptp_codec import (
     encode_message,
     encode_value,
 )
-from drivers.usb import INTERRUPT
-from simulators.faults import Faults
-from simulators.usb import (
+from emmc_rig.drivers.usb import INTERRUPT
+from emmc_rig.simulators.faults import Faults
+from emmc_rig.simulators.usb import (
     DeviceSpec,
     EndpointSpec,
     InterfaceSpec,

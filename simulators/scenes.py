@@ -16,9 +16,9 @@ from functools import lru_cache
 import numpy as np
 
 from emmc_rig.model.errors import SceneError, did_you_mean
-from simulators import textures
-from simulators.moving import flow_between, world_at
-from simulators.raycaster import (
+from emmc_rig.simulators import textures
+from emmc_rig.simulators.moving import flow_between, world_at
+from emmc_rig.simulators.raycaster import (
     Ball,
     CameraMotion,
     Card,

@@ -5,10 +5,10 @@ For measurements and tests around devices: a move takes no time, or exactly the 
 
 from collections.abc import Iterable, Mapping
 
-from drivers.camera import Limits
-from drivers.clock import Clock
-from drivers.errors import LimitExceededError, NotHomedError
-from drivers.stage import Stage
+from emmc_rig.drivers.camera import Limits
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import LimitExceededError, NotHomedError
+from emmc_rig.drivers.stage import Stage
 
 TRAVEL_UM = (0.0, 100_000.0)
 

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.clock import Clock
-from drivers.pixel_formats import BY_CODE, BY_NAME, PixelFormat
-from simulators import u3v_description as xml
-from simulators.faults import Faults
-from simulators.usb import (
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.pixel_formats import BY_CODE, BY_NAME, PixelFormat
+from emmc_rig.simulators import u3v_description as xml
+from emmc_rig.simulators.faults import Faults
+from emmc_rig.simulators.usb import (
     SUPER_SPEED,
     DeviceSpec,
     EndpointSpec,

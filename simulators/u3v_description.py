@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.pixel_formats import BY_NAME
+from emmc_rig.drivers.pixel_formats import BY_NAME
 
 BASE = 0x100000
 WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x00, 0x04, 0x08, 0x0C

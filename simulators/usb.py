@@ -21,7 +21,7 @@ import usb.backend
 import usb.core
 import usb.util
 
-from drivers.clock import Clock
+from emmc_rig.drivers.clock import Clock
 
 HIGH_SPEED, SUPER_SPEED = 3, 4
 ENGLISH = 0x0409

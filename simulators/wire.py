@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from drivers.clock import Clock
-from drivers.errors import PortGoneError, PortNotFoundError, TransportTimeoutError
-from drivers.transport import Transport
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import PortGoneError, PortNotFoundError, TransportTimeoutError
+from emmc_rig.drivers.transport import Transport
 
 READ_SIZE = 4096
 TICK_S = 0.002

@@ -12,10 +12,10 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
-from drivers.clock import Clock
-from drivers.zaber_codec import DEFAULT_RESOLUTION, FLAG_MEANINGS, SPEED_SCALE, lrc
-from simulators.firmware import SimulatedController, earliest_s
-from simulators.motion import AxisSpec, End, Motion, Motor
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.zaber_codec import DEFAULT_RESOLUTION, FLAG_MEANINGS, SPEED_SCALE, lrc
+from emmc_rig.simulators.firmware import SimulatedController, earliest_s
+from emmc_rig.simulators.motion import AxisSpec, End, Motion, Motor
 
 __all__ = ["BENCH_AXES", "AxisSpec", "Motion", "ZaberChain"]
 

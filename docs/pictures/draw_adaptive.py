@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import emmc_rig as emmc
-from reconstruction.adaptive.fits import averaged, fitted_models
-from reconstruction.adaptive.search import Volume, variance_per_pixel
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import checked, surveyed
+from emmc_rig.reconstruction.adaptive.fits import averaged, fitted_models
+from emmc_rig.reconstruction.adaptive.search import Volume, variance_per_pixel
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.survey import checked, surveyed
 
 SCENE, CAMERA, SIZE = "deep-occlusions", "scenario-ii-cfa", (96, 128)
 MODELS = ("surfaces, looser fit", "surfaces, closer fit", "no surfaces (total variation)")

@@ -15,15 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board, channels_of
-from calibration.errors import CalibrationError
-from calibration.locator import Location, frame_board, locate, starting_placement
-from calibration.openings import views_open
-from calibration.shadow import SEARCH_UM, ShadowMask, shadow_mask
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.checks import FrameRefusedError
 from emmc_rig.bench.hands import APERTURE, MASK, NoAttendant, hole_name
 from emmc_rig.bench.hardware import RigType
+from emmc_rig.calibration.boards import Board, channels_of
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.locator import Location, frame_board, locate, starting_placement
+from emmc_rig.calibration.openings import views_open
+from emmc_rig.calibration.shadow import SEARCH_UM, ShadowMask, shadow_mask
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid

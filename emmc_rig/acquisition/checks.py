@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera import within
-from drivers.errors import DriverError
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Checks
 from emmc_rig.bench.hardware import Rig
+from emmc_rig.drivers.camera import within
+from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Figures
 from emmc_rig.session.planned import PlannedFrame

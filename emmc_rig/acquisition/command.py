@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.amend import amendment
 from emmc_rig.acquisition.between import load_hook
 from emmc_rig.acquisition.by_hand import with_hands
@@ -34,6 +33,7 @@ from emmc_rig.acquisition.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.rig_config import AnyRig, Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
+from emmc_rig.drivers.folder import FolderCamera, Recorded
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.arguments import NAMES, path_of, required

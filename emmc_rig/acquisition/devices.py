@@ -13,15 +13,15 @@ from dataclasses import asdict, dataclass, field
 from itertools import count
 from typing import Any
 
-from drivers.errors import DriverError
-from drivers.raw import RawFrame
-from drivers.stage import Stage, StageIdentity
 from emmc_rig.acquisition.checks import FrameRefusedError
 from emmc_rig.acquisition.focus import FocusFound, focused, sharpness
 from emmc_rig.acquisition.metering import METERABLE_LEVELS, METERING_TRIES
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.acquisition.retries import Mending
 from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
+from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.raw import RawFrame
+from emmc_rig.drivers.stage import Stage, StageIdentity
 from emmc_rig.errors import AppError
 from emmc_rig.session.brightness import figures, level_of, next_exposure_s
 from emmc_rig.session.journal import Figures

@@ -11,12 +11,12 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from statistics import median
 
-from drivers.stage import needs_approach
 from emmc_rig.acquisition.metering import metered_exposure_s
 from emmc_rig.acquisition.order import APPROACH_UM
 from emmc_rig.acquisition.plan import METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import Rig
+from emmc_rig.drivers.stage import needs_approach
 from emmc_rig.session.journal import FrameEntry, MeteredEntry
 from emmc_rig.session.planned import PlannedFrame
 

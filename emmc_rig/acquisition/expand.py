@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from calibration.openings import CENTRED, views_open, window_place_um
-from calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.acquisition.metering import BRACKET_STEP, MOST_STEPS
 from emmc_rig.acquisition.order import spread
 from emmc_rig.acquisition.plan import AUTO, METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.calibration.openings import CENTRED, views_open, window_place_um
+from emmc_rig.calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid

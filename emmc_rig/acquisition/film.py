@@ -15,13 +15,13 @@ from queue import Empty, Full, Queue
 from threading import Event
 from typing import Any, NamedTuple, Self
 
-from drivers.camera import Camera as CameraDevice
-from drivers.clock import SYSTEM_CLOCK
-from drivers.errors import CaptureError
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.estimate import pace_of
 from emmc_rig.acquisition.plan import Plan
 from emmc_rig.bench.hardware import Rig
+from emmc_rig.drivers.camera import Camera as CameraDevice
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.errors import CaptureError
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.session.planned import PlannedFrame
 

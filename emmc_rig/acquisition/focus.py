@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw import RawFrame
-from drivers.stage import Stage
+from emmc_rig.drivers.raw import RawFrame
+from emmc_rig.drivers.stage import Stage
 from emmc_rig.errors import AppError
 from emmc_rig.pages.frame_view import colour_planes
 

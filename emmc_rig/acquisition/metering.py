@@ -11,9 +11,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from drivers.camera import Limits
-from drivers.errors import CameraSettingError
 from emmc_rig.acquisition.plan import Metering
+from emmc_rig.drivers.camera import Limits
+from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.session.brightness import exposure_for_s
 from emmc_rig.session.journal import Figures, FrameEntry, MeteredEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame

@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from drivers.camera import EXPOSURE_AGREEMENT
-from drivers.errors import FolderCameraError
-from drivers.folder import FolderCamera, Recorded
 from emmc_rig.bench.hardware import Rig
+from emmc_rig.drivers.camera import EXPOSURE_AGREEMENT
+from emmc_rig.drivers.errors import FolderCameraError
+from emmc_rig.drivers.folder import FolderCamera, Recorded
 from emmc_rig.errors import AppError
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session

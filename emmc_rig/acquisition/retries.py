@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.errors import (
+from emmc_rig.acquisition.checks import SaturatedError
+from emmc_rig.acquisition.plan import Retries
+from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,
     CardFullError,
@@ -23,8 +25,6 @@ from drivers.errors import (
     UsbPermissionError,
     UsbUnavailableError,
 )
-from emmc_rig.acquisition.checks import SaturatedError
-from emmc_rig.acquisition.plan import Retries
 from emmc_rig.errors import AppError
 
 HOPELESS = (

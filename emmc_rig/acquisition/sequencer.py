@@ -22,9 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import SYSTEM_CLOCK
-from drivers.errors import DriverError
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.between import Between, HookError, plain
 from emmc_rig.acquisition.by_hand import HandPlaces, WrongPlaceError
 from emmc_rig.acquisition.checks import check, is_same, refuse_impossible
@@ -50,6 +47,9 @@ from emmc_rig.acquisition.writer import Writer
 from emmc_rig.bench.environment import read_all
 from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.registration import LEAST_LIKENESS, Shift, registered
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError, StopCapture
 from emmc_rig.files.results import command_line, shown_bytes, versions
 from emmc_rig.model.camera import Camera

@@ -10,19 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from calibration.scale import Scale
-from calibration.shadow import shadow_mask
 from emmc_rig.acquisition.plan import Plan
+from emmc_rig.calibration.scale import Scale
+from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.progress import Event, Watcher
+from emmc_rig.reconstruction.methods import reconstruct
+from emmc_rig.reconstruction.result import Progress, Reconstruction
 from emmc_rig.session.journal import DecidedEntry, ended, of_kind
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import shot_readings
 from emmc_rig.session.session import Session
-from reconstruction.methods import reconstruct
-from reconstruction.result import Progress, Reconstruction
 
 SMALLEST = (16, 16)
 METHOD = "adaptive-fast"

@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import Field, TypeAdapter, ValidationError, create_model
 
-from drivers.apt import ACTUATORS
-from drivers.stage import StageSettings
 from emmc_rig.bench.plugins import STAGES, plug_ins
+from emmc_rig.drivers.apt import ACTUATORS
+from emmc_rig.drivers.stage import StageSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.reading import parse_yaml, read_yaml

@@ -28,7 +28,7 @@ from typing import Annotated, Self
 import serial
 from pydantic import Field, model_validator
 
-from drivers.ports import find_port
+from emmc_rig.drivers.ports import find_port
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import Settings
 

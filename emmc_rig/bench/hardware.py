@@ -17,22 +17,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.apt import ACTUATORS, AptAxis, AptStage
-from drivers.apt import identify as identify_apt
-from drivers.camera import Camera as CameraDevice
-from drivers.cameras import CAMERA_HELP, CAMERAS
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.combined import CombinedStage
-from drivers.dng import SMALLEST_SIDE_PX
-from drivers.errors import DriverError, FirmwareError, TransportTimeoutError
-from drivers.grbl import GrblStage
-from drivers.grbl import identify as identify_grbl
-from drivers.ports import find_port, guess_of, list_serial_ports
-from drivers.ptp import open_camera as open_ptp
-from drivers.stage import HostStage, Stage, StageSettings
-from drivers.transport import SerialTransport, Transport
-from drivers.u3v import open_camera as open_u3v
-from drivers.zaber import ZaberStage, find_devices
 from emmc_rig.bench import plugins
 from emmc_rig.bench.device_config import (
     AptConfig,
@@ -50,22 +34,38 @@ from emmc_rig.bench.device_config import (
 from emmc_rig.bench.environment import Source
 from emmc_rig.bench.hands import Attendant
 from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
+from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage
+from emmc_rig.drivers.apt import identify as identify_apt
+from emmc_rig.drivers.camera import Camera as CameraDevice
+from emmc_rig.drivers.cameras import CAMERA_HELP, CAMERAS
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.combined import CombinedStage
+from emmc_rig.drivers.dng import SMALLEST_SIDE_PX
+from emmc_rig.drivers.errors import DriverError, FirmwareError, TransportTimeoutError
+from emmc_rig.drivers.grbl import GrblStage
+from emmc_rig.drivers.grbl import identify as identify_grbl
+from emmc_rig.drivers.ports import find_port, guess_of, list_serial_ports
+from emmc_rig.drivers.ptp import open_camera as open_ptp
+from emmc_rig.drivers.stage import HostStage, Stage, StageSettings
+from emmc_rig.drivers.transport import SerialTransport, Transport
+from emmc_rig.drivers.u3v import open_camera as open_u3v
+from emmc_rig.drivers.zaber import ZaberStage, find_devices
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera, Sensor
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.settings import validated
-from simulators.apt import AptController
-from simulators.bench import RAYS_PER_VIEW, Bench, window_side_um
-from simulators.clock import ManualClock
-from simulators.effects import Flaws
-from simulators.firmware import SimulatedController
-from simulators.grbl import LETTERS, GrblController
-from simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
-from simulators.u3v import U3vCameraSimulator
-from simulators.usb import SimulatedUsb, UsbFunction
-from simulators.wire import PtyServer
-from simulators.zaber import AxisSpec, ZaberChain
+from emmc_rig.simulators.apt import AptController
+from emmc_rig.simulators.bench import RAYS_PER_VIEW, Bench, window_side_um
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.effects import Flaws
+from emmc_rig.simulators.firmware import SimulatedController
+from emmc_rig.simulators.grbl import LETTERS, GrblController
+from emmc_rig.simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
+from emmc_rig.simulators.u3v import U3vCameraSimulator
+from emmc_rig.simulators.usb import SimulatedUsb, UsbFunction
+from emmc_rig.simulators.wire import PtyServer
+from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 _log = logging.getLogger(__name__)
 
@@ -372,7 +372,7 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
             STAGES, config.protocol, config.port, care, SYSTEM_CLOCK, **config.options
         )
     if isinstance(config, MicroManagerConfig):
-        from drivers.micromanager import MicroManagerStage, StageSetup, load_core
+        from emmc_rig.drivers.micromanager import MicroManagerStage, StageSetup, load_core
 
         names = (field.name for field in fields(StageSetup))
         setup = StageSetup(**{name: getattr(config, name) for name in names})

@@ -12,7 +12,7 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from drivers.errors import DriverError
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.model.reading import one_line
 

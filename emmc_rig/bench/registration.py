@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw import RawFrame
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.masks import cfa_tile
 

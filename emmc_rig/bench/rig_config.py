@@ -11,8 +11,6 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
-from drivers.clock import SYSTEM_CLOCK
-from drivers.stage import Stage
 from emmc_rig.bench.environment import Source, SourceConfig
 from emmc_rig.bench.hands import Ask, AskingAttendant, NoAttendant
 from emmc_rig.bench.hardware import (
@@ -25,6 +23,8 @@ from emmc_rig.bench.hardware import (
     open_stages,
     simulated_rig,
 )
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.stage import Stage
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.arguments import path_of
@@ -32,10 +32,10 @@ from emmc_rig.model.camera import Camera
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
-from simulators.bench import RAYS_PER_VIEW
-from simulators.effects import EFFECTS, TOGETHER, flawed
-from simulators.scenes import MOVING_SCENES
-from simulators.still import StillStage
+from emmc_rig.simulators.bench import RAYS_PER_VIEW
+from emmc_rig.simulators.effects import EFFECTS, TOGETHER, flawed
+from emmc_rig.simulators.scenes import MOVING_SCENES
+from emmc_rig.simulators.still import StillStage
 
 SIMULATED = "simulated"
 IMPORTED = "imported"

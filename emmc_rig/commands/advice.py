@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 
-from drivers.errors import AxisFaultError, NotHomedError, PositionMismatchError
+from emmc_rig.drivers.errors import AxisFaultError, NotHomedError, PositionMismatchError
 from emmc_rig.model.advice import AdvisedError
 
 WORDS = {

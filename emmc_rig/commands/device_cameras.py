@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drivers.cameras import CAMERA_HELP
 from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
+from emmc_rig.drivers.cameras import CAMERA_HELP
 from emmc_rig.errors import AppError
 from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import new_file, refuse_inside_session
 
 if TYPE_CHECKING:
-    from drivers.camera import Camera
-    from drivers.raw import RawFrame
+    from emmc_rig.drivers.camera import Camera
+    from emmc_rig.drivers.raw import RawFrame
 
 CameraSpec = Annotated[
     str,

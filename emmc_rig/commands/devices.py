@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drivers.cameras import CAMERAS
 from emmc_rig.acquisition.control import signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
+from emmc_rig.drivers.cameras import CAMERAS
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
-    from drivers.stage import Stage
+    from emmc_rig.drivers.stage import Stage
 
 app = typer.Typer(
     name="devices",
@@ -50,8 +50,8 @@ app.command()(conform)
 @app.command("list")
 def list_devices(rig: RigOption = None) -> None:
     """List the serial ports and USB cameras of this computer."""
-    from drivers.clock import SYSTEM_CLOCK
-    from drivers.ports import guess_of, holder_of, list_serial_ports
+    from emmc_rig.drivers.clock import SYSTEM_CLOCK
+    from emmc_rig.drivers.ports import guess_of, holder_of, list_serial_ports
 
     if rig is not None:
         from emmc_rig.bench.device_config import PROTOCOLS
@@ -77,8 +77,8 @@ def list_devices(rig: RigOption = None) -> None:
 
 def _list_cameras(backend: Any = None) -> None:
     """Print the cameras that are plugged in; `backend`: of pyusb."""
-    from drivers.errors import DriverError
-    from drivers.usb import list_devices as list_usb
+    from emmc_rig.drivers.errors import DriverError
+    from emmc_rig.drivers.usb import list_devices as list_usb
 
     try:
         found = [
@@ -117,11 +117,11 @@ def probe(
     rig: RigOption = None,
 ) -> None:
     """Ask serial ports which stage answers; nothing moves."""
-    from drivers.ports import guess_of, list_serial_ports
     from emmc_rig.bench.hardware import probe_port, probe_simulated
+    from emmc_rig.drivers.ports import guess_of, list_serial_ports
 
     # Silence in all protocols but one is what a probe expects.
-    with _errors_only(logging.getLogger("drivers")):
+    with _errors_only(logging.getLogger("emmc_rig.drivers")):
         if rig is not None:
             protocol = simulated_protocol(rig)
             tell(f"simulated:{protocol}: {probe_simulated(protocol)}")
@@ -273,7 +273,7 @@ def jog(
     rig: RigOption = None,
 ) -> None:
     """Move an axis by a distance (-5: back), or to a position."""
-    from drivers.errors import NotHomedError
+    from emmc_rig.drivers.errors import NotHomedError
 
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
@@ -300,7 +300,7 @@ def jog(
 @app.command("udev-rule")
 def udev_rule() -> None:
     """Print the udev rule that lets users open the devices (Linux)."""
-    from drivers.ports import udev_rule_path
+    from emmc_rig.drivers.ports import udev_rule_path
 
     tell(udev_rule_path().read_text(encoding="utf-8").removesuffix("\n"))
 
@@ -325,7 +325,7 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
 
 
 def _show(stage: Stage) -> None:
-    from drivers.errors import NotHomedError
+    from emmc_rig.drivers.errors import NotHomedError
 
     rows, axes = [], {}
     for axis in stage.axes:

@@ -26,8 +26,8 @@ from emmc_rig.commands.output import say
 from emmc_rig.model.compiling import is_kept
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction import kernels
-from reconstruction.result import Progress
+from emmc_rig.reconstruction import kernels
+from emmc_rig.reconstruction.result import Progress
 
 SIZE = (32, 40)
 """Of the light field that is compiled for: no kernel depends on it."""
@@ -97,7 +97,7 @@ def helped_to_compile(method: str, camera: str, shots: int | None) -> Iterator[N
 def compile_for(part: str, camera: str, shots: int | None) -> None:
     """Reconstruct a small light field, or do that part of it: its kernels are compiled and kept."""
     import emmc_rig as emmc
-    from reconstruction.tv import few_steps
+    from emmc_rig.reconstruction.tv import few_steps
 
     described = emmc.camera(camera, shots)
     psi = described.psi(SIZE)
@@ -121,7 +121,7 @@ def compile_for(part: str, camera: str, shots: int | None) -> None:
 
 def _search(psi: ImagingMatrix, frames: NDArray[np.floating]) -> None:
     """Reconstruct as far as the first fit: search disparities, and start by total variation."""
-    from reconstruction.adaptive.method import reconstruct_adaptive
+    from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
 
     class FitError(Exception):
         """The first step of a fit is done."""
@@ -141,8 +141,8 @@ def _fit(
     picture: NDArray[np.floating],
 ) -> None:
     """Fit surfaces of this disparity (y, x), sweep a plane with them and draw their views."""
-    from reconstruction.adaptive.joint import TextureSettings, solve
-    from reconstruction.adaptive.sweep import plane_frames
+    from emmc_rig.reconstruction.adaptive.joint import TextureSettings, solve
+    from emmc_rig.reconstruction.adaptive.sweep import plane_frames
 
     precision = np.full(psi.frames_shape, NOISE**-2, dtype=np.float32)
     scene = solve(psi, disparity, 1, frames, precision, picture, TextureSettings())

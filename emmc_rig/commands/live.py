@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drivers.cameras import CAMERA_HELP
 from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import SIMULATED, RigOption, RigSceneOption, RigSizeOption
 from emmc_rig.commands.output import say, shown_progress, tell
+from emmc_rig.drivers.cameras import CAMERA_HELP
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
-    from calibration.scale import Scale
+    from emmc_rig.calibration.scale import Scale
     from emmc_rig.live.light_field import LiveLightField
     from emmc_rig.live.watch import Watch
     from emmc_rig.model.camera import Camera
@@ -131,9 +131,9 @@ def _watch(
     plan: Path | None,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
-    from drivers.errors import UsbNotFoundError
     from emmc_rig.acquisition.plan import load_plan
     from emmc_rig.bench.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
+    from emmc_rig.drivers.errors import UsbNotFoundError
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.live.save import Files
     from emmc_rig.live.watch import Watch
@@ -199,9 +199,9 @@ def _light_field(
     """Return what reconstructs while the camera watches; None without a Psi."""
     if psi is None:
         return None
-    from calibration.scale import designed_scale
+    from emmc_rig.calibration.scale import designed_scale
     from emmc_rig.live.light_field import LiveLightField
-    from reconstruction.methods import DEFAULT_METHOD, find_method
+    from emmc_rig.reconstruction.methods import DEFAULT_METHOD, find_method
 
     chosen = method or DEFAULT_METHOD
     if find_method(chosen).needs_dictionary:

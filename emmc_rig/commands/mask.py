@@ -44,7 +44,7 @@ def mask(
     ] = None,
 ) -> None:  # fmt: skip
     """Measure a mask's cells in a photograph of it."""
-    from calibration.mask_photo import read_mask
+    from emmc_rig.calibration.mask_photo import read_mask
     from emmc_rig.errors import WrongUsageError
     from emmc_rig.files.photograph import read_photograph
     from emmc_rig.files.results import parse_size

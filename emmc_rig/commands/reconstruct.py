@@ -97,7 +97,7 @@ def reconstruct(
     from emmc_rig.processing.captures import opened_capture
     from emmc_rig.processing.memory import parse_memory
     from emmc_rig.processing.reconstructing import load_settings, reconstruct_captures
-    from reconstruction.methods import DEFAULT_METHOD, find_method
+    from emmc_rig.reconstruction.methods import DEFAULT_METHOD, find_method
 
     if list_methods:
         _list_methods()
@@ -249,7 +249,7 @@ def _say_result(metrics: dict, out: Path) -> None:
 
 
 def _list_methods() -> None:
-    from reconstruction.methods import METHODS
+    from emmc_rig.reconstruction.methods import METHODS
 
     for known in METHODS.values():
         tell(f"{known.name}: {known.title}")

@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 import pytest
 
-from drivers.errors import CameraSettingError, DriverError
+from emmc_rig.drivers.errors import CameraSettingError, DriverError
 from emmc_rig.session.frame_file import NO_FIGURES, decode_frame, frame_entry, frame_file
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Frozen, Session

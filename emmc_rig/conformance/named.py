@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from drivers.camera import Camera
-from drivers.stage import Stage
+from emmc_rig.drivers.camera import Camera
+from emmc_rig.drivers.stage import Stage
 
 pytest.register_assert_rewrite("emmc_rig.conformance.cameras", "emmc_rig.conformance.stages")
 

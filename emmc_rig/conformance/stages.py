@@ -8,7 +8,7 @@ import math
 
 import pytest
 
-from drivers.errors import (
+from emmc_rig.drivers.errors import (
     LimitExceededError,
     NotHomedError,
     SpeedFixedError,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from reconstruction.dictionary import (
+from emmc_rig.reconstruction.dictionary import (
     Dictionary,
     dct_dictionary,
     lambertian_dictionary,

@@ -32,8 +32,8 @@ from emmc_rig.model.errors import SceneError, nearest_of
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ANGLES
+from emmc_rig.simulators.scenes import SCENES
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION, Listing, is_session
-from simulators.scenes import SCENES
 
 FRAMES = "frames"
 

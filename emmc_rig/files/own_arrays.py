@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import RawFrameError
-from drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.raw import RAW_SUFFIXES, RawFrame, decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.files.shards import is_zarr, read_array
 from emmc_rig.model.decoding.regular import file_bytes

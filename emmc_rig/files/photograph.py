@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import RawFrameError
-from drivers.raw import RAW_SUFFIXES, decode_raw
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.raw import RAW_SUFFIXES, decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.model.decoding.pictures import orientation_in, upright
 from emmc_rig.model.decoding.regular import file_bytes

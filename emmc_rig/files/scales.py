@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from calibration.frames import MeanFrame, SensorGain
-from calibration.scale import MANY, Scale, designed_scale
+from emmc_rig.calibration.frames import MeanFrame, SensorGain
+from emmc_rig.calibration.scale import MANY, Scale, designed_scale
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import PSI
 from emmc_rig.model.json_text import parse_json

@@ -27,8 +27,8 @@ from emmc_rig.model.lightfield import (
 )
 from emmc_rig.model.view_axes import ANGLES, shows_parallax
 from emmc_rig.model.view_order import ViewOrder, order_of
-from simulators.raycaster import World
-from simulators.scenes import SCENES, render, rendered_disparity_px
+from emmc_rig.simulators.raycaster import World
+from emmc_rig.simulators.scenes import SCENES, render, rendered_disparity_px
 
 APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
 """How much finer the simulated rig sees a scene than it is reconstructed, along each axis."""

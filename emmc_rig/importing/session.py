@@ -19,12 +19,12 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from drivers.camera import EXPOSURE_AGREEMENT
-from drivers.capture_order import capture_order
-from drivers.raw import RawFrame, captured_at
 from emmc_rig.acquisition.expand import fittings, mask_offsets_um
 from emmc_rig.acquisition.plan import Checks, Plan, planned_camera
 from emmc_rig.bench.rig_config import IMPORTED
+from emmc_rig.drivers.camera import EXPOSURE_AGREEMENT
+from emmc_rig.drivers.capture_order import capture_order
+from emmc_rig.drivers.raw import RawFrame, captured_at
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.own_arrays import OwnFrames, read_own

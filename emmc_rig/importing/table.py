@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from drivers.capture_order import natural
+from emmc_rig.drivers.capture_order import natural
 from emmc_rig.errors import AppError
 from emmc_rig.model.decoding.regular import check_regular, file_bytes
 from emmc_rig.model.errors import did_you_mean

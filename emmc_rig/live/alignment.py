@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.boards import Board, channels_of
-from calibration.errors import CalibrationError
-from calibration.locator import Location, frame_board, locate, refine, starting_placement
-from calibration.openings import views_open
-from calibration.placement import Placement
-from calibration.shadow import shadow_mask
-from drivers.raw import RawFrame
+from emmc_rig.calibration.boards import Board, channels_of
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.locator import Location, frame_board, locate, refine, starting_placement
+from emmc_rig.calibration.openings import views_open
+from emmc_rig.calibration.placement import Placement
+from emmc_rig.calibration.shadow import shadow_mask
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.session.brightness import is_dark
 

@@ -12,8 +12,8 @@ from contextlib import suppress
 from queue import Empty, Queue
 from typing import Any
 
-from drivers.errors import DriverError, NotHomedError
-from drivers.stage import Stage
+from emmc_rig.drivers.errors import DriverError, NotHomedError
+from emmc_rig.drivers.stage import Stage
 from emmc_rig.errors import AppError
 
 POLL_S = 0.1

@@ -24,9 +24,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import CalibrationError
-from calibration.scale import Scale, exposure_of
-from drivers.raw import RawFrame
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.scale import Scale, exposure_of
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.formats.format import Export
 from emmc_rig.files.scales import open_scale
@@ -37,18 +37,18 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.pages.display import PART_PIXELS
 from emmc_rig.pages.viewer import viewer_data
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD, find_method
+from emmc_rig.reconstruction.preview import Preview
+from emmc_rig.reconstruction.result import Progress, Reconstruction
+from emmc_rig.reconstruction.verdict.kept import missed_readings
+from emmc_rig.reconstruction.verdict.rules import Verdict
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.session.brightness import is_dark
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import is_session
-from reconstruction.adaptive.film import Film
-from reconstruction.errors import ReconstructionError
-from reconstruction.methods import DEFAULT_METHOD, find_method
-from reconstruction.preview import Preview
-from reconstruction.result import Progress, Reconstruction
-from reconstruction.verdict.kept import missed_readings
-from reconstruction.verdict.rules import Verdict
-from reconstruction.verdict.run import reconstruct_judged
 
 Array = NDArray[np.floating]
 FACTOR = 4

@@ -15,7 +15,7 @@ from numba import prange
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.raw import RawFrame
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.settings import Settings

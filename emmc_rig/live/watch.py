@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from calibration.errors import CalibrationError
-from drivers.camera import Camera
-from drivers.errors import DriverError, ExposureStoppedError
-from drivers.raw import RawFrame
-from drivers.stage import Stage
 from emmc_rig.acquisition.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.bench.registration import LEAST_LIKENESS, registered
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.drivers.camera import Camera
+from emmc_rig.drivers.errors import DriverError, ExposureStoppedError
+from emmc_rig.drivers.raw import RawFrame
+from emmc_rig.drivers.stage import Stage
 from emmc_rig.errors import AppError
 from emmc_rig.live.alignment import MaskGauge
 from emmc_rig.live.driving import Driving

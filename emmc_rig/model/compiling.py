@@ -36,7 +36,6 @@ from numba.core import config
 from numba.core.registry import CPUDispatcher
 
 _PROJECT = Path(__file__).parents[2]
-_PACKAGES = ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators")
 _IMPORT = re.compile(r"^from +([\w.]+) +import +(\([^)]*\)|.*)|^import +([\w.]+)", re.MULTILINE)
 _UNUSED_DAYS = 30
 """Machine code that no process has loaded for so long is removed: its sources have changed."""
@@ -266,7 +265,7 @@ def _read(source: Path, root: Path) -> tuple[bytes, frozenset[Path]]:
         level = len(module) - len(module.lstrip("."))
         if level:
             bases = [source.parents[level - 1]]
-        elif parts[0] in _PACKAGES:
+        elif parts[0] == "emmc_rig":
             bases = [_PROJECT]
         else:
             bases = [root] if (root / parts[0]) in source.parents else []

@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from calibration.choice import HeldOut
-from calibration.routes import Outcome
-from calibration.sensor import SensorSheet
+from emmc_rig.calibration.choice import HeldOut
+from emmc_rig.calibration.routes import Outcome
+from emmc_rig.calibration.sensor import SensorSheet
 from emmc_rig.model.files import write_text
 from emmc_rig.pages.display import finite, round_up
 from emmc_rig.pages.drawing import ACCENT, INK, drawn_map, sheet, svg_of, titled

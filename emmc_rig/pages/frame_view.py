@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw import RawFrame
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.model.srgb import codes_of, srgb_of
 from emmc_rig.session.brightness import BRIGHT_PERCENTILE
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from calibration.mask_photo import MaskReading
+from emmc_rig.calibration.mask_photo import MaskReading
 from emmc_rig.files.results import metrics_text, provenance
 from emmc_rig.model.srgb import codes_of, srgb_of
 from emmc_rig.pages.drawing import ACCENT, COLOURS, FAINT, save_publication, sheet, titled

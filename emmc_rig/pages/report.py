@@ -27,7 +27,7 @@ from emmc_rig.pages.display import (
 )
 from emmc_rig.pages.page import Card, estimated, framed, light_field_head
 from emmc_rig.pages.viewer import poster, viewer_data
-from reconstruction.verdict.rules import NOISE, UNEXPLAINED
+from emmc_rig.reconstruction.verdict.rules import NOISE, UNEXPLAINED
 
 Array = NDArray[np.floating]
 EXPLAINED = 1 - UNEXPLAINED.doubt

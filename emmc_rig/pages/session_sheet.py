@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 
-from drivers.errors import DriverError
-from drivers.raw import RawFrame
+from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import shown_bytes, write_metrics
 from emmc_rig.model.files import write_text

@@ -8,17 +8,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from calibration.errors import CalibrationError
-from calibration.openings import parts
-from calibration.planning import (
+from emmc_rig.acquisition.expand import mask_offsets_um
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.openings import parts
+from emmc_rig.calibration.planning import (
     FEW_MODEL_ERROR,
     Kind,
     Light,
     plan_combined,
     plan_parametric,
 )
-from calibration.shadow import ShadowMask, shadow_mask
-from emmc_rig.acquisition.expand import mask_offsets_um
+from emmc_rig.calibration.shadow import ShadowMask, shadow_mask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 from emmc_rig.processing.board_plan import (

@@ -36,11 +36,10 @@ from emmc_rig.processing.jobs import Store, digest_of, run_job, settled
 from emmc_rig.processing.memory import peak_memory_mib, task_bytes
 from emmc_rig.processing.pool import Pool
 from emmc_rig.progress import Watcher
-from emmc_rig.version import __version__
-from reconstruction.dictionary import Dictionary
-from reconstruction.methods import MethodSettings, find_method
-from reconstruction.result import Reconstruction, Status, stated_figures
-from reconstruction.tiles import (
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.methods import MethodSettings, find_method
+from emmc_rig.reconstruction.result import Reconstruction, Status, stated_figures
+from emmc_rig.reconstruction.tiles import (
     AXES,
     ArrayType,
     Block,
@@ -58,8 +57,9 @@ from reconstruction.tiles import (
     whole_shapes,
     within,
 )
-from reconstruction.verdict.evidence import Evidence
-from reconstruction.verdict.rules import Verdict, verdict_from
+from emmc_rig.reconstruction.verdict.evidence import Evidence
+from emmc_rig.reconstruction.verdict.rules import Verdict, verdict_from
+from emmc_rig.version import __version__
 
 FRAMES, ABOUT = "frames.h5", "about"
 REMEDY = "the same command computes it again"

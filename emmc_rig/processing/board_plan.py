@@ -10,9 +10,18 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from calibration.openings import parts
-from calibration.placement import Placement, designed_placement
-from calibration.planning import (
+from emmc_rig.acquisition.expand import expand
+from emmc_rig.acquisition.plan import (
+    METERING_EXPOSURE_S,
+    Boards,
+    Darks,
+    OpenBoard,
+    Plan,
+    PlannedShot,
+)
+from emmc_rig.calibration.openings import parts
+from emmc_rig.calibration.placement import Placement, designed_placement
+from emmc_rig.calibration.planning import (
     FEW_MODEL_ERROR,
     MODEL_ERROR,
     MOST_FRAMES,
@@ -23,16 +32,7 @@ from calibration.planning import (
     plan_combined,
     plan_parametric,
 )
-from calibration.shadow import ShadowMask, shadow_mask
-from emmc_rig.acquisition.expand import expand
-from emmc_rig.acquisition.plan import (
-    METERING_EXPOSURE_S,
-    Boards,
-    Darks,
-    OpenBoard,
-    Plan,
-    PlannedShot,
-)
+from emmc_rig.calibration.shadow import ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera

@@ -14,7 +14,7 @@ import numpy as np
 from emmc_rig.files.results import parse_seconds
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.methods import METHODS, reconstruct
+from emmc_rig.reconstruction.methods import METHODS, reconstruct
 
 FACTORS = {name: method.factor for name, method in METHODS.items() if method.factor is not None}
 TIMED = next(name for name, factor in FACTORS.items() if factor == 1)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from calibration.boards import BoardFrame, BoardSet
-from calibration.frames import MeanFrame, average
-from calibration.scale import Scale
+from emmc_rig.calibration.boards import BoardFrame, BoardSet
+from emmc_rig.calibration.frames import MeanFrame, average
+from emmc_rig.calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.model.arguments import numbers_of, refusal, required
 from emmc_rig.model.blas import one_blas_thread

@@ -14,7 +14,7 @@ from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import is_session
 
 if TYPE_CHECKING:
-    from reconstruction.verdict.rules import Reason
+    from emmc_rig.reconstruction.verdict.rules import Reason
 
 
 class Capture(Protocol):

@@ -61,6 +61,16 @@ from emmc_rig.processing.reconstructing import (
 from emmc_rig.processing.result import Result
 from emmc_rig.processing.session_capture import SessionCapture
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.methods import (
+    DEFAULT_METHOD,
+    MethodSettings,
+    film_methods,
+    find_method,
+)
+from emmc_rig.reconstruction.verdict.rules import LEVELS
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
 from emmc_rig.session.readings import FilmPlace, film_frames, film_places
@@ -70,11 +80,6 @@ from emmc_rig.store.folders import (
     result_folder,
 )
 from emmc_rig.version import __version__
-from reconstruction.adaptive.film import Film
-from reconstruction.errors import ReconstructionError
-from reconstruction.methods import DEFAULT_METHOD, MethodSettings, film_methods, find_method
-from reconstruction.verdict.rules import LEVELS
-from reconstruction.verdict.run import reconstruct_judged
 
 ABOUT = "plain"
 DONE = "[0-9]*"

@@ -18,8 +18,8 @@ import numpy as np
 
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.files.psi import StoredPsi
-from reconstruction.methods import MethodSettings
-from reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
 
 UNITS = {"K": 10**3, "M": 10**6, "G": 10**9, "KI": 2**10, "MI": 2**20, "GI": 2**30}
 BASE_BYTES = 512 * 2**20

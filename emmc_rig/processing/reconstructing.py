@@ -43,17 +43,17 @@ from emmc_rig.processing.memory import (
 from emmc_rig.processing.pool import Pool, opened_pool
 from emmc_rig.processing.result import Result, compared, figures, open_result
 from emmc_rig.progress import Notes, Watcher
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.inputs import check_frames
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
+from emmc_rig.reconstruction.result import Progress
+from emmc_rig.reconstruction.tiles import reconstruct_in_blocks
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.store.folders import (
     KEPT,
     kept_folder,
     result_folder,
 )
-from reconstruction.dictionary import Dictionary
-from reconstruction.inputs import check_frames
-from reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
-from reconstruction.result import Progress
-from reconstruction.tiles import reconstruct_in_blocks
-from reconstruction.verdict.run import reconstruct_judged
 
 OnStep = Callable[[Progress], None]
 PSI_TAKES = (

@@ -34,10 +34,10 @@ from emmc_rig.model.lightfield import psnr_db, replicate_centre, ssim
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from emmc_rig.model.view_axes import ViewAxes, grid_name
+from emmc_rig.reconstruction.result import Reconstruction, Status
+from emmc_rig.reconstruction.verdict.kept import missed_readings
+from emmc_rig.reconstruction.verdict.rules import Verdict
 from emmc_rig.store.folders import result_folder
-from reconstruction.result import Reconstruction, Status
-from reconstruction.verdict.kept import missed_readings
-from reconstruction.verdict.rules import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,11 +13,11 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.placement import SCALARS, labels
-from calibration.routes import Outcome
-from calibration.scale import Scale
-from calibration.sensor import SensorSheet, characterise
-from calibration.whiteboard import Calibration, NewArray, in_memory
+from emmc_rig.calibration.placement import SCALARS, labels
+from emmc_rig.calibration.routes import Outcome
+from emmc_rig.calibration.scale import Scale
+from emmc_rig.calibration.sensor import SensorSheet, characterise
+from emmc_rig.calibration.whiteboard import Calibration, NewArray, in_memory
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import PSI
 from emmc_rig.files.result_files import read_metrics
@@ -30,6 +30,7 @@ from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.inputs import check_frames
 from emmc_rig.session.board_sets import sensor_pairs
 from emmc_rig.session.frame_means import camera_of, taken_shots
 from emmc_rig.session.measured_psi import (
@@ -44,7 +45,6 @@ from emmc_rig.session.measured_psi import (
 from emmc_rig.session.session import CALIBRATION, Session
 from emmc_rig.store.folders import result_folder
 from emmc_rig.store.products import record_product
-from reconstruction.inputs import check_frames
 
 SENSOR = "sensor.json"
 METHODS = {

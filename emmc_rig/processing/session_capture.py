@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibration.scale import Scale
+from emmc_rig.calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import PSI, StoredPsi
 from emmc_rig.files.scales import CALIBRATION_FILE, open_scale
@@ -14,13 +14,13 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.session_calibration import calibrated_scale
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.verdict.rules import Reason
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_means import frame_shape, session_darks, taken_shots
 from emmc_rig.session.measured_psi import psi_is_assumed
 from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import CALIBRATION, Session
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION
-from reconstruction.verdict.rules import Reason
 
 
 @dataclass(frozen=True)

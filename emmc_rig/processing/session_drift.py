@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import Board
-from calibration.colours import mixing
-from calibration.defects import mask_with_losses
-from calibration.drift import Drift, DriftSettings, find_drift
-from calibration.fit import fit_placement
-from calibration.parametric import SAMPLED, Stages, psi_at, shot_stages
-from calibration.placement import SCALARS, Placement, with_aperture_mean_one
-from calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
+from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.colours import mixing
+from emmc_rig.calibration.defects import mask_with_losses
+from emmc_rig.calibration.drift import Drift, DriftSettings, find_drift
+from emmc_rig.calibration.fit import fit_placement
+from emmc_rig.calibration.parametric import SAMPLED, Stages, psi_at, shot_stages
+from emmc_rig.calibration.placement import SCALARS, Placement, with_aperture_mean_one
+from emmc_rig.calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import FRAMES, PSI, read_frames
 from emmc_rig.files.results import write_metrics

@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import BoardFrame, BoardSet
-from calibration.levels import Check, check_of
-from calibration.sensor import Pair
+from emmc_rig.calibration.boards import BoardFrame, BoardSet
+from emmc_rig.calibration.levels import Check, check_of
+from emmc_rig.calibration.sensor import Pair
 from emmc_rig.errors import AppError
 from emmc_rig.session.frame_means import (
     alike_frames,

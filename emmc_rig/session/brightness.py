@@ -11,8 +11,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera import Limits
-from drivers.raw import RawFrame
+from emmc_rig.drivers.camera import Limits
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.session.journal import Figures
 
 SAMPLED_PIXELS = 1 << 16

@@ -25,9 +25,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from drivers.camera import CameraIdentity
-from drivers.dng import Facts
-from drivers.raw import captured_at
+from emmc_rig.drivers.camera import CameraIdentity
+from emmc_rig.drivers.dng import Facts
+from emmc_rig.drivers.raw import captured_at
 from emmc_rig.errors import AppError
 from emmc_rig.progress import Watcher
 from emmc_rig.session.frame_file import dng_of

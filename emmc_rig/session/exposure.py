@@ -7,7 +7,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from calibration.frames import DARK_ELECTRONS_PER_S, dark_current_known
+from emmc_rig.calibration.frames import DARK_ELECTRONS_PER_S, dark_current_known
+from emmc_rig.reconstruction.verdict.rules import Reason
 from emmc_rig.session.brightness import (
     GOOD_LEVELS,
     OVEREXPOSED,
@@ -16,7 +17,6 @@ from emmc_rig.session.brightness import (
 )
 from emmc_rig.session.journal import FrameEntry
 from emmc_rig.session.session import Session
-from reconstruction.verdict.rules import Reason
 
 DARK_SHARE = 0.005
 """Of the brightest reading: twice what a good calibration is off by."""

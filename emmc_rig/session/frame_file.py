@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.camera import CameraIdentity
-from drivers.cameras import CAMERAS
-from drivers.dng import LARGEST_TILE, Facts, encode_dng, private_data
-from drivers.errors import DriverError, RawFrameError
-from drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
+from emmc_rig.drivers.camera import CameraIdentity
+from emmc_rig.drivers.cameras import CAMERAS
+from emmc_rig.drivers.dng import LARGEST_TILE, Facts, encode_dng, private_data
+from emmc_rig.drivers.errors import DriverError, RawFrameError
+from emmc_rig.drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Figures, FrameEntry
 

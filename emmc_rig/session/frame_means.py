@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.frames import MeanFrame, average, before_and_after
-from drivers.raw import RawFrame
+from emmc_rig.calibration.frames import MeanFrame, average, before_and_after
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import validated

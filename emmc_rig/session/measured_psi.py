@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from calibration.boards import BoardSet, channels_of
-from calibration.frames import MeanFrame
-from calibration.routes import Outcome, calibrate
-from calibration.scale import Scale, designed_scale
-from calibration.whiteboard import Calibration, NewArray, in_memory, measure_psi
+from emmc_rig.calibration.boards import BoardSet, channels_of
+from emmc_rig.calibration.frames import MeanFrame
+from emmc_rig.calibration.routes import Outcome, calibrate
+from emmc_rig.calibration.scale import Scale, designed_scale
+from emmc_rig.calibration.whiteboard import Calibration, NewArray, in_memory, measure_psi
 from emmc_rig.errors import AppError
 from emmc_rig.files.psi import PSI
 from emmc_rig.files.scales import open_scale

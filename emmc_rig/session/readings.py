@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.scale import Scale
+from emmc_rig.calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix

@@ -40,7 +40,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from calibration.frames import MeanFrame
+from emmc_rig.calibration.frames import MeanFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of

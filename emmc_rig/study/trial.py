@@ -24,13 +24,13 @@ from emmc_rig.model.errors import CameraError
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
+from emmc_rig.reconstruction.result import Reconstruction
+from emmc_rig.simulators.raycaster import World
+from emmc_rig.simulators.scenes import SCENES
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.rows import dictionary_identity, machine
-from reconstruction.dictionary import Dictionary
-from reconstruction.methods import METHODS, MethodSettings, reconstruct
-from reconstruction.result import Reconstruction
-from simulators.raycaster import World
-from simulators.scenes import SCENES
 
 Array = NDArray[np.floating]
 open_dictionary_once = lru_cache(maxsize=4)(open_dictionary)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands, summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.lanes import (
+from emmc_rig.reconstruction.adaptive.lanes import (
     LANES,
     TAPS,
     add_box,

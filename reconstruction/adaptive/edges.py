@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.settings import SIDES, Side
+from emmc_rig.reconstruction.adaptive.settings import SIDES, Side
 
 Array = NDArray[np.floating]
 WIDEST = 5

@@ -27,9 +27,9 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence_kernels import SIZE, Hypotheses, evidence
-from reconstruction.adaptive.register_tiles import LANES, SIDE
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.adaptive.evidence_kernels import SIZE, Hypotheses, evidence
+from emmc_rig.reconstruction.adaptive.register_tiles import LANES, SIDE
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 PROBES = 4

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from emmc_rig.model.compiling import njit
-from reconstruction.adaptive.register_tiles import (
+from emmc_rig.reconstruction.adaptive.register_tiles import (
     LANES,
     SIDE,
     combined,

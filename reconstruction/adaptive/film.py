@@ -30,22 +30,22 @@ from emmc_rig.model.frames import even_frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
-from reconstruction.adaptive import mixture, search
-from reconstruction.adaptive.fits import Fits
-from reconstruction.adaptive.flow import at_places, flow_between, sampled
-from reconstruction.adaptive.joint import (
+from emmc_rig.reconstruction.adaptive import mixture, search
+from emmc_rig.reconstruction.adaptive.fits import Fits
+from emmc_rig.reconstruction.adaptive.flow import at_places, flow_between, sampled
+from emmc_rig.reconstruction.adaptive.joint import (
     FittedScene,
     TextureSettings,
     margin_of,
     solve,
     surfaces_of,
 )
-from reconstruction.adaptive.parts import from_arrays, to_arrays
-from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Plain, checked, plain_of, unseen_by
-from reconstruction.adaptive.sweep import STRIDE, mean_around, swept
-from reconstruction.adaptive.times import (
+from emmc_rig.reconstruction.adaptive.parts import from_arrays, to_arrays
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.survey import Plain, checked, plain_of, unseen_by
+from emmc_rig.reconstruction.adaptive.sweep import STRIDE, mean_around, swept
+from emmc_rig.reconstruction.adaptive.times import (
     HELD_WINDOW_PX,
     WINDOW_PX,
     OtherTime,
@@ -53,8 +53,8 @@ from reconstruction.adaptive.times import (
     padded,
     rested,
 )
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import Readings
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 

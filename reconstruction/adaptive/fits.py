@@ -10,16 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_views
-from reconstruction.adaptive import mixture, search
-from reconstruction.adaptive.joint import FittedScene, solve
-from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import Seen
-from reconstruction.adaptive.second import surfaces_fail
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Plain, Survey
-from reconstruction.adaptive.sweep import swept
-from reconstruction.adaptive.times import OtherTime
-from reconstruction.adaptive.uncertainty import blur_views, features, stated, variance_of_mean
+from emmc_rig.reconstruction.adaptive import mixture, search
+from emmc_rig.reconstruction.adaptive.joint import FittedScene, solve
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.refine import Seen
+from emmc_rig.reconstruction.adaptive.second import surfaces_fail
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.survey import Plain, Survey
+from emmc_rig.reconstruction.adaptive.sweep import swept
+from emmc_rig.reconstruction.adaptive.times import OtherTime
+from emmc_rig.reconstruction.adaptive.uncertainty import (
+    blur_views,
+    features,
+    stated,
+    variance_of_mean,
+)
 
 Array = NDArray[np.floating]
 Patches = Callable[[NDArray[np.bool_]], Array]

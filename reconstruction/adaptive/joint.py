@@ -17,10 +17,10 @@ from pydantic import Field
 
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
-from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import Seen, fitted, refined
-from reconstruction.adaptive.shrinkage import denoised
-from reconstruction.adaptive.visibility import carried
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.refine import Seen, fitted, refined
+from emmc_rig.reconstruction.adaptive.shrinkage import denoised
+from emmc_rig.reconstruction.adaptive.visibility import carried
 
 Array = NDArray[np.floating]
 

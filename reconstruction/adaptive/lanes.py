@@ -12,7 +12,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 
-from reconstruction.adaptive.vectors import FLOAT, LANE, Code, function, intrinsic
+from emmc_rig.reconstruction.adaptive.vectors import FLOAT, LANE, Code, function, intrinsic
 
 LANES = 8
 """Cells of a vector: the rows of a box are padded to whole vectors."""

@@ -30,24 +30,24 @@ from numpy.typing import NDArray
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive import search
-from reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
-from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.film import Film, followed
-from reconstruction.adaptive.fits import Fits, Patches, averaged, fitted_models
-from reconstruction.adaptive.second import searched_again
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import (
+from emmc_rig.reconstruction.adaptive import search
+from emmc_rig.reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
+from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
+from emmc_rig.reconstruction.adaptive.film import Film, followed
+from emmc_rig.reconstruction.adaptive.fits import Fits, Patches, averaged, fitted_models
+from emmc_rig.reconstruction.adaptive.second import searched_again
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.survey import (
     Plain,
     checked,
     checked_disparity,
     plain_of,
     surveyed,
 )
-from reconstruction.adaptive.times import OtherTime, moved, of_present, surveyed_together
-from reconstruction.adaptive.uncertainty import within_db
-from reconstruction.inputs import Readings
-from reconstruction.result import WITHIN, Progress, Reconstruction, Status
+from emmc_rig.reconstruction.adaptive.times import OtherTime, moved, of_present, surveyed_together
+from emmc_rig.reconstruction.adaptive.uncertainty import within_db
+from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 TEXTURED = 0.01

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.assembly import Layout, laid_out
-from reconstruction.adaptive.lanes import TAPS, read_taps
+from emmc_rig.reconstruction.adaptive.assembly import Layout, laid_out
+from emmc_rig.reconstruction.adaptive.lanes import TAPS, read_taps
 
 Array = NDArray[np.floating]
 

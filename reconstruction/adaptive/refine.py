@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
-from reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
 
 Array = NDArray[np.floating]
 EVEN_PX = 0.02

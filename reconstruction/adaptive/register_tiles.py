@@ -18,7 +18,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import models, register_model
 
-from reconstruction.adaptive.vectors import FLOAT, Code, function, intrinsic
+from emmc_rig.reconstruction.adaptive.vectors import FLOAT, Code, function, intrinsic
 
 LANES = 16
 """Problems side by side: a vector register of AVX-512; other processors take several for it."""

@@ -28,13 +28,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence import (
+from emmc_rig.reconstruction.adaptive.evidence import (
     EvidencePatches,
     PatchEvidence,
     TexturePrior,
     patch_evidence,
 )
-from reconstruction.inputs import Readings
+from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 COARSE_STEP_PX = 0.5

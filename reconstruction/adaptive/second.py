@@ -20,9 +20,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.adaptive import mixture, search
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import Survey
+from emmc_rig.reconstruction.adaptive import mixture, search
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.survey import Survey
 
 LOOSER = 4.0
 """Misfit of the second search over that of the first. Twice, alone, two crops of dice (64x80, three

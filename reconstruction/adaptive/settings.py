@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, get_args
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from reconstruction.adaptive.joint import TextureSettings
+from emmc_rig.reconstruction.adaptive.joint import TextureSettings
 
 Length = Annotated[float, Field(gt=0)]
 Side = Literal["top", "bottom", "left", "right"]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import summed_in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.lightfield import OPPONENT
-from reconstruction.adaptive.stacks import (
+from emmc_rig.reconstruction.adaptive.stacks import (
     CELL,
     SIDE,
     STACK,

@@ -14,7 +14,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 
-from reconstruction.adaptive.vectors import FLOAT, LANE, Code, function, intrinsic
+from emmc_rig.reconstruction.adaptive.vectors import FLOAT, LANE, Code, function, intrinsic
 
 SIDE = 8
 CELL = SIDE // 2

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive import search
-from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.adaptive.mixture import stored
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.uncertainty import held_out
-from reconstruction.choices import choose_mu, contrast, smooth_guess
-from reconstruction.colour import unseen_colour
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import Readings
-from reconstruction.tv import few_steps
+from emmc_rig.reconstruction.adaptive import search
+from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
+from emmc_rig.reconstruction.adaptive.mixture import stored
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.uncertainty import held_out
+from emmc_rig.reconstruction.choices import choose_mu, contrast, smooth_guess
+from emmc_rig.reconstruction.colour import unseen_colour
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.tv import few_steps
 
 Array = NDArray[np.floating]
 COARSE_PX = 8.0, 2.0

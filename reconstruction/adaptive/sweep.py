@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.lanes import CUBIC, TAPS
-from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.search import (
+from emmc_rig.reconstruction.adaptive.lanes import CUBIC, TAPS
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.search import (
     Volume,
     compatibility,
     interpolated,
     places,
     posteriors,
 )
-from reconstruction.inputs import Readings
+from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 FREEDOM = 3.0

@@ -15,21 +15,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.adaptive import mixture
-from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
-from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import Seen
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import (
+from emmc_rig.reconstruction.adaptive import mixture
+from emmc_rig.reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.refine import Seen
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.survey import (
     Plain,
     Survey,
     plain_of,
     surveyed,
     unseen_by,
 )
-from reconstruction.adaptive.sweep import mean_around
-from reconstruction.adaptive.visibility import carried
-from reconstruction.inputs import Readings
+from emmc_rig.reconstruction.adaptive.sweep import mean_around
+from emmc_rig.reconstruction.adaptive.visibility import carried
+from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0

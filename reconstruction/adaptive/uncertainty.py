@@ -39,9 +39,9 @@ from scipy.optimize import minimize
 
 from emmc_rig.model.bands import in_views
 from emmc_rig.model.lightfield import sum_of_squares
-from reconstruction.adaptive.joint import FittedScene
-from reconstruction.adaptive.refine import slopes
-from reconstruction.result import SCALE, TAILS
+from emmc_rig.reconstruction.adaptive.joint import FittedScene
+from emmc_rig.reconstruction.adaptive.refine import slopes
+from emmc_rig.reconstruction.result import SCALE, TAILS
 
 Array = NDArray[np.floating]
 HELD_SHARE, MOST_SHARE = 0.02, 0.06

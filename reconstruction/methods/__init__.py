@@ -20,15 +20,15 @@ from emmc_rig.model.compiling import compiling_s, running_s
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.film import Film
-from reconstruction.dictionary import Dictionary
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import checked_inputs
-from reconstruction.method import Given, Method
-from reconstruction.result import Progress, Reconstruction
-from reconstruction.screening import screened
-from reconstruction.settings import ShippedSettings
-from reconstruction.sparse import PatchEstimates
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.method import Given, Method
+from emmc_rig.reconstruction.result import Progress, Reconstruction
+from emmc_rig.reconstruction.screening import screened
+from emmc_rig.reconstruction.settings import ShippedSettings
+from emmc_rig.reconstruction.sparse import PatchEstimates
 
 DEFAULT_METHOD = "adaptive"
 ENTRY_POINTS = "emmc_rig.methods"

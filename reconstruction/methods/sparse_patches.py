@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from functools import partial
 
-from reconstruction.method import Given, Method, cost_words
-from reconstruction.result import Reconstruction
-from reconstruction.settings import ShippedSettings
-from reconstruction.sparse import SparseSettings, reconstruct_sparse
+from emmc_rig.reconstruction.method import Given, Method, cost_words
+from emmc_rig.reconstruction.result import Reconstruction
+from emmc_rig.reconstruction.settings import ShippedSettings
+from emmc_rig.reconstruction.sparse import SparseSettings, reconstruct_sparse
 
 
 def _solve(solver: str, given: Given, settings: ShippedSettings) -> Reconstruction:

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.method import (
+from emmc_rig.reconstruction.adaptive.method import (
     reconstruct_adaptive,
     reconstruct_moving,
     reconstruct_next,
 )
-from reconstruction.adaptive.settings import AdaptiveSettings, fast
-from reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
-from reconstruction.method import Given, Method, Sensitivity, cost_words
-from reconstruction.methods.variational import solve_tv_dict
-from reconstruction.result import Reconstruction
-from reconstruction.settings import ShippedSettings
-from reconstruction.sparse import SparseSettings
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
+from emmc_rig.reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
+from emmc_rig.reconstruction.method import Given, Method, Sensitivity, cost_words
+from emmc_rig.reconstruction.methods.variational import solve_tv_dict
+from emmc_rig.reconstruction.result import Reconstruction
+from emmc_rig.reconstruction.settings import ShippedSettings
+from emmc_rig.reconstruction.sparse import SparseSettings
 
 PATCH_RTOL, PATCH_STEPS = 1e-2, 100
 """Of the patches beside surfaces. On 64x80 middles with three shots those of `tv-dict` itself cost

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.choices import choose_mu
-from reconstruction.inputs import checked_inputs
-from reconstruction.method import Given, Method, Sensitivity, cost_words
-from reconstruction.problem import PatchTerm
-from reconstruction.result import Reconstruction
-from reconstruction.settings import ShippedSettings
-from reconstruction.sparse import SparseSettings, estimate_patches
-from reconstruction.tv import TVSettings, reconstruct_tv
+from emmc_rig.reconstruction.choices import choose_mu
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.method import Given, Method, Sensitivity, cost_words
+from emmc_rig.reconstruction.problem import PatchTerm
+from emmc_rig.reconstruction.result import Reconstruction
+from emmc_rig.reconstruction.settings import ShippedSettings
+from emmc_rig.reconstruction.sparse import SparseSettings, estimate_patches
+from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
 PATCHED_MU, PATCHED_RHO = 3.0, 18.0

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from reconstruction.verdict.evidence import Evidence
-from reconstruction.verdict.rules import LEVELS, Limits, Reason, Verdict, verdict_from
+from emmc_rig.reconstruction.verdict.evidence import Evidence
+from emmc_rig.reconstruction.verdict.rules import LEVELS, Limits, Reason, Verdict, verdict_from
 
 Combine = Callable[[Sequence[float], Sequence[float]], float]
 DOUBTED_SHARE = Limits(0.25, 1.0)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.camera import Camera, camera_of, draw_plates, seen_of_white
 from emmc_rig.model.errors import ModelError, SensingError
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.verdict.shadow import (
+from emmc_rig.reconstruction.verdict.shadow import (
     LEAST_RELIEF,
     SMOOTH_PX,
     Relief,

@@ -14,14 +14,14 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import centre_view, sum_of_squares
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
-from reconstruction.colour import unseen_colour
-from reconstruction.result import SCALE, Reconstruction
-from reconstruction.verdict.compression import blockiness, quantised
-from reconstruction.verdict.displaced import displaced
-from reconstruction.verdict.kept import compare_held_out, over_baselines
-from reconstruction.verdict.pixels import pixel_figures
-from reconstruction.verdict.shadow import Relief, relief, shadow
-from reconstruction.verdict.shots import Motion, compared
+from emmc_rig.reconstruction.colour import unseen_colour
+from emmc_rig.reconstruction.result import SCALE, Reconstruction
+from emmc_rig.reconstruction.verdict.compression import blockiness, quantised
+from emmc_rig.reconstruction.verdict.displaced import displaced
+from emmc_rig.reconstruction.verdict.kept import compare_held_out, over_baselines
+from emmc_rig.reconstruction.verdict.pixels import pixel_figures
+from emmc_rig.reconstruction.verdict.shadow import Relief, relief, shadow
+from emmc_rig.reconstruction.verdict.shots import Motion, compared
 
 Array = NDArray[np.floating]
 CLIPPED = 0.5

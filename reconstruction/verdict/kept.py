@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.choices import choose_mu
-from reconstruction.tv import few_steps
-from reconstruction.verdict.pixels import neighbours
-from reconstruction.verdict.shadow import Relief
+from emmc_rig.reconstruction.choices import choose_mu
+from emmc_rig.reconstruction.tv import few_steps
+from emmc_rig.reconstruction.verdict.pixels import neighbours
+from emmc_rig.reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
 FEWEST = 30

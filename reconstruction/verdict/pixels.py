@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.verdict.shadow import Relief
+from emmc_rig.reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
 BLIND_PX = 1.9

@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 
 from emmc_rig.model.view_axes import picture_name, shows_parallax
-from reconstruction.method import Sensitivity
-from reconstruction.methods import METHODS
-from reconstruction.verdict.evidence import Evidence
+from emmc_rig.reconstruction.method import Sensitivity
+from emmc_rig.reconstruction.methods import METHODS
+from emmc_rig.reconstruction.verdict.evidence import Evidence
 
 Level = Literal["trust", "cannot tell", "doubt", "do not use"]
 LEVELS: tuple[Level, ...] = ("trust", "cannot tell", "doubt", "do not use")

@@ -20,19 +20,19 @@ from emmc_rig.model.compiling import compiling_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import shows_parallax
-from reconstruction.adaptive.film import Film
-from reconstruction.choices import choose_mu
-from reconstruction.dictionary import Dictionary
-from reconstruction.inputs import checked_inputs
-from reconstruction.methods import MethodSettings, find_method, reconstruct
-from reconstruction.result import Progress, Reconstruction
-from reconstruction.screening import screened
-from reconstruction.tv import few_steps
-from reconstruction.verdict.evidence import FittedFrames, gathered
-from reconstruction.verdict.kept import kept_readings
-from reconstruction.verdict.rules import MOTION, Verdict, verdict_from
-from reconstruction.verdict.shadow import relief
-from reconstruction.verdict.shots import Motion, motion
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.choices import choose_mu
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.methods import MethodSettings, find_method, reconstruct
+from emmc_rig.reconstruction.result import Progress, Reconstruction
+from emmc_rig.reconstruction.screening import screened
+from emmc_rig.reconstruction.tv import few_steps
+from emmc_rig.reconstruction.verdict.evidence import FittedFrames, gathered
+from emmc_rig.reconstruction.verdict.kept import kept_readings
+from emmc_rig.reconstruction.verdict.rules import MOTION, Verdict, verdict_from
+from emmc_rig.reconstruction.verdict.shadow import relief
+from emmc_rig.reconstruction.verdict.shots import Motion, motion
 
 FEWEST_SHORT = 1e-3
 """Share of the readings from which on a second fit is worth its time."""

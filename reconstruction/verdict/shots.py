@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.verdict.shadow import Relief, cross_strength, shadow
+from emmc_rig.reconstruction.verdict.shadow import Relief, cross_strength, shadow
 
 Array = NDArray[np.floating]
 SPOT_PX = 1.5

@@ -20,7 +20,7 @@ from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.session.journal import HaltEntry, HookEntry, RetryEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
-from simulators.still import StillStage
+from emmc_rig.simulators.still import StillStage
 
 ROOT = Path("/disk")
 PLAN = """

@@ -16,9 +16,6 @@ from capture_rigs import begun, plan_and_camera, request_for, still_rig
 from simulated_disk import SimulatedDisk
 from watching import Acting
 
-from drivers.dng import encode_dng
-from drivers.errors import DriverError
-from drivers.raw import decode_raw
 from emmc_rig.acquisition.checks import check
 from emmc_rig.acquisition.command import (
     begun_session,
@@ -35,6 +32,9 @@ from emmc_rig.acquisition.retries import GaveUpError, Mending, mending
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.session.brightness import figures
@@ -42,7 +42,7 @@ from emmc_rig.session.journal import ComparedEntry, FrameEntry, RetryEntry, RunE
 from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
-from simulators.clock import ManualClock
+from emmc_rig.simulators.clock import ManualClock
 
 ROOT = Path("/disk")
 SIZE = (24, 32)

@@ -24,16 +24,16 @@ import yaml
 from capture_rigs import BLACK, WHITE, NamedFrames, still_rig
 from programs import done, one_line
 
-import drivers.errors
 import emmc_rig
-from drivers.dng import encode_dng
-from drivers.errors import DriverError
+import emmc_rig.drivers.errors
 from emmc_rig import cli
 from emmc_rig.acquisition import command, sequencer
 from emmc_rig.acquisition.checks import SaturatedError
 from emmc_rig.acquisition.retries import HOPELESS
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.rig_config import opened_rig
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.model.files import Disk
 from emmc_rig.session import session as session_module
 from emmc_rig.session.board_sets import whiteboards
@@ -771,7 +771,7 @@ def sample(kind):
 def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
     kinds = [
         kind
-        for kind in vars(drivers.errors).values()
+        for kind in vars(emmc_rig.drivers.errors).values()
         if inspect.isclass(kind) and issubclass(kind, DriverError)
     ]
     assert set(HOPELESS) - set(kinds) == {SaturatedError}

@@ -8,9 +8,9 @@ import pytest
 from capture_rigs import begun, still_rig
 from simulated_disk import SimulatedDisk
 
-from drivers.dng import encode_dng
-from drivers.folder import FolderCamera, Recorded
 from emmc_rig.acquisition.replay import matched, missing_words, there
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.folder import FolderCamera, Recorded
 from emmc_rig.session.planned import Bench, PlannedFrame
 
 
@@ -86,5 +86,5 @@ def test_files_are_in_the_order_of_their_times_where_all_state_one(tmp_path, mon
     def stated(file):
         return 0.01, datetime.strptime(times[file.read()[-5:].decode()], "%Y:%m:%d %H:%M:%S")
 
-    monkeypatch.setattr("drivers.folder.exposure_and_time", stated)
+    monkeypatch.setattr("emmc_rig.drivers.folder.exposure_and_time", stated)
     assert [file.name for file in FolderCamera(tmp_path).files()] == ["2.dng", "1.dng"]

@@ -8,7 +8,6 @@ import pytest
 from capture_rigs import begun, plan_and_camera, request_for, stops_after
 from simulated_disk import SimulatedDisk
 
-from drivers.errors import CameraSettingError
 from emmc_rig.acquisition.amend import amendment
 from emmc_rig.acquisition.command import _frozen, planned_frames
 from emmc_rig.acquisition.control import Control
@@ -17,12 +16,13 @@ from emmc_rig.acquisition.plan import Metering
 from emmc_rig.acquisition.retries import GaveUpError
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.session.brightness import GOOD_LEVELS, next_exposure_s
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import Figures, metered
 from emmc_rig.session.verify import verify
-from simulators.clock import ManualClock
+from emmc_rig.simulators.clock import ManualClock
 
 SIZE = (24, 32)
 AUTO = """

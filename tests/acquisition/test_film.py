@@ -13,10 +13,6 @@ from capture_rigs import PreparedCamera, begun, still_rig
 from pydantic import ValidationError
 from simulated_disk import PowerCutError, SimulatedDisk
 
-from drivers.clock import SYSTEM_CLOCK
-from drivers.dng import encode_dng
-from drivers.errors import CaptureError
-from drivers.raw import RawFrame, decode_raw
 from emmc_rig.acquisition import film as films
 from emmc_rig.acquisition.command import estimated
 from emmc_rig.acquisition.control import Control
@@ -24,6 +20,10 @@ from emmc_rig.acquisition.film import Ring, refuse_impossible_film, room_for
 from emmc_rig.acquisition.plan import Plan, new_plan, planned_camera
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import Fitted, simulated_rig
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import CaptureError
+from emmc_rig.drivers.raw import RawFrame, decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
@@ -32,7 +32,7 @@ from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import DroppedEntry, FilmEntry, RetryEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
-from simulators.clock import ManualClock
+from emmc_rig.simulators.clock import ManualClock
 
 ROOT = Path("/disk")
 SIZE = (24, 32)
@@ -336,7 +336,7 @@ def test_a_frame_that_the_camera_sends_twice_is_dropped():
 def test_micro_managers_stream_becomes_a_film_at_the_plans_rate():
     pytest.importorskip("pymmcore_plus", reason="the extra `micromanager` is not installed")
     pytest.importorskip("mm_test_adapters", reason="the extra `micromanager` is not installed")
-    from drivers.micromanager import CameraSetup, MicroManagerCamera, load_core
+    from emmc_rig.drivers.micromanager import CameraSetup, MicroManagerCamera, load_core
 
     text = FILM.replace("rate: 10", "rate: 20").replace("exposure_s: 0.02", "exposure_s: 0.002")
     text = text.replace("darks: {repeats: 2}", "darks: null\nchecks: {smallest_signal: 0}")

@@ -9,9 +9,9 @@ from capture_rigs import begun, plan_and_camera
 from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
-from drivers.errors import DriverError, NotHomedError
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.drivers.errors import DriverError, NotHomedError
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.session.journal import FocusEntry, HaltEntry, RetryEntry, of_kind
 

@@ -18,11 +18,11 @@ from emmc_rig.acquisition.until import Until, stated_psnr_db
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.pages.session_sheet import events, sheet
+from emmc_rig.reconstruction.result import Reconstruction, Status
 from emmc_rig.session.journal import DecidedEntry, UntilEntry, of_kind
 from emmc_rig.session.listing import summary
 from emmc_rig.session.session import JOURNAL, Session
 from emmc_rig.session.verify import verify
-from reconstruction.result import Reconstruction, Status
 
 pytestmark = pytest.mark.slow
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import LimitExceededError
 from emmc_rig.bench.hardware import open_camera, open_stage
+from emmc_rig.drivers.errors import LimitExceededError
 from emmc_rig.errors import AppError
 
 EXAMPLE = Path(__file__).parents[2] / "docs/example_plugin"
@@ -80,7 +80,7 @@ def test_a_stage_of_a_plug_in_is_opened_by_name_with_our_settings(installed, tmp
 def test_a_camera_of_a_plug_in_takes_its_options_from_a_file(installed, tmp_path):
     program = tmp_path / "take.py"
     program.write_text(
-        "import sys, numpy\nfrom drivers.dng import encode_dng\n"
+        "import sys, numpy\nfrom emmc_rig.drivers.dng import encode_dng\n"
         "data = encode_dng(numpy.full((30, 40), 9, 'u2'), 'rggb', 0, 255, 0.02)\n"
         "open(sys.argv[1] + '/frame.dng', 'wb').write(data)\n"
     )

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration.bracket import fuse
-from calibration.errors import CalibrationError
-from calibration.frames import DARK_ELECTRONS_PER_S, SensorGain, average
+from emmc_rig.calibration.bracket import fuse
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import DARK_ELECTRONS_PER_S, SensorGain, average
 from emmc_rig.model.noise import SensorNoise
 
 NOISE = SensorNoise(

@@ -7,8 +7,8 @@ import pytest
 from outside_bench import Course, Optics, Sensor
 from outside_boards import Photographer, agreement, bench_of, camera_of
 
-from calibration.errors import CalibrationError
-from calibration.routes import calibrate
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.routes import calibrate
 
 SIZE, SMALLER = (48, 64), (32, 40)
 ALL_VIEWS = tuple((v, u) for v in range(5) for u in range(5))

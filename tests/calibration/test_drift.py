@@ -8,15 +8,15 @@ import pytest
 from moved_mask import CAMERA
 from whiteboard_bench import BenchTruth, WhiteboardBench
 
-from calibration.drift import (
+from emmc_rig.calibration.drift import (
     KINDS,
     DriftSettings,
     displacement_px,
     drifted,
     find_drift,
 )
-from calibration.errors import CalibrationError
-from calibration.evidence import (
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.evidence import (
     CHROMA_SPREAD,
     COARSE_PX,
     COARSE_SPREAD,
@@ -28,14 +28,14 @@ from calibration.evidence import (
     log_evidence,
     plane_prior,
 )
-from calibration.parametric import psi_at
-from calibration.placement import designed_placement
-from calibration.shadow import Shadow, shadow_mask
+from emmc_rig.calibration.parametric import psi_at
+from emmc_rig.calibration.placement import designed_placement
+from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
 from emmc_rig.model.frames import Frames
-from simulators.bench import MountingErrors
-from simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, SensorFlaws
+from emmc_rig.simulators.bench import MountingErrors
+from emmc_rig.simulators.flaws import PERFECT_OPTICS, PERFECT_SENSOR, SensorFlaws
 
 SIZE = (64, 80)
 MOUNTING = MountingErrors((12.0, -7.0), 0.05, 1.0005, edge_blur_um=2.0)

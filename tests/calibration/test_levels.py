@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from calibration.board_angle import board_over_angle
-from calibration.boards import Board, BoardSet
-from calibration.colours import crosstalk
-from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain
-from calibration.levels import Check, fit_levels
-from calibration.misfit import combined
-from calibration.whiteboard import Calibration
+from emmc_rig.calibration.board_angle import board_over_angle
+from emmc_rig.calibration.boards import Board, BoardSet
+from emmc_rig.calibration.colours import crosstalk
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import MeanFrame, SensorGain
+from emmc_rig.calibration.levels import Check, fit_levels
+from emmc_rig.calibration.misfit import combined
+from emmc_rig.calibration.whiteboard import Calibration
 from emmc_rig.model.sensing import ImagingMatrix
 
 WARM_UP_S = 120.0

@@ -8,12 +8,18 @@ import pytest
 from mask_frames import BLACK, CAMERAS, SIZE, bench_frame
 from scipy.ndimage import fourier_shift
 
-from calibration.boards import channels_of
-from calibration.errors import CalibrationError
-from calibration.locator import LEAST_CORRELATION, frame_board, locate, refine, starting_placement
-from calibration.openings import views_open
-from calibration.robust import correlation, deviation_of, tukey_loss, tukey_weights
-from calibration.shadow import shadow_mask
+from emmc_rig.calibration.boards import channels_of
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.locator import (
+    LEAST_CORRELATION,
+    frame_board,
+    locate,
+    refine,
+    starting_placement,
+)
+from emmc_rig.calibration.openings import views_open
+from emmc_rig.calibration.robust import correlation, deviation_of, tukey_loss, tukey_weights
+from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.camera import psi_layout
 
 CAMERA = "rgbw-bayer-1shot"

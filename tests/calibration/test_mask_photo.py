@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from calibration.errors import CalibrationError
-from calibration.mask_photo import find_corners, read_mask
-from drivers.dng import encode_dng
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.mask_photo import find_corners, read_mask
+from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.masks import fiducial_marks
 from emmc_rig.model.srgb import codes_of, srgb_of

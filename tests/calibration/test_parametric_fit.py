@@ -12,20 +12,26 @@ from whiteboard_bench import (
     WhiteboardBench,
 )
 
-from calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
-from calibration.choice import HeldOut, choose, judge, predicted_by_shadow
-from calibration.defects import find_defects, loss_variance, mask_with_losses
-from calibration.errors import CalibrationError
-from calibration.findings import fit_advice
-from calibration.fit import FitSettings, fit_placement, shares_of_prior
-from calibration.locator import register
-from calibration.openings import CENTRED, parts, views_open
-from calibration.parametric import psi_at, psi_deviation, psi_information, shot_stages
-from calibration.placement import SCALARS, Placement, Tolerances, designed_placement, labels
-from calibration.routes import calibrate
-from calibration.shadow import Shadow, shadow_mask
+from emmc_rig.calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
+from emmc_rig.calibration.choice import HeldOut, choose, judge, predicted_by_shadow
+from emmc_rig.calibration.defects import find_defects, loss_variance, mask_with_losses
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.findings import fit_advice
+from emmc_rig.calibration.fit import FitSettings, fit_placement, shares_of_prior
+from emmc_rig.calibration.locator import register
+from emmc_rig.calibration.openings import CENTRED, parts, views_open
+from emmc_rig.calibration.parametric import psi_at, psi_deviation, psi_information, shot_stages
+from emmc_rig.calibration.placement import (
+    SCALARS,
+    Placement,
+    Tolerances,
+    designed_placement,
+    labels,
+)
+from emmc_rig.calibration.routes import calibrate
+from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix
-from simulators.bench import MountingErrors
+from emmc_rig.simulators.bench import MountingErrors
 
 SIZE = (44, 60)
 VIEWS = (3, 3)
@@ -280,7 +286,7 @@ def test_deviations_of_psi_do_not_depend_on_the_bands_they_are_computed_in(desig
     covariance = np.diag(np.full(len(shadow.placement.vector()), 1e-4))
     found = []
     for pixels in (2**16, 130):
-        monkeypatch.setattr("calibration.parametric.BAND_PIXELS", pixels)
+        monkeypatch.setattr("emmc_rig.calibration.parametric.BAND_PIXELS", pixels)
         found.append(psi_deviation(shadow, design, shot_stages(CAMERA), covariance))
     assert found[0].min() > 0
     np.testing.assert_array_equal(*found)

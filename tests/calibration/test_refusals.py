@@ -9,11 +9,11 @@ import pytest
 from moved_mask import CAMERA
 from whiteboard_bench import BenchTruth, Setting, WhiteboardBench, held_out_settings
 
-from calibration.errors import CalibrationError
-from calibration.routes import calibrate
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.routes import calibrate
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.processing.board_plan import STAGE_KINDS_UM
-from simulators.flaws import BoardFlaws
+from emmc_rig.simulators.flaws import BoardFlaws
 
 SIZE = (32, 48)
 TRUTH = BenchTruth(rays_per_view=128)

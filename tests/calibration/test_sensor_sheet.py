@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from calibration.errors import CalibrationError
-from calibration.sensor import Pair, characterise
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.sensor import Pair, characterise
 from emmc_rig.model.noise import SensorNoise
-from simulators.flaws import SensorFlaws
+from emmc_rig.simulators.flaws import SensorFlaws
 
 SIZE = (120, 160)
 WHITE_DN = 65_535

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from outside_bench import Bench, Course, Optics, Sensor
 
-from calibration.sensor import Pair, characterise
+from emmc_rig.calibration.sensor import Pair, characterise
 
 FLATS_S = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 DARKS_S = (0.01, 1.0, 10.0)

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.errors import CalibrationError
-from calibration.parametric import psi_at, shot_stages
-from calibration.placement import (
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.parametric import psi_at, shot_stages
+from emmc_rig.calibration.placement import (
     LEAST_BLUR_UM,
     SCALARS,
     designed_placement,
     labels,
     with_aperture_mean_one,
 )
-from calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, shadow_mask, share_tables
+from emmc_rig.calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, shadow_mask, share_tables
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 
 SIZE = (16, 22)

@@ -8,7 +8,7 @@ import pytest
 from programs import exit_code
 
 import emmc_rig as emmc
-from calibration import frames
+from emmc_rig.calibration import frames
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.processing.board_plan import PLAN, PlanSettings, write_plan

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from calibration.boards import BoardFrame, BoardSet
-from calibration.errors import CalibrationError
-from calibration.frames import MeanFrame, SensorGain, average, photon_transfer
-from calibration.scale import MANY, Scale
-from calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
+from emmc_rig.calibration.boards import BoardFrame, BoardSet
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.frames import MeanFrame, SensorGain, average, photon_transfer
+from emmc_rig.calibration.scale import MANY, Scale
+from emmc_rig.calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.processing.session_calibration import GivenFrame
 

@@ -9,9 +9,9 @@ from typing import get_args
 import pytest
 import typer
 
-from drivers.errors import LimitExceededError, NotHomedError, StalledError
 from emmc_rig import cli
 from emmc_rig.commands.advice import HOME, WORDS, in_shell
+from emmc_rig.drivers.errors import LimitExceededError, NotHomedError, StalledError
 from emmc_rig.errors import AppError
 from emmc_rig.model.advice import Advice
 

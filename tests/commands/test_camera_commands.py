@@ -10,21 +10,21 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from drivers.clock import SYSTEM_CLOCK
-from drivers.dng import encode_dng
-from drivers.errors import DriverError, RawFrameError, UsbNotFoundError
-from drivers.folder import FolderCamera
-from drivers.raw import decode_raw
 from emmc_rig.bench import hardware
 from emmc_rig.bench.hardware import open_camera, scene_simulator
 from emmc_rig.commands import device_cameras
 from emmc_rig.commands.device_cameras import register, save_frame
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import DriverError, RawFrameError, UsbNotFoundError
+from emmc_rig.drivers.folder import FolderCamera
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError, WrongUsageError
 from emmc_rig.pages.frame_view import brightest, histogram, preview, white_balance
 from emmc_rig.session.brightness import figures, level_of
-from simulators.clock import ManualClock
-from simulators.ptp import PtpUsbFunction
-from simulators.usb import SimulatedUsb
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.ptp import PtpUsbFunction
+from emmc_rig.simulators.usb import SimulatedUsb
 
 BLACK, WHITE = 100, 1100
 

@@ -17,7 +17,7 @@ import pytest
 import yaml
 from programs import done, one_line, program, refused, wait_until
 
-from drivers.raw import decode_raw
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.session.listing import sessions_in
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
@@ -141,7 +141,7 @@ def test_an_export_that_is_killed_leaves_no_part_after_the_next_one(captured, ru
 
 
 def test_a_session_goes_on_with_another_stage_only_where_that_is_meant(copy, run, monkeypatch):
-    monkeypatch.setattr("simulators.zaber.FIRST_SERIAL_NUMBER", 900)
+    monkeypatch.setattr("emmc_rig.simulators.zaber.FIRST_SERIAL_NUMBER", 900)
     journal = (copy / "journal.jsonl").read_bytes()
     code, _, err = run("capture", copy)
     assert code == 1

@@ -8,8 +8,8 @@ import numpy as np
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import even_frames
+from emmc_rig.reconstruction.method import Given
 from emmc_rig.study.trial import Capture
-from reconstruction.method import Given
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")

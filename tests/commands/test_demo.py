@@ -16,9 +16,9 @@ from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import load_hdf5, psnr_db, replicate_centre
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings
-from reconstruction.tv import TVSettings
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.tv import TVSettings
 
 SIZE = (96, 128)
 

@@ -16,18 +16,18 @@ import yaml
 from programs import done, one_line, wait_until
 from serial.tools import list_ports
 
-from drivers.apt import ACTUATORS, AptAxis, AptStage
-from drivers.clock import SYSTEM_CLOCK
-from drivers.stage import StageSettings
-from drivers.transport import SerialTransport
-from drivers.zaber import ZaberStage
 from emmc_rig.bench.device_config import parse_stage
 from emmc_rig.bench.hardware import SIMULATED_SCALES, open_stage, probe_port
+from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.stage import StageSettings
+from emmc_rig.drivers.transport import SerialTransport
+from emmc_rig.drivers.zaber import ZaberStage
 from emmc_rig.errors import AppError
-from simulators.apt import Z825, AptController
-from simulators.grbl import BENCH_AXES, GrblController
-from simulators.wire import PtyServer
-from simulators.zaber import AxisSpec, ZaberChain
+from emmc_rig.simulators.apt import Z825, AptController
+from emmc_rig.simulators.grbl import BENCH_AXES, GrblController
+from emmc_rig.simulators.wire import PtyServer
+from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 Z825_MOTOR = ACTUATORS["z825"]
 PATIENCE_S = 20.0

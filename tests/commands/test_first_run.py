@@ -9,8 +9,8 @@ from numba import njit
 from programs import wait_until
 
 from emmc_rig.commands import first_run
-from reconstruction import kernels
-from reconstruction.adaptive import evidence, rays
+from emmc_rig.reconstruction import kernels
+from emmc_rig.reconstruction.adaptive import evidence, rays
 
 SLEEPS = "import time; time.sleep(600)"
 

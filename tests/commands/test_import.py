@@ -15,7 +15,7 @@ import tifffile
 import yaml
 from programs import done, one_line, program, refused
 
-from drivers.dng import Facts, encode_dng
+from emmc_rig.drivers.dng import Facts, encode_dng
 from emmc_rig.files.cameras import shipped_camera_files
 from emmc_rig.importing.session import _Import as importing
 from emmc_rig.processing.reconstructing import open_frames

@@ -15,7 +15,7 @@ from outside_bench import Bench, Optics, Sensor
 from outside_boards import agreement, camera_of
 from programs import done
 
-from calibration.shadow import shadow_mask
+from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.processing.reconstructing import open_frames
 

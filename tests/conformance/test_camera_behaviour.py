@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from simulated_raw_camera import SimulatedRawCamera
 
-from drivers.camera import Camera, RawFileCamera
-from drivers.dng import encode_dng
-from drivers.folder import FolderCamera
-from drivers.ptp import PtpCamera, PtpSession
-from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.u3v import open_camera
-from drivers.usb import open_device
 from emmc_rig.conformance.cameras import *  # noqa: F403
-from simulators.clock import ManualClock
-from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
-from simulators.u3v import U3vCameraSimulator
-from simulators.usb import SimulatedUsb
+from emmc_rig.drivers.camera import Camera, RawFileCamera
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.folder import FolderCamera
+from emmc_rig.drivers.ptp import PtpCamera, PtpSession
+from emmc_rig.drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from emmc_rig.drivers.u3v import open_camera
+from emmc_rig.drivers.usb import open_device
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.ptp import PtpCameraSimulator, PtpUsbFunction
+from emmc_rig.simulators.u3v import U3vCameraSimulator
+from emmc_rig.simulators.usb import SimulatedUsb
 
 SHAPE, CFA = (40, 48), "grbg"
 MOSAIC = np.random.default_rng(0).integers(0, 4095, SHAPE, dtype=np.uint16)

@@ -8,9 +8,9 @@ import struct
 
 import pytest
 
-from drivers import apt_codec as codec
-from drivers.apt_codec import Id, Message, MotorStatus, StatusBit, VelocityParameters
-from drivers.errors import GarbledReplyError
+from emmc_rig.drivers import apt_codec as codec
+from emmc_rig.drivers.apt_codec import Id, Message, MotorStatus, StatusBit, VelocityParameters
+from emmc_rig.drivers.errors import GarbledReplyError
 
 
 @pytest.mark.parametrize(

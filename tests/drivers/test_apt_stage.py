@@ -2,10 +2,10 @@
 
 import pytest
 
-from drivers import apt_codec as codec
-from drivers.apt import ACTUATORS, AptAxis, AptStage, identify
-from drivers.apt_codec import Id, StatusBit
-from drivers.errors import (
+from emmc_rig.drivers import apt_codec as codec
+from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage, identify
+from emmc_rig.drivers.apt_codec import Id, StatusBit
+from emmc_rig.drivers.errors import (
     AxisFaultError,
     CommandRefusedError,
     DriverError,
@@ -14,9 +14,9 @@ from drivers.errors import (
     NotHomedError,
     TransportTimeoutError,
 )
-from drivers.stage import StageSettings
-from simulators.apt import HOME_OFFSET_UM, Z825, AptController
-from simulators.clock import ManualClock
+from emmc_rig.drivers.stage import StageSettings
+from emmc_rig.simulators.apt import HOME_OFFSET_UM, Z825, AptController
+from emmc_rig.simulators.clock import ManualClock
 
 Z825_MOTOR = ACTUATORS["z825"]
 PLAIN = StageSettings(approach_um=0.0)

@@ -4,7 +4,7 @@ from datetime import datetime, timedelta, timezone
 
 import pytest
 
-from drivers.capture_order import capture_order
+from emmc_rig.drivers.capture_order import capture_order
 
 NOON = datetime(2026, 11, 27, 12)
 ROLL = ["IMG_0001.dng", "IMG_0002.dng", "IMG_9998.dng", "IMG_9999.dng"]

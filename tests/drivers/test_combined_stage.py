@@ -2,10 +2,10 @@
 
 import pytest
 
-from drivers.combined import CombinedStage
-from drivers.errors import LimitExceededError, NotHomedError, UnknownAxisError
-from simulators.clock import ManualClock
-from simulators.still import StillStage
+from emmc_rig.drivers.combined import CombinedStage
+from emmc_rig.drivers.errors import LimitExceededError, NotHomedError, UnknownAxisError
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.still import StillStage
 
 
 class Recorded(StillStage):

@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import CameraDescriptionError, CameraSettingError, DriverError
-from drivers.genapi import Features
-from drivers.genapi_formula import Formula, FormulaError
-from simulators import u3v_description
-from simulators.clock import ManualClock
-from simulators.u3v import U3vCameraSimulator
+from emmc_rig.drivers.errors import CameraDescriptionError, CameraSettingError, DriverError
+from emmc_rig.drivers.genapi import Features
+from emmc_rig.drivers.genapi_formula import Formula, FormulaError
+from emmc_rig.simulators import u3v_description
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.u3v import U3vCameraSimulator
 
 HEAD = (
     '<?xml version="1.0" encoding="utf-8"?><RegisterDescription ModelName="M" VendorName="V" '

@@ -14,24 +14,24 @@ import pytest
 
 pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
 
-from drivers.errors import (
+from emmc_rig.bench.hardware import open_camera
+from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,
     CaptureError,
     GphotoError,
     RawFrameError,
 )
-from drivers.gphoto import GphotoCamera, seconds_of
-from drivers.ptp_codec import Property
-from emmc_rig.bench.hardware import open_camera
-from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.drivers.gphoto import GphotoCamera, seconds_of
+from emmc_rig.drivers.ptp_codec import Property
 from emmc_rig.errors import AppError
 
 SERVER = """
 import json, sys
 import numpy as np
-from drivers.clock import SystemClock
-from simulators.ptp import PtpCameraSimulator
+from emmc_rig.drivers.clock import SystemClock
+from emmc_rig.simulators.ptp import PtpCameraSimulator
 from simulated_eos import EosCameraSimulator
 from ptpip_server import PtpIpServer
 
@@ -160,7 +160,8 @@ def test_of_raw_with_jpeg_the_raw_file_is_taken_and_deleted():
 @pytest.mark.slow
 def test_an_eos_exposes_for_a_user_who_never_ran_libgphoto2(tmp_path):
     program = (
-        "import sys; from drivers.gphoto import GphotoCamera; camera = GphotoCamera(sys.argv[1]);"
+        "import sys; from emmc_rig.drivers.gphoto import GphotoCamera;"
+        "camera = GphotoCamera(sys.argv[1]);"
         "camera.set_exposure_s(0.5); print(camera.snap().mosaic.shape); camera.close()"
     )
     home = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path / "config")}

@@ -5,8 +5,8 @@ Lines marked with a section are examples printed there; the others are built by 
 
 import pytest
 
-from drivers.errors import GarbledReplyError
-from drivers.grbl_codec import (
+from emmc_rig.drivers.errors import GarbledReplyError
+from emmc_rig.drivers.grbl_codec import (
     Alarm,
     Banner,
     Feedback,

@@ -7,11 +7,11 @@ from contextlib import closing
 
 import pytest
 
-from drivers.clock import SYSTEM_CLOCK
-from drivers.errors import LimitExceededError, NotHomedError
-from drivers.grbl import GrblStage, identify
-from drivers.stage import StageSettings
-from drivers.transport import SerialTransport
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.errors import LimitExceededError, NotHomedError
+from emmc_rig.drivers.grbl import GrblStage, identify
+from emmc_rig.drivers.stage import StageSettings
+from emmc_rig.drivers.transport import SerialTransport
 
 pytestmark = [pytest.mark.peers, pytest.mark.slow]
 

@@ -6,8 +6,8 @@ from functools import partial
 import pytest
 from stage_rigs import after_first_sleep
 
-from drivers import grbl_codec as codec
-from drivers.errors import (
+from emmc_rig.drivers import grbl_codec as codec
+from emmc_rig.drivers.errors import (
     AxisFaultError,
     CommandRefusedError,
     FirmwareError,
@@ -19,10 +19,10 @@ from drivers.errors import (
     SpeedLimitError,
     TransportTimeoutError,
 )
-from drivers.grbl import GrblStage, identify
-from drivers.stage import DEFAULT_SETTINGS, StageSettings
-from simulators.clock import ManualClock
-from simulators.grbl import BENCH_AXES, WITH_SINGLE_AXIS_HOMING, GrblController
+from emmc_rig.drivers.grbl import GrblStage, identify
+from emmc_rig.drivers.stage import DEFAULT_SETTINGS, StageSettings
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.grbl import BENCH_AXES, WITH_SINGLE_AXIS_HOMING, GrblController
 
 AXES = {"x": "X", "y": "Y"}
 TRAVEL_UM = BENCH_AXES["X"].travel_um

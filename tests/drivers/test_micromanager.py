@@ -18,7 +18,9 @@ pytest.importorskip("mm_test_adapters", reason="the extra `micromanager` is not 
 
 from pymmcore_plus.seq_tester import decode_image
 
-from drivers.errors import (
+from emmc_rig.bench.hardware import open_camera, open_stage
+from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,
     LimitExceededError,
@@ -27,16 +29,14 @@ from drivers.errors import (
     PortGoneError,
     SpeedFixedError,
 )
-from drivers.micromanager import (
+from emmc_rig.drivers.micromanager import (
     CameraSetup,
     MicroManagerCamera,
     MicroManagerStage,
     StageSetup,
     load_core,
 )
-from drivers.raw import decode_raw
-from emmc_rig.bench.hardware import open_camera, open_stage
-from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 
 DEMO = "MMConfig_demo.cfg"

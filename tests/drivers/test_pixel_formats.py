@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, image_bytes, unpack
-from simulators.u3v import pack
+from emmc_rig.drivers.pixel_formats import BY_CODE, BY_NAME, FORMATS, image_bytes, unpack
+from emmc_rig.simulators.u3v import pack
 
 RNG = np.random.default_rng(3)
 

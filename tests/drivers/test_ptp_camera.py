@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drivers.errors import (
+from emmc_rig.drivers.errors import (
     CameraBusyError,
     CameraFormatError,
     CameraRefusedError,
@@ -18,13 +18,13 @@ from drivers.errors import (
     UsbGoneError,
     UsbTimeoutError,
 )
-from drivers.ptp import PtpCamera, PtpSession, PtpSettings, is_raw
-from drivers.ptp_codec import Format, ObjectInfo, Operation
-from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.usb import open_device
-from simulators.clock import ManualClock
-from simulators.ptp import ANY_EXPOSURE, PtpCameraSimulator, PtpUsbFunction
-from simulators.usb import SimulatedUsb
+from emmc_rig.drivers.ptp import PtpCamera, PtpSession, PtpSettings, is_raw
+from emmc_rig.drivers.ptp_codec import Format, ObjectInfo, Operation
+from emmc_rig.drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from emmc_rig.drivers.usb import open_device
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.ptp import ANY_EXPOSURE, PtpCameraSimulator, PtpUsbFunction
+from emmc_rig.simulators.usb import SimulatedUsb
 
 SHAPE = (60, 80)
 

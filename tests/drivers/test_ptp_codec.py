@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import ptp_codec as codec
-from drivers.errors import CameraFormatError
-from drivers.ptp_codec import Kind, Message, Operation
+from emmc_rig.drivers import ptp_codec as codec
+from emmc_rig.drivers.errors import CameraFormatError
+from emmc_rig.drivers.ptp_codec import Kind, Message, Operation
 
 HEARD_HANDLES = bytes.fromhex("1c000000 0200 0710 02000000 03000000 03000000 02000000 01000000")
 HEARD_RESPONSE = bytes.fromhex("0c000000 0300 0120 02000000")

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from drivers import ptp_codec as codec
-from drivers.dng import encode_dng
-from drivers.errors import DriverError
-from drivers.ptp import PtpCamera, PtpSession, PtpSettings
-from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.raw import decode_raw
-from drivers.usb import open_device
-from simulators.clock import ManualClock
-from simulators.ptp import PtpCameraSimulator, PtpUsbFunction
-from simulators.usb import SimulatedUsb, StallError, UnpluggedError
+from emmc_rig.drivers import ptp_codec as codec
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.ptp import PtpCamera, PtpSession, PtpSettings
+from emmc_rig.drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from emmc_rig.drivers.raw import decode_raw
+from emmc_rig.drivers.usb import open_device
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.ptp import PtpCameraSimulator, PtpUsbFunction
+from emmc_rig.simulators.usb import SimulatedUsb, StallError, UnpluggedError
 
 SHAPE = (24, 26)
 MOSAIC = np.random.default_rng(0).integers(0, 4095, SHAPE, dtype=np.uint16)

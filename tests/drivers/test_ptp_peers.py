@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import SystemClock
-from drivers.dng import encode_dng
-from drivers.ptp import PtpSession, PtpSettings, is_raw
-from drivers.ptp_codec import HEADER_SIZE, Format, Operation, Property
-from drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from drivers.raw import decode_raw
-from drivers.usb import INTERRUPT, open_device
-from simulators.clock import ManualClock
-from simulators.ptp import BULK_IN, BULK_OUT, INTERRUPT_IN
-from simulators.usb import (
+from emmc_rig.drivers.clock import SystemClock
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.ptp import PtpSession, PtpSettings, is_raw
+from emmc_rig.drivers.ptp_codec import HEADER_SIZE, Format, Operation, Property
+from emmc_rig.drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from emmc_rig.drivers.raw import decode_raw
+from emmc_rig.drivers.usb import INTERRUPT, open_device
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.ptp import BULK_IN, BULK_OUT, INTERRUPT_IN
+from emmc_rig.simulators.usb import (
     DeviceSpec,
     EndpointSpec,
     InterfaceSpec,

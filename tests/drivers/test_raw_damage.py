@@ -15,9 +15,9 @@ import pytest
 import tifffile
 from test_raw_frames import BLACK_DN, noise
 
-from drivers.dng import encode_dng
-from drivers.errors import RawFrameError
-from drivers.raw import decode_raw
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.raw import decode_raw
 
 LOSSLESS_JPEG = 7
 PANASONIC_BLOCK = 0x4000

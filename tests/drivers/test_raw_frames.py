@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from simulated_raw_camera import SimulatedRawCamera
 
-from drivers.camera import Camera, RawFileCamera
-from drivers.dng import encode_dng
-from drivers.errors import RawFrameError
-from drivers.raw import decode_raw
-from simulators.clock import ManualClock
+from emmc_rig.drivers.camera import Camera, RawFileCamera
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.raw import decode_raw
+from emmc_rig.simulators.clock import ManualClock
 
 BAYER = ("rggb", "grbg", "gbrg", "bggr")
 BLACK_DN = np.array([[60, 61], [62, 63]])

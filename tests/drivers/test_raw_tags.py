@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from drivers.dng import Facts, encode_dng
-from drivers.errors import RawFrameError
-from drivers.folder import FolderCamera
-from drivers.raw import captured_at, decode_raw
+from emmc_rig.drivers.dng import Facts, encode_dng
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.folder import FolderCamera
+from emmc_rig.drivers.raw import captured_at, decode_raw
 from emmc_rig.session.brightness import figures
 from emmc_rig.session.frame_file import decode_frame, dng_of, frame_entry, frame_file
 from emmc_rig.session.journal import Figures
-from simulators.clock import ManualClock
+from emmc_rig.simulators.clock import ManualClock
 
 ROWS, COLUMNS = 64, 96
 LIGHT = np.random.default_rng(0).integers(1000, 3000, (ROWS, COLUMNS)).astype(np.uint16)
@@ -123,7 +123,7 @@ def test_levels_by_place_are_kept_in_a_session_and_in_its_dngs(name):
 
 
 def _identity():
-    from drivers.camera import CameraIdentity
+    from emmc_rig.drivers.camera import CameraIdentity
 
     return CameraIdentity("", "Test")
 

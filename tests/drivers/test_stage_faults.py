@@ -7,7 +7,8 @@ from contextlib import suppress
 import pytest
 from stage_rigs import RIGS, SIMULATED, after_first_sleep, opened, simulated_rig  # noqa: F401
 
-from drivers.errors import (
+from emmc_rig.conformance.stages import TOLERANCE_UM, middle_um
+from emmc_rig.drivers.errors import (
     DriverError,
     GarbledReplyError,
     MoveTimeoutError,
@@ -17,8 +18,7 @@ from drivers.errors import (
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import START_GRACE_S, move_time_limit_s
-from emmc_rig.conformance.stages import TOLERANCE_UM, middle_um
+from emmc_rig.drivers.stage import START_GRACE_S, move_time_limit_s
 
 BACKLASH_UM = 3.0
 REPLY_FAULTS = ("drop_reply", "lose_reply_byte", "garble_reply", "late_reply", "duplicate_reply")

@@ -13,16 +13,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_ptp_fuzz import errors_of_the_driver_allowed
 
-from drivers import apt_codec, grbl_codec, zaber_codec
-from drivers.apt import ACTUATORS, AptAxis, AptStage
-from drivers.grbl import GrblStage
-from drivers.stage import StageSettings
-from drivers.zaber import ZaberStage
-from simulators.apt import COUNTS_PER_UM, Z825, AptController
-from simulators.clock import ManualClock
-from simulators.grbl import GrblController
-from simulators.wire import MemoryTransport
-from simulators.zaber import AxisSpec, ZaberChain
+from emmc_rig.drivers import apt_codec, grbl_codec, zaber_codec
+from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage
+from emmc_rig.drivers.grbl import GrblStage
+from emmc_rig.drivers.stage import StageSettings
+from emmc_rig.drivers.zaber import ZaberStage
+from emmc_rig.simulators.apt import COUNTS_PER_UM, Z825, AptController
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.grbl import GrblController
+from emmc_rig.simulators.wire import MemoryTransport
+from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 Z825_MOTOR = ACTUATORS["z825"]
 CARELESS = StageSettings(poll_s=0.2, settle_s=0.0)

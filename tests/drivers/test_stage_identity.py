@@ -2,13 +2,13 @@
 
 import pytest
 
-from drivers.apt import identify
-from drivers.combined import CombinedStage
-from drivers.errors import UnknownAxisError
-from drivers.stage import StageIdentity
 from emmc_rig.bench.hardware import open_simulated
-from simulators.clock import ManualClock
-from simulators.still import StillStage
+from emmc_rig.drivers.apt import identify
+from emmc_rig.drivers.combined import CombinedStage
+from emmc_rig.drivers.errors import UnknownAxisError
+from emmc_rig.drivers.stage import StageIdentity
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.still import StillStage
 
 
 @pytest.mark.parametrize("protocol", ["zaber", "grbl", "apt"])

@@ -12,13 +12,13 @@ from dataclasses import replace
 import pytest
 from tcp_server import TcpServer
 
-from drivers import apt_codec
-from drivers.apt_codec import Id
-from drivers.clock import SYSTEM_CLOCK
-from simulators.apt import COUNTS_PER_UM, Z825, AptController
-from simulators.grbl import BENCH_AXES, GrblController
-from simulators.wire import PtyServer
-from simulators.zaber import AxisSpec, ZaberChain
+from emmc_rig.drivers import apt_codec
+from emmc_rig.drivers.apt_codec import Id
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.simulators.apt import COUNTS_PER_UM, Z825, AptController
+from emmc_rig.simulators.grbl import BENCH_AXES, GrblController
+from emmc_rig.simulators.wire import PtyServer
+from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 pytestmark = pytest.mark.peers
 EARLY_READER = pytest.mark.timing(

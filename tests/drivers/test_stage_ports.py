@@ -16,9 +16,9 @@ from serial.tools import list_ports
 from stage_rigs import JumpingClock
 from tcp_server import TcpServer
 
-from drivers import ports
-from drivers.clock import SYSTEM_CLOCK
-from drivers.errors import (
+from emmc_rig.drivers import ports
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.errors import (
     GarbledReplyError,
     PortBusyError,
     PortGoneError,
@@ -26,18 +26,18 @@ from drivers.errors import (
     PortPermissionError,
     TransportTimeoutError,
 )
-from drivers.ports import find_port, guess_of, holder_of, list_serial_ports, udev_rule_path
-from drivers.stage import StageSettings
-from drivers.transport import SerialTransport
-from drivers.zaber import ZaberStage
-from simulators.clock import ManualClock
-from simulators.faults import Faults
-from simulators.firmware import Occasion
-from simulators.wire import PtyServer
-from simulators.zaber import AxisSpec, ZaberChain
+from emmc_rig.drivers.ports import find_port, guess_of, holder_of, list_serial_ports, udev_rule_path
+from emmc_rig.drivers.stage import StageSettings
+from emmc_rig.drivers.transport import SerialTransport
+from emmc_rig.drivers.zaber import ZaberStage
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.faults import Faults
+from emmc_rig.simulators.firmware import Occasion
+from emmc_rig.simulators.wire import PtyServer
+from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 HOLD_A_PORT = (
-    "import sys, time; from drivers.transport import SerialTransport; "
+    "import sys, time; from emmc_rig.drivers.transport import SerialTransport; "
     "transport = SerialTransport(sys.argv[1]); print('held', flush=True); time.sleep(60)"
 )
 

@@ -5,17 +5,17 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from drivers.apt import ACTUATORS
-from drivers.errors import ScaleError, SpeedLimitError
-from drivers.grbl import FACTORY_STEPS_PER_MM, GrblStage
-from drivers.stage import StageSettings
-from drivers.zaber import ZaberStage
 from emmc_rig.bench.device_config import parse_stage
 from emmc_rig.bench.hardware import open_stage
+from emmc_rig.drivers.apt import ACTUATORS
+from emmc_rig.drivers.errors import ScaleError, SpeedLimitError
+from emmc_rig.drivers.grbl import FACTORY_STEPS_PER_MM, GrblStage
+from emmc_rig.drivers.stage import StageSettings
+from emmc_rig.drivers.zaber import ZaberStage
 from emmc_rig.errors import AppError
-from simulators.clock import ManualClock
-from simulators.grbl import BENCH_AXES, GrblController
-from simulators.zaber import AxisSpec, ZaberChain
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.grbl import BENCH_AXES, GrblController
+from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 COARSE = AxisSpec(travel_um=150_000.0, microstep_um=0.49609375, backlash_um=0.0)
 """The X-LSQ150B, ten times as coarse as the usual screw; no table here has its id."""

@@ -13,8 +13,9 @@ import pytest
 import usb.core
 from hypothesis import strategies as st
 
-from drivers import u3v_codec as codec
-from drivers.errors import (
+from emmc_rig.bench.hardware import open_camera
+from emmc_rig.drivers import u3v_codec as codec
+from emmc_rig.drivers.errors import (
     CameraBusyError,
     CameraDescriptionError,
     CameraFormatError,
@@ -30,18 +31,17 @@ from drivers.errors import (
     UsbTimeoutError,
     UsbTransferError,
 )
-from drivers.transport import QUERY_ATTEMPTS
-from drivers.u3v import UNZIPPED_LIMIT, decode_frame
-from drivers.u3v import open_camera as open_u3v
-from drivers.u3v_codec import CONTROL
-from drivers.u3v_control import BUSY_LIMIT_S
-from drivers.u3v_stream import plan_sizes
-from drivers.usb import TRANSFER_BYTES, list_devices
-from emmc_rig.bench.hardware import open_camera
-from simulators import u3v as simulation
-from simulators.clock import ManualClock
-from simulators.u3v import U3vCameraSimulator
-from simulators.usb import SimulatedUsb
+from emmc_rig.drivers.transport import QUERY_ATTEMPTS
+from emmc_rig.drivers.u3v import UNZIPPED_LIMIT, decode_frame
+from emmc_rig.drivers.u3v import open_camera as open_u3v
+from emmc_rig.drivers.u3v_codec import CONTROL
+from emmc_rig.drivers.u3v_control import BUSY_LIMIT_S
+from emmc_rig.drivers.u3v_stream import plan_sizes
+from emmc_rig.drivers.usb import TRANSFER_BYTES, list_devices
+from emmc_rig.simulators import u3v as simulation
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.u3v import U3vCameraSimulator
+from emmc_rig.simulators.usb import SimulatedUsb
 
 SHAPE = (40, 48)
 MOSAIC = np.random.default_rng(0).integers(64, 4096, SHAPE, dtype=np.uint16)

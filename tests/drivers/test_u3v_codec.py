@@ -6,8 +6,8 @@ from random import Random
 import pytest
 from hypothesis import strategies as st
 
-from drivers.errors import CameraFormatError, DriverError
-from drivers.u3v_codec import (
+from emmc_rig.drivers.errors import CameraFormatError, DriverError
+from emmc_rig.drivers.u3v_codec import (
     IMAGE,
     READMEM_ACK,
     Acknowledge,

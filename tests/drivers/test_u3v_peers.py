@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.pixel_formats import FORMATS
+from emmc_rig.drivers.pixel_formats import FORMATS
 
 pytestmark = pytest.mark.peers
 

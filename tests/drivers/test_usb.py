@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from drivers.errors import (
+from emmc_rig.drivers.errors import (
     UsbClaimedError,
     UsbGoneError,
     UsbNotFoundError,
@@ -14,9 +14,9 @@ from drivers.errors import (
     UsbTimeoutError,
     UsbTransferError,
 )
-from drivers.usb import BULK, INTERRUPT, find_holders, list_devices, open_device
-from simulators.clock import ManualClock
-from simulators.usb import (
+from emmc_rig.drivers.usb import BULK, INTERRUPT, find_holders, list_devices, open_device
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.usb import (
     DeviceSpec,
     EndpointSpec,
     InterfaceSpec,

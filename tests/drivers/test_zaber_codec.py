@@ -6,8 +6,8 @@ quoted; the others were seen with a running client, or are built by the manual's
 
 import pytest
 
-from drivers.errors import GarbledReplyError
-from drivers.zaber_codec import Reply, decode_message, encode_command, lrc
+from emmc_rig.drivers.errors import GarbledReplyError
+from emmc_rig.drivers.zaber_codec import Reply, decode_message, encode_command, lrc
 
 
 @pytest.mark.parametrize(

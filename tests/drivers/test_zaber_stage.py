@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import serial
 
-from drivers.errors import (
+from emmc_rig.drivers.errors import (
     CommandRefusedError,
     EmergencyStopError,
     GarbledReplyError,
@@ -19,18 +19,18 @@ from drivers.errors import (
     PortNotFoundError,
     TransportTimeoutError,
 )
-from drivers.stage import (
+from emmc_rig.drivers.stage import (
     DEFAULT_SETTINGS,
     Stage,
     StageSettings,
     move_time_limit_s,
     needs_approach,
 )
-from drivers.transport import SerialTransport, Transport
-from drivers.zaber import ZaberStage, find_devices
-from simulators.clock import ManualClock
-from simulators.wire import MemoryTransport, PtyServer
-from simulators.zaber import BENCH_AXES, AxisSpec, ZaberChain
+from emmc_rig.drivers.transport import SerialTransport, Transport
+from emmc_rig.drivers.zaber import ZaberStage, find_devices
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.wire import MemoryTransport, PtyServer
+from emmc_rig.simulators.zaber import BENCH_AXES, AxisSpec, ZaberChain
 
 AXES = {"mask_x": (1, 1), "mask_y": (1, 2), "aperture_x": (2, 1), "aperture_y": (2, 2)}
 SPEC = AxisSpec()

@@ -17,11 +17,11 @@ import tifffile
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.dng import encode_dng
-from drivers.errors import RawFrameError
-from drivers.raw import decode_raw
 from emmc_rig.bench.device_config import parse_camera, parse_stage
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.psi import StoredPsi, save_shards
@@ -501,7 +501,7 @@ class _Rawpy:
     [RuntimeError("RAW image is not flat"), OSError("x\ny"), KeyError(b"cfa"), RecursionError()],
 )
 def test_whatever_libraw_raises_is_a_frame_that_cannot_be_decoded(monkeypatch, fault):
-    monkeypatch.setattr("drivers.raw.rawpy", _Rawpy(fault))
+    monkeypatch.setattr("emmc_rig.drivers.raw.rawpy", _Rawpy(fault))
     with pytest.raises(RawFrameError, match="LibRaw cannot decode it") as refused:
         decode_raw(b"FUJIFILMCCD-RAW " + bytes(200))
     assert "\n" not in str(refused.value)
@@ -526,7 +526,9 @@ def test_a_raw_file_that_claims_more_than_its_bytes_hold_is_not_unpacked(tmp_pat
         tags[257].overwrite(20_000)
     (tmp_path / "x.dng").write_bytes(stream.getvalue())
     said, megabytes, _ = watched(
-        "from drivers.raw import decode_raw", "decode_raw(path.read_bytes())", tmp_path / "x.dng"
+        "from emmc_rig.drivers.raw import decode_raw",
+        "decode_raw(path.read_bytes())",
+        tmp_path / "x.dng",
     )
     assert "cannot hold 20000x20000 pixels" in said
     assert megabytes < 100

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from PIL import Image, ImageOps
 
-from drivers.dng import encode_dng
+from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.errors import AppError
 from emmc_rig.files.own_arrays import read_own
 from emmc_rig.files.photograph import read_photograph

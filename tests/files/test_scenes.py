@@ -7,7 +7,7 @@ from view_files import save_views
 from emmc_rig.files.scenes import box_average, fine_scene, open_scene
 from emmc_rig.model.errors import ModelError, SceneError
 from emmc_rig.model.lightfield import psnr_db, save_hdf5
-from simulators.scenes import SCENES, render
+from emmc_rig.simulators.scenes import SCENES, render
 
 
 @pytest.fixture

@@ -19,10 +19,10 @@ from emmc_rig.files.psi import StoredPsi, read_frames
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.reconstructing import open_frames, reconstruct_undrawn
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.settings import BlockSettings
+from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.store.folders import result_folder
-from reconstruction.methods import MethodSettings
-from reconstruction.settings import BlockSettings
-from reconstruction.tv import TVSettings
 
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
 SETTINGS = MethodSettings(

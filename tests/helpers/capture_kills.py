@@ -25,8 +25,8 @@ from emmc_rig.progress import Watcher
 from emmc_rig.session import journal, lock, session
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
+from emmc_rig.simulators.still import StillStage
 from emmc_rig.store import journal as lines
-from simulators.still import StillStage
 
 PLAN = """
 camera: rgbw-bayer-1shot

@@ -12,13 +12,13 @@ import numpy as np
 import yaml
 from watching import Acting
 
-from drivers.camera import CameraIdentity, RawFileCamera
-from drivers.dng import encode_dng
 from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
 from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.bench.hardware import Rig
-from simulators.clock import ManualClock
-from simulators.still import StillStage
+from emmc_rig.drivers.camera import CameraIdentity, RawFileCamera
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.still import StillStage
 
 SIZE = (24, 32)
 BLACK, WHITE = 100, 4000

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from drivers.raw import RawFrame
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.model.camera import shipped_cameras
-from simulators.bench import Bench, MountingErrors
+from emmc_rig.simulators.bench import Bench, MountingErrors
 
 SIZE = (72, 96)
 CAMERAS = shipped_cameras()

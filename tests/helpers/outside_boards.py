@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from outside_bench import Bench, Optics
 
-from calibration.boards import BoardFrame, BoardSet
-from calibration.frames import average
-from calibration.shadow import shadow_mask
+from emmc_rig.calibration.boards import BoardFrame, BoardSet
+from emmc_rig.calibration.frames import average
+from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.camera import Camera
 
 REPEATS = 4

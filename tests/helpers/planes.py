@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
 
 
 def textured(size, seed=0, detail=1.5):

@@ -13,8 +13,8 @@ import struct
 import threading
 from contextlib import suppress
 
-from drivers.ptp_codec import Kind, Message
-from simulators.ptp import Answer, PtpCameraSimulator
+from emmc_rig.drivers.ptp_codec import Kind, Message
+from emmc_rig.simulators.ptp import Answer, PtpCameraSimulator
 
 HOST, PORT = "127.0.0.1", 15740
 PACKET = struct.Struct("<II")

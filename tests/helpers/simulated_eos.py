@@ -11,9 +11,9 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
-from drivers.clock import Clock
-from drivers.ptp_codec import Code, EventCode, Operation, Property
-from simulators.ptp import EXPOSURE_UNIT_S, Answer, Array, PtpCameraSimulator
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.ptp_codec import Code, EventCode, Operation, Property
+from emmc_rig.simulators.ptp import EXPOSURE_UNIT_S, Answer, Array, PtpCameraSimulator
 
 TO_HOST = 4
 """As capture destination: pictures go to the computer, not onto the card."""

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drivers.clock import Clock
-from drivers.dng import encode_dng
-from simulators.faults import Faults
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.simulators.faults import Faults
 
 Array = np.ndarray
 

@@ -12,19 +12,19 @@ import pytest
 from serial.urlhandler import protocol_socket
 from tcp_server import TcpServer
 
-from drivers import grbl_codec as codec
-from drivers.apt import ACTUATORS, AptAxis, AptStage
-from drivers.apt_codec import Id
-from drivers.grbl import GrblStage
-from drivers.stage import DEFAULT_SETTINGS, HostStage, StageSettings
-from drivers.transport import SerialTransport, Transport
-from drivers.zaber import ZaberStage
-from simulators.apt import AptController
-from simulators.clock import ManualClock
-from simulators.firmware import Occasion, SimulatedController
-from simulators.grbl import GrblController
-from simulators.wire import PtyServer
-from simulators.zaber import AxisSpec, ZaberChain
+from emmc_rig.drivers import grbl_codec as codec
+from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage
+from emmc_rig.drivers.apt_codec import Id
+from emmc_rig.drivers.grbl import GrblStage
+from emmc_rig.drivers.stage import DEFAULT_SETTINGS, HostStage, StageSettings
+from emmc_rig.drivers.transport import SerialTransport, Transport
+from emmc_rig.drivers.zaber import ZaberStage
+from emmc_rig.simulators.apt import AptController
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.firmware import Occasion, SimulatedController
+from emmc_rig.simulators.grbl import GrblController
+from emmc_rig.simulators.wire import PtyServer
+from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 WIRES = ("memory", "pty", "tcp")
 MEMORY_TIMEOUT_S = 0.5

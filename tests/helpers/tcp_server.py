@@ -3,8 +3,8 @@
 import socket
 from contextlib import suppress
 
-from drivers.transport import IN_USE
-from simulators.wire import READ_SIZE, PtyServer
+from emmc_rig.drivers.transport import IN_USE
+from emmc_rig.simulators.wire import READ_SIZE, PtyServer
 
 
 class TcpServer(PtyServer):

@@ -5,8 +5,8 @@ from functools import cache, reduce
 import numpy as np
 from scipy import sparse
 
-from reconstruction.differences import fitting_indices, planar_variation
-from reconstruction.problem import PatchTerm
+from emmc_rig.reconstruction.differences import fitting_indices, planar_variation
+from emmc_rig.reconstruction.problem import PatchTerm
 
 AXIS = (3, 2, 1, 0)
 """Entries of a multi-index, x y u v, as axes of (v, u, y, x, c)."""

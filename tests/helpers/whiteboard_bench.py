@@ -9,17 +9,17 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards import BoardFrame, BoardSet, channels_of
-from calibration.frames import MeanFrame, average, before_and_after
-from calibration.levels import Check, check_of
-from calibration.openings import CENTRED, Window, views_open, window_place_um
-from calibration.whiteboard import LAMP_COLOURS
+from emmc_rig.calibration.boards import BoardFrame, BoardSet, channels_of
+from emmc_rig.calibration.frames import MeanFrame, average, before_and_after
+from emmc_rig.calibration.levels import Check, check_of
+from emmc_rig.calibration.openings import CENTRED, Window, views_open, window_place_um
+from emmc_rig.calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.sensing import ImagingMatrix
-from simulators.bench import Bench, MountingErrors, window_side_um
-from simulators.effects import ORDINARY, Flaws, flawed
-from simulators.flaws import OpticsFlaws, SensorFlaws
+from emmc_rig.simulators.bench import Bench, MountingErrors, window_side_um
+from emmc_rig.simulators.effects import ORDINARY, Flaws, flawed
+from emmc_rig.simulators.flaws import OpticsFlaws, SensorFlaws
 
 Array = NDArray[np.floating]
 DARK_REPEATS = 2

@@ -19,15 +19,15 @@ from programs import exit_code
 from pydantic import ValidationError
 from test_live_alignment import BLACK, WHITE, frame_of
 
-from drivers.camera import CameraIdentity
-from drivers.errors import (
+from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.drivers.camera import CameraIdentity
+from emmc_rig.drivers.errors import (
     DriverError,
     ExposureStoppedError,
     PositionMismatchError,
     RawFrameError,
     TransportTimeoutError,
 )
-from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene

@@ -19,7 +19,7 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.save import Files
 from emmc_rig.live.steps import LONGEST_UNASKED_S
-from simulators.clock import ManualClock
+from emmc_rig.simulators.clock import ManualClock
 
 DESIGN, SIZE, FOCUS_UM = "rgbw-bayer-1shot", (32, 48), 9000.0
 CLICKS = {

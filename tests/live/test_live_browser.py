@@ -6,10 +6,10 @@ import pytest
 from browsers import MARKS, complaints
 from test_live import FakeCamera, PatientCamera
 
-from calibration.scale import designed_scale
-from drivers.errors import DriverError
 from emmc_rig.acquisition.control import Control
 from emmc_rig.bench.hardware import simulated_rig
+from emmc_rig.calibration.scale import designed_scale
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
 from emmc_rig.live.light_field import LiveLightField
@@ -17,7 +17,7 @@ from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
 from emmc_rig.live.watch import Watch
 from emmc_rig.pages.page import source
-from simulators.bench import MountingErrors
+from emmc_rig.simulators.bench import MountingErrors
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.common.exceptions import StaleElementReferenceException

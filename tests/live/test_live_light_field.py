@@ -11,7 +11,7 @@ import pytest
 from test_live_alignment import frame_of
 
 import emmc_rig as emmc
-from calibration.scale import designed_scale
+from emmc_rig.calibration.scale import designed_scale
 from emmc_rig.errors import AppError
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.live.light_field import LiveLightField, disparity_of, live_scale
@@ -19,11 +19,11 @@ from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db, shifted
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.errors import ReconstructionError
-from reconstruction.preview import Preview, coarser
-from reconstruction.result import Progress, Reconstruction, Status
-from reconstruction.verdict.rules import Verdict
-from reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.preview import Preview, coarser
+from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
+from emmc_rig.reconstruction.verdict.rules import Verdict
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 
 SIZE = (48, 64)
 PATIENCE_S = 60.0

@@ -16,7 +16,7 @@ from emmc_rig.files.scenes import fine_scene
 from emmc_rig.files.yaml_edit import replace_text, with_values
 from emmc_rig.live.alignment import MaskPlace
 from emmc_rig.live.save import Files, Found
-from simulators.bench import MountingErrors
+from emmc_rig.simulators.bench import MountingErrors
 
 RIG_YAML = """# the bench in room 12
 stage: stage.yaml          # four axes

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators")
 RENDER = """
 import numpy as np
-from reconstruction.adaptive import rays
+from emmc_rig.reconstruction.adaptive import rays
 out = np.zeros((1, 1, 4, 6, 1), np.float32)
 texture = np.arange(192, dtype=np.float32).reshape(1, 12, 16)
 rays._render(np.full((1, 1, 4, 6), 0.3, np.float32), texture, 4, 0, 4, out)
@@ -33,7 +33,7 @@ RECONSTRUCT = """
 import hashlib
 import numpy as np
 import emmc_rig as emmc
-from reconstruction.adaptive import rays
+from emmc_rig.reconstruction.adaptive import rays
 psi = emmc.camera("scenario-ii-cfa").psi((48, 64))
 frames = psi @ emmc.scene("near-planar", size=(48, 64))
 frames += np.float32(0.01) * np.random.default_rng(0).standard_normal(frames.shape, np.float32)
@@ -46,12 +46,13 @@ print(digest, sum(kept.values()), rays._render.stats.cache_path)
 
 @pytest.fixture
 def copied(tmp_path, monkeypatch):
-    """The packages, copied to where a test may change them, without machine code."""
+    """The package, copied to where a test may change them, without machine code."""
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     source = tmp_path / "source"
-    for name in PACKAGES:
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "emmc_rig", source / "emmc_rig", ignore=shutil.ignore_patterns("__pycache__")
+    )
     return source
 
 
@@ -77,7 +78,9 @@ def test_a_helper_changed_in_another_file_changes_what_kernels_compute(copied, m
     assert kept == 0
     assert run(copied)[:2] == (before, 1)
     edit(
-        copied / "reconstruction/adaptive/lanes.py", "(0.0, 1.0, 0.0, 0.0)", "(0.0, 1.3, 0.0, 0.0)"
+        copied / "emmc_rig/reconstruction/adaptive/lanes.py",
+        "(0.0, 1.0, 0.0, 0.0)",
+        "(0.0, 1.3, 0.0, 0.0)",
     )
     after = run(copied)[0]
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(copied / "empty"))
@@ -116,7 +119,7 @@ def test_a_constant_changed_in_a_file_imported_through_others_changes_the_state(
 
 @pytest.mark.slow
 def test_where_the_folder_beside_the_source_is_not_writable_the_users_keeps_the_code(copied):
-    blocked = copied / "reconstruction/adaptive/__pycache__"
+    blocked = copied / "emmc_rig/reconstruction/adaptive/__pycache__"
     blocked.mkdir(exist_ok=True)
     (blocked / "kernels").write_text("no folder")
     before, _, folder = run(copied)
@@ -151,7 +154,7 @@ def test_code_that_no_process_used_for_a_month_is_removed(tmp_path):
 
 def test_every_kernel_whose_file_imports_others_of_the_project_is_compiled_with_its_sources():
     plain = re.compile(r"^from numba import .*\bn?jit\b|\bnumba\.n?jit\b", re.MULTILINE)
-    project = re.compile(rf"^(from|import) +({'|'.join(PACKAGES)})\b", re.MULTILINE)
+    project = re.compile(r"^(from|import) +emmc_rig\b", re.MULTILINE)
     own = ROOT / "emmc_rig/model/compiling.py"
     for name in PACKAGES:
         for file in sorted(set((ROOT / name).rglob("*.py")) - {own}):

@@ -29,9 +29,9 @@ from emmc_rig.model.masks import Picture
 from emmc_rig.model.reading import parse_yaml, read_yaml, stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import validated
-from reconstruction.dictionary import Dictionary
-from reconstruction.errors import DictionaryError
-from reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.errors import DictionaryError
+from emmc_rig.reconstruction.methods import MethodSettings
 
 TRIES = int(os.environ.get("EMMC_FUZZ", "150"))
 fuzzed = settings(

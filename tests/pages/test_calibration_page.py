@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.choice import HeldOut
+from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.pages.calibration_page import PARAMETERS, write_calibration_report

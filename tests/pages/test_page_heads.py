@@ -8,10 +8,10 @@ import pytest
 from emmc_rig.files.formats.format import Export
 from emmc_rig.pages.page import light_field_head, typed
 from emmc_rig.pages.viewer import render_viewer
+from emmc_rig.reconstruction.verdict.rules import LEVELS
 from emmc_rig.study.chart.charting import chart_page
 from emmc_rig.study.stability.stability_run import stability_page
 from emmc_rig.study.tables.tables_page import tables_page
-from reconstruction.verdict.rules import LEVELS
 
 NOT_ASKED: Any = None
 """The study, where nothing was measured."""

@@ -22,14 +22,14 @@ gi.require_version("Aravis", "0.8")
 from gi.repository import Aravis  # noqa: E402
 from usbfs import mock  # noqa: E402
 
-from drivers.clock import SYSTEM_CLOCK  # noqa: E402
-from drivers.genapi import Features  # noqa: E402
-from drivers.pixel_formats import BY_CODE, unpack  # noqa: E402
-from drivers.u3v import open_camera  # noqa: E402
-from drivers.u3v_codec import CONTROL  # noqa: E402
-from drivers.usb import list_devices  # noqa: E402
-from simulators.u3v import U3vCameraSimulator  # noqa: E402
-from simulators.usb import SimulatedUsb  # noqa: E402
+from emmc_rig.drivers.clock import SYSTEM_CLOCK  # noqa: E402
+from emmc_rig.drivers.genapi import Features  # noqa: E402
+from emmc_rig.drivers.pixel_formats import BY_CODE, unpack  # noqa: E402
+from emmc_rig.drivers.u3v import open_camera  # noqa: E402
+from emmc_rig.drivers.u3v_codec import CONTROL  # noqa: E402
+from emmc_rig.drivers.usb import list_devices  # noqa: E402
+from emmc_rig.simulators.u3v import U3vCameraSimulator  # noqa: E402
+from emmc_rig.simulators.usb import SimulatedUsb  # noqa: E402
 
 SHAPE, FRAMES, SESSIONS = (1024, 1022), 4, 2
 MOSAIC = np.random.default_rng(7).integers(64, 4096, SHAPE, dtype=np.uint16)

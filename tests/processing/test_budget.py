@@ -13,8 +13,8 @@ from emmc_rig.files.results import METRICS, parse_seconds
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.processing import budget
 from emmc_rig.processing.budget import FACTORS, method_within, timed
-from reconstruction.methods import reconstruct
-from simulators.scenes import render
+from emmc_rig.reconstruction.methods import reconstruct
+from emmc_rig.simulators.scenes import render
 
 NOT_READ: Any = None
 """Psi and frames, where a trial on them is replaced."""

@@ -6,11 +6,11 @@ from moved_mask import CAMERA
 from whiteboard_bench import ORDINARY_BENCH, BenchTruth, Setting, WhiteboardBench
 
 import emmc_rig as emmc
-from calibration.boards import BoardFrame, BoardSet
-from calibration.frames import average
-from calibration.routes import calibrate
+from emmc_rig.calibration.boards import BoardFrame, BoardSet
+from emmc_rig.calibration.frames import average
+from emmc_rig.calibration.routes import calibrate
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
-from simulators.bench import MountingErrors
+from emmc_rig.simulators.bench import MountingErrors
 
 SIZE = (44, 60)
 MOUNTING = MountingErrors((31.0, -22.0), 0.15, 1.002, 0.0008, 0.05, 1.0, 3.0)

@@ -21,9 +21,9 @@ from emmc_rig.session import frame_means
 from emmc_rig.session.frame_means import camera_of
 from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import Session
+from emmc_rig.simulators.bench import MountingErrors
+from emmc_rig.simulators.effects import flawed
 from emmc_rig.store.folders import Listing
-from simulators.bench import MountingErrors
-from simulators.effects import flawed
 
 pytestmark = pytest.mark.slow
 

@@ -24,14 +24,14 @@ from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.pool import WorkersError, opened_pool
 from emmc_rig.processing.reconstructing import reconstruct_undrawn
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.settings import BlockSettings
+from emmc_rig.reconstruction.tiles import CaptureSurvey, Grid
+from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.store.folders import result_folder
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.stability_run import run_stability
 from emmc_rig.study.stability.stability_study import stability_settings
-from reconstruction.methods import MethodSettings
-from reconstruction.settings import BlockSettings
-from reconstruction.tiles import CaptureSurvey, Grid
-from reconstruction.tv import TVSettings
 
 pytestmark = pytest.mark.timing("workers that answer late are taken for lost")
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"

@@ -29,10 +29,10 @@ from emmc_rig.processing import filming
 from emmc_rig.processing.filming import reconstruct_film_session
 from emmc_rig.processing.reconstructing import sensor_deviation
 from emmc_rig.processing.session_capture import SessionCapture
+from emmc_rig.reconstruction.adaptive.film import Film, FilmSettings
+from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.session.readings import film_places
 from emmc_rig.session.session import Session
-from reconstruction.adaptive.film import Film, FilmSettings
-from reconstruction.methods import MethodSettings
 
 FRAMES, RATE, METHOD = 6, 10, "adaptive-fast"
 PLAN = f"""

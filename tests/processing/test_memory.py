@@ -18,8 +18,8 @@ from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.processing.memory import Ceiling, task_bytes
 from emmc_rig.processing.pool import Processes, WorkersError
-from reconstruction.settings import BlockSettings
-from reconstruction.tiles import Grid
+from emmc_rig.reconstruction.settings import BlockSettings
+from emmc_rig.reconstruction.tiles import Grid
 
 CAMERA, SIZE = "rgbw-bayer-1shot", (64, 80)
 MIB = 2**20

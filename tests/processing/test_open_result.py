@@ -17,8 +17,8 @@ from emmc_rig.files.exports import open_export, open_film
 from emmc_rig.files.results import write_metrics
 from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.reconstructing import reconstruct_undrawn
+from emmc_rig.reconstruction.verdict.rules import Verdict
 from emmc_rig.store.folders import result_folder
-from reconstruction.verdict.rules import Verdict
 
 SIZE = (24, 32)
 OLD = Path(__file__).parent / "result-of-0.4.0"

@@ -8,7 +8,7 @@ import pytest
 
 import emmc_rig as emmc
 from emmc_rig.model.camera import shipped_cameras
-from simulators.scenes import STILL_SCENES
+from emmc_rig.simulators.scenes import STILL_SCENES
 
 RAW = Path(os.environ.get("EMMC_PEER_FILES", "")) / "raw"
 

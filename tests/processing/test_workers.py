@@ -25,8 +25,8 @@ from emmc_rig.processing import block_tasks
 from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.memory import parse_memory
 from emmc_rig.processing.reconstructing import load_settings, reconstruct_undrawn
+from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.store.folders import result_folder
-from reconstruction.errors import ReconstructionError
 
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
 BLOCKS = {"blocks": {"whole": 1000, "side": 32, "blend": 4}, "tv": {"max_steps": 20}}

@@ -13,15 +13,14 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import OPPONENT, centre_view, psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive import assembly, method
-from reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
-from reconstruction.adaptive.joint import TextureSettings, solve
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.rays import Surfaces
-from reconstruction.adaptive.refine import fitted, slopes
-from reconstruction.adaptive.register_tiles import LANES
-from reconstruction.adaptive.search import (
+from emmc_rig.reconstruction.adaptive import assembly, method
+from emmc_rig.reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
+from emmc_rig.reconstruction.adaptive.joint import TextureSettings, solve
+from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
+from emmc_rig.reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.refine import fitted, slopes
+from emmc_rig.reconstruction.adaptive.register_tiles import LANES
+from emmc_rig.reconstruction.adaptive.search import (
     TILE,
     Volume,
     _asked,
@@ -37,20 +36,21 @@ from reconstruction.adaptive.search import (
     posteriors,
     variance_per_pixel,
 )
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.adaptive.survey import checked, surveyed
-from reconstruction.adaptive.sweep import plane_frames, swept
-from reconstruction.adaptive.uncertainty import (
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive.survey import checked, surveyed
+from emmc_rig.reconstruction.adaptive.sweep import plane_frames, swept
+from emmc_rig.reconstruction.adaptive.uncertainty import (
     FEATURES,
     features,
     foretold_db,
     held_out,
     within_db,
 )
-from reconstruction.adaptive.visibility import carried
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import Readings
-from reconstruction.tv import reconstruct_tv
+from emmc_rig.reconstruction.adaptive.visibility import carried
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.tv import reconstruct_tv
+from emmc_rig.study.trial import Capture, trial_of
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from reconstruction.bpdn import BPDNSettings, prepared
-from reconstruction.bpdn_solvers import ridge_inverse
-from reconstruction.patches import padded
+from emmc_rig.reconstruction.bpdn import BPDNSettings, prepared
+from emmc_rig.reconstruction.bpdn_solvers import ridge_inverse
+from emmc_rig.reconstruction.patches import padded
 
 SIZES = [(60, 20), (33, 16), (300, 45), (12, 30)]
 

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from reconstruction.dictionary import (
+from emmc_rig.reconstruction.dictionary import (
     KINDS,
     OPPONENT,
     Dictionary,
@@ -12,7 +12,7 @@ from reconstruction.dictionary import (
     lambertian_dictionary,
     plane_disparities,
 )
-from reconstruction.errors import DictionaryError, ReconstructionError
+from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
 
 VIEWS, PATCH = (3, 2), (4, 5)
 SHAPE = (*VIEWS, *PATCH, 3)
@@ -110,7 +110,7 @@ def test_a_failed_write_leaves_the_old_file(some, tmp_path, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("reconstruction.dictionary.os.replace", full)
+    monkeypatch.setattr("emmc_rig.reconstruction.dictionary.os.replace", full)
     with pytest.raises(DictionaryError, match="No space left"):
         Dictionary.normalised(random_atoms(9), "ksvd").save(path)
     assert path.read_bytes() == before

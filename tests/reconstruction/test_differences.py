@@ -12,15 +12,15 @@ from variation import AXIS, adjoint, gradient, variation
 
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from reconstruction import kernels
-from reconstruction.differences import (
+from emmc_rig.reconstruction import kernels
+from emmc_rig.reconstruction.differences import (
     fitting_indices,
     multi_indices,
     norm_squared,
     stencils,
 )
-from reconstruction.errors import ReconstructionError
-from reconstruction.problem import colour_metric
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.problem import colour_metric
 
 EPS = float(np.finfo(np.float32).eps)
 SHAPES = [(2, 3, 4, 5, 3), (1, 1, 4, 6, 3), (3, 1, 2, 4, 3), (1, 4, 1, 5, 3)]
@@ -198,7 +198,7 @@ def swept(psi, usable, frames, light_field, dual, order, bands, pull=None, count
     dual_state = np.ascontiguousarray(dual.transpose(1, 2, 3, 0, 5, 4), dtype=kind)
     moved = np.zeros((psi.frames_shape[1], 2))
     taps = stencils(order, psi.light_field_shape, np.dtype(kind))
-    with patch("reconstruction.kernels.in_bands", partial(in_bands, bands=bands)):
+    with patch("emmc_rig.reconstruction.kernels.in_bands", partial(in_bands, bands=bands)):
         for _ in range(count):
             kernels.sweep(data, steps, taps, state, dual_state, room, moved)
     return np.swapaxes(state, -1, -2), dual_state.transpose(3, 0, 1, 2, 5, 4), moved

@@ -6,11 +6,11 @@ from planes import plane_scene
 
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive import method
-from reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
-from reconstruction.adaptive.joint import TextureSettings
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.adaptive import method
+from emmc_rig.reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
+from emmc_rig.reconstruction.adaptive.joint import TextureSettings
+from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 
 SIGMA = 2e-3
 

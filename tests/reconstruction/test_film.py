@@ -8,14 +8,14 @@ import pytest
 from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.film import Film
-from reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
-from reconstruction.adaptive.joint import surfaces_of
-from reconstruction.adaptive.times import OtherTime
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import Readings
-from reconstruction.methods import reconstruct
-from simulators.scenes import render
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
+from emmc_rig.reconstruction.adaptive.joint import surfaces_of
+from emmc_rig.reconstruction.adaptive.times import OtherTime
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.methods import reconstruct
+from emmc_rig.simulators.scenes import render
 
 SIZE = (48, 64)
 LEAST_GAIN_DB, MOST_LOSS_DB = 0.3, 0.2

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from reconstruction.adaptive.lanes import (
+from emmc_rig.reconstruction.adaptive.lanes import (
     LANES,
     TAPS,
     add_box,

@@ -14,13 +14,13 @@ import pytest
 from pydantic import ValidationError
 
 from emmc_rig.model.errors import RemovedSettingWarning
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.dictionary import usual_patch
-from reconstruction.errors import ReconstructionError
-from reconstruction.methods import DEFAULT_METHOD, METHODS, MethodSettings, find_method
-from reconstruction.methods.surfaces import sparse_patches
-from reconstruction.patches import regular_grid
-from reconstruction.sparse import SparseSettings
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.dictionary import usual_patch
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD, METHODS, MethodSettings, find_method
+from emmc_rig.reconstruction.methods.surfaces import sparse_patches
+from emmc_rig.reconstruction.patches import regular_grid
+from emmc_rig.reconstruction.sparse import SparseSettings
 
 CHART = Path(__file__).parents[2] / "docs/results/chart-group-a-64x80.csv"
 MEAN_PICTURE = textwrap.dedent('''
@@ -30,8 +30,8 @@ MEAN_PICTURE = textwrap.dedent('''
     from pydantic import Field
 
     from emmc_rig.model.settings import Settings
-    from reconstruction.method import Method
-    from reconstruction.result import Reconstruction, Status
+    from emmc_rig.reconstruction.method import Method
+    from emmc_rig.reconstruction.result import Reconstruction, Status
 
 
     class MeanSettings(Settings):
@@ -55,7 +55,7 @@ USED = textwrap.dedent("""
     from emmc_rig.files.cameras import find_camera
     from emmc_rig.model.camera import build_imaging_matrix
     from emmc_rig.model.frames import even_frames
-    from reconstruction.methods import MethodSettings, reconstruct
+    from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
 
     psi = build_imaging_matrix(find_camera("rgbw-mono"), (8, 8))
     settings = MethodSettings.model_validate({"mean": {"gain": 0.5}})

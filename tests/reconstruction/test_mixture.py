@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.adaptive.mixture import (
+from emmc_rig.reconstruction.adaptive.mixture import (
     HIDDEN,
     PATCHES_POWER,
     averaged,

@@ -6,7 +6,7 @@ from scipy import sparse
 from variation import from_patches
 
 from emmc_rig.model.frames import even_frames
-from reconstruction.tv import TVSettings, reconstruct_tv
+from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 
 SHAPE = (2, 3, 7, 9, 3)
 REGULAR = [(y, x, 4, 4) for y in (0, 2, 3) for x in (0, 2, 4, 5)]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from emmc_rig.model.frames import even_frames
-from reconstruction.errors import ReconstructionError
-from reconstruction.patches import (
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.patches import (
     overlap_add,
     padded,
     pixel_of_sample,

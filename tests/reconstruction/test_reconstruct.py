@@ -19,10 +19,10 @@ from emmc_rig.processing.reconstructing import (
 )
 from emmc_rig.processing.result import Result
 from emmc_rig.progress import Watcher
-from reconstruction.adaptive.joint import TextureSettings
-from reconstruction.adaptive.settings import AdaptiveSettings
-from reconstruction.dictionary import Dictionary
-from reconstruction.errors import DictionaryError, ReconstructionError
+from emmc_rig.reconstruction.adaptive.joint import TextureSettings
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
 
 SCENE, CAMERA, SIZE = "deep-occlusions", "rgbw-bayer-2shots", (36, 44)
 

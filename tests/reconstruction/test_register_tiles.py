@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from reconstruction.adaptive.register_tiles import (
+from emmc_rig.reconstruction.adaptive.register_tiles import (
     LANES,
     SIDE,
     combined,

@@ -8,10 +8,10 @@ import pytest
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
+from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
+from emmc_rig.reconstruction.screening import bad_pixels, neighbour_range, screened
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture
-from reconstruction.methods import MethodSettings, reconstruct
-from reconstruction.screening import bad_pixels, neighbour_range, screened
 
 SIZE = (48, 64)
 CAMERA = find_camera("rgbw-bayer-3shots")

@@ -10,12 +10,12 @@ import pytest
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import even_frames
+from emmc_rig.reconstruction.adaptive import fits, method, second
+from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
+from emmc_rig.reconstruction.adaptive.second import searched_again, surfaces_fail
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
+from emmc_rig.reconstruction.adaptive.survey import checked, surveyed
 from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive import fits, method, second
-from reconstruction.adaptive.method import reconstruct_adaptive
-from reconstruction.adaptive.second import searched_again, surfaces_fail
-from reconstruction.adaptive.settings import AdaptiveSettings, fast
-from reconstruction.adaptive.survey import checked, surveyed
 
 SIZE = (48, 56)
 QUICK = fast(AdaptiveSettings()).model_copy(update={"second": True})

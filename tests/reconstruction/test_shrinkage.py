@@ -7,8 +7,8 @@ from scipy.fft import dctn, idctn
 from scipy.linalg import hadamard
 
 from emmc_rig.model.lightfield import OPPONENT, psnr_db
-from reconstruction.adaptive.shrinkage import ALIKE, denoised
-from reconstruction.adaptive.stacks import (
+from emmc_rig.reconstruction.adaptive.shrinkage import ALIKE, denoised
+from emmc_rig.reconstruction.adaptive.stacks import (
     CELL,
     SIDE,
     STACK,

@@ -8,11 +8,11 @@ import pytest
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.bpdn import BPDNSettings
-from reconstruction.dictionary import Dictionary
-from reconstruction.errors import DictionaryError, ReconstructionError
-from reconstruction.methods import METHODS, MethodSettings, find_method, reconstruct
-from reconstruction.sparse import SparseSettings, reconstruct_sparse
+from emmc_rig.reconstruction.bpdn import BPDNSettings
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, find_method, reconstruct
+from emmc_rig.reconstruction.sparse import SparseSettings, reconstruct_sparse
 
 VIEWS, PATCH = (3, 3), (6, 6)
 

@@ -11,7 +11,7 @@ import emmc_rig as emmc
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.methods import reconstruct
+from emmc_rig.reconstruction.methods import reconstruct
 
 NOISE = 0.004
 SIZE = (24, 32)

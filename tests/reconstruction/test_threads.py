@@ -9,7 +9,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from emmc_rig.model.blas import one_blas_thread
-from reconstruction.methods import METHODS
+from emmc_rig.reconstruction.methods import METHODS
 
 BEGIN = """
 import hashlib, json, sys
@@ -39,7 +39,7 @@ def for_each_number_of_threads(call):
     return found
 """
 METHOD = """
-from reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.methods import MethodSettings
 
 camera = emmc.camera("scenario-ii-cfa", 2)
 slow = MethodSettings.model_validate({"sparse": {"solver": {"max_steps": 60}}})

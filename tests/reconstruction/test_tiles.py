@@ -9,14 +9,14 @@ from emmc_rig.files.psi import StoredPsi
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.settings import SIDES, AdaptiveSettings
-from reconstruction.dictionary import dct_dictionary
-from reconstruction.errors import ReconstructionError
-from reconstruction.methods import MethodSettings, reconstruct
-from reconstruction.result import Reconstruction, Status
-from reconstruction.settings import BlockSettings
-from reconstruction.sparse import SparseSettings
-from reconstruction.tiles import (
+from emmc_rig.reconstruction.adaptive.settings import SIDES, AdaptiveSettings
+from emmc_rig.reconstruction.dictionary import dct_dictionary
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
+from emmc_rig.reconstruction.result import Reconstruction, Status
+from emmc_rig.reconstruction.settings import BlockSettings
+from emmc_rig.reconstruction.sparse import SparseSettings
+from emmc_rig.reconstruction.tiles import (
     CaptureSurvey,
     Grid,
     reconstruct_in_blocks,
@@ -25,9 +25,9 @@ from reconstruction.tiles import (
     surveyed,
     within,
 )
-from reconstruction.tv import TVSettings
-from reconstruction.verdict.blocks import JudgedBlock, combined, judged_together
-from reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.reconstruction.tv import TVSettings
+from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, combined, judged_together
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 
 VIEWS = (2, 2)
 SMALL = BlockSettings(whole=1, side=48, blend=4)

@@ -5,14 +5,14 @@ import pytest
 
 from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
-from reconstruction.adaptive.film import Film
-from reconstruction.adaptive.times import OtherTime, aligned, rested
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import Readings
-from reconstruction.methods import reconstruct
-from reconstruction.verdict import run
-from reconstruction.verdict.run import reconstruct_judged
-from simulators.scenes import flow_px, render
+from emmc_rig.reconstruction.adaptive.film import Film
+from emmc_rig.reconstruction.adaptive.times import OtherTime, aligned, rested
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.methods import reconstruct
+from emmc_rig.reconstruction.verdict import run
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.simulators.scenes import flow_px, render
 
 SIZE = (48, 64)
 CAMERA = shipped_cameras()["rgbw-bayer-3shots"]

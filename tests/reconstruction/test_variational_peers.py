@@ -5,7 +5,7 @@ import pytest
 from variation import from_patches, gradient
 
 from emmc_rig.model.frames import even_frames
-from reconstruction.tv import TVSettings, reconstruct_tv
+from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 
 
 def capture(psi):

@@ -19,28 +19,28 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.study.stability.faults import Point
-from emmc_rig.study.trial import Capture, trial_of
-from reconstruction.adaptive.settings import AdaptiveSettings, fast
-from reconstruction.methods import MethodSettings
-from reconstruction.result import Reconstruction, Status
-from reconstruction.screening import screened
-from reconstruction.tv import TVSettings, reconstruct_tv
-from reconstruction.verdict.blocks import JudgedBlock, judged_together
-from reconstruction.verdict.compression import blockiness, quantised
-from reconstruction.verdict.displaced import _tiled, displaced
-from reconstruction.verdict.evidence import Evidence, FittedFrames, gathered
-from reconstruction.verdict.kept import (
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.result import Reconstruction, Status
+from emmc_rig.reconstruction.screening import screened
+from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
+from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, judged_together
+from emmc_rig.reconstruction.verdict.compression import blockiness, quantised
+from emmc_rig.reconstruction.verdict.displaced import _tiled, displaced
+from emmc_rig.reconstruction.verdict.evidence import Evidence, FittedFrames, gathered
+from emmc_rig.reconstruction.verdict.kept import (
     compare_held_out,
     kept_readings,
     missed_readings,
     over_baselines,
 )
-from reconstruction.verdict.pixels import pixel_figures
-from reconstruction.verdict.rules import LEVELS, verdict_from
-from reconstruction.verdict.run import reconstruct_judged
-from reconstruction.verdict.shadow import Relief, relief, shadow, tile_edges
-from reconstruction.verdict.shots import _differences, _differing, compared, motion
+from emmc_rig.reconstruction.verdict.pixels import pixel_figures
+from emmc_rig.reconstruction.verdict.rules import LEVELS, verdict_from
+from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.reconstruction.verdict.shadow import Relief, relief, shadow, tile_edges
+from emmc_rig.reconstruction.verdict.shots import _differences, _differing, compared, motion
+from emmc_rig.study.stability.faults import Point
+from emmc_rig.study.trial import Capture, trial_of
 
 SIZE = (48, 64)
 SCREENED = ("flicker", "repeated-shot", "missing-shot", "bad-pixels")

@@ -29,8 +29,8 @@ from emmc_rig.pages.viewer import render_viewer, viewer_data
 from emmc_rig.processing.captures import opened_capture
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.processing.reconstructing import reconstruct_undrawn
-from reconstruction.methods import MethodSettings
-from reconstruction.preview import Preview
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.preview import Preview
 
 SIZE = (24, 32)
 BANDS, TIMES = ("angle", "band"), ("time", "angle")

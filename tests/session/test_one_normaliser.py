@@ -8,10 +8,10 @@ import yaml
 from programs import program
 
 import emmc_rig as emmc
-from calibration.frames import MeanFrame, SensorGain
-from calibration.scale import Scale
-from drivers.dng import encode_dng
-from drivers.raw import decode_raw
+from emmc_rig.calibration.frames import MeanFrame, SensorGain
+from emmc_rig.calibration.scale import Scale
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.live.light_field import LiveLightField, live_scale
 from emmc_rig.model.camera import pixel_light
 from emmc_rig.model.frames import Frames

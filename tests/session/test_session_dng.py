@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from capture_rigs import begun, still_rig
 
-from drivers.dng import Facts, encode_dng
-from drivers.raw import decode_raw
 from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.drivers.dng import Facts, encode_dng
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.session.export import export_dng

@@ -9,8 +9,6 @@ import yaml
 from capture_rigs import begun
 from simulated_disk import SimulatedDisk
 
-from drivers.errors import DriverError
-from drivers.raw import RawFrame
 from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hands import AskingAttendant
@@ -21,6 +19,8 @@ from emmc_rig.bench.rig_config import (
     RealRig,
     rig_description,
 )
+from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.files.scenes import fine_scene
@@ -28,11 +28,11 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import NO_FIGURES, decode_frame, frame_entry, frame_file
 from emmc_rig.session.readings import session_frames
-from simulators.clock import ManualClock
-from simulators.effects import Flaws
-from simulators.flaws import SensorFlaws
-from simulators.u3v import U3vCameraSimulator
-from simulators.usb import SimulatedUsb
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.effects import Flaws
+from emmc_rig.simulators.flaws import SensorFlaws
+from emmc_rig.simulators.u3v import U3vCameraSimulator
+from emmc_rig.simulators.usb import SimulatedUsb
 
 SIZE = (24, 32)
 BRIGHT = 0.08

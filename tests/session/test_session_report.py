@@ -12,11 +12,11 @@ from capture_rigs import SIZE, begun, still_rig
 from rich.console import Console
 from simulated_disk import SimulatedDisk
 
-from drivers.dng import encode_dng
-from drivers.raw import RawFrame, decode_raw
 from emmc_rig.acquisition.control import Control
 from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.commands.capture_display import CaptureDisplay
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.raw import RawFrame, decode_raw
 from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.pages.session_sheet import run_times, sheet
 from emmc_rig.session.brightness import figures, thinned
@@ -24,7 +24,7 @@ from emmc_rig.session.exposure import ShotExposure, exposure_reasons
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry
 from emmc_rig.session.journal import RetryEntry
 from emmc_rig.session.session import Session
-from simulators.still import StillStage
+from emmc_rig.simulators.still import StillStage
 
 ROOT = Path("/disk")
 
@@ -154,8 +154,8 @@ def test_hot_pixels_are_no_light_that_a_frame_is_metered_by():
 
 
 def test_a_still_stage_refuses_what_a_real_one_would():
-    from drivers.errors import LimitExceededError, NotHomedError
-    from simulators.clock import ManualClock
+    from emmc_rig.drivers.errors import LimitExceededError, NotHomedError
+    from emmc_rig.simulators.clock import ManualClock
 
     stage = StillStage(("x",), ManualClock(), move_s=0.5)
     with pytest.raises(NotHomedError):

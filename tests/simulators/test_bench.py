@@ -5,7 +5,7 @@ import pytest
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.masks import CFA
-from simulators.bench import NO_ERRORS, Bench, MountingErrors, lens_points_um, ray_points
+from emmc_rig.simulators.bench import NO_ERRORS, Bench, MountingErrors, lens_points_um, ray_points
 
 SIZE = (12, 18)
 CENTRED = {"mask_x": 0.0, "mask_y": 0.0, "aperture_x": 0.0, "aperture_y": 0.0}

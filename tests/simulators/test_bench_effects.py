@@ -9,8 +9,8 @@ from scipy.special import erf, fresnel
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.noise import SensorNoise
-from simulators.bench import NO_ERRORS, Bench, _met
-from simulators.flaws import BoardFlaws, LampFlaws, OpticsFlaws, SensorFlaws, diffracted
+from emmc_rig.simulators.bench import NO_ERRORS, Bench, _met
+from emmc_rig.simulators.flaws import BoardFlaws, LampFlaws, OpticsFlaws, SensorFlaws, diffracted
 
 SIZE = (12, 18)
 LENS_UM, DISTANCE_UM = 50_000.0, 400.0

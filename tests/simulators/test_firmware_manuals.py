@@ -11,11 +11,11 @@ from itertools import pairwise
 
 import pytest
 
-from simulators.apt import AptController
-from simulators.clock import ManualClock
-from simulators.grbl import GrblController
-from simulators.motion import AxisSpec
-from simulators.zaber import ZaberChain
+from emmc_rig.simulators.apt import AptController
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.grbl import GrblController
+from emmc_rig.simulators.motion import AxisSpec
+from emmc_rig.simulators.zaber import ZaberChain
 
 
 class Wire:

@@ -7,9 +7,9 @@ from smooth_texture import SMOOTH, UNLIT
 
 from emmc_rig.files.scenes import fine_scene, open_scene
 from emmc_rig.model.lightfield import centre_view
-from simulators.moving import flow_between, world_at
-from simulators.raycaster import Ball, CameraMotion, Card, Motion, World, tabulated
-from simulators.scenes import MOVING_SCENES, flow_px, render, rendered
+from emmc_rig.simulators.moving import flow_between, world_at
+from emmc_rig.simulators.raycaster import Ball, CameraMotion, Card, Motion, World, tabulated
+from emmc_rig.simulators.scenes import MOVING_SCENES, flow_px, render, rendered
 
 SIZE_PX = (48, 64)
 PICTURE_PLANE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], dtype=float)

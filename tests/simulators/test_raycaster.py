@@ -9,9 +9,9 @@ from smooth_texture import SIDE, SMOOTH, UNLIT
 
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import centre_view, psnr_db
-from simulators.changes import deepened, moved
-from simulators.raycaster import Ball, Card, World, tabulated
-from simulators.scenes import SCENES, Scene, render, rendered
+from emmc_rig.simulators.changes import deepened, moved
+from emmc_rig.simulators.raycaster import Ball, Card, World, tabulated
+from emmc_rig.simulators.scenes import SCENES, Scene, render, rendered
 
 SIZE_PX = (48, 64)
 _names = (f"test world {i}" for i in itertools.count())

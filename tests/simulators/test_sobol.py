@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats.qmc import Sobol
 
-from simulators.sobol import AXES, sobol_points
+from emmc_rig.simulators.sobol import AXES, sobol_points
 
 
 @pytest.mark.parametrize("axes", range(1, AXES + 1))

@@ -9,13 +9,13 @@ import pytest
 
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.processing.memory import peak_memory_mib
+from emmc_rig.reconstruction.methods import installed_methods
+from emmc_rig.simulators.scenes import render
 from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point, charted_points
 from emmc_rig.study.chart.charting import answer
 from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts, pareto_front
 from emmc_rig.study.scores import angular_snr_db, scored, swept_disparity
 from emmc_rig.study.trial import Capture
-from reconstruction.methods import installed_methods
-from simulators.scenes import render
 
 SETTINGS = ChartSettings(scenes=("dark",), cameras=("rgbw-bayer-1shot",), size=(24, 32))
 

@@ -12,13 +12,13 @@ from view_files import save_views
 from emmc_rig.errors import AppError
 from emmc_rig.files.results import METRICS
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.simulators.scenes import render
 from emmc_rig.study.chart import chart_points, measure
 from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings
 from emmc_rig.study.chart.charting import COLUMNS, run_chart
 from emmc_rig.study.chart.measure import ChartStudy, measured
 from emmc_rig.study.trial import Capture
-from reconstruction.methods import MethodSettings
-from simulators.scenes import render
 
 SIZE = (24, 32)
 LEVELS = {"tv": {"2 steps": {"tv": {"max_steps": 2}}, "default": {"tv": {"max_steps": 9}}}}

@@ -11,10 +11,10 @@ import pytest
 import yaml
 from programs import done
 
-from calibration.boards import Board
-from calibration.locator import register
-from calibration.placement import designed_placement
-from calibration.shadow import shadow_mask
+from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.locator import register
+from emmc_rig.calibration.placement import designed_placement
+from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix, load_camera
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.masks import FILTERS

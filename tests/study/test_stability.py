@@ -13,6 +13,9 @@ from view_files import save_views
 from emmc_rig.errors import StoppedError
 from emmc_rig.files.results import METRICS
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
+from emmc_rig.simulators.scenes import render
 from emmc_rig.study import trial
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.curves import (
@@ -33,9 +36,6 @@ from emmc_rig.study.stability.stability_study import (
     stability_settings,
 )
 from emmc_rig.study.trial import Capture
-from reconstruction.errors import ReconstructionError
-from reconstruction.methods import METHODS, MethodSettings, reconstruct
-from simulators.scenes import render
 
 SIZE = (24, 32)
 

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from view_files import save_views
 
-from calibration.placement import designed_placement
+from emmc_rig.calibration.placement import designed_placement
 from emmc_rig.errors import AppError
 from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.simulators import changes
+from emmc_rig.simulators.scenes import render
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.stability.mask_faults import misplaced_psi
 from emmc_rig.study.stability.shot_faults import flicker_gains
 from emmc_rig.study.trial import Capture
-from simulators import changes
-from simulators.scenes import render
 
 SCENE, SIZE = "near-planar", (32, 40)
 CAMERA = find_camera("rgbw-bayer-3shots")

@@ -10,14 +10,14 @@ import numpy as np
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.method import Given, Method, cost_words
+from emmc_rig.reconstruction.result import Reconstruction, Status
 from emmc_rig_unrolled.weights import NetworkWeights
-from reconstruction.errors import ReconstructionError
-from reconstruction.inputs import Readings
-from reconstruction.method import Given, Method, cost_words
-from reconstruction.result import Reconstruction, Status
 
 if TYPE_CHECKING:
-    from reconstruction.methods import MethodSettings
+    from emmc_rig.reconstruction.methods import MethodSettings
 
 SHIPPED = Path(__file__).with_name("any-psi.h5")
 

@@ -17,7 +17,7 @@ from emmc_rig.model.files import whole_file
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import one_line, stored_arrays
 from emmc_rig.model.settings import Settings, validated
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 FORMAT = "emmc-rig network 1"
 REMEDY = "`benchmarks/train_network.py` makes one"

@@ -11,10 +11,10 @@ from emmc_rig.files.cameras import find_camera
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.choices import smooth_guess
-from reconstruction.errors import ReconstructionError
-from reconstruction.methods import METHODS, MethodSettings, reconstruct
-from simulators.scenes import render
+from emmc_rig.reconstruction.choices import smooth_guess
+from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
+from emmc_rig.simulators.scenes import render
 
 torch = pytest.importorskip("torch", reason="the network needs PyTorch")
 pytest.importorskip("emmc_rig_unrolled", reason="the plug-in is not installed")

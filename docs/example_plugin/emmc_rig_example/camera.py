@@ -16,9 +16,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from drivers.camera import CameraIdentity, RawFileCamera
-from drivers.clock import Clock
-from drivers.errors import CaptureError
+from emmc_rig.drivers.camera import CameraIdentity, RawFileCamera
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import CaptureError
 
 GRACE_S = 30.0
 

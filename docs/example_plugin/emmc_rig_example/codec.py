@@ -9,7 +9,7 @@ from functools import reduce
 from operator import xor
 from typing import NamedTuple
 
-from drivers.errors import GarbledReplyError
+from emmc_rig.drivers.errors import GarbledReplyError
 
 STEP_UM = 0.1
 END = b"\n"

@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 
-from drivers.clock import Clock
-from drivers.errors import GarbledReplyError
-from drivers.stage import HostStage, StageSettings
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.errors import GarbledReplyError
+from emmc_rig.drivers.stage import HostStage, StageSettings
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.firmware import SimulatedController
+from emmc_rig.simulators.motion import AxisSpec, End, Motor
 from emmc_rig_example.codec import END, STEP_UM, seal, unseal
 from emmc_rig_example.stage import TOP_SPEED_UM_S, TRAVEL_UM, ExampleStage
-from simulators.clock import ManualClock
-from simulators.firmware import SimulatedController
-from simulators.motion import AxisSpec, End, Motor
 
 SPEC = AxisSpec(travel_um=TRAVEL_UM[1], max_speed_um_s=TOP_SPEED_UM_S)
 

@@ -3,16 +3,16 @@
 from collections.abc import Mapping
 from itertools import cycle
 
-from drivers.clock import SYSTEM_CLOCK, Clock
-from drivers.errors import (
+from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
+from emmc_rig.drivers.errors import (
     CommandRefusedError,
     DriverError,
     GarbledReplyError,
     StalledError,
     TransportTimeoutError,
 )
-from drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings
-from drivers.transport import SerialTransport, Transport
+from emmc_rig.drivers.stage import DEFAULT_SETTINGS, HostStage, Reading, StageSettings
+from emmc_rig.drivers.transport import SerialTransport, Transport
 from emmc_rig_example.codec import END, STEP_UM, Status, decode_status, seal
 
 AXIS = "x"

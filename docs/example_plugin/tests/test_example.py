@@ -10,17 +10,17 @@ from emmc_rig_example.codec import Status, decode_status, seal
 from emmc_rig_example.simulator import ExampleController
 from emmc_rig_example.stage import ExampleStage
 
-from drivers.clock import SYSTEM_CLOCK
-from drivers.errors import CaptureError, GarbledReplyError
-from drivers.stage import DEFAULT_SETTINGS
 from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.conformance.stages import *  # noqa: F403
-from simulators.clock import ManualClock
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.errors import CaptureError, GarbledReplyError
+from emmc_rig.drivers.stage import DEFAULT_SETTINGS
+from emmc_rig.simulators.clock import ManualClock
 
 PROGRAM = """
 import sys
 import numpy as np
-from drivers.dng import encode_dng
+from emmc_rig.drivers.dng import encode_dng
 mosaic = np.full((40, 48), 100, np.uint16)
 data = encode_dng(mosaic, "bggr", 64, 4095, float(sys.argv[1]) / 1e6)
 open(sys.argv[2], "wb").write(data)

@@ -17,12 +17,12 @@ import numpy as np
 from genicam.gentl import GenericException, TimeoutException
 from harvesters.core import Harvester
 
-from drivers.camera import CameraIdentity, Limits, check_setting
-from drivers.clock import Clock
-from drivers.dng import frame_of_array
-from drivers.errors import CameraClosedError, CameraSettingError, CaptureError, DriverError
-from drivers.pixel_formats import FORMATS
-from drivers.raw import RawFrame
+from emmc_rig.drivers.camera import CameraIdentity, Limits, check_setting
+from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.dng import frame_of_array
+from emmc_rig.drivers.errors import CameraClosedError, CameraSettingError, CaptureError, DriverError
+from emmc_rig.drivers.pixel_formats import FORMATS
+from emmc_rig.drivers.raw import RawFrame
 
 RAW_SETTINGS = {
     "ExposureAuto": "Off",

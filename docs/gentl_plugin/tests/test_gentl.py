@@ -11,9 +11,9 @@ pytest.importorskip("harvesters", reason="harvesters and genicam are not install
 import genicam
 from emmc_rig_gentl.camera import open_camera
 
-from drivers.clock import SYSTEM_CLOCK
-from drivers.errors import CameraSettingError, DriverError
 from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
+from emmc_rig.drivers.errors import CameraSettingError, DriverError
 
 VIKY = Path(genicam.__file__).with_name("viky.cti")
 pytestmark = pytest.mark.skipif(

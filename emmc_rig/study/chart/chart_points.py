@@ -15,9 +15,9 @@ from pydantic import Field
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.settings import Settings
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, installed_methods
+from emmc_rig.simulators.scenes import STILL_SCENES
 from emmc_rig.study.trial import Capture
-from reconstruction.methods import METHODS, MethodSettings, installed_methods
-from simulators.scenes import STILL_SCENES
 
 FAST_SCENES = ("near-planar", "deep-occlusions")
 FAST_CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")

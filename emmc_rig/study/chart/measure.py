@@ -12,17 +12,17 @@ import time
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, replace
 
-from calibration.errors import CalibrationError
-from drivers.errors import DriverError
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
 from emmc_rig.processing.memory import forget_peak, peak_memory_mib
+from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.study.chart.chart_points import ChartSettings, Point
 from emmc_rig.study.points import Results, Study
 from emmc_rig.study.rows import available_cores
 from emmc_rig.study.scores import scored
 from emmc_rig.study.trial import Trial, method_inputs, trial_of
-from reconstruction.errors import ReconstructionError
 
 WARM_UP_PX = 27
 """Side of the window of the warm-up: large enough for patches, small enough to take no time."""

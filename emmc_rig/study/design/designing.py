@@ -24,6 +24,7 @@ from emmc_rig.pages.page import (
     typed,
 )
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD, reconstruct
 from emmc_rig.store.folders import result_folder
 from emmc_rig.study.design.bench import DesignBench, bench_text
 from emmc_rig.study.design.expected import SIZE, expected
@@ -41,7 +42,6 @@ from emmc_rig.study.design.search import AS_DESIGNED, MASK, Search, search
 from emmc_rig.study.points import Results, Study, study_folder
 from emmc_rig.study.rows import check_scene_names, provenance
 from emmc_rig.study.trial import Capture
-from reconstruction.methods import DEFAULT_METHOD, reconstruct
 
 JOURNAL, PAGE, CAMERA = "simulations.jsonl", "report.html", "camera.yaml"
 COMMAND = "design"

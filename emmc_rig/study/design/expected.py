@@ -39,8 +39,8 @@ from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.geometry import fresnel_number
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.sensing import ImagingMatrix
-from reconstruction.adaptive.evidence import TexturePrior
-from reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
+from emmc_rig.reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
 SIDE = 16

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.shadow import SPARE_UM
+from emmc_rig.calibration.shadow import SPARE_UM
 from emmc_rig.model.camera import Camera, draw_plates
 from emmc_rig.model.masks import FILTERS, Picture, fiducial_marks
 from emmc_rig.study.design.bench import DesignBench

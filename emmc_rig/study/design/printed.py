@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion
 
 from emmc_rig.model.camera import Camera, Plate, build_imaging_matrix, draw_plates
 from emmc_rig.model.sensing import ImagingMatrix
-from simulators.flaws import WAVELENGTHS_UM, diffracted
+from emmc_rig.simulators.flaws import WAVELENGTHS_UM, diffracted
 
 GRAIN_UM = 2.0
 """A quarter of the first fringe behind a cell of 36 um at 0.12 mm."""

@@ -8,16 +8,16 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from calibration.errors import CalibrationError
-from calibration.parametric import psi_at, shot_stages
-from calibration.placement import Placement, designed_placement
-from calibration.shadow import Shadow, shadow_mask
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.parametric import psi_at, shot_stages
+from emmc_rig.calibration.placement import Placement, designed_placement
+from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.simulators.flaws import OpticsFlaws
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.fault import MASK, Fault
 from emmc_rig.study.trial import Capture, Trial, trial_of
-from simulators.flaws import OpticsFlaws
 
 
 def misplaced_psi(capture: Capture, placement: Placement) -> ImagingMatrix:

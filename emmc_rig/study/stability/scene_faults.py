@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from emmc_rig.simulators import changes
+from emmc_rig.simulators.scenes import SCENES
 from emmc_rig.study.stability.fault import SCENE, Fault
 from emmc_rig.study.trial import Capture, Trial, trial_of
-from simulators import changes
-from simulators.scenes import SCENES
 
 
 def disparity_range(capture: Capture, px: float) -> Trial:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.camera import pixel_light
 from emmc_rig.model.noise import SensorNoise
+from emmc_rig.simulators.flaws import SensorFlaws
 from emmc_rig.study.stability.fault import SENSOR, Fault
 from emmc_rig.study.trial import Array, Capture, Trial, trial_of
-from simulators.flaws import SensorFlaws
 
 DEAD_RESPONSE = 0.02
 CODES = 255

@@ -9,11 +9,11 @@ import numpy as np
 from emmc_rig.files.scenes import open_scene
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
+from emmc_rig.simulators import changes
+from emmc_rig.simulators.raycaster import World
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.fault import SEVERAL, SHOTS, Fault
 from emmc_rig.study.trial import Array, Capture, Trial, trial_of
-from simulators import changes
-from simulators.raycaster import World
 
 FLICKER_SEED = 6
 

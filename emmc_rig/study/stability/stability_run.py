@@ -40,6 +40,7 @@ from emmc_rig.pages.page import (
 )
 from emmc_rig.processing.pool import opened_pool
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.methods import METHODS
 from emmc_rig.store.folders import result_folder
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, machine, provenance
@@ -54,7 +55,6 @@ from emmc_rig.study.stability.curves import (
 )
 from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.stability_study import StabilitySettings, StabilityStudy, planned
-from reconstruction.methods import METHODS
 
 DRAWN = "charts"
 POINTS_CSV, BREAKS_CSV, PAGE = "points.csv", "breaking.csv", "stability.html"

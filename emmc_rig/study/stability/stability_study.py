@@ -13,13 +13,13 @@ from pydantic import Field
 
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, find_method
+from emmc_rig.reconstruction.sparse import SparseSettings
 from emmc_rig.study.points import Results, Study
 from emmc_rig.study.rows import check_scene_names, check_size, described
 from emmc_rig.study.scores import angular_snr_db
 from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.trial import Capture, Trial, method_inputs
-from reconstruction.methods import METHODS, MethodSettings, find_method
-from reconstruction.sparse import SparseSettings
 
 SWEPT_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
 FAST_METHODS = ("tv", "adaptive-fast")
@@ -140,7 +140,7 @@ class StabilityStudy(Study[Point]):
             return {"failed": "not enough memory", "keep": False}
         except Exception as fault:
             # That a method fails is a finding; a fault of the program is measured again next time.
-            known = type(fault).__module__.startswith(("reconstruction", "emmc_rig"))
+            known = type(fault).__module__.startswith("emmc_rig")
             kind = "" if known else f"{type(fault).__name__}: "
             return {"failed": f"{kind}{fault}", "view_db": view_db, "keep": known}
         estimate = result.light_field

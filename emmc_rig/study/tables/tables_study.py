@@ -19,20 +19,20 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction import methods as solvers
+from emmc_rig.reconstruction.bpdn import BPDNSettings
+from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.reconstruction.sparse import PatchEstimates, SparseSettings, estimate_patches
+from emmc_rig.reconstruction.tv import TVSettings
+from emmc_rig.simulators.scenes import STILL_SCENES
 from emmc_rig.study.points import Results, Study
 from emmc_rig.study.rows import SMALLEST_PX, dictionary_identity
 from emmc_rig.study.scores import scored
 from emmc_rig.study.tables import paper
 from emmc_rig.study.tables.cells import Cell, Part, Setup, cells_of
 from emmc_rig.study.trial import Capture, Trial, open_dictionary_once, trial_of
-from reconstruction import methods as solvers
-from reconstruction.bpdn import BPDNSettings
-from reconstruction.dictionary import Dictionary
-from reconstruction.inputs import checked_inputs
-from reconstruction.methods import MethodSettings
-from reconstruction.sparse import PatchEstimates, SparseSettings, estimate_patches
-from reconstruction.tv import TVSettings
-from simulators.scenes import STILL_SCENES
 
 Size = tuple[int, int] | None
 VIEWS = (5, 5)

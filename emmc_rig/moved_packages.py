@@ -1,0 +1,30 @@
+"""Imports by names of versions before 0.5: a line states the new name, until version 0.6."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+MOVED = ("calibration", "drivers", "reconstruction", "simulators")
+
+
+class _MovedPackages(MetaPathFinder, Loader):
+    """Finds the old names after everything else, so that a user's own modules come first."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return ModuleSpec(fullname, self) if fullname in MOVED else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        name = spec.name
+        raise ModuleNotFoundError(f"import emmc_rig.{name}, its name since 0.5", name=name)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Never called: `create_module` raises."""
+
+
+sys.meta_path.append(_MovedPackages())
