@@ -78,10 +78,10 @@ def test_the_spread_is_the_weighted_variance_of_light_fields():
     rng = np.random.default_rng(3)
     fields = rng.random((2, 3, 3, 4, 6, 3)).astype(np.float32)
     first, other = fields
-    first = rng.random((2, 3)).astype(np.float32)
+    coarse = rng.random((2, 3)).astype(np.float32)
     models = [stored(field) for field in fields]
-    together = averaged(models, np.stack([first, 1 - first]), 2, models[1])
-    share = first.repeat(2, axis=0).repeat(2, axis=1)
+    together = averaged(models, np.stack([coarse, 1 - coarse]), 2, models[1])
+    share = coarse.repeat(2, axis=0).repeat(2, axis=1)
     square = np.square(first - other).mean(axis=-1)
     np.testing.assert_allclose(
         together.light_field, share[..., None] * first + (1 - share[..., None]) * other, atol=1e-5
