@@ -43,6 +43,7 @@ whiteboards: null
 darks: {{repeats: 2}}
 """
 TIMES = {
+    "commit",  # a checkout that other tests write to is "-dirty"
     "compiling_seconds",
     "threads",
     "seconds",
