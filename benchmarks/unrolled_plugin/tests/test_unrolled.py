@@ -151,7 +151,7 @@ def test_weights_that_were_tampered_with_are_refused(tmp_path, what):
 
 
 @pytest.mark.parametrize(
-    ("content", "says"), [(None, "no such file"), (b"weights", "cannot be read")]
+    ("content", "says"), [(None, "no such file"), (b"weights", "of an unknown format")]
 )
 def test_a_file_that_is_no_network_is_refused(tmp_path, content, says):
     path = tmp_path / "a.h5"
