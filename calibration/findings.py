@@ -235,8 +235,8 @@ def fit_advice(fit: Fit) -> list[str]:
         if fit.more_boards >= MOST_MORE_BOARDS:
             more = "capture some through a pinhole"
         found.append(
-            f"too few whiteboards to measure {len(fit.undecided)} parameter(s) ({shown}), which "
-            f"keep the design's values: {more}"
+            f"too few whiteboards to measure {shown}: Psi takes the value of the camera's file "
+            f"instead; {more}"
         )
     return found
 

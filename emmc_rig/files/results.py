@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 METRICS = "metrics.json"
 PSI_ASSUMED = (
-    "Psi is computed from the camera's description, not calibrated: its error is in no estimated "
-    "accuracy, and misplaced masks are noticed only where the frames show them"
+    "Psi is computed from the camera's description, not calibrated: the estimated accuracy "
+    "does not include its error, and a misplaced mask is noticed only if the frames show it"
 )
 _SECONDS = {"us": 1e-6, "ms": 1e-3, "": 1, "s": 1, "min": 60, "m": 60, "h": 3600}
 VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")

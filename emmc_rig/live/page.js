@@ -47,8 +47,8 @@ function draw() {
   drawLevels(figures);
   const focus = figures.focus;
   write("focus", !focus ? (figures.dark ? "nothing to see" : "no edge above the noise")
-    : focus.share >= 1 ? "the sharpest of the last minute"
-    : `${percent(focus.share, focus.deviation)} of the sharpest of the last minute`);
+    : focus.share >= 1 ? "best sharpness of the last minute"
+    : `${percent(focus.share, focus.deviation)} of the best sharpness of the last minute`);
   const shift = figures.shift;
   write("shift", shift ? `x ${shift.x_px.toFixed(2)}, y ${shift.y_px.toFixed(2)} px, correlation ${Math.round(100 * shift.likeness)} %`
     : state.reference ? "the frame does not match the reference" : "no reference");

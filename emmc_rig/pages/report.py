@@ -149,7 +149,7 @@ FIGURES = {
     "stated_db": Figure("Estimated accuracy", ".2f", "dB",
         "PSNR, by the method, without the truth"),
     "stated_interval_db": Figure("Its interval", ".1f", "dB",
-        "from and to; it holds the true PSNR in 9 of 10 captures"),
+        "from and to; the true PSNR lies inside in 9 of 10 captures"),
     "ssim": Figure("SSIM", ".4f", "",
         "structural similarity, averaged over {picture}s; 1 is identical"),
     "replicate_psnr_db": Figure("PSNR of the baseline", ".2f", "dB",
@@ -208,7 +208,7 @@ FIGURES = {
     "parameters.stated_scale_db": Figure("Scale of the deviation", ".2f", "dB",
         "against what the validation readings show"),
     "parameters.stated_within_db": Figure("Half of the interval", ".2f", "dB",
-        "of the estimated accuracy, which holds the true PSNR in 9 of 10 captures"),
+        "of the estimated accuracy; the true PSNR lies inside in 9 of 10 captures"),
 }  # fmt: skip
 """By the name in metrics.json; a figure without a row here is listed under its own name. Braces:
 words of the view axes, {picture} and {middle}, and {lost}, the meaning of a negative margin."""
@@ -276,7 +276,7 @@ def _cards(content: ReportContent) -> list[Card]:
     evidence = verdict.get("features") or {} if isinstance(verdict, Mapping) else {}
     explained, noise = _number(evidence.get("explained")), _number(evidence.get("noise"))
     if explained is not None:
-        note = f"of the detail in validation readings is predicted; good: above {EXPLAINED:.0%}"
+        note = f"of the detail in validation readings, predicted; good: above {EXPLAINED:.0%}"
         tone = fine if explained > EXPLAINED else "bad"
         cards.append(Card("Explained", f"{max(explained, 0):.0%}", note, tone))
     if noise is not None:
