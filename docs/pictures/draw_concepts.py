@@ -267,7 +267,7 @@ PICTURES: dict[str, tuple[Callable[[], Parts], int]] = {
     "psi": (psi, 272),
     "whiteboard": (whiteboard, 282),
 }
-"""By picture: the function that draws it, and its height."""
+"""Drawing function and height of each picture."""
 
 
 def drawn(name: str) -> str:

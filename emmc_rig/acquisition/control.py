@@ -30,7 +30,7 @@ class Control:
 
     stays: at the end the capture waits until it is stopped, so that frames may be taken again.
     between_frames: a hook is running, so that nothing is lost by stopping at once.
-    answered: what somebody was asked to do at the bench is done.
+    answered: a person has done the work at the bench that the capture requested.
     """
 
     def __init__(self, stays: bool = False) -> None:

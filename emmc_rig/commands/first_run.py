@@ -1,10 +1,10 @@
 """The first run on a machine compiles kernels, in several processes, with a message.
 
-Numba keeps compiled kernels on the disk. A process that needs a kernel which another process is
-compiling waits for it (`emmc_rig.model.compiling`). So this process runs the simulated capture and
-the first kernels of the reconstruction, while other processes compile the later kernels, the
-slowest first. All cores are busy until every kernel is compiled. The other processes end with this
-process.
+Numba keeps compiled kernels on the disk, and each kernel is compiled by a single process: the other
+processes wait for its machine code (`emmc_rig.model.compiling`). So this process runs the simulated
+capture and the first kernels of the reconstruction, while other processes compile the later
+kernels, the slowest first. All cores are busy until every kernel is compiled. The other processes
+end with this process.
 """
 
 from __future__ import annotations
