@@ -11,6 +11,7 @@ from random import Random
 import numpy as np
 import pytest
 import usb.core
+from fuzzing import fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.bench.hardware import open_camera
@@ -676,7 +677,7 @@ class Noise(U3vCameraSimulator):
 
 
 @pytest.mark.slow
-def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(fuzz, caplog):
+def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(caplog):
     caplog.set_level("CRITICAL")
     mosaic = MOSAIC[:4, :6].copy()
     clock = ManualClock()
@@ -729,7 +730,7 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
 
 
 @pytest.mark.slow
-def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors(fuzz):
+def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors():
     original = Bench(MOSAIC[:4, :6].copy()).open().snap().original
 
     def check(seed):
