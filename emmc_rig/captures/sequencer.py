@@ -25,14 +25,14 @@ from numpy.typing import NDArray
 from emmc_rig.bench.environment import read_all
 from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.registration import LEAST_LIKENESS, Shift, registered
-from emmc_rig.capture.between import Between, HookError, plain
-from emmc_rig.capture.by_hand import HandPlaces, WrongPlaceError
-from emmc_rig.capture.checks import check, is_same, refuse_impossible
-from emmc_rig.capture.control import Control, uninterrupted
-from emmc_rig.capture.devices import Devices, Spans
-from emmc_rig.capture.estimate import known_exposures, pace_of
-from emmc_rig.capture.events import RunEnd, named
-from emmc_rig.capture.film import (
+from emmc_rig.captures.between import Between, HookError, plain
+from emmc_rig.captures.by_hand import HandPlaces, WrongPlaceError
+from emmc_rig.captures.checks import check, is_same, refuse_impossible
+from emmc_rig.captures.control import Control, uninterrupted
+from emmc_rig.captures.devices import Devices, Spans
+from emmc_rig.captures.estimate import known_exposures, pace_of
+from emmc_rig.captures.events import RunEnd, named
+from emmc_rig.captures.film import (
     ARRIVAL_POLL_S,
     INTERRUPTED,
     LATE,
@@ -42,11 +42,11 @@ from emmc_rig.capture.film import (
     room_for,
     streams,
 )
-from emmc_rig.capture.focus import FocusFound
-from emmc_rig.capture.metering import asked_of_scene, first_meterings, metered_exposure_s
-from emmc_rig.capture.plan import Boards, Plan
-from emmc_rig.capture.retries import Budget, mending
-from emmc_rig.capture.writer import Writer
+from emmc_rig.captures.focus import FocusFound
+from emmc_rig.captures.metering import asked_of_scene, first_meterings, metered_exposure_s
+from emmc_rig.captures.plan import Boards, Plan
+from emmc_rig.captures.retries import Budget, mending
+from emmc_rig.captures.writer import Writer
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import RawFrame

@@ -16,8 +16,8 @@ from threading import Event
 from typing import Any, NamedTuple, Self
 
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.capture.estimate import pace_of
-from emmc_rig.capture.plan import Plan
+from emmc_rig.captures.estimate import pace_of
+from emmc_rig.captures.plan import Plan
 from emmc_rig.drivers.camera import Camera as CameraDevice
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import CaptureError

@@ -13,9 +13,9 @@ from statistics import median
 
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.capture.metering import metered_exposure_s
-from emmc_rig.capture.order import APPROACH_UM
-from emmc_rig.capture.plan import METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.captures.metering import metered_exposure_s
+from emmc_rig.captures.order import APPROACH_UM
+from emmc_rig.captures.plan import METERING_EXPOSURE_S, Boards, Plan
 from emmc_rig.drivers.stage import needs_approach
 from emmc_rig.session.journal import FrameEntry, MeteredEntry
 from emmc_rig.session.planned import PlannedFrame
