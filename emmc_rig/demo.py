@@ -13,19 +13,18 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
-from emmc_rig.acquisition.plan import Boards, Checks, Darks, Plan, PlannedShot
-from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
-from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.results import write_metrics
-from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.captures.plan import Boards, Checks, Darks, Plan, PlannedShot
+from emmc_rig.captures.run import CaptureRequest, new_session, planned_frames
+from emmc_rig.captures.sequencer import Sequencer
+from emmc_rig.formats.dictionaries import open_dictionary
+from emmc_rig.formats.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.result import Result
+from emmc_rig.process.result import Result
 from emmc_rig.progress import Event, Watcher
 from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from emmc_rig.reconstruction.result import Progress, Reconstruction
@@ -39,6 +38,7 @@ from emmc_rig.session.readings import shot_frames, shot_readings
 from emmc_rig.session.session import Session
 from emmc_rig.simulators.bench import Bench
 from emmc_rig.simulators.scenes import SCENES
+from emmc_rig.store.results import write_metrics
 
 Array = NDArray[np.floating]
 SIZE = (108, 144)
@@ -49,7 +49,7 @@ SIZE = (108, 144)
 class DemoSettings:
     """What to run: scene and camera with their names, size (rows, columns) or None, seed.
 
-    method: see `reconstruction.methods`; dictionary: see `emmc_rig.files.dictionaries`.
+    method: see `reconstruction.methods`; dictionary: see `emmc_rig.formats.dictionaries`.
     exact_psi: reconstruct with the exact Psi too, which shows what calibration costs.
     out: the folder as typed; named in what to do next.
     """

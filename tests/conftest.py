@@ -23,7 +23,9 @@ from emmc_rig.model.sensing import ImagingMatrix
 # A script's background job ignores Ctrl-C, and so would every program that a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-pytest.register_assert_rewrite("emmc_rig.conformance.cameras", "emmc_rig.conformance.stages")
+pytest.register_assert_rewrite(
+    "emmc_rig.bench.conformance.cameras", "emmc_rig.bench.conformance.stages"
+)
 
 
 def pytest_addoption(parser):

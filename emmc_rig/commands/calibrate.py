@@ -86,10 +86,10 @@ def calibrate(
 
     Or plan these by --plan, or correct Psi for drift by --drift.
     """
-    from emmc_rig.files.cameras import find_camera
-    from emmc_rig.files.results import parse_size
-    from emmc_rig.processing.board_plan import PlanSettings, write_plan
+    from emmc_rig.captures.board_plan import PlanSettings, write_plan
+    from emmc_rig.formats.cameras import find_camera
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import parse_size
 
     if drift is not None:
         if known is None:
@@ -132,11 +132,11 @@ def _tell_findings(metrics: dict) -> None:
 
 
 def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) -> None:
-    from emmc_rig.files.result_files import read_metrics
-    from emmc_rig.processing.session_calibration import SENSOR, calibrate_into
+    from emmc_rig.process.session_calibration import SENSOR, calibrate_into
     from emmc_rig.session.measured_psi import stored_calibration
     from emmc_rig.session.session import CALIBRATION, Session
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.result_files import read_metrics
 
     captured, place = Session(path), path / CALIBRATION
     product, words = stored_calibration(captured) if out is None else (None, "")
@@ -164,7 +164,7 @@ def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) 
 
 
 def _judge_drift(known: Path, frames: Path, out: Path) -> None:
-    from emmc_rig.processing.session_drift import run_drift
+    from emmc_rig.process.session_drift import run_drift
     from emmc_rig.store.folders import result_folder
 
     with result_folder(out, "calibrate --drift") as folder, shown_progress("fit the drift"):

@@ -25,13 +25,13 @@ def cameras(
 ) -> None:
     """List the shipped cameras, or draw the masks of one."""
     import emmc_rig as emmc
-    from emmc_rig.files.results import write_metrics
-    from emmc_rig.pages.camera_sheet import (
+    from emmc_rig.report.camera_sheet import (
         camera_figures,
         camera_rows,
         draw_camera,
     )
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import write_metrics
 
     if name is None:
         shown = camera_rows()

@@ -27,7 +27,7 @@ from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.progress import Event, Watcher
 
 if TYPE_CHECKING:
-    from emmc_rig.acquisition.control import Control
+    from emmc_rig.captures.control import Control
 
 OptionalPath = Path | None
 
@@ -110,8 +110,8 @@ def capture(
     if plan is None:
         raise typer.BadParameter("name a plan, or write one by --new CAMERA")
     from emmc_rig.bench.rig_config import SIMULATED, ImagedRig, rig_description
-    from emmc_rig.files.results import parse_psnr, parse_size
     from emmc_rig.model.settings import validated
+    from emmc_rig.store.results import parse_psnr, parse_size
 
     given: dict[str, Any] = {} if rays is None else {"rays": rays}
     if flaws is not None:
@@ -132,9 +132,9 @@ def capture(
 
 
 def _write_plan(name: str, path: Path) -> None:
-    from emmc_rig.acquisition.command import write_new
-    from emmc_rig.acquisition.plan import new_plan
-    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.captures.plan import new_plan
+    from emmc_rig.captures.run import write_new
+    from emmc_rig.formats.cameras import find_camera
 
     write_new(path, new_plan(name, find_camera(name)))
     tell(f"wrote {path}; edit it, then: emmc-rig capture {path} --rig simulated")
@@ -150,15 +150,15 @@ def _run(
     host: str,
     other_devices: bool,
 ) -> None:
-    from emmc_rig.acquisition.command import FrontEnd, asked_folder, capture_session
-    from emmc_rig.acquisition.control import Control, pressed_keys
-    from emmc_rig.acquisition.estimate import Estimate
-    from emmc_rig.acquisition.events import Listener
+    from emmc_rig.captures.control import Control, pressed_keys
+    from emmc_rig.captures.estimate import Estimate
+    from emmc_rig.captures.events import Listener
+    from emmc_rig.captures.run import FrontEnd, asked_folder, capture_session
     from emmc_rig.commands.capture_display import CaptureDisplay
-    from emmc_rig.files.results import shown_bytes, shown_seconds
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.journal import ended
     from emmc_rig.session.session import REPORT
+    from emmc_rig.store.results import shown_bytes, shown_seconds
 
     control = Control(stays=page == "steers")
     display = CaptureDisplay(Console(stderr=True, quiet=json_wanted.get()), control)
@@ -240,7 +240,7 @@ def _page(
 
     other: gets every event before the page.
     """
-    from emmc_rig.acquisition.events import DISPLAYED, Listener
+    from emmc_rig.captures.events import DISPLAYED, Listener
     from emmc_rig.live.server import (
         LOCAL_HOSTS,
         address,

@@ -40,7 +40,7 @@ def chart(
 
     The same command goes on where it stopped.
     """
-    from emmc_rig.files.results import parse_size
+    from emmc_rig.store.results import parse_size
     from emmc_rig.study.chart.chart_points import chart_settings
     from emmc_rig.study.chart.charting import run_chart
 

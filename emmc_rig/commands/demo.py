@@ -48,11 +48,11 @@ def demo(
     import emmc_rig as emmc
     from emmc_rig.commands.first_run import helped_to_compile
     from emmc_rig.demo import DemoSettings, run_demo
-    from emmc_rig.files.results import parse_size, stated_words
     from emmc_rig.model.view_axes import middle_name
     from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
     from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import parse_size, stated_words
 
     method = method or DEFAULT_METHOD
     if not find_method(method).needs_dictionary:

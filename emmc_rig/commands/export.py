@@ -46,12 +46,12 @@ def export(
     ] = None,
 ) -> None:
     """Export a light field or Psi to other programs, or as a viewer."""
-    from emmc_rig.files.exports import film_of, open_export
-    from emmc_rig.files.formats.registry import ALIASES, FORMATS
-    from emmc_rig.files.result_files import holds_light_field
-    from emmc_rig.files.results import parse_size, shown_bytes, write_metrics
-    from emmc_rig.pages.viewer import VIEWER
+    from emmc_rig.formats.exports import film_of, open_export
+    from emmc_rig.formats.registry import ALIASES, FORMATS
+    from emmc_rig.report.viewer import VIEWER
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.result_files import holds_light_field
+    from emmc_rig.store.results import parse_size, shown_bytes, write_metrics
 
     if of is not None and result != "psi":
         raise typer.BadParameter(f"'{of}': export one light field at a time")
@@ -105,15 +105,15 @@ def export(
 def _export_psi(source: Path, form: str, out: Path | None) -> None:
     """Write the Psi of a file or folder, and its frames if it has any, as a sparse matrix."""
     import emmc_rig as emmc
-    from emmc_rig.files.psi import (
+    from emmc_rig.formats.psi_exports import PSI_FORMATS
+    from emmc_rig.store.folders import is_session, result_folder
+    from emmc_rig.store.psi import (
         PSI_GROUP,
         StoredPsi,
         holds_frames,
         psi_beside,
     )
-    from emmc_rig.files.psi_exports import PSI_FORMATS
-    from emmc_rig.files.results import shown_bytes, write_metrics
-    from emmc_rig.store.folders import is_session, result_folder
+    from emmc_rig.store.results import shown_bytes, write_metrics
 
     if form not in PSI_FORMATS:
         raise typer.BadParameter(f"no format {form!r} of psi; there are {', '.join(PSI_FORMATS)}")

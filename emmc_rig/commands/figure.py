@@ -40,10 +40,10 @@ def figure(
     out: OutOption = Path("emmc-figure"),
 ) -> None:
     """Draw results of one capture side by side, for a paper."""
-    from emmc_rig.files.exports import open_export
-    from emmc_rig.files.results import parse_size, write_metrics
-    from emmc_rig.pages.result_figure import FigureSettings, draw_results
+    from emmc_rig.formats.exports import open_export
+    from emmc_rig.report.result_figure import FigureSettings, draw_results
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import parse_size, write_metrics
 
     settings = FigureSettings(
         None if view is None else _pair("--view", view),

@@ -131,10 +131,10 @@ def _watch(
     plan: Path | None,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
-    from emmc_rig.acquisition.plan import load_plan
     from emmc_rig.bench.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
+    from emmc_rig.captures.plan import load_plan
     from emmc_rig.drivers.errors import UsbNotFoundError
-    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.formats.cameras import find_camera
     from emmc_rig.live.save import Files
     from emmc_rig.live.watch import Watch
 
@@ -147,7 +147,7 @@ def _watch(
     with ExitStack() as stack:
         if rig is not None:
             from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
-            from emmc_rig.files.results import parse_size
+            from emmc_rig.store.results import parse_size
 
             imaged = ImagedRig(scene=scene, size=parse_size(size), real_time=True)
             opened = stack.enter_context(

@@ -103,7 +103,7 @@ def give_result(out: Path | None = None, **facts: Any) -> None:
     if not json_wanted.get():
         return
     if out is not None:
-        from emmc_rig.files.result_files import METRICS, read_metrics
+        from emmc_rig.store.result_files import METRICS, read_metrics
 
         if (out / METRICS).is_file():
             facts = {"metrics": read_metrics(out), **facts}

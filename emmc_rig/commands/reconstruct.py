@@ -12,7 +12,7 @@ from emmc_rig.commands.options import PARALLEL, ClusterOption, DictionaryOption,
 from emmc_rig.commands.output import give_result, say, show_verdict, shown_progress, tell
 
 if TYPE_CHECKING:
-    from emmc_rig.processing.captures import Capture
+    from emmc_rig.process.captures import Capture
 
 DEFAULT = Path("emmc-reconstruction")
 """The folder that is written, unless it is in a session."""
@@ -94,9 +94,9 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Reconstruct light fields from frames, or a film of them, with a verdict."""
-    from emmc_rig.processing.captures import opened_capture
-    from emmc_rig.processing.memory import parse_memory
-    from emmc_rig.processing.reconstructing import load_settings, reconstruct_captures
+    from emmc_rig.process.captures import opened_capture
+    from emmc_rig.process.memory import parse_memory
+    from emmc_rig.process.reconstructing import load_settings, reconstruct_captures
     from emmc_rig.reconstruction.methods import DEFAULT_METHOD, find_method
 
     if list_methods:
@@ -136,7 +136,7 @@ def reconstruct(
             raise typer.BadParameter(
                 "--budget chooses method and settings: leave --method and --settings out"
             )
-        from emmc_rig.processing.budget import method_within
+        from emmc_rig.process.budget import method_within
 
         method, why = method_within(*captures[0].loaded(psi, frame), budget)
         say("chosen", why, "cyan")
@@ -177,8 +177,8 @@ def _film(capture: Any, out: Path, strict: bool, **given: Any) -> None:
 
     capture: a `SessionCapture`.
     """
-    from emmc_rig.files.results import shown_seconds, stated_words
-    from emmc_rig.processing.filming import reconstruct_film_session
+    from emmc_rig.process.filming import reconstruct_film_session
+    from emmc_rig.store.results import shown_seconds, stated_words
 
     with shown_progress(given["method"]) as bars:
         metrics = reconstruct_film_session(capture, out, watcher=bars, **given)
@@ -220,8 +220,8 @@ def _places(captures: Sequence[Capture], out: Path | None) -> list[tuple[Capture
 
 
 def _say_result(metrics: dict, out: Path) -> None:
-    from emmc_rig.files.results import stated_words
     from emmc_rig.model.view_axes import axes_of, middle_name
+    from emmc_rig.store.results import stated_words
 
     if "assumed" in metrics:
         say("note", metrics["assumed"])

@@ -58,7 +58,7 @@ def stability(
 
     The same command goes on where it stopped.
     """
-    from emmc_rig.files.results import parse_size
+    from emmc_rig.store.results import parse_size
     from emmc_rig.study.stability.curves import breaking_rows
     from emmc_rig.study.stability.stability_run import run_stability
     from emmc_rig.study.stability.stability_study import CAMERA, stability_settings

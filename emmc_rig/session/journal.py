@@ -19,10 +19,10 @@ from typing import Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict
 
-from emmc_rig.files.results import shown_seconds
 from emmc_rig.model.files import Disk
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.store.journal import Lines
+from emmc_rig.store.results import shown_seconds
 
 
 @dataclass(frozen=True)

@@ -226,7 +226,7 @@ def test_a_session_is_reconstructed_as_it_is(captured, run, tmp_path):
 
 
 def test_the_psi_of_a_session_is_that_of_the_demo_s_road(captured):
-    from emmc_rig.files.cameras import find_camera
+    from emmc_rig.formats.cameras import find_camera
     from emmc_rig.model.camera import build_imaging_matrix
     from emmc_rig.session.readings import session_frames
 

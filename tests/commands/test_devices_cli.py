@@ -287,7 +287,7 @@ def test_a_stage_that_vanishes_in_a_move_is_an_error_that_says_it_could_not_be_s
 def test_every_test_that_the_list_of_troubles_names_exists():
     root = Path(__file__).parents[2]
     named = set(re.findall(r"`(test_\w+)`", (root / "tests/drivers/README.md").read_text()))
-    places = (root / "tests", root / "emmc_rig/conformance")
+    places = (root / "tests", root / "emmc_rig/bench/conformance")
     written = "".join(path.read_text() for place in places for path in place.rglob("*.py"))
     assert len(named) > 10
     assert [name for name in sorted(named) if f"def {name}(" not in written] == []

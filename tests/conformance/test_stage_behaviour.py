@@ -7,8 +7,8 @@
 import pytest
 from stage_rigs import SIMULATED, opened, simulated_rig  # noqa: F401
 
-from emmc_rig.conformance.named import NamedStage
-from emmc_rig.conformance.stages import *  # noqa: F403
+from emmc_rig.bench.conformance.named import NamedStage
+from emmc_rig.bench.conformance.stages import *  # noqa: F403
 
 
 @pytest.fixture(params=[*SIMULATED, pytest.param("hardware", marks=pytest.mark.hardware)])

@@ -14,8 +14,8 @@ import pytest
 
 pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
 
+from emmc_rig.bench.conformance.cameras import *  # noqa: F403
 from emmc_rig.bench.hardware import open_camera
-from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,

@@ -7,7 +7,7 @@ from contextlib import suppress
 import pytest
 from stage_rigs import RIGS, SIMULATED, after_first_sleep, opened, simulated_rig  # noqa: F401
 
-from emmc_rig.conformance.stages import TOLERANCE_UM, middle_um
+from emmc_rig.bench.conformance.stages import TOLERANCE_UM, middle_um
 from emmc_rig.drivers.errors import (
     DriverError,
     GarbledReplyError,

@@ -15,8 +15,8 @@ from test_live import PATIENCE_S, until, watching
 
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.live.save import Files
 from emmc_rig.live.steps import LONGEST_UNASKED_S
 from emmc_rig.simulators.clock import ManualClock

@@ -16,9 +16,9 @@ import yaml
 from asked_person import manned
 
 import emmc_rig as emmc
-from emmc_rig.acquisition.command import FrontEnd, capture_session
-from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.sequencer import ALL_TAKEN
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.run import FrontEnd, capture_session
+from emmc_rig.captures.sequencer import ALL_TAKEN
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served

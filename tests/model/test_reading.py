@@ -18,8 +18,8 @@ from fuzzing import FUZZ
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from emmc_rig.acquisition.plan import Plan
 from emmc_rig.bench.rig_config import RealRig
+from emmc_rig.captures.plan import Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError, SceneError, SensingError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.reconstruction.choices import smooth_guess

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from emmc_rig.files.psi import StoredPsi
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
@@ -29,6 +28,7 @@ from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.reconstruction.verdict import run
 from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, combined, judged_together
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.store.psi import StoredPsi
 
 VIEWS = (2, 2)
 SMALL = BlockSettings(whole=1, side=48, blend=4)

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 import emmc_rig as emmc
 from emmc_rig.cli import app
 from emmc_rig.commands.simulate import simulate_into
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
