@@ -123,7 +123,7 @@ class U3vCameraSimulator(UsbFunction):
         exposure_us: tuple[float, float] = (10.0, 10_000_000.0),
         gain_db: tuple[float, float] = (0.0, 24.0),
     ) -> None:
-        self.faults = Faults(FAULTS, clock)
+        self.faults = Faults(FAULTS)
         self.spec = _spec(serial, packet)
         self._render = render
         self._clock = clock
