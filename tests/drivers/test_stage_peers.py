@@ -6,7 +6,7 @@ They come with the extra `peers`, and talk over real pseudo-terminals and TCP in
 import io
 import struct
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -38,27 +38,21 @@ def wait_until(condition):
 
 
 @contextmanager
-def zaber_peer(wire):
+def zaber_peer():
     """Yield a chain, and the devices that zaber-motion finds on it."""
     ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
-    chain = ZaberChain(
-        SYSTEM_CLOCK, {(device, axis): QUICK for device in (1, 2) for axis in (1, 2)}
-    )
-    with ExitStack() as opened:
-        if wire == "pty":
-            server = opened.enter_context(PtyServer(chain))
-            connection = ascii_protocol.Connection.open_serial_port(server.port)
-        else:
-            server = opened.enter_context(TcpServer(chain))
-            connection = ascii_protocol.Connection.open_tcp(*server.address)
-        opened.enter_context(connection)
+    axes = {(device, axis): QUICK for device in (1, 2) for axis in (1, 2)}
+    chain = ZaberChain(SYSTEM_CLOCK, axes)
+    with (
+        PtyServer(chain) as server,
+        ascii_protocol.Connection.open_serial_port(server.port) as connection,
+    ):
         yield chain, connection.detect_devices(identify_devices=False)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wire", ["pty", "tcp"])
-def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
-    with zaber_peer(wire) as (chain, devices):
+def test_zaber_motion_finds_homes_moves_stops_and_is_refused():
+    with zaber_peer() as (chain, devices):
         refusals = pytest.importorskip("zaber_motion.exceptions")
         assert [device.device_address for device in devices] == [1, 2]
         axis = devices[0].get_axis(2)
@@ -96,19 +90,13 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wire", [PtyServer, TcpServer])
-def test_zaber_motion_finds_the_axis_where_its_last_session_left_it(wire):
+def test_zaber_motion_finds_the_axis_where_its_last_session_left_it():
     ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
     chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK})
-    with wire(chain) as server:
+    with TcpServer(chain) as server:
         before = 0.0
         for target in (100_000, 40_000):
-            opening = (
-                ascii_protocol.Connection.open_serial_port(server.port)
-                if wire is PtyServer
-                else ascii_protocol.Connection.open_tcp(*server.address)
-            )
-            with opening as connection:
+            with ascii_protocol.Connection.open_tcp(*server.address) as connection:
                 (device,) = connection.detect_devices(identify_devices=False)
                 axis = device.get_axis(1)
                 if not before:
@@ -128,13 +116,9 @@ def apt_controller():
 
 @pytest.mark.slow
 @EARLY_READER
-@pytest.mark.parametrize("model", ["kdc101.KDC101", "tdc001.TDC001"])
-def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
-    module, _, name = model.partition(".")
-    devices = pytest.importorskip(
-        f"thorlabs_apt_device.devices.{module}", reason="needs the extra `peers`"
-    )
-    client = getattr(devices, name)
+def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller):
+    tdc001 = "thorlabs_apt_device.devices.tdc001"
+    client = pytest.importorskip(tdc001, reason="needs the extra `peers`").TDC001
     with PtyServer(apt_controller) as server:
         peer = client(serial_port=server.port, home=False)
         try:

@@ -153,6 +153,34 @@ def test_a_port_that_comes_back_late_is_waited_for(tmp_path):
         stage.close()
 
 
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda wire: wire.write(b"/1\n"),
+        lambda wire: wire.waiting(),
+        lambda wire: wire.discard_input(),
+        lambda wire: wire.read_until(b"\n"),
+    ],
+)
+def test_a_wire_in_memory_is_dead_from_the_unplugging_until_it_is_opened_again(use):
+    chain = ZaberChain(ManualClock())
+    wire = chain.transport()
+    chain.unplug()
+    with pytest.raises(PortGoneError):
+        use(wire)
+    with pytest.raises(PortNotFoundError):
+        wire.reopen()
+    chain.replug()
+    with pytest.raises(PortGoneError):
+        use(wire)
+    wire.reopen()
+    wire.write(b"/1 0 1\n")
+    assert wire.read_until(b"\n").startswith(b"@01 0 01 OK")
+    wire.close()
+    with pytest.raises(PortGoneError):
+        use(wire)
+
+
 def test_the_second_process_on_a_port_hears_who_holds_it(served):
     command = [sys.executable, "-c", HOLD_A_PORT, served.port]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -311,8 +311,8 @@ def test_payloads_of_any_size_pass_whatever_alignment_and_packets(shape, alignme
 
 
 def test_a_frame_of_many_transfers_comes_whole():
-    mosaic = np.random.default_rng(1).integers(0, 4096, (2000, 3000), dtype=np.uint16)
-    bench = Bench(mosaic)
+    mosaic = np.random.default_rng(1).integers(0, 4096, (1500, 3000), dtype=np.uint16)
+    bench = Bench(mosaic, depths=("12",))
     camera = bench.open()
     np.testing.assert_array_equal(camera.snap().mosaic, mosaic)
     sirm = [bench.simulator._read_u32(simulation.SIRM, offset) for offset in (0x1C, 0x20, 0x24)]

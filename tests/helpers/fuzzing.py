@@ -9,7 +9,7 @@ from emmc_rig.drivers.errors import DriverError
 
 FUZZ = int(os.environ.get("EMMC_FUZZ", "1"))
 """Factor on the number of cases of every fuzz and race test."""
-DRIVER_CASES = 500
+DRIVER_CASES = 250
 
 
 def fuzz(check, *strategies, cases=DRIVER_CASES):
