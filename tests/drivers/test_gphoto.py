@@ -61,7 +61,7 @@ CAMERAS = {
     "jpeg": {"quality": "jpeg"},
     "torn": {"quality": "raw+jpeg", "faults": ["torn_raw"]},
 }
-"""hidden: properties that a camera lacks, instead of those that such cameras usually lack."""
+"""hidden: the properties that a camera hides; each class hides some unless this list is given."""
 MOSAIC = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
 
 

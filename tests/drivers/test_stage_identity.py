@@ -50,6 +50,6 @@ def test_several_stages_in_one_ask_the_one_that_has_the_axis():
     with CombinedStage([zaber, grbl, still]) as stage:
         assert stage.identity("mask_x") == zaber.identity("mask_x")
         assert stage.identity(grbl.axes[0]).model == "Grbl"
-        # One that does not say, as of a plug-in.
+        # A stage without an identity, as a plug-in's may be.
         assert stage.identity("still") == StageIdentity()
         assert stage.temperatures_c() == {"stage 1 device 1": 31.4, "stage 1 device 2": 31.4}
