@@ -164,6 +164,50 @@ def _place(column, row, start, height, width):
     return 0 if beside else start + i * width + j
 
 
+@njit(forceinline=True, fastmath=True)
+def _find_cells(
+    place, plate, start, shape, first_x, ray_y, ray_u, ray_v, blur_x, blur_y, lens_um, pitch_um
+):
+    """Set place (x) to the cell that the ray of every pixel of a row meets on a mask.
+
+    plate: a `MaskRow`. first_x, ray_y: sensor point of the first pixel's ray, in um; ray_u, ray_v:
+    the lens point of all. blur_x, blur_y: shift of the mask's edges, in standard deviations. A
+    thin, flat, undistorted mask is met at distance d in x + d / lens (u - x), linear in x.
+    """
+    distance_um, x_um, y_um = plate[:3]
+    column_x, column_y, row_x, row_y = plate[3:7]
+    bend, edge_um, slope_x, slope_y, sag, glass_um, index = plate[7:]
+    ratio = distance_um / lens_um
+    at_x = (1 - ratio) * first_x + ratio * ray_u - x_um + edge_um * blur_x
+    at_y = (1 - ratio) * ray_y + ratio * ray_v - y_um + edge_um * blur_y
+    height, width = shape
+    column = column_x * at_x + column_y * at_y + width / 2
+    row = row_x * at_x + row_y * at_y + height / 2
+    along = (1 - ratio) * pitch_um * column_x
+    across = (1 - ratio) * pitch_um * row_x
+    flat = slope_x == 0 and slope_y == 0 and sag == 0 and glass_um == 0
+    if flat and bend == 0:
+        for x in range(place.size):
+            place[x] = _place(column + along * x, row + across * x, start, height, width)
+        return
+    for x in range(place.size):
+        to_column, to_row = column + along * x, row + across * x
+        ray_x = first_x + x * pitch_um
+        if not flat:
+            met_x, met_y = _met(
+                ray_x, ray_y, ray_u, ray_v,
+                lens_um, distance_um, slope_x, slope_y, sag, glass_um, index,
+            )  # fmt: skip
+            more_x = met_x - ((1 - ratio) * ray_x + ratio * ray_u)
+            more_y = met_y - ((1 - ratio) * ray_y + ratio * ray_v)
+            to_column += column_x * more_x + column_y * more_y
+            to_row += row_x * more_x + row_y * more_y
+        cubed = bend * (ray_x * ray_x + ray_y * ray_y)
+        to_column += cubed * (column_x * ray_x + column_y * ray_y)
+        to_row += cubed * (row_x * ray_x + row_y * ray_y)
+        place[x] = _place(to_column, to_row, start, height, width)
+
+
 @row_kernel("readings", 0, fastmath=True)
 def trace(
     begin,
@@ -219,58 +263,17 @@ def trace(
                         continue
                     in_x, in_y, in_u, in_v = points[v, u, ray, :4]
                     ray_u, ray_v = at_lens_um[v, u, ray]
+                    blur_x = points[v, u, ray, 4] if points.shape[3] == 6 else 0.0
+                    blur_y = points[v, u, ray, 5] if points.shape[3] == 6 else 0.0
                     first_x = -(columns - 1) / 2 * pitch_um + (in_x - 0.5) * width_um
                     ray_y = (y - (rows - 1) / 2) * pitch_um + (in_y - 0.5) * width_um
                     for c in range(3):
                         passed[c, :] = lamp[c]
                     for mask in range(plates.shape[0]):
-                        distance_um, x_um, y_um = plates[mask, :3]
-                        column_x, column_y, row_x, row_y = plates[mask, 3:7]
-                        bend, edge_um, slope_x, slope_y, sag, glass_um, index = plates[mask, 7:]
-                        ratio = distance_um / lens_um
-                        at_x = (1 - ratio) * first_x + ratio * ray_u - x_um
-                        at_y = (1 - ratio) * ray_y + ratio * ray_v - y_um
-                        if points.shape[3] == 6:
-                            at_x += edge_um * points[v, u, ray, 4]
-                            at_y += edge_um * points[v, u, ray, 5]
-                        height, width = shapes[mask, 0], shapes[mask, 1]
-                        column = column_x * at_x + column_y * at_y + width / 2
-                        row = row_x * at_x + row_y * at_y + height / 2
-                        along = (1 - ratio) * pitch_um * column_x
-                        across = (1 - ratio) * pitch_um * row_x
-                        start = starts[mask]
-                        flat = slope_x == 0 and slope_y == 0 and sag == 0 and glass_um == 0
-                        if flat and bend == 0:
-                            for x in range(columns):
-                                place[x] = _place(
-                                    column + along * x, row + across * x, start, height, width
-                                )
-                        else:
-                            for x in range(columns):
-                                to_column, to_row = column + along * x, row + across * x
-                                ray_x = first_x + x * pitch_um
-                                if not flat:
-                                    met_x, met_y = _met(
-                                        ray_x,
-                                        ray_y,
-                                        ray_u,
-                                        ray_v,
-                                        lens_um,
-                                        distance_um,
-                                        slope_x,
-                                        slope_y,
-                                        sag,
-                                        glass_um,
-                                        index,
-                                    )
-                                    more_x = met_x - ((1 - ratio) * ray_x + ratio * ray_u)
-                                    more_y = met_y - ((1 - ratio) * ray_y + ratio * ray_v)
-                                    to_column += column_x * more_x + column_y * more_y
-                                    to_row += row_x * more_x + row_y * more_y
-                                cubed = bend * (ray_x * ray_x + ray_y * ray_y)
-                                to_column += cubed * (column_x * ray_x + column_y * ray_y)
-                                to_row += cubed * (row_x * ray_x + row_y * ray_y)
-                                place[x] = _place(to_column, to_row, start, height, width)
+                        _find_cells(
+                            place, plates[mask], starts[mask], shapes[mask],
+                            first_x, ray_y, ray_u, ray_v, blur_x, blur_y, lens_um, pitch_um,
+                        )  # fmt: skip
                         for c in range(3):
                             for x in range(columns):
                                 passed[c, x] *= cells[place[x], c]
