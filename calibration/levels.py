@@ -27,6 +27,7 @@ Array = NDArray[np.floating]
 CHANNELS = 4
 """Red, green and blue pixels, and those that see all colours."""
 MOST_KNOTS = 8
+"""Of the lamp's line in time: a lamp warms up over minutes."""
 TRIMMED = 0.01
 """Share of the pixels at either end that a check's mean leaves out: hot pixels saturate."""
 LEAST_DEVIATION = 5e-5
