@@ -22,11 +22,11 @@ from emmc_rig.capture.by_hand import with_hands
 from emmc_rig.capture.checks import refuse_impossible
 from emmc_rig.capture.control import Control, interruptible
 from emmc_rig.capture.devices import identity_of
-from emmc_rig.capture.estimate import Estimate, known_exposures, pace_of
+from emmc_rig.capture.estimate import Estimate, pace_of
 from emmc_rig.capture.events import Listener, OnEvent, RunEnd, emit_end
 from emmc_rig.capture.expand import expand
 from emmc_rig.capture.film import refuse_impossible_film
-from emmc_rig.capture.metering import first_meterings
+from emmc_rig.capture.metering import Exposures
 from emmc_rig.capture.order import ordered
 from emmc_rig.capture.plan import Plan, load_plan, planned_camera
 from emmc_rig.capture.replay import missing_words, replaying, there
@@ -42,7 +42,7 @@ from emmc_rig.model.files import SYSTEM_DISK, Disk
 from emmc_rig.model.settings import validated
 from emmc_rig.progress import Watcher
 from emmc_rig.report.session_sheet import quick_pictures, write_sheet
-from emmc_rig.session.journal import UntilEntry, metered
+from emmc_rig.session.journal import UntilEntry
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
@@ -189,10 +189,7 @@ def estimated(
     session: Session | None = None,
 ) -> Estimate:
     """Return what frames will take."""
-    meterings = {} if session is None else first_meterings(session)
-    decided = None if session is None else metered(session.journal.entries)
-    known = known_exposures(plan, meterings, decided)
-    return pace_of(rig, plan).estimate(frames, known)
+    return pace_of(rig, plan).estimate(frames, Exposures(plan, session).known_s)
 
 
 def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -> None:
