@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
-from emmc_rig.capture.plan import Boards, Checks, Darks, Plan, PlannedShot
-from emmc_rig.capture.run import CaptureRequest, new_session, planned_frames
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.plan import Boards, Checks, Darks, Plan, PlannedShot
+from emmc_rig.captures.run import CaptureRequest, new_session, planned_frames
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.formats.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix

@@ -86,7 +86,7 @@ def calibrate(
 
     Or plan these by --plan, or correct Psi for drift by --drift.
     """
-    from emmc_rig.capture.board_plan import PlanSettings, write_plan
+    from emmc_rig.captures.board_plan import PlanSettings, write_plan
     from emmc_rig.formats.cameras import find_camera
     from emmc_rig.store.folders import result_folder
     from emmc_rig.store.results import parse_size

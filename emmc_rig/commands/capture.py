@@ -27,7 +27,7 @@ from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.progress import Event, Watcher
 
 if TYPE_CHECKING:
-    from emmc_rig.capture.control import Control
+    from emmc_rig.captures.control import Control
 
 OptionalPath = Path | None
 
@@ -132,8 +132,8 @@ def capture(
 
 
 def _write_plan(name: str, path: Path) -> None:
-    from emmc_rig.capture.plan import new_plan
-    from emmc_rig.capture.run import write_new
+    from emmc_rig.captures.plan import new_plan
+    from emmc_rig.captures.run import write_new
     from emmc_rig.formats.cameras import find_camera
 
     write_new(path, new_plan(name, find_camera(name)))
@@ -150,10 +150,10 @@ def _run(
     host: str,
     other_devices: bool,
 ) -> None:
-    from emmc_rig.capture.control import Control, pressed_keys
-    from emmc_rig.capture.estimate import Estimate
-    from emmc_rig.capture.events import Listener
-    from emmc_rig.capture.run import FrontEnd, asked_folder, capture_session
+    from emmc_rig.captures.control import Control, pressed_keys
+    from emmc_rig.captures.estimate import Estimate
+    from emmc_rig.captures.events import Listener
+    from emmc_rig.captures.run import FrontEnd, asked_folder, capture_session
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.journal import ended
@@ -240,7 +240,7 @@ def _page(
 
     other: gets every event before the page.
     """
-    from emmc_rig.capture.events import DISPLAYED, Listener
+    from emmc_rig.captures.events import DISPLAYED, Listener
     from emmc_rig.live.server import (
         LOCAL_HOSTS,
         address,

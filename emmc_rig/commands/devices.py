@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emmc_rig.capture.control import signals_interrupt
+from emmc_rig.captures.control import signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
@@ -160,7 +160,7 @@ def check(
     """List which cameras and calibrations a rig can do."""
     from emmc_rig.bench.hands import NoAttendant
     from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
-    from emmc_rig.capture.bench_check import ability, shown_error
+    from emmc_rig.captures.bench_check import ability, shown_error
     from emmc_rig.formats.cameras import find_camera
     from emmc_rig.model.camera import shipped_camera_files
 

@@ -46,8 +46,8 @@ def import_(
     ] = False,
 ) -> None:
     """Make a session from frames of another program."""
-    from emmc_rig.capture.import_session import import_session
-    from emmc_rig.capture.import_table import ImportedKind, read_table, rows_of_globs
+    from emmc_rig.captures.import_session import import_session
+    from emmc_rig.captures.import_table import ImportedKind, read_table, rows_of_globs
 
     globs: dict[ImportedKind, list[str] | None] = {
         "shot": shots, "dark": darks, "open": whites, "reference": references

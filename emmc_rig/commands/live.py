@@ -132,7 +132,7 @@ def _watch(
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
     from emmc_rig.bench.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
-    from emmc_rig.capture.plan import load_plan
+    from emmc_rig.captures.plan import load_plan
     from emmc_rig.drivers.errors import UsbNotFoundError
     from emmc_rig.formats.cameras import find_camera
     from emmc_rig.live.save import Files

@@ -18,11 +18,11 @@ from watching import Acting
 
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
-from emmc_rig.capture.checks import check
-from emmc_rig.capture.control import Control, interruptible
-from emmc_rig.capture.plan import Checks, Retries
-from emmc_rig.capture.retries import GaveUpError, Mending, mending
-from emmc_rig.capture.run import (
+from emmc_rig.captures.checks import check
+from emmc_rig.captures.control import Control, interruptible
+from emmc_rig.captures.plan import Checks, Retries
+from emmc_rig.captures.retries import GaveUpError, Mending, mending
+from emmc_rig.captures.run import (
     begun_session,
     disk_faults_named,
     estimated,
@@ -31,7 +31,7 @@ from emmc_rig.capture.run import (
     refuse_other_devices,
     refuse_small_disk,
 )
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import decode_raw

@@ -9,12 +9,12 @@ from capture_rigs import begun, still_rig
 from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.estimate import Pace
-from emmc_rig.capture.events import Listener
-from emmc_rig.capture.metering import Exposures
-from emmc_rig.capture.plan import load_plan
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.estimate import Pace
+from emmc_rig.captures.events import Listener
+from emmc_rig.captures.metering import Exposures
+from emmc_rig.captures.plan import load_plan
+from emmc_rig.captures.sequencer import Sequencer
 
 PLAN = {
     "camera": "rgbw-bayer-2shots",

@@ -13,8 +13,8 @@ from programs import done, program
 from simulated_disk import SimulatedDisk
 from watching import Acting
 
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.until import Until, stated_psnr_db
+from emmc_rig.captures.sequencer import Sequencer
+from emmc_rig.captures.until import Until, stated_psnr_db
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.result import Reconstruction, Status

@@ -13,8 +13,8 @@ import yaml
 from watching import Acting
 
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.capture.plan import Plan, planned_camera
-from emmc_rig.capture.run import CaptureRequest, new_session, planned_frames
+from emmc_rig.captures.plan import Plan, planned_camera
+from emmc_rig.captures.run import CaptureRequest, new_session, planned_frames
 from emmc_rig.drivers.camera import CameraIdentity, RawFileCamera
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.simulators.clock import ManualClock

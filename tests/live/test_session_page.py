@@ -16,9 +16,9 @@ import yaml
 from asked_person import manned
 
 import emmc_rig as emmc
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.run import FrontEnd, capture_session
-from emmc_rig.capture.sequencer import ALL_TAKEN
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.run import FrontEnd, capture_session
+from emmc_rig.captures.sequencer import ALL_TAKEN
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served

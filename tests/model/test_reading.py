@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from emmc_rig.bench.rig_config import RealRig
-from emmc_rig.capture.plan import Plan
+from emmc_rig.captures.plan import Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError, SceneError, SensingError

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from emmc_rig.capture.plan import Boards, Metering, Plan
+from emmc_rig.captures.plan import Boards, Metering, Plan
 from emmc_rig.drivers.camera import Limits
 from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.session.brightness import exposure_for_s

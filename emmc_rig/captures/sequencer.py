@@ -1,8 +1,8 @@
 """The sequencer: the runner that takes every missing frame of a session, until it is complete.
 
 `State` shows the run at a glance. The runner owns the state, the tries after faults, and what
-somebody wants in between; `emmc_rig.capture.engine` takes a frame, `emmc_rig.capture.film` the
-frames of a film, each at its time, and `emmc_rig.capture.recorder` stores them while the stage
+somebody wants in between; `emmc_rig.captures.engine` takes a frame, `emmc_rig.captures.film` the
+frames of a film, each at its time, and `emmc_rig.captures.recorder` stores them while the stage
 already moves on. However a run ends, the lamp is off and the stage stands when `run` returns or
 raises.
 """
@@ -18,18 +18,18 @@ from typing import TypeVar
 
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.bench.registration import LEAST_LIKENESS
-from emmc_rig.capture.between import Between
-from emmc_rig.capture.by_hand import WrongPlaceError
-from emmc_rig.capture.checks import refuse_impossible
-from emmc_rig.capture.control import Control, uninterrupted
-from emmc_rig.capture.engine import Engine, Facts
-from emmc_rig.capture.estimate import pace_of
-from emmc_rig.capture.events import RunEnd
-from emmc_rig.capture.film import FilmRun
-from emmc_rig.capture.metering import Exposures
-from emmc_rig.capture.plan import Plan
-from emmc_rig.capture.recorder import Recorder
-from emmc_rig.capture.retries import Budget, mending
+from emmc_rig.captures.between import Between
+from emmc_rig.captures.by_hand import WrongPlaceError
+from emmc_rig.captures.checks import refuse_impossible
+from emmc_rig.captures.control import Control, uninterrupted
+from emmc_rig.captures.engine import Engine, Facts
+from emmc_rig.captures.estimate import pace_of
+from emmc_rig.captures.events import RunEnd
+from emmc_rig.captures.film import FilmRun
+from emmc_rig.captures.metering import Exposures
+from emmc_rig.captures.plan import Plan
+from emmc_rig.captures.recorder import Recorder
+from emmc_rig.captures.retries import Budget, mending
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError, StopCapture

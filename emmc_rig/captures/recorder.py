@@ -15,7 +15,7 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
-from emmc_rig.capture.events import named
+from emmc_rig.captures.events import named
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.progress import Event, Watcher
 from emmc_rig.session.brightness import level_of
@@ -208,7 +208,7 @@ class Recorder:
         self._watcher.tell(message)
 
     def emit(self, name: str, **facts: Any) -> None:
-        """Emit an event, see `emmc_rig.capture.events`."""
+        """Emit an event, see `emmc_rig.captures.events`."""
         self._watcher.event(Event(name, facts))
 
     def emit_step(self, step: str, planned: PlannedFrame) -> None:

@@ -2,7 +2,7 @@
 
 `Engine.take` shows the steps: attend (lamp, board, masks), the plan's hook, move, settle, expose,
 read back, check, hand over. Each raises a `DriverError` for a frame that cannot be right. The
-engine neither tries again nor chooses frames: the runner does, `emmc_rig.capture.sequencer`.
+engine neither tries again nor chooses frames: the runner does, `emmc_rig.captures.sequencer`.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from emmc_rig.bench.environment import read_all
 from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.registration import Shift, registered
-from emmc_rig.capture.between import Between, HookError, plain
-from emmc_rig.capture.by_hand import places_in_session
-from emmc_rig.capture.checks import check
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.devices import Devices, Spans
-from emmc_rig.capture.focus import FocusFound
-from emmc_rig.capture.metering import Exposures
-from emmc_rig.capture.plan import Plan
-from emmc_rig.capture.recorder import Recorder
+from emmc_rig.captures.between import Between, HookError, plain
+from emmc_rig.captures.by_hand import places_in_session
+from emmc_rig.captures.checks import check
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.devices import Devices, Spans
+from emmc_rig.captures.focus import FocusFound
+from emmc_rig.captures.metering import Exposures
+from emmc_rig.captures.plan import Plan
+from emmc_rig.captures.recorder import Recorder
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError, StopCapture
 from emmc_rig.model.json_text import one_line

@@ -13,8 +13,8 @@ from statistics import median
 
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.capture.order import APPROACH_UM
-from emmc_rig.capture.plan import METERING_EXPOSURE_S, Plan
+from emmc_rig.captures.order import APPROACH_UM
+from emmc_rig.captures.plan import METERING_EXPOSURE_S, Plan
 from emmc_rig.drivers.stage import needs_approach
 from emmc_rig.session.planned import PlannedFrame
 
