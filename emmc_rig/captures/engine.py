@@ -50,9 +50,9 @@ class Focused(NamedTuple):
     """How focusing ended."""
 
     found: FocusFound | None
-    """None where no peak was seen, or somebody stopped it."""
+    """The sharpest position; None without a peak, or after a stop."""
     fault: str
-    """Why no peak was seen; "" where it was, or somebody stopped it."""
+    """Why no peak was seen, in words; "" otherwise."""
 
 
 class Engine:

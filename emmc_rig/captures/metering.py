@@ -67,7 +67,7 @@ class Exposures:
                 self.learn(planned[entry.id], entry)
 
     def learn(self, planned: PlannedFrame, entry: FrameEntry) -> None:
-        """Remember the journal line of a metering frame; that of another frame tells nothing."""
+        """Remember the journal line of a frame if it is a metering frame."""
         if planned.kind == "metering":
             self._meterings.setdefault(planned.id, entry)
 
@@ -95,7 +95,7 @@ class Exposures:
         return metered_exposure_s(entry, level, planned.light, limits_s)
 
     def known_s(self, planned: PlannedFrame) -> float | None:
-        """Return a frame's exposure for an estimate; None where it is not known yet."""
+        """Return a frame's exposure for an estimate; None as long as its metering is open."""
         try:
             return self.exposure_s(planned)
         except CameraSettingError:

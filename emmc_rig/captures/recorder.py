@@ -232,7 +232,7 @@ class Recorder:
         self.emit("planned", planned=self._planned)
 
     def count_shots(self) -> None:
-        """Count the frames that are missing of each shot, by which its end is known."""
+        """Count the missing frames of each shot: the last of them emits `shot.done`."""
         left: dict[int, set[str]] = {}
         for frame in self._session.missing():
             if frame.is_still_shot:

@@ -123,11 +123,11 @@ class Sequencer:
         self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
         self._budget = Budget(plan.retries)
-        # The frames chosen last, and those of them that are left to take.
+        # The latest choice of frames, and the rest of this choice that is still to be taken.
         self._chosen: tuple[PlannedFrame, ...] = ()
         self._left: list[PlannedFrame] = []
         self._is_homed = self._is_all_taken = False
-        # Whether the hook is called after the last frame: where none was missing it was before.
+        # Whether the hook is called after the last frame: not again for a complete session.
         self._ends_by_hook = False
         self._taken = 0
         # How many frames were taken when the scene was focused.
