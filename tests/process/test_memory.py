@@ -3,7 +3,6 @@
 import json
 import re
 import subprocess
-import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from pools import held_bytes
+from programs import PROGRAM
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
@@ -112,8 +112,7 @@ def test_the_ceiling_that_a_refusal_names_works_and_is_kept(tmp_path):
     def started(memory):
         return subprocess.Popen(
             [
-                sys.executable, "-c", "from emmc_rig.cli import main; raise SystemExit(main())",
-                "reconstruct", str(frames), "--method", "tv", "--settings",
+                *PROGRAM, "reconstruct", str(frames), "--method", "tv", "--settings",
                 str(tmp_path / "blocks.yaml"), "--out", str(tmp_path / "out"), "--memory", memory,
             ],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
