@@ -22,7 +22,7 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.process import block_tasks
 from emmc_rig.process.captures import opened_capture
-from emmc_rig.process.memory import parse_memory
+from emmc_rig.process.cost import parse_memory
 from emmc_rig.process.reconstructing import load_settings, reconstruct_undrawn
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.store.folders import result_folder
