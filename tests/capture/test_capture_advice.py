@@ -45,7 +45,11 @@ from emmc_rig.session.verify import verify
 
 HOUSE = Path(emmc_rig.__file__).parent
 SCANNED = (
-    *sorted((HOUSE / "captures").glob("*.py")),
+    *sorted(
+        module
+        for module in (HOUSE / "captures").glob("*.py")
+        if not module.name.startswith(("bench_check", "board_plan", "import_"))
+    ),
     HOUSE / "session" / "session.py",
     HOUSE / "session" / "lock.py",
     HOUSE / "commands" / "capture.py",
