@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from emmc_rig.drivers.camera import CameraIdentity
 from emmc_rig.drivers.dng import Facts, encode_dng
 from emmc_rig.drivers.errors import RawFrameError
 from emmc_rig.drivers.folder import FolderCamera
@@ -118,14 +119,8 @@ def test_levels_by_place_are_kept_in_a_session_and_in_its_dngs(name):
     back = decode_frame(file.data, type(entry).model_validate_json(entry.model_dump_json()))
     np.testing.assert_array_equal(back.black_level_dn, frame.black_level_dn)
     assert entry.black_dn == pytest.approx(frame.black_by_place().mean(), rel=3e-3)
-    again = decode_raw(dng_of(frame, _identity()))
+    again = decode_raw(dng_of(frame, CameraIdentity("", "Test")))
     np.testing.assert_allclose(again.black_by_place(), frame.black_by_place(), atol=1e-4)
-
-
-def _identity():
-    from emmc_rig.drivers.camera import CameraIdentity
-
-    return CameraIdentity("", "Test")
 
 
 def test_a_dng_refuses_levels_that_no_tag_can_say():
@@ -201,6 +196,23 @@ def test_the_time_of_capture_has_its_fraction_and_zone():
     local = decode_raw(dng((306, 2, 0, "2026:10:25 02:59:58"))).metadata
     assert captured_at(local) == datetime(2026, 10, 25, 2, 59, 58)
     assert captured_at({}) is None
+
+
+def test_the_facts_of_a_frame_are_in_its_file_and_unknown_ones_are_not():
+    def written(exposure_s, identity, facts):
+        data = encode_dng(LIGHT, "rggb", 64, 4095, exposure_s, identity, facts=facts)
+        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+            tags = tiff.pages.first.tags
+            found = {code: tags.valueof(code) for code in (269, 305, 50735) if code in tags}
+            return found, tags.valueof(34665)
+
+    facts = Facts(70_000, document="frame.dng", unique_id="ab" * 16, software="emmc-rig")
+    found, exif = written(0.01, CameraIdentity("", "Test", "S7"), facts)
+    assert found == {269: "frame.dng", 305: "emmc-rig", 50735: "S7"}
+    assert (exif["ISOSpeedRatings"], exif["ExposureTime"]) == (65_535, (1, 100))
+    assert (exif["ImageUniqueID"], exif["BodySerialNumber"]) == ("ab" * 16, "S7")
+    found, exif = written(None, CameraIdentity("", "Test"), Facts())
+    assert (found, list(exif)) == ({}, ["ExifVersion"])
 
 
 def test_a_folder_gives_its_files_in_the_order_that_it_lists_them(tmp_path, caplog):
