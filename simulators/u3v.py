@@ -37,9 +37,9 @@ Array = np.ndarray
 FAULTS = (
     "pending",
     "busy",
-    "lost_reply",
+    "drop_reply",
     "late_reply",
-    "garbled_reply",
+    "garble_reply",
     "duplicate_reply",
     "stall_control",
     "unplug",
@@ -249,7 +249,7 @@ class U3vCameraSimulator(UsbFunction):
         if (
             prefix != 0x43563355
             or len(body) != length
-            or self.faults.strikes("lost_reply", address)
+            or self.faults.strikes("drop_reply", address)
         ):
             return
         now_s = self._clock.now_s()
@@ -264,7 +264,7 @@ class U3vCameraSimulator(UsbFunction):
         answer = self._execute(command, request_id, body)
         if self.faults.strikes("late_reply", address):
             now_s += LATE_REPLY_S
-        if self.faults.strikes("garbled_reply", address):
+        if self.faults.strikes("garble_reply", address):
             answer = answer[:2] + bytes((answer[2] ^ 0x10,)) + answer[3:]
         self._answers.append((now_s, answer))
         if self.faults.strikes("duplicate_reply", address):

@@ -340,7 +340,7 @@ def test_a_stream_that_asks_for_absurd_sizes_is_refused(leader, payload):
 
 
 @pytest.mark.parametrize(
-    "fault", ["lost_reply", "late_reply", "garbled_reply", "duplicate_reply", "stall_control"]
+    "fault", ["drop_reply", "late_reply", "garble_reply", "duplicate_reply", "stall_control"]
 )
 @pytest.mark.parametrize("after", range(0, 12, 3))
 def test_a_read_that_goes_wrong_is_repeated(bench, faults, fault, after):
@@ -355,8 +355,8 @@ def test_a_read_that_goes_wrong_is_repeated(bench, faults, fault, after):
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
-        ("lost_reply", UsbTimeoutError),
-        ("garbled_reply", CameraFormatError),
+        ("drop_reply", UsbTimeoutError),
+        ("garble_reply", CameraFormatError),
         ("stall_control", UsbStalledError),
     ],
 )
@@ -392,7 +392,7 @@ def test_a_write_that_was_done_in_part_is_an_error_but_an_old_camera_states_no_c
 
 def test_a_camera_that_stays_silent_is_given_up_in_bounded_time(bench, faults):
     camera = bench.open()
-    faults.inject("lost_reply", times=math.inf)
+    faults.inject("drop_reply", times=math.inf)
     before_s = bench.clock.now_s()
     with pytest.raises(UsbTimeoutError, match="was silent"):
         camera.features.number("Width")
@@ -472,7 +472,7 @@ def test_a_stream_passes_over_a_torn_frame_and_counts_it(fault, shape):
 def test_faults_strike_the_frame_or_the_register_that_they_are_armed_for(bench, faults):
     camera = bench.open()
     faults.inject("dropped_frame", when=lambda block: block == 2)
-    faults.inject("lost_reply", times=math.inf, when=lambda address: address == 0x100010)
+    faults.inject("drop_reply", times=math.inf, when=lambda address: address == 0x100010)
     frames = itertools.islice(camera.stream(), 4)
     assert [frame.metadata["block_id"] for frame in frames] == ["0", "1", "3", "4"]
     assert camera.features.number("Width") == SHAPE[1]
