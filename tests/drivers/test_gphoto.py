@@ -176,7 +176,7 @@ def test_an_eos_exposes_for_a_user_who_never_ran_libgphoto2(served, tmp_path):
     program = (
         "import sys; from emmc_rig.drivers.gphoto import GphotoCamera;"
         "camera = GphotoCamera(sys.argv[1]);"
-        "camera.set_exposure_s(0.5); print(camera.snap().mosaic.shape); camera.close()"
+        "camera.set_exposure_s(0.008); print(camera.snap().mosaic.shape); camera.close()"
     )
     home = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path / "config")}
     ran = subprocess.run(
