@@ -47,9 +47,9 @@ from emmc_rig.calibration.planning import Kind, PlannedFrames
 from emmc_rig.calibration.routes import Outcome
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.calibration.whiteboard import LAMP_COLOURS, Calibration
-from emmc_rig.capture.board_plan import BOARD_LEVEL, capture_plan, soft_design
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.plan import Checks, Plan, PlannedShot
+from emmc_rig.captures.board_plan import BOARD_LEVEL, capture_plan, soft_design
+from emmc_rig.captures.expand import expand
+from emmc_rig.captures.plan import Checks, Plan, PlannedShot
 from emmc_rig.demo import simulated_session
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.raw import decode_raw
@@ -93,7 +93,7 @@ COMPARED_ROWS, FRAME_S, SEED, LEAST_LOST_DB = 32, 0.5, 0, 0.2
 PROGRAM = """\
 import atexit, time
 from emmc_rig.cli import main
-from emmc_rig.process.memory import peak_memory_mib
+from emmc_rig.process.cost import peak_memory_mib
 atexit.register(lambda: print(peak_memory_mib(), time.process_time()))
 main()
 """

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from emmc_rig.bench.hardware import ALL_FITTED, Fitted, Rig, simulated_rig
 from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.calibration.whiteboard import Calibration
-from emmc_rig.capture.board_plan import (
+from emmc_rig.captures.board_plan import (
     PlanSettings,
     capture_plan,
     combined_plan,
     few_plan,
     plan_light,
 )
-from emmc_rig.capture.by_hand import with_hands
-from emmc_rig.capture.expand import expand, mask_offsets_um
-from emmc_rig.capture.plan import Plan
-from emmc_rig.capture.run import CaptureRequest, planned_frames
+from emmc_rig.captures.by_hand import with_hands
+from emmc_rig.captures.expand import expand, mask_offsets_um
+from emmc_rig.captures.plan import Plan
+from emmc_rig.captures.run import CaptureRequest, planned_frames
 from emmc_rig.demo import simulated_session
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix

@@ -26,7 +26,7 @@ from emmc_rig.version import __version__
 
 if TYPE_CHECKING:
     from emmc_rig.bench.rig_config import rig
-    from emmc_rig.capture.run import capture
+    from emmc_rig.captures.run import capture
     from emmc_rig.errors import ERRORS, StopCapture
     from emmc_rig.formats.cameras import find_camera as camera
     from emmc_rig.formats.scenes import Scene
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _HOME = {
     "calibrate": "emmc_rig.process.calibrating:calibrate",
     "camera": "emmc_rig.formats.cameras:find_camera",
-    "capture": "emmc_rig.capture.run:capture",
+    "capture": "emmc_rig.captures.run:capture",
     "frames": "emmc_rig.process.raw_frames:frames",
     "rig": "emmc_rig.bench.rig_config:rig",
     "scene": "emmc_rig.formats.scenes:open_scene",

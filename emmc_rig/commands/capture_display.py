@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.progress import Progress, TaskID
 from rich.text import Text
 
-from emmc_rig.capture.control import Control, pressed_keys
+from emmc_rig.captures.control import Control, pressed_keys
 from emmc_rig.commands.output import columns
 from emmc_rig.progress import Event, Watcher
 from emmc_rig.store.results import shown_seconds
@@ -25,7 +25,7 @@ PAUSE_KEY, STOP_KEY = "p", "q"
 
 
 class CaptureDisplay(Watcher):
-    """Shows a capture and its keys, see `emmc_rig.capture.events`."""
+    """Shows a capture and its keys, see `emmc_rig.captures.events`."""
 
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.bench.rig_config import SIMULATED, RealRig, SimulatedFile
-from emmc_rig.capture.focus import FocusFound
-from emmc_rig.capture.plan import Plan, load_plan
+from emmc_rig.captures.focus import FocusFound
+from emmc_rig.captures.plan import Plan, load_plan
 from emmc_rig.errors import AppError
 from emmc_rig.formats.yaml_edit import Key, replace_text, with_values
 from emmc_rig.live.alignment import MaskPlace

@@ -12,8 +12,8 @@ import numpy as np
 from emmc_rig.bench.hands import hole_name
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.scale import Scale
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.until import METHOD, light_field_so_far
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.until import METHOD, light_field_so_far
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.live.light_field import Pictures, export_of, field_pictures

@@ -20,7 +20,7 @@ import numpy as np
 from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.bench.registration import LEAST_LIKENESS, registered
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.capture.focus import FocusMeter, Sharpness, focused, sharpness
+from emmc_rig.captures.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.drivers.camera import Camera
 from emmc_rig.drivers.errors import DriverError, ExposureStoppedError
 from emmc_rig.drivers.raw import RawFrame

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.local_mean import local_mean
+from emmc_rig.model.frames import local_mean
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.problem import smooth_guess
 

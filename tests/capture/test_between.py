@@ -15,8 +15,8 @@ from capture_rigs import begun, still_rig
 from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
-from emmc_rig.capture.between import Between, HookError, load_hook, plain
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.between import Between, HookError, load_hook, plain
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.session.journal import HaltEntry, HookEntry, RetryEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify

@@ -10,12 +10,12 @@ from programs import done, refused
 
 from emmc_rig.bench.hands import AskingAttendant, NoAttendant, hole_name
 from emmc_rig.bench.hardware import Fitted, simulated_rig
-from emmc_rig.capture import bench_check
-from emmc_rig.capture.bench_check import ability
-from emmc_rig.capture.by_hand import HandPlaces, with_hands
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.order import ordered
-from emmc_rig.capture.plan import Plan, planned_camera
+from emmc_rig.captures import bench_check
+from emmc_rig.captures.bench_check import ability
+from emmc_rig.captures.by_hand import HandPlaces, with_hands
+from emmc_rig.captures.expand import expand
+from emmc_rig.captures.order import ordered
+from emmc_rig.captures.plan import Plan, planned_camera
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
-from emmc_rig.capture.estimate import Pace
-from emmc_rig.capture.expand import expand, exposures_s, fittings
-from emmc_rig.capture.order import ordered, travel_um
-from emmc_rig.capture.plan import (
+from emmc_rig.captures.estimate import Pace
+from emmc_rig.captures.expand import expand, exposures_s, fittings
+from emmc_rig.captures.order import ordered, travel_um
+from emmc_rig.captures.plan import (
     Boards,
     Darks,
     OpenBoard,

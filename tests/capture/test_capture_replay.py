@@ -8,7 +8,7 @@ import pytest
 from capture_rigs import begun, still_rig
 from simulated_disk import SimulatedDisk
 
-from emmc_rig.capture.replay import matched, missing_words, there
+from emmc_rig.captures.replay import matched, missing_words, there
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.folder import FolderCamera, Recorded
 from emmc_rig.session.planned import Bench, PlannedFrame

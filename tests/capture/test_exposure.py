@@ -9,13 +9,13 @@ from capture_rigs import begun, plan_and_camera, request_for, stops_after
 from simulated_disk import SimulatedDisk
 
 from emmc_rig.bench.hardware import simulated_rig
-from emmc_rig.capture.amend import amendment
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.metering import BRACKET_STEP, METERABLE_LEVELS, asked_of_scene
-from emmc_rig.capture.plan import Metering
-from emmc_rig.capture.retries import GaveUpError
-from emmc_rig.capture.run import _frozen, planned_frames
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.amend import amendment
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.metering import BRACKET_STEP, METERABLE_LEVELS, asked_of_scene
+from emmc_rig.captures.plan import Metering
+from emmc_rig.captures.retries import GaveUpError
+from emmc_rig.captures.run import _frozen, planned_frames
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.session.brightness import GOOD_LEVELS, next_exposure_s

@@ -14,12 +14,12 @@ from pydantic import ValidationError
 from simulated_disk import PowerCutError, SimulatedDisk
 
 from emmc_rig.bench.hardware import Fitted, simulated_rig
-from emmc_rig.capture import film as films
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.film import Ring, refuse_impossible_film, room_for
-from emmc_rig.capture.plan import Plan, new_plan, planned_camera
-from emmc_rig.capture.run import estimated
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures import film as films
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.film import Ring, refuse_impossible_film, room_for
+from emmc_rig.captures.plan import Plan, new_plan, planned_camera
+from emmc_rig.captures.run import estimated
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.errors import CaptureError

@@ -10,7 +10,7 @@ from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
 from emmc_rig.bench.hardware import simulated_rig
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import DriverError, NotHomedError
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.session.journal import FocusEntry, HaltEntry, RetryEntry, of_kind

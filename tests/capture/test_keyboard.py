@@ -4,7 +4,7 @@ import os
 import sys
 import time
 
-from emmc_rig.capture.control import pressed_keys
+from emmc_rig.captures.control import pressed_keys
 
 PATIENCE_S = 5.0
 

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from PIL import Image, ImageOps
 
-from emmc_rig.capture.import_table import read_table
+from emmc_rig.captures.import_table import read_table
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.errors import AppError
 from emmc_rig.formats.own_arrays import read_own

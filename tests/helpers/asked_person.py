@@ -59,7 +59,7 @@ class Person(AskingAttendant):
 def manned(folder, monkeypatch, wrong=()):
     """Return plan and rig of a bench on which a person moves the pinhole; see `Person`."""
 
-    from emmc_rig.capture import run as capture_run
+    from emmc_rig.captures import run as capture_run
 
     @contextmanager
     def opened(description, camera, ask):

@@ -17,7 +17,7 @@ import typer
 from capture_rigs import still_rig
 
 from emmc_rig import cli
-from emmc_rig.capture import run
+from emmc_rig.captures import run
 from emmc_rig.errors import AppError
 from emmc_rig.process import session_calibration as calibrate_session
 from emmc_rig.report import session_sheet

@@ -8,7 +8,7 @@ from test_live import FakeCamera, PatientCamera
 
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.calibration.scale import designed_scale
-from emmc_rig.capture.control import Control
+from emmc_rig.captures.control import Control
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene

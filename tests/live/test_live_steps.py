@@ -9,7 +9,7 @@ from test_live import until, watching
 
 from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
-from emmc_rig.capture.focus import FocusFound, peak
+from emmc_rig.captures.focus import FocusFound, peak
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene

@@ -13,7 +13,7 @@ from programs import exit_code, program
 from simulated_calibration import CalibrateSettings, rig_to_calibrate, true_psi
 
 from emmc_rig.bench.hardware import NO_FLAWS
-from emmc_rig.capture.plan import load_plan
+from emmc_rig.captures.plan import load_plan
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix

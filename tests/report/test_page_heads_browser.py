@@ -5,7 +5,7 @@ import pytest
 from browsers import MARKS
 from capture_rigs import begun, still_rig
 
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.formats.format import Export
 from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.report.page import Head, Section, framed

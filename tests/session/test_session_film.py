@@ -11,8 +11,8 @@ from capture_rigs import begun
 from simulated_disk import SimulatedDisk
 
 from emmc_rig.bench.hardware import Fitted, simulated_rig
-from emmc_rig.capture.plan import Plan, planned_camera
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.plan import Plan, planned_camera
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.frames import Exposure

@@ -17,8 +17,8 @@ from emmc_rig.bench.rig_config import (
     RealRig,
     rig_description,
 )
-from emmc_rig.capture.plan import Plan, planned_camera
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.plan import Plan, planned_camera
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError

@@ -12,8 +12,8 @@ from capture_rigs import SIZE, begun, still_rig
 from rich.console import Console
 from simulated_disk import SimulatedDisk
 
-from emmc_rig.capture.control import Control
-from emmc_rig.capture.sequencer import Sequencer
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.raw import RawFrame, decode_raw

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 from emmc_rig.calibration.scale import Scale
 from emmc_rig.calibration.shadow import shadow_mask
-from emmc_rig.capture.plan import Plan
+from emmc_rig.captures.plan import Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.progress import Event, Watcher

@@ -18,13 +18,13 @@ from emmc_rig.calibration.planning import (
     plan_parametric,
 )
 from emmc_rig.calibration.shadow import ShadowMask, shadow_mask
-from emmc_rig.capture.board_plan import (
+from emmc_rig.captures.board_plan import (
     MORE_STAGES_UM,
     STAGE_KINDS_UM,
     plan_light,
     soft_design,
 )
-from emmc_rig.capture.expand import mask_offsets_um
+from emmc_rig.captures.expand import mask_offsets_um
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.capture.plan import Checks
+from emmc_rig.captures.plan import Checks
 from emmc_rig.drivers.camera import within
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import RawFrame

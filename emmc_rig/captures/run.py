@@ -16,23 +16,23 @@ from typing import Any
 from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.rig_config import AnyRig, Ask, RigChoice, opened_rig
 from emmc_rig.bench.rig_config import rig as choose_rig
-from emmc_rig.capture.amend import amendment
-from emmc_rig.capture.between import load_hook
-from emmc_rig.capture.by_hand import with_hands
-from emmc_rig.capture.checks import refuse_impossible
-from emmc_rig.capture.control import Control, interruptible
-from emmc_rig.capture.devices import identity_of
-from emmc_rig.capture.estimate import Estimate, known_exposures, pace_of
-from emmc_rig.capture.events import Listener, OnEvent, RunEnd, emit_end
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.film import refuse_impossible_film
-from emmc_rig.capture.metering import first_meterings
-from emmc_rig.capture.order import ordered
-from emmc_rig.capture.plan import Plan, load_plan, planned_camera
-from emmc_rig.capture.replay import missing_words, replaying, there
-from emmc_rig.capture.retries import GaveUpError
-from emmc_rig.capture.sequencer import Sequencer
-from emmc_rig.capture.until import Until, refuse_unless_shots_can_be_spared
+from emmc_rig.captures.amend import amendment
+from emmc_rig.captures.between import load_hook
+from emmc_rig.captures.by_hand import with_hands
+from emmc_rig.captures.checks import refuse_impossible
+from emmc_rig.captures.control import Control, interruptible
+from emmc_rig.captures.devices import identity_of
+from emmc_rig.captures.estimate import Estimate, pace_of
+from emmc_rig.captures.events import Listener, OnEvent, RunEnd, emit_end
+from emmc_rig.captures.expand import expand
+from emmc_rig.captures.film import refuse_impossible_film
+from emmc_rig.captures.metering import Exposures
+from emmc_rig.captures.order import ordered
+from emmc_rig.captures.plan import Plan, load_plan, planned_camera
+from emmc_rig.captures.replay import missing_words, replaying, there
+from emmc_rig.captures.retries import GaveUpError
+from emmc_rig.captures.sequencer import Sequencer
+from emmc_rig.captures.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.drivers.folder import FolderCamera, Recorded
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.model.arguments import NAMES, path_of, required
@@ -42,7 +42,7 @@ from emmc_rig.model.files import SYSTEM_DISK, Disk
 from emmc_rig.model.settings import validated
 from emmc_rig.progress import Watcher
 from emmc_rig.report.session_sheet import quick_pictures, write_sheet
-from emmc_rig.session.journal import UntilEntry, metered
+from emmc_rig.session.journal import UntilEntry
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
@@ -189,10 +189,7 @@ def estimated(
     session: Session | None = None,
 ) -> Estimate:
     """Return what frames will take."""
-    meterings = {} if session is None else first_meterings(session)
-    decided = None if session is None else metered(session.journal.entries)
-    known = known_exposures(plan, meterings, decided)
-    return pace_of(rig, plan).estimate(frames, known)
+    return pace_of(rig, plan).estimate(frames, Exposures(plan, session).known_s)
 
 
 def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -> None:
@@ -431,7 +428,7 @@ def capture(
         until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
         other_devices: a session may go on with a camera or stage of another serial number.
         watcher: observes the capture.
-        on_event: is called with each event of `emmc_rig.capture.events`, as `frame.written` or
+        on_event: is called with each event of `emmc_rig.captures.events`, as `frame.written` or
             `shot.done`; a function that raises is not called again.
         ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emmc_rig.capture.checks import SaturatedError
-from emmc_rig.capture.plan import Retries
+from emmc_rig.captures.checks import SaturatedError
+from emmc_rig.captures.plan import Retries
 from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,

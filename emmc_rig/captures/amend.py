@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from emmc_rig.capture.plan import Plan, differences
+from emmc_rig.captures.plan import Plan, differences
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError

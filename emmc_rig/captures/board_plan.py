@@ -24,8 +24,8 @@ from emmc_rig.calibration.planning import (
     plan_parametric,
 )
 from emmc_rig.calibration.shadow import ShadowMask, shadow_mask
-from emmc_rig.capture.expand import expand
-from emmc_rig.capture.plan import (
+from emmc_rig.captures.expand import expand
+from emmc_rig.captures.plan import (
     METERING_EXPOSURE_S,
     Boards,
     Darks,

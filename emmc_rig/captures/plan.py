@@ -249,7 +249,7 @@ class Plan(Settings):
     between: str | None = Field(
         default=None,
         description="module:function, called before every frame and after the last, see "
-        "`emmc_rig.capture.between`",
+        "`emmc_rig.captures.between`",
     )
     focus: Focusing | None = Field(
         default=None, description=f"`{BEFORE_SHOTS}`, or when: needs an axis named focus"

@@ -20,9 +20,9 @@ import yaml
 from numpy.typing import NDArray
 
 from emmc_rig.bench.rig_config import IMPORTED
-from emmc_rig.capture.expand import fittings, mask_offsets_um
-from emmc_rig.capture.import_table import LONGEST_S, Listed
-from emmc_rig.capture.plan import Checks, Plan, planned_camera
+from emmc_rig.captures.expand import fittings, mask_offsets_um
+from emmc_rig.captures.import_table import LONGEST_S, Listed
+from emmc_rig.captures.plan import Checks, Plan, planned_camera
 from emmc_rig.drivers.camera import EXPOSURE_AGREEMENT
 from emmc_rig.drivers.capture_order import capture_order
 from emmc_rig.drivers.raw import RawFrame, captured_at
@@ -125,7 +125,7 @@ def import_session(
 ) -> Imported:
     """Write the session of some files.
 
-    listed: the files, see `emmc_rig.capture.import_table`. camera: a shipped camera, or a YAML
+    listed: the files, see `emmc_rig.captures.import_table`. camera: a shipped camera, or a YAML
     file. planes: take the red, green and blue of a colour file as three shots of a monochrome
     sensor. on_file: gets the name of each file that was read. Raises AppError or CameraError,
     with nothing written.
