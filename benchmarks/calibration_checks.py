@@ -37,8 +37,6 @@ from simulated_calibration import (
 )
 
 import emmc_rig as emmc
-from emmc_rig.acquisition.expand import expand
-from emmc_rig.acquisition.plan import Checks, Plan, PlannedShot
 from emmc_rig.bench.hardware import Fitted
 from emmc_rig.calibration.boards import channels_of
 from emmc_rig.calibration.drift import DriftSettings, drifted, find_drift
@@ -49,18 +47,18 @@ from emmc_rig.calibration.planning import Kind, PlannedFrames
 from emmc_rig.calibration.routes import Outcome
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.calibration.whiteboard import LAMP_COLOURS, Calibration
+from emmc_rig.captures.board_plan import BOARD_LEVEL, capture_plan, soft_design
+from emmc_rig.captures.expand import expand
+from emmc_rig.captures.plan import Checks, Plan, PlannedShot
 from emmc_rig.demo import simulated_session
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.raw import decode_raw
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.psi import StoredPsi
-from emmc_rig.files.results import parse_size
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.camera import psi_layout
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.board_plan import BOARD_LEVEL, capture_plan, soft_design
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.methods import DEFAULT_METHOD
 from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
@@ -70,6 +68,8 @@ from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import session_frames, shot_readings
 from emmc_rig.session.session import Frozen, Session
 from emmc_rig.simulators.effects import EFFECTS, ORDINARY, TOGETHER, Flaws, flawed
+from emmc_rig.store.psi import StoredPsi
+from emmc_rig.store.results import parse_size
 
 Array = NDArray[np.floating]
 CAMERA = "rgbw-bayer-1shot"
@@ -93,7 +93,7 @@ COMPARED_ROWS, FRAME_S, SEED, LEAST_LOST_DB = 32, 0.5, 0, 0.2
 PROGRAM = """\
 import atexit, time
 from emmc_rig.cli import main
-from emmc_rig.processing.memory import peak_memory_mib
+from emmc_rig.process.cost import peak_memory_mib
 atexit.register(lambda: print(peak_memory_mib(), time.process_time()))
 main()
 """

@@ -6,7 +6,7 @@ import lab
 import numpy as np
 from scipy.stats import spearmanr
 
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.methods import DEFAULT_METHOD, reconstruct

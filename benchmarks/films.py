@@ -16,8 +16,8 @@ import lab
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.film import Film

@@ -13,7 +13,7 @@ import lab
 import numpy as np
 from films import frame_of, opened, window
 
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.film import Film

@@ -10,25 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.acquisition.by_hand import with_hands
-from emmc_rig.acquisition.command import CaptureRequest, planned_frames
-from emmc_rig.acquisition.expand import expand, mask_offsets_um
-from emmc_rig.acquisition.plan import Plan
 from emmc_rig.bench.hardware import ALL_FITTED, Fitted, Rig, simulated_rig
 from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.calibration.whiteboard import Calibration
-from emmc_rig.demo import simulated_session
-from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.board_plan import (
+from emmc_rig.captures.board_plan import (
     PlanSettings,
     capture_plan,
     combined_plan,
     few_plan,
     plan_light,
 )
-from emmc_rig.processing.calibrating import calibrate
-from emmc_rig.processing.session_calibration import SessionCalibration
+from emmc_rig.captures.by_hand import with_hands
+from emmc_rig.captures.expand import expand, mask_offsets_um
+from emmc_rig.captures.plan import Plan
+from emmc_rig.captures.run import CaptureRequest, planned_frames
+from emmc_rig.demo import simulated_session
+from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.process.calibrating import calibrate
+from emmc_rig.process.session_calibration import SessionCalibration
 from emmc_rig.progress import Watcher
 from emmc_rig.simulators.bench import Bench
 from emmc_rig.simulators.effects import ORDINARY, Flaws, flawed

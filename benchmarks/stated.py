@@ -11,7 +11,7 @@ import lab
 import numpy as np
 import pandas as pd
 
-from emmc_rig.files.scenes import Scene, open_scene
+from emmc_rig.formats.scenes import Scene, open_scene
 from emmc_rig.reconstruction.adaptive.uncertainty import (
     EVEN_DECIDED,
     FEATURES,

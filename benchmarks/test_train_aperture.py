@@ -9,10 +9,10 @@ from random_worlds import with_pattern
 from train_aperture import PATCH_PX, Moments, aperture_of, learned_cells, patch_moments, train
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import camera_file, find_camera
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.cameras import camera_file, find_camera
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import load_camera
-from emmc_rig.processing.reconstructing import reconstruct
+from emmc_rig.process.reconstructing import reconstruct
 
 VIEWS = 25
 

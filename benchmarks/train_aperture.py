@@ -26,12 +26,12 @@ from scipy.optimize import minimize
 from training_patches import cut_patches
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.files.cameras import camera_file
-from emmc_rig.files.results import command_line
+from emmc_rig.formats.cameras import camera_file
 from emmc_rig.model.camera import Camera, load_camera, pixel_light
 from emmc_rig.model.masks import Parameters
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.store.folders import new_file
+from emmc_rig.store.results import command_line
 
 Array = NDArray[np.float64]
 PATCH_PX = 5

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from training_patches import PatchSettings, training_patches
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.files.results import command_line, parse_size, versions
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.files import whole_file
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.store.folders import new_file
+from emmc_rig.store.results import command_line, parse_size, versions
 
 CHECKPOINT_INTERVAL_S = 60.0
 SHOWN_ATOMS, ZOOM, GAP_PX = 400, 3, 2

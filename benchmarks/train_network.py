@@ -31,12 +31,12 @@ from emmc_rig_unrolled.weights import Architecture, NetworkWeights
 from training_patches import cut_patches
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.results import command_line, versions
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.files import whole_file
 from emmc_rig.store.folders import new_file
+from emmc_rig.store.results import command_line, versions
 
 CAMERAS = "scenario-ii-cfa", "rgbw-bayer-1shot", "rgbw-bayer-3shots", "rgbw-mono"
 VIEWS = 5, 5

@@ -24,7 +24,7 @@ from emmc_rig.calibration.repeats import vertex
 from emmc_rig.calibration.robust import correlation, deviation_of, tukey_weights
 from emmc_rig.calibration.shadow import SEARCH_UM, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.local_mean import local_mean
+from emmc_rig.model.frames import local_mean
 
 Array = NDArray[np.floating]
 CROP_PX = 160

@@ -25,39 +25,39 @@ from emmc_rig import moved_packages as moved_packages
 from emmc_rig.version import __version__
 
 if TYPE_CHECKING:
-    from emmc_rig.acquisition.command import capture
     from emmc_rig.bench.rig_config import rig
+    from emmc_rig.captures.run import capture
     from emmc_rig.errors import ERRORS, StopCapture
-    from emmc_rig.files.cameras import find_camera as camera
-    from emmc_rig.files.scenes import Scene
-    from emmc_rig.files.scenes import open_scene as scene
+    from emmc_rig.formats.cameras import find_camera as camera
+    from emmc_rig.formats.scenes import Scene
+    from emmc_rig.formats.scenes import open_scene as scene
     from emmc_rig.model.camera import Camera
     from emmc_rig.model.frames import Frames
     from emmc_rig.model.sensing import ImagingMatrix as Psi
-    from emmc_rig.processing.calibrating import calibrate
-    from emmc_rig.processing.filming import reconstruct_film
-    from emmc_rig.processing.raw_frames import frames
-    from emmc_rig.processing.reconstructing import open_frames, reconstruct
-    from emmc_rig.processing.result import Result, open_result
+    from emmc_rig.process.calibrating import calibrate
+    from emmc_rig.process.filming import reconstruct_film
+    from emmc_rig.process.raw_frames import frames
+    from emmc_rig.process.reconstructing import open_frames, reconstruct
+    from emmc_rig.process.result import Result, open_result
     from emmc_rig.session.session import Session
 
 _HOME = {
-    "calibrate": "emmc_rig.processing.calibrating:calibrate",
-    "camera": "emmc_rig.files.cameras:find_camera",
-    "capture": "emmc_rig.acquisition.command:capture",
-    "frames": "emmc_rig.processing.raw_frames:frames",
+    "calibrate": "emmc_rig.process.calibrating:calibrate",
+    "camera": "emmc_rig.formats.cameras:find_camera",
+    "capture": "emmc_rig.captures.run:capture",
+    "frames": "emmc_rig.process.raw_frames:frames",
     "rig": "emmc_rig.bench.rig_config:rig",
-    "scene": "emmc_rig.files.scenes:open_scene",
-    "open_frames": "emmc_rig.processing.reconstructing:open_frames",
-    "open_result": "emmc_rig.processing.result:open_result",
-    "reconstruct": "emmc_rig.processing.reconstructing:reconstruct",
-    "reconstruct_film": "emmc_rig.processing.filming:reconstruct_film",
+    "scene": "emmc_rig.formats.scenes:open_scene",
+    "open_frames": "emmc_rig.process.reconstructing:open_frames",
+    "open_result": "emmc_rig.process.result:open_result",
+    "reconstruct": "emmc_rig.process.reconstructing:reconstruct",
+    "reconstruct_film": "emmc_rig.process.filming:reconstruct_film",
     "Camera": "emmc_rig.model.camera:Camera",
     "ERRORS": "emmc_rig.errors:ERRORS",
     "Frames": "emmc_rig.model.frames:Frames",
     "Psi": "emmc_rig.model.sensing:ImagingMatrix",
-    "Result": "emmc_rig.processing.result:Result",
-    "Scene": "emmc_rig.files.scenes:Scene",
+    "Result": "emmc_rig.process.result:Result",
+    "Scene": "emmc_rig.formats.scenes:Scene",
     "Session": "emmc_rig.session.session:Session",
     "StopCapture": "emmc_rig.errors:StopCapture",
 }

@@ -8,7 +8,14 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-MOVED = ("calibration", "drivers", "reconstruction", "simulators")
+MOVED = {
+    "calibration": "emmc_rig.calibration",
+    "drivers": "emmc_rig.drivers",
+    "reconstruction": "emmc_rig.reconstruction",
+    "simulators": "emmc_rig.simulators",
+    "emmc_rig.conformance": "emmc_rig.bench.conformance",
+}
+"""The old name of each package that plug-ins and notebooks import, and its name since 0.5."""
 
 
 class _MovedPackages(MetaPathFinder, Loader):
@@ -21,7 +28,7 @@ class _MovedPackages(MetaPathFinder, Loader):
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
         name = spec.name
-        raise ModuleNotFoundError(f"import emmc_rig.{name}, its name since 0.5", name=name)
+        raise ModuleNotFoundError(f"import {MOVED[name]}, its name since 0.5", name=name)
 
     def exec_module(self, module: ModuleType) -> None:
         """Never called: `create_module` raises."""

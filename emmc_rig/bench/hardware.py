@@ -51,7 +51,7 @@ from emmc_rig.drivers.transport import SerialTransport, Transport
 from emmc_rig.drivers.u3v import open_camera as open_u3v
 from emmc_rig.drivers.zaber import ZaberStage, find_devices
 from emmc_rig.errors import AppError
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Camera, Sensor
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.settings import validated

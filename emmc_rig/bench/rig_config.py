@@ -26,7 +26,7 @@ from emmc_rig.bench.hardware import (
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.stage import Stage
 from emmc_rig.errors import AppError
-from emmc_rig.files.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.formats.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.json_text import shown_path

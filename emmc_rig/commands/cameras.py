@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.options import out_option
 from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 
 
@@ -19,19 +20,17 @@ def cameras(
     name: Annotated[
         str | None, typer.Argument(help="a shipped camera or a YAML file (default: list all)")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="folder for the drawing (default: camera-NAME)")
-    ] = None,
+    out: Annotated[Path | None, out_option("camera-NAME")] = None,
 ) -> None:
     """List the shipped cameras, or draw the masks of one."""
     import emmc_rig as emmc
-    from emmc_rig.files.results import write_metrics
-    from emmc_rig.pages.camera_sheet import (
+    from emmc_rig.report.camera_sheet import (
         camera_figures,
         camera_rows,
         draw_camera,
     )
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import write_metrics
 
     if name is None:
         shown = camera_rows()

@@ -15,17 +15,17 @@ from rich.live import Live
 from rich.progress import Progress, TaskID
 from rich.text import Text
 
-from emmc_rig.acquisition.control import Control, pressed_keys
+from emmc_rig.captures.control import Control, pressed_keys
 from emmc_rig.commands.output import columns
-from emmc_rig.files.results import shown_seconds
 from emmc_rig.progress import Event, Watcher
+from emmc_rig.store.results import shown_seconds
 
 KEY_POLL_S = 0.1
 PAUSE_KEY, STOP_KEY = "p", "q"
 
 
 class CaptureDisplay(Watcher):
-    """Shows a capture and its keys, see `emmc_rig.acquisition.events`."""
+    """Shows a capture and its keys, see `emmc_rig.captures.events`."""
 
     def __init__(self, console: Console, control: Control) -> None:
         self._console, self._control = console, control

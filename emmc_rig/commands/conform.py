@@ -47,7 +47,7 @@ def conform(
         )
         if not typer.confirm(question, err=True):
             raise AppError("nothing was moved")
-    from emmc_rig import conformance
+    from emmc_rig.bench import conformance
 
     here = Path(conformance.__file__).parent
     with (
@@ -59,7 +59,7 @@ def conform(
         code = pytest.main(
             [
                 *(str(here / SUITES[suite]) for suite in suites),
-                *("-p", "emmc_rig.conformance.named", "--device", device),
+                *("-p", "emmc_rig.bench.conformance.named", "--device", device),
                 *("-c", os.devnull, "--rootdir", str(here), "-p", "no:cacheprovider"),
                 *("--import-mode=importlib", "-v", "--no-header", "--tb=short"),
             ]

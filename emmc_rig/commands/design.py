@@ -24,7 +24,7 @@ def design(
     out: OutOption = Path("emmc-design"),
 ) -> None:
     """Design the mask to order, by theory and simulation."""
-    from emmc_rig.files.results import parse_size
+    from emmc_rig.store.results import parse_size
     from emmc_rig.study.design.bench import load_bench
     from emmc_rig.study.design.designing import run_design, simulated_table
 

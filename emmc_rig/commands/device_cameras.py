@@ -69,7 +69,7 @@ def snap(
     out: OutFolder = Path("emmc-snaps"),
 ) -> None:
     """Take frames and save them as the camera's own files, with a PNG preview of each."""
-    from emmc_rig.files.results import parse_seconds
+    from emmc_rig.store.results import parse_seconds
 
     exposure_s = parse_seconds(exposure, "--exposure")
     with closing(open_camera(_chosen(camera, rig))) as device:
@@ -129,7 +129,7 @@ def choose(device: Camera, exposure_s: float | None, gain: float | None) -> None
 
 def frame_line(frame: RawFrame) -> str:
     """Return a frame's figures in one line."""
-    from emmc_rig.pages.frame_view import brightest
+    from emmc_rig.report.frame_view import brightest
     from emmc_rig.session.brightness import figures
 
     rows, columns = frame.mosaic.shape
@@ -159,7 +159,7 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     """
     import cv2
 
-    from emmc_rig.pages.frame_view import preview
+    from emmc_rig.report.frame_view import preview
     from emmc_rig.session.frame_file import frame_facts, frame_file
 
     number = next(n for n in itertools.count(1) if not any(folder.glob(f"frame-{n:04d}.*")))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import ExportSizeOption, OutOption
+from emmc_rig.commands.options import ExportSizeOption, OutOption, TruthOption
 from emmc_rig.commands.output import give_result, shown_progress, tell
 
 
@@ -15,9 +15,7 @@ def figure(
     results: Annotated[
         list[str], typer.Argument(help="folders of `reconstruct` or `demo`, or sessions")
     ],
-    truth: Annotated[
-        str | None, typer.Option("--truth", help="the scene that was captured: adds errors, PSNR")
-    ] = None,
+    truth: TruthOption = None,
     view: Annotated[
         str | None,
         typer.Option(
@@ -40,10 +38,10 @@ def figure(
     out: OutOption = Path("emmc-figure"),
 ) -> None:
     """Draw results of one capture side by side, for a paper."""
-    from emmc_rig.files.exports import open_export
-    from emmc_rig.files.results import parse_size, write_metrics
-    from emmc_rig.pages.result_figure import FigureSettings, draw_results
+    from emmc_rig.formats.exports import open_export
+    from emmc_rig.report.result_figure import FigureSettings, draw_results
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import parse_size, write_metrics
 
     settings = FigureSettings(
         None if view is None else _pair("--view", view),

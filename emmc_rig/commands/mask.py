@@ -46,9 +46,9 @@ def mask(
     """Measure a mask's cells in a photograph of it."""
     from emmc_rig.calibration.mask_photo import read_mask
     from emmc_rig.errors import WrongUsageError
-    from emmc_rig.files.photograph import read_photograph
-    from emmc_rig.files.results import parse_size
-    from emmc_rig.pages.mask_drawing import write_mask
+    from emmc_rig.formats.photograph import read_photograph
+    from emmc_rig.report.mask_drawing import write_mask
+    from emmc_rig.store.results import parse_size
 
     size = parse_size(cells, "--cells", "64x64") or (0, 0)
     at = None if corners is None else _corners(corners)

@@ -30,8 +30,8 @@ def list_sessions(
     from rich.table import Column
 
     from emmc_rig.errors import AppError
-    from emmc_rig.files.results import shown_bytes
     from emmc_rig.session.listing import sessions_in
+    from emmc_rig.store.results import shown_bytes
 
     with shown_progress("read sessions") as progress:
         found = []
@@ -60,13 +60,13 @@ def list_sessions(
 @app.command()
 def show(session: Folder) -> None:
     """Show a session's frames, plan and events, without reading the frames."""
-    from emmc_rig.files.results import shown_bytes
-    from emmc_rig.pages.session_sheet import events
+    from emmc_rig.report.session_sheet import events
     from emmc_rig.session.exposure import exposure_reasons, shot_exposures
     from emmc_rig.session.listing import summary
     from emmc_rig.session.planned import kind_name
     from emmc_rig.session.session import PLAN, Session, amended_name
     from emmc_rig.session.verify import counts
+    from emmc_rig.store.results import shown_bytes
 
     opened = Session(session)
     listed = summary(opened)
@@ -131,9 +131,9 @@ def export(
     ] = False,
 ) -> None:
     """Export a session as one HDF5 file (NeXus), or its frames as DNG."""
-    from emmc_rig.files.results import shown_bytes
     from emmc_rig.session.export import export_dng, export_hdf5
     from emmc_rig.session.session import Session
+    from emmc_rig.store.results import shown_bytes
 
     opened = Session(session)
     if dng:
@@ -163,7 +163,7 @@ def sheet(
     ] = 200,
 ) -> None:
     """Write the contact sheet of a session: frames, events and times in one HTML page."""
-    from emmc_rig.pages.session_sheet import write_sheet
+    from emmc_rig.report.session_sheet import write_sheet
     from emmc_rig.session.session import REPORT, Session
 
     opened = Session(session)

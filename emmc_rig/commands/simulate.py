@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from emmc_rig.commands.options import (
     DEFAULT_CAMERA,
@@ -16,6 +14,7 @@ from emmc_rig.commands.options import (
     SeedOption,
     ShotsOption,
     SizeOption,
+    ZarrOption,
 )
 from emmc_rig.commands.output import give_result, shown_progress, tell
 
@@ -30,14 +29,12 @@ def simulate(
     seed: SeedOption = 0,
     size: SizeOption = None,
     out: OutOption = Path("emmc-frames"),
-    as_zarr: Annotated[
-        bool, typer.Option("--zarr", help="write frames and Psi as Zarr, for large ones")
-    ] = False,
+    as_zarr: ZarrOption = False,
 ) -> None:
     """Simulate the frames that a camera takes of a light field."""
     import emmc_rig as emmc
-    from emmc_rig.files.results import parse_size
     from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import parse_size
 
     described = emmc.camera(camera, shots)
     with result_folder(out, "simulate") as folder, shown_progress("simulate"):
@@ -67,9 +64,9 @@ def simulate_into(
     frames.zarr and psi.zarr in their place.
     """
     import emmc_rig as emmc
-    from emmc_rig.files.psi import FRAMES, FRAMES_GROUP, PSI, PSI_GROUP, save_shards
-    from emmc_rig.files.results import save_frames, write_metrics
     from emmc_rig.model.lightfield import psnr_db
+    from emmc_rig.store.psi import FRAMES, FRAMES_GROUP, PSI, PSI_GROUP, save_shards
+    from emmc_rig.store.results import save_frames, write_metrics
 
     scene = emmc.scene(scene_name, size=size, views=camera.views, seed=seed)
     psi = camera.psi(scene.size)

@@ -28,15 +28,12 @@ from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.scale import Scale, exposure_of
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.files.formats.format import Export
-from emmc_rig.files.scales import open_scale
+from emmc_rig.formats.format import Export
 from emmc_rig.live.server import Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
-from emmc_rig.pages.display import PART_PIXELS
-from emmc_rig.pages.viewer import viewer_data
 from emmc_rig.reconstruction.adaptive.film import Film
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.methods import DEFAULT_METHOD, find_method
@@ -45,8 +42,11 @@ from emmc_rig.reconstruction.result import Progress, Reconstruction
 from emmc_rig.reconstruction.verdict.kept import missed_readings
 from emmc_rig.reconstruction.verdict.rules import Verdict
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.report.display import PART_PIXELS
+from emmc_rig.report.viewer import viewer_data
 from emmc_rig.session.brightness import is_dark
 from emmc_rig.session.measured_psi import session_scale
+from emmc_rig.session.scales import open_scale
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import is_session
 

@@ -19,7 +19,7 @@ from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.settings import Settings
-from emmc_rig.pages.frame_view import BAYER, srgb_codes
+from emmc_rig.report.frame_view import BAYER, srgb_codes
 
 LONGEST_PX = 1600
 SMALLEST_PART = 1 / 256

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from emmc_rig.acquisition.focus import FocusFound
-from emmc_rig.acquisition.plan import Plan, load_plan
 from emmc_rig.bench.rig_config import SIMULATED, RealRig, SimulatedFile
+from emmc_rig.captures.focus import FocusFound
+from emmc_rig.captures.plan import Plan, load_plan
 from emmc_rig.errors import AppError
-from emmc_rig.files.yaml_edit import Key, replace_text, with_values
+from emmc_rig.formats.yaml_edit import Key, replace_text, with_values
 from emmc_rig.live.alignment import MaskPlace
 from emmc_rig.model.reading import parse_yaml, read_yaml
 from emmc_rig.model.settings import validated

@@ -34,7 +34,7 @@ from starlette.routing import Route
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.pages.page import ENVIRONMENT, TEMPLATES
+from emmc_rig.report.page import ENVIRONMENT, TEMPLATES
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = ("0.0.0.0", "::")

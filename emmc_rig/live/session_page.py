@@ -9,25 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.until import METHOD, light_field_so_far
 from emmc_rig.bench.hands import hole_name
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.scale import Scale
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.until import METHOD, light_field_so_far
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import stated_words
 from emmc_rig.live.light_field import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
-from emmc_rig.pages.session_sheet import HEADINGS, small_jpeg, stored_jpeg
 from emmc_rig.progress import Event, Watcher
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.result import Progress, Reconstruction
+from emmc_rig.report.session_sheet import HEADINGS, small_jpeg, stored_jpeg
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
+from emmc_rig.store.results import stated_words
 
 SHOWN_FRAMES, SHOWN_MESSAGES = 300, 12
 PATIENCE_S = 10.0

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from emmc_rig.acquisition.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.bench.hardware import FOCUS
 from emmc_rig.bench.registration import LEAST_LIKENESS, registered
 from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.captures.focus import FocusMeter, Sharpness, focused, sharpness
 from emmc_rig.drivers.camera import Camera
 from emmc_rig.drivers.errors import DriverError, ExposureStoppedError
 from emmc_rig.drivers.raw import RawFrame
@@ -43,7 +43,7 @@ from emmc_rig.live.steps import (
 from emmc_rig.model.camera import Camera as Design
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.settings import validated
-from emmc_rig.pages.frame_view import brightest, histogram
+from emmc_rig.report.frame_view import brightest, histogram
 from emmc_rig.session.brightness import (
     GOOD_LEVELS,
     OVEREXPOSED,

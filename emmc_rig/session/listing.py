@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.result_files import read_metrics
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION, is_session, refuse_missing
+from emmc_rig.store.result_files import read_metrics
 
 
 @dataclass(frozen=True)

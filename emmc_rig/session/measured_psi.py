@@ -13,8 +13,6 @@ from emmc_rig.calibration.routes import Outcome, calibrate
 from emmc_rig.calibration.scale import Scale, designed_scale
 from emmc_rig.calibration.whiteboard import Calibration, NewArray, in_memory, measure_psi
 from emmc_rig.errors import AppError
-from emmc_rig.files.psi import PSI
-from emmc_rig.files.scales import open_scale
 from emmc_rig.model.camera import Camera, build_imaging_matrix, psi_layout
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Watcher
@@ -27,8 +25,10 @@ from emmc_rig.session.frame_means import (
     taken_shots,
 )
 from emmc_rig.session.planned import VALIDATION
+from emmc_rig.session.scales import open_scale
 from emmc_rig.session.session import CALIBRATION, Session
 from emmc_rig.store.products import Product, product_digest, read_product
+from emmc_rig.store.psi import PSI
 
 PSI_PRODUCT = "psi"
 SCENE_KINDS = ("shot", "metering")

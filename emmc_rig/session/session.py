@@ -42,7 +42,6 @@ from typing import Any
 
 from emmc_rig.calibration.frames import MeanFrame
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import METRICS
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.files import (
     SYSTEM_DISK,
@@ -84,6 +83,7 @@ from emmc_rig.store.folders import (
     SESSION_JOURNAL,
     SESSION_RECONSTRUCTION,
 )
+from emmc_rig.store.results import METRICS
 
 HEADER, JOURNAL = SESSION_HEADER, SESSION_JOURNAL
 PLAN, CAMERA, RIG, ORDER = "plan.yaml", "camera.json", "rig.json", "frames.json"

@@ -1,1 +1,1 @@
-"""The store: files that appear whole, results, locks, journals, and products by digest."""
+"""Files that appear whole: folders of results, locks, journals, jobs, products by digest."""

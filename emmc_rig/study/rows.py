@@ -15,9 +15,9 @@ from typing import Any
 from pydantic_core import to_jsonable_python
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import command_line, metrics_text, versions
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
+from emmc_rig.store.results import command_line, metrics_text, versions
 
 
 def plain(result: Mapping[str, object]) -> dict:

@@ -31,7 +31,7 @@ from emmc_rig.calibration.evidence import (
 from emmc_rig.calibration.parametric import psi_at
 from emmc_rig.calibration.placement import designed_placement
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix, psi_layout
 from emmc_rig.model.frames import Frames
 from emmc_rig.simulators.bench import MountingErrors

@@ -8,7 +8,7 @@ import yaml
 from whiteboard_bench import BenchTruth, Setting, WhiteboardBench
 
 from emmc_rig.calibration.openings import parts, views_open, window_place_um
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 
 CAMERA = find_camera("rgbw-bayer-1shot")
 

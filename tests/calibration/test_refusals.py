@@ -11,8 +11,8 @@ from whiteboard_bench import BenchTruth, Setting, WhiteboardBench, held_out_sett
 
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.routes import calibrate
+from emmc_rig.captures.board_plan import STAGE_KINDS_UM
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.processing.board_plan import STAGE_KINDS_UM
 from emmc_rig.simulators.flaws import BoardFlaws
 
 SIZE = (32, 48)

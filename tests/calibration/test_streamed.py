@@ -9,9 +9,9 @@ from programs import exit_code
 
 import emmc_rig as emmc
 from emmc_rig.calibration import frames
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.captures.board_plan import PLAN, PlanSettings, write_plan
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.board_plan import PLAN, PlanSettings, write_plan
 
 NAME, SIZE = "rgbw-bayer-1shot", (48, 64)
 

@@ -9,7 +9,7 @@ from emmc_rig.calibration.frames import MeanFrame, SensorGain, average, photon_t
 from emmc_rig.calibration.scale import MANY, Scale
 from emmc_rig.calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
-from emmc_rig.processing.session_calibration import GivenFrame
+from emmc_rig.process.session_calibration import GivenFrame
 
 SIZE = (12, 16)
 WHITE_DN = 65_535

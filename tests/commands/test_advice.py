@@ -10,10 +10,10 @@ import pytest
 import typer
 
 from emmc_rig import cli
-from emmc_rig.commands.advice import HOME, WORDS, in_shell
+from emmc_rig.commands.output import HOME, WORDS, in_shell
 from emmc_rig.drivers.errors import LimitExceededError, NotHomedError, StalledError
 from emmc_rig.errors import AppError
-from emmc_rig.model.advice import Advice
+from emmc_rig.model.errors import Advice
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
@@ -21,11 +21,11 @@ PRODUCT = ("reconstruction", "calibration", "drivers", "simulators", "emmc_rig")
 OURS = ("emmc_rig/commands/", "emmc_rig/cli.py")
 TYPED = re.compile(rf"emmc-rig (?:{'|'.join(COMMANDS)})\b|`emmc-rig $|(?<![\w-])--[a-z]")
 SHOWN = {
-    "emmc_rig/conformance/named.py": "the option is pytest's",
-    "emmc_rig/files/results.py": "the flags are git's",
-    "emmc_rig/pages/calibration_page.py": "a report's next command",
-    "emmc_rig/pages/page.py": "a report's next command",
-    "emmc_rig/pages/session_sheet.py": "a report's next command",
+    "emmc_rig/bench/conformance/named.py": "the option is pytest's",
+    "emmc_rig/store/results.py": "the flags are git's",
+    "emmc_rig/report/calibration_page.py": "a report's next command",
+    "emmc_rig/report/page.py": "a report's next command",
+    "emmc_rig/report/session_sheet.py": "a report's next command",
     "emmc_rig/session/export.py": "what made a file is stored in it",
     "emmc_rig/study/chart/charting.py": "a report's next command",
     "emmc_rig/study/design/designing.py": "a report's next command",

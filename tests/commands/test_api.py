@@ -17,7 +17,7 @@ from matplotlib import pyplot
 from scipy import sparse
 
 import emmc_rig as emmc
-from emmc_rig.files import scenes
+from emmc_rig.formats import scenes
 from emmc_rig.model.lightfield import load_hdf5, psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 
@@ -190,8 +190,8 @@ def test_public_names_are_functions_and_classes_and_no_folder_is_called_as_one()
     ("module", "unwanted"),
     [
         ("emmc_rig", ["numpy", "pydantic", "typer"]),
-        ("emmc_rig.acquisition", ["matplotlib"]),
-        ("emmc_rig.acquisition.sequencer", ["matplotlib"]),
+        ("emmc_rig.captures.run", ["matplotlib"]),
+        ("emmc_rig.captures.sequencer", ["matplotlib"]),
         ("emmc_rig.cli", ["numpy", "scipy", "cv2", "numba", "matplotlib", "pydantic"]),
     ],
 )
@@ -205,13 +205,13 @@ def test_a_module_loads_only_what_it_needs(module, unwanted):
     "module",
     [
         "emmc_rig",
-        "emmc_rig.files.cameras",
-        "emmc_rig.files.scenes",
+        "emmc_rig.formats.cameras",
+        "emmc_rig.formats.scenes",
         "emmc_rig.model.sensing",
-        "emmc_rig.processing.filming",
-        "emmc_rig.processing.raw_frames",
-        "emmc_rig.processing.reconstructing",
-        "emmc_rig.processing.result",
+        "emmc_rig.process.filming",
+        "emmc_rig.process.raw_frames",
+        "emmc_rig.process.reconstructing",
+        "emmc_rig.process.result",
         "emmc_rig.bench.rig_config",
     ],
 )

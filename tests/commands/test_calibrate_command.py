@@ -19,13 +19,13 @@ from emmc_rig.calibration.drift import DriftSettings
 from emmc_rig.calibration.placement import SCALARS
 from emmc_rig.calibration.planning import DARK_FRAMES, REFERENCE_FRAMES
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.results import save_frames, write_metrics
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.processing.session_drift import run_drift
+from emmc_rig.process.session_drift import run_drift
 from emmc_rig.simulators.effects import ORDINARY, TOGETHER, Flaws, flawed
+from emmc_rig.store.results import save_frames, write_metrics
 
 SIZE = ["--size", "32x40"]
 QUICK = DriftSettings(blocks=40, coarse_blocks=16, disparity_px=1.0, disparity_steps=5, block_px=6)

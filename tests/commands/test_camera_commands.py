@@ -20,7 +20,7 @@ from emmc_rig.drivers.errors import DriverError, RawFrameError, UsbNotFoundError
 from emmc_rig.drivers.folder import FolderCamera
 from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError, WrongUsageError
-from emmc_rig.pages.frame_view import brightest, histogram, preview, white_balance
+from emmc_rig.report.frame_view import brightest, histogram, preview, white_balance
 from emmc_rig.session.brightness import figures, level_of
 from emmc_rig.simulators.clock import ManualClock
 from emmc_rig.simulators.ptp import PtpUsbFunction

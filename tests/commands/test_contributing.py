@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import even_frames
 from emmc_rig.reconstruction.method import Given

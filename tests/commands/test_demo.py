@@ -10,9 +10,9 @@ import pytest
 from watching import Recorder
 
 from emmc_rig.demo import DemoSettings, run_demo
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.exports import open_export
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.exports import open_export
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import load_hdf5, psnr_db, replicate_centre
 from emmc_rig.model.sensing import ImagingMatrix

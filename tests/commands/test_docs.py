@@ -20,7 +20,7 @@ from programs import done, program
 
 from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
-from emmc_rig.processing import session_calibration as calibrate_session
+from emmc_rig.process import session_calibration as calibrate_session
 from emmc_rig.session import measured_psi
 
 ROOT = Path(__file__).parents[2]

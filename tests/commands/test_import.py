@@ -15,10 +15,10 @@ import tifffile
 import yaml
 from programs import done, one_line, program, refused
 
+from emmc_rig.captures.import_session import _Import as importing
 from emmc_rig.drivers.dng import Facts, encode_dng
-from emmc_rig.files.cameras import shipped_camera_files
-from emmc_rig.importing.session import _Import as importing
-from emmc_rig.processing.reconstructing import open_frames
+from emmc_rig.formats.cameras import shipped_camera_files
+from emmc_rig.process.reconstructing import open_frames
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import ImportedEntry, of_kind
@@ -609,7 +609,7 @@ def test_a_disk_that_is_full_leaves_nothing(where, tmp_path, run, monkeypatch):
     if where == "session":
         monkeypatch.setattr(Session, "store", fault)
     else:
-        monkeypatch.setattr("emmc_rig.importing.session._spooled", fault)
+        monkeypatch.setattr("emmc_rig.captures.import_session._spooled", fault)
     assert "No space left on device; nothing was imported" in refused(
         run("import", table, "--camera", CAMERA, "--out", tmp_path / "out")
     )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emmc_rig.importing.table import rows_of_globs
+from emmc_rig.captures.import_table import rows_of_globs
 
 
 def test_a_glob_names_an_array_of_each_of_its_files(tmp_path):

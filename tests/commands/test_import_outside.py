@@ -17,7 +17,7 @@ from programs import done
 
 from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.processing.reconstructing import open_frames
+from emmc_rig.process.reconstructing import open_frames
 
 pytestmark = pytest.mark.slow
 

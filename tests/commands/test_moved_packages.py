@@ -46,4 +46,4 @@ def test_an_import_by_the_old_name_ends_in_a_line_with_the_new_name(tmp_path, na
     done = run(f"import emmc_rig, {name}", folder)
     assert done.returncode == 1
     last = done.stderr.strip().splitlines()[-1]
-    assert last == f"ModuleNotFoundError: import emmc_rig.{name}, its name since 0.5"
+    assert last == f"ModuleNotFoundError: import {MOVED[name]}, its name since 0.5"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from simulated_raw_camera import SimulatedRawCamera
 
-from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.bench.conformance.cameras import *  # noqa: F403
 from emmc_rig.drivers.camera import Camera, RawFileCamera
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.folder import FolderCamera

@@ -18,8 +18,8 @@ pytest.importorskip("mm_test_adapters", reason="the extra `micromanager` is not 
 
 from pymmcore_plus.seq_tester import decode_image
 
+from emmc_rig.bench.conformance.cameras import *  # noqa: F403
 from emmc_rig.bench.hardware import open_camera, open_stage
-from emmc_rig.conformance.cameras import *  # noqa: F403
 from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,

@@ -58,14 +58,15 @@ class Person(AskingAttendant):
 
 def manned(folder, monkeypatch, wrong=()):
     """Return plan and rig of a bench on which a person moves the pinhole; see `Person`."""
-    from emmc_rig.acquisition import command
+
+    from emmc_rig.captures import run as capture_run
 
     @contextmanager
     def opened(description, camera, ask):
         with opened_rig(description, camera, ask) as rig:
             yield replace(rig, attendant=Person(camera, ask, rig, wrong))
 
-    monkeypatch.setattr(command, "opened_rig", opened)
+    monkeypatch.setattr(capture_run, "opened_rig", opened)
     plan, file = folder / "plan.yaml", folder / "rig.yaml"
     plan.write_text(yaml.safe_dump(PLAN))
     file.write_text("kind: simulated\naxes: [mask_x, mask_y]\nhands_um: 100\n")

@@ -12,9 +12,9 @@ import numpy as np
 import yaml
 from watching import Acting
 
-from emmc_rig.acquisition.command import CaptureRequest, new_session, planned_frames
-from emmc_rig.acquisition.plan import Plan, planned_camera
 from emmc_rig.bench.hardware import Rig
+from emmc_rig.captures.plan import Plan, planned_camera
+from emmc_rig.captures.run import CaptureRequest, new_session, planned_frames
 from emmc_rig.drivers.camera import CameraIdentity, RawFileCamera
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.simulators.clock import ManualClock
@@ -148,3 +148,8 @@ def begun(folder, disk, rig, text=PLAN_YAML):
     """Return a new session on a disk, and its plan."""
     request = request_for(folder, text=text)
     return new_session(request, planned_frames(request, rig), disk), request.plan
+
+
+def frames_in(session):
+    """Return the bytes of each frame that a session needs, by the frame's name."""
+    return {frame.id: session.read(frame.id) for frame in session.needed}

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.files.result_files import write_light_field
-from emmc_rig.files.results import write_metrics
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.scenes import open_scene
+from emmc_rig.store.result_files import write_light_field
+from emmc_rig.store.results import write_metrics
 
 SIZE = 36, 48
 

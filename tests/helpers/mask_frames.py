@@ -3,7 +3,7 @@
 import numpy as np
 
 from emmc_rig.drivers.raw import RawFrame
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.camera import shipped_cameras
 from emmc_rig.simulators.bench import Bench, MountingErrors
 

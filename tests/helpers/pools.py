@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numba
 
-from emmc_rig.processing.pool import Pool
+from emmc_rig.store.pool import Pool
 
 
 class StoppedHereError(Exception):

@@ -17,10 +17,10 @@ import typer
 from capture_rigs import still_rig
 
 from emmc_rig import cli
-from emmc_rig.acquisition import command
+from emmc_rig.captures import run
 from emmc_rig.errors import AppError
-from emmc_rig.pages import session_sheet
-from emmc_rig.processing import session_calibration as calibrate_session
+from emmc_rig.process import session_calibration as calibrate_session
+from emmc_rig.report import session_sheet
 from emmc_rig.session import export
 from emmc_rig.session.board_sets import whiteboards
 
@@ -44,7 +44,7 @@ def _child(arguments, name, wait_s):
     log = os.open(f"{name}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(log, 1)
     os.dup2(log, 2)
-    command.opened_rig = quick_rig
+    run.opened_rig = quick_rig
     calibrate_session.session_outcome = read_whiteboards
     sys.argv = ["emmc-rig", *arguments]
     time.sleep(wait_s)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.files.formats.format import Export
-from emmc_rig.files.formats.registry import FORMATS
+from emmc_rig.formats.format import Export
+from emmc_rig.formats.registry import FORMATS
 
 
 def save_views(folder: Path, light_field: np.ndarray) -> None:

@@ -29,8 +29,8 @@ from emmc_rig.drivers.errors import (
     TransportTimeoutError,
 )
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.live import watch as watch_module
 from emmc_rig.live.driving import Driving
 from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window

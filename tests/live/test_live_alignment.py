@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from mask_frames import BLACK, CAMERAS, SIZE, WHITE, bench_frame, frame_of
 
-from emmc_rig.acquisition import focus
-from emmc_rig.acquisition.focus import REMEMBERED_S, FocusMeter, sharpness
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import edge_direction
 from emmc_rig.calibration.repeats import Repeats, repeats_of
+from emmc_rig.captures import focus
+from emmc_rig.captures.focus import REMEMBERED_S, FocusMeter, sharpness
 from emmc_rig.live.alignment import MaskGauge
 from emmc_rig.model.camera import Camera
 

@@ -6,17 +6,17 @@ import pytest
 from browsers import MARKS, complaints
 from test_live import FakeCamera, PatientCamera
 
-from emmc_rig.acquisition.control import Control
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.calibration.scale import designed_scale
+from emmc_rig.captures.control import Control
 from emmc_rig.drivers.errors import DriverError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
 from emmc_rig.live.watch import Watch
-from emmc_rig.pages.page import source
+from emmc_rig.report.page import source
 from emmc_rig.simulators.bench import MountingErrors
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")

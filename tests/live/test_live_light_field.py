@@ -13,7 +13,7 @@ from test_live_alignment import frame_of
 import emmc_rig as emmc
 from emmc_rig.calibration.scale import designed_scale
 from emmc_rig.errors import AppError
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.live.light_field import LiveLightField, disparity_of, live_scale
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import even_frames

@@ -7,13 +7,13 @@ import pytest
 import yaml
 from test_live import until, watching
 
-from emmc_rig.acquisition.focus import FocusFound, peak
 from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
+from emmc_rig.captures.focus import FocusFound, peak
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import fine_scene
-from emmc_rig.files.yaml_edit import replace_text, with_values
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import fine_scene
+from emmc_rig.formats.yaml_edit import replace_text, with_values
 from emmc_rig.live.alignment import MaskPlace
 from emmc_rig.live.save import Files, Found
 from emmc_rig.simulators.bench import MountingErrors

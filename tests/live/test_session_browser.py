@@ -3,9 +3,9 @@
 import pytest
 from capture_rigs import begun, still_rig
 
-from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.model.files import SYSTEM_DISK
-from emmc_rig.pages.session_sheet import write_sheet
+from emmc_rig.report.session_sheet import write_sheet
 from emmc_rig.session.session import REPORT
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")

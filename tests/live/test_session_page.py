@@ -4,7 +4,6 @@ import http.client
 import json
 import re
 import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -14,11 +13,12 @@ import numpy as np
 import pytest
 import yaml
 from asked_person import manned
+from programs import PROGRAM
 
 import emmc_rig as emmc
-from emmc_rig.acquisition.command import FrontEnd, capture_session
-from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.sequencer import ALL_TAKEN
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.run import FrontEnd, capture_session
+from emmc_rig.captures.sequencer import ALL_TAKEN
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.live import server
 from emmc_rig.live.server import application, served
@@ -261,9 +261,6 @@ def test_enter_at_the_terminal_answers_too():
     control.until_answered(lambda: next(keys))
     assert next(keys, None) is None
     assert not control.answered
-
-
-PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ from asked_person import manned
 from browsers import MARKS, complaints, open_browser
 
 import emmc_rig as emmc
-from emmc_rig.acquisition.command import FrontEnd, capture_session
-from emmc_rig.acquisition.control import Control
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.run import FrontEnd, capture_session
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
 from emmc_rig.progress import Event

@@ -1,10 +1,9 @@
 """Files from outside: whatever is in them becomes data, or one line of the caller's error.
 
-EMMC_FUZZ=100000 tries that many inputs of each kind instead of a few hundred.
+EMMC_FUZZ multiplies the number of inputs of each kind.
 """
 
 import io
-import os
 import resource
 import struct
 import zlib
@@ -15,11 +14,12 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from fuzzing import FUZZ
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from emmc_rig.acquisition.plan import Plan
 from emmc_rig.bench.rig_config import RealRig
+from emmc_rig.captures.plan import Plan
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError, SceneError, SensingError
@@ -33,9 +33,8 @@ from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import DictionaryError
 from emmc_rig.reconstruction.methods import MethodSettings
 
-TRIES = int(os.environ.get("EMMC_FUZZ", "150"))
 fuzzed = settings(
-    max_examples=TRIES, deadline=None,
+    max_examples=150 * FUZZ, deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )  # fmt: skip
 

@@ -8,7 +8,7 @@ import pytest
 from planes import plane_scene, textured
 from scipy.stats import multivariate_t
 
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import OPPONENT, centre_view, psnr_db

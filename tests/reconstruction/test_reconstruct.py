@@ -8,21 +8,20 @@ import pytest
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.psi import read_frames
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.lightfield import load_hdf5
-from emmc_rig.processing.captures import opened_capture
-from emmc_rig.processing.reconstructing import (
+from emmc_rig.process.captures import opened_capture
+from emmc_rig.process.reconstructing import (
     load_settings,
     reconstruct_captures,
 )
-from emmc_rig.processing.result import Result
+from emmc_rig.process.result import Result
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.adaptive.joint import TextureSettings
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
-from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.dictionary import Dictionary, open_dictionary
 from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
+from emmc_rig.store.psi import read_frames
 
 SCENE, CAMERA, SIZE = "deep-occlusions", "rgbw-bayer-2shots", (36, 44)
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.methods import MethodSettings, reconstruct

@@ -5,16 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from emmc_rig.files.psi import StoredPsi
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.settings import SIDES, AdaptiveSettings
 from emmc_rig.reconstruction.dictionary import dct_dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
 from emmc_rig.reconstruction.result import Reconstruction, Status
-from emmc_rig.reconstruction.settings import BlockSettings
 from emmc_rig.reconstruction.sparse import SparseSettings
 from emmc_rig.reconstruction.tiles import (
     CaptureSurvey,
@@ -29,6 +28,7 @@ from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.reconstruction.verdict import run
 from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, combined, judged_together
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
+from emmc_rig.store.psi import StoredPsi
 
 VIEWS = (2, 2)
 SMALL = BlockSettings(whole=1, side=48, blend=4)

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 import emmc_rig as emmc
 from emmc_rig.cli import app
 from emmc_rig.commands.simulate import simulate_into
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
@@ -25,7 +25,6 @@ from emmc_rig.reconstruction.result import Reconstruction, Status
 from emmc_rig.reconstruction.screening import screened
 from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, judged_together
-from emmc_rig.reconstruction.verdict.compression import blockiness, quantised
 from emmc_rig.reconstruction.verdict.displaced import _tiled, displaced
 from emmc_rig.reconstruction.verdict.evidence import Evidence, FittedFrames, gathered
 from emmc_rig.reconstruction.verdict.kept import (
@@ -34,7 +33,7 @@ from emmc_rig.reconstruction.verdict.kept import (
     missed_readings,
     over_baselines,
 )
-from emmc_rig.reconstruction.verdict.pixels import pixel_figures
+from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
 from emmc_rig.reconstruction.verdict.rules import LEVELS, verdict_from
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.reconstruction.verdict.shadow import Relief, relief, shadow, tile_edges

@@ -12,25 +12,25 @@ import yaml
 from programs import program
 
 import emmc_rig as emmc
-from emmc_rig.files.exports import open_export
-from emmc_rig.files.formats.registry import FORMATS
-from emmc_rig.files.psi import FRAMES, PSI, StoredPsi, save_shards
-from emmc_rig.files.result_files import MAPS
+from emmc_rig.formats.exports import open_export
+from emmc_rig.formats.registry import FORMATS
 from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
 from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES
-from emmc_rig.pages.page import light_field_head
-from emmc_rig.pages.report import ReportContent, render
-from emmc_rig.pages.result_figure import draw_results
-from emmc_rig.pages.viewer import render_viewer, viewer_data
-from emmc_rig.processing.captures import opened_capture
-from emmc_rig.processing.pool import opened_pool
-from emmc_rig.processing.reconstructing import reconstruct_undrawn
+from emmc_rig.process.captures import opened_capture
+from emmc_rig.process.reconstructing import reconstruct_undrawn
 from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.reconstruction.preview import Preview
+from emmc_rig.report.page import light_field_head
+from emmc_rig.report.report import ReportContent, render
+from emmc_rig.report.result_figure import draw_results
+from emmc_rig.report.viewer import render_viewer, viewer_data
+from emmc_rig.store.pool import opened_pool
+from emmc_rig.store.psi import FRAMES, PSI, StoredPsi, save_shards
+from emmc_rig.store.result_files import MAPS
 
 SIZE = (24, 32)
 BANDS, TIMES = ("angle", "band"), ("time", "angle")

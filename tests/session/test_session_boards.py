@@ -12,8 +12,8 @@ import pytest
 from capture_rigs import SIZE, PreparedCamera, begun, still_rig, stops_after
 from simulated_disk import SimulatedDisk
 
-from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.errors import AppError
 from emmc_rig.session import measured_psi
 from emmc_rig.session.board_sets import board_sets, sensor_pairs, whiteboards

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from capture_rigs import begun, still_rig
 
-from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.dng import Facts, encode_dng
 from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError

@@ -10,11 +10,11 @@ import yaml
 from capture_rigs import begun
 from simulated_disk import SimulatedDisk
 
-from emmc_rig.acquisition.plan import Plan, planned_camera
-from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hardware import Fitted, simulated_rig
+from emmc_rig.captures.plan import Plan, planned_camera
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.errors import AppError
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.frames import Exposure
 from emmc_rig.session.frame_file import FrameFile
 from emmc_rig.session.frame_means import decoded, taken_shots

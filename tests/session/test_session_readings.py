@@ -9,8 +9,6 @@ import yaml
 from capture_rigs import begun
 from simulated_disk import SimulatedDisk
 
-from emmc_rig.acquisition.plan import Plan, planned_camera
-from emmc_rig.acquisition.sequencer import Sequencer
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import NO_FLAWS, open_camera, simulated_rig
 from emmc_rig.bench.rig_config import (
@@ -19,11 +17,13 @@ from emmc_rig.bench.rig_config import (
     RealRig,
     rig_description,
 )
+from emmc_rig.captures.plan import Plan, planned_camera
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.scenes import fine_scene
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.session.exposure import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import NO_FIGURES, decode_frame, frame_entry, frame_file

@@ -12,13 +12,13 @@ from capture_rigs import SIZE, begun, still_rig
 from rich.console import Console
 from simulated_disk import SimulatedDisk
 
-from emmc_rig.acquisition.control import Control
-from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.commands.capture_display import CaptureDisplay
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.raw import RawFrame, decode_raw
 from emmc_rig.model.files import SYSTEM_DISK
-from emmc_rig.pages.session_sheet import run_times, sheet
+from emmc_rig.report.session_sheet import run_times, sheet
 from emmc_rig.session.brightness import figures, thinned
 from emmc_rig.session.exposure import ShotExposure, exposure_reasons
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry
@@ -76,7 +76,7 @@ def test_a_contact_sheet_of_few_pictures_says_so(captured):
 
 
 def test_the_shots_come_first_and_every_other_kind_of_frame_is_folded(captured, monkeypatch):
-    monkeypatch.setattr("emmc_rig.pages.session_sheet.FIRST_PICTURES", 1)
+    monkeypatch.setattr("emmc_rig.report.session_sheet.FIRST_PICTURES", 1)
     page = sheet(captured)
     kinds = Counter(frame.kind for frame in captured.needed)
     assert [int(count) for count in re.findall(r"<summary>(\d+) more<", page)] == [

@@ -25,9 +25,9 @@ from capture_rigs import (
 )
 from simulated_disk import PowerCutError, SimulatedDisk
 
-from emmc_rig.acquisition.amend import amendment
-from emmc_rig.acquisition.expand import expand
-from emmc_rig.acquisition.sequencer import Sequencer
+from emmc_rig.captures.amend import amendment
+from emmc_rig.captures.expand import expand
+from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.files import SYSTEM_DISK, part_of, write_whole

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from smooth_texture import SMOOTH, UNLIT
 
-from emmc_rig.files.scenes import fine_scene, open_scene
+from emmc_rig.formats.scenes import fine_scene, open_scene
 from emmc_rig.model.lightfield import centre_view
 from emmc_rig.simulators.moving import flow_between, world_at
 from emmc_rig.simulators.raycaster import Ball, CameraMotion, Card, Motion, World, tabulated

@@ -10,10 +10,10 @@ from pages import Page
 from view_files import save_views
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import METRICS
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.simulators.scenes import render
+from emmc_rig.store.results import METRICS
 from emmc_rig.study.chart import chart_points, measure
 from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings
 from emmc_rig.study.chart.charting import COLUMNS, run_chart

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import pytest
 
 from emmc_rig.errors import AppError, StoppedError
-from emmc_rig.pages.page import Head, Section, framed, number, part
 from emmc_rig.progress import Watcher
+from emmc_rig.report.page import Head, Section, framed, number, part
 from emmc_rig.study.points import Journal, NotApplicableError, Study, study_folder
 from emmc_rig.study.rows import csv_text, plain
 

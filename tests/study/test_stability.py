@@ -11,11 +11,11 @@ from programs import done
 from view_files import save_views
 
 from emmc_rig.errors import StoppedError
-from emmc_rig.files.results import METRICS
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
 from emmc_rig.simulators.scenes import render
+from emmc_rig.store.results import METRICS
 from emmc_rig.study import trial
 from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.curves import (

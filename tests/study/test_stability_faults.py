@@ -6,7 +6,7 @@ from view_files import save_views
 
 from emmc_rig.calibration.placement import designed_placement
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.simulators import changes
 from emmc_rig.simulators.scenes import render

@@ -10,8 +10,8 @@ from emmc_rig_example.codec import Status, decode_status, seal
 from emmc_rig_example.simulator import ExampleController
 from emmc_rig_example.stage import ExampleStage
 
-from emmc_rig.conformance.cameras import *  # noqa: F403
-from emmc_rig.conformance.stages import *  # noqa: F403
+from emmc_rig.bench.conformance.cameras import *  # noqa: F403
+from emmc_rig.bench.conformance.stages import *  # noqa: F403
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import CaptureError, GarbledReplyError
 from emmc_rig.drivers.stage import DEFAULT_SETTINGS

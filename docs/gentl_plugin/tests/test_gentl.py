@@ -11,7 +11,7 @@ pytest.importorskip("harvesters", reason="harvesters and genicam are not install
 import genicam
 from emmc_rig_gentl.camera import open_camera
 
-from emmc_rig.conformance.cameras import *  # noqa: F403
+from emmc_rig.bench.conformance.cameras import *  # noqa: F403
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import CameraSettingError, DriverError
 

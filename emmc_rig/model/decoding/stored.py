@@ -2,7 +2,7 @@
 
 A TIFF or another picture is read as a viewer shows it: upright, in the colours of its palette, all
 pages of the file. Zarr and RAW files, whose packages are above the model, join in
-`emmc_rig.files.own_arrays`.
+`emmc_rig.formats.own_arrays`.
 """
 
 from __future__ import annotations

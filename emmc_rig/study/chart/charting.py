@@ -11,9 +11,9 @@ from statistics import mean
 from matplotlib.axes import Axes
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.drawing import (
+from emmc_rig.progress import Watcher
+from emmc_rig.report.drawing import (
     FAINT,
     INK,
     LEGEND,
@@ -24,7 +24,7 @@ from emmc_rig.pages.drawing import (
     sheet,
     titled,
 )
-from emmc_rig.pages.page import (
+from emmc_rig.report.page import (
     Head,
     Section,
     embedded,
@@ -33,8 +33,8 @@ from emmc_rig.pages.page import (
     number,
     provenance_section,
 )
-from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import result_folder
+from emmc_rig.store.results import write_metrics
 from emmc_rig.study.chart.chart_points import ChartSettings, Point, charted_points
 from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts
 from emmc_rig.study.chart.measure import ChartStudy

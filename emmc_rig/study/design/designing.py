@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from emmc_rig.files.results import write_metrics
 from emmc_rig.model.camera import Camera, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.pages.page import (
+from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.methods import DEFAULT_METHOD, reconstruct
+from emmc_rig.report.page import (
     Card,
     Head,
     Section,
@@ -23,9 +24,8 @@ from emmc_rig.pages.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.progress import Watcher
-from emmc_rig.reconstruction.methods import DEFAULT_METHOD, reconstruct
 from emmc_rig.store.folders import result_folder
+from emmc_rig.store.results import write_metrics
 from emmc_rig.study.design.bench import DesignBench, bench_text
 from emmc_rig.study.design.expected import SIZE, expected
 from emmc_rig.study.design.mask_file import (

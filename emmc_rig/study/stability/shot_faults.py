@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emmc_rig.files.scenes import open_scene
+from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.errors import SceneError
 from emmc_rig.model.lightfield import shifted
 from emmc_rig.simulators import changes

@@ -16,11 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from emmc_rig.errors import AppError
-from emmc_rig.files.cameras import find_camera
-from emmc_rig.files.dictionaries import open_dictionary
-from emmc_rig.files.results import write_metrics
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.drawing import (
+from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.dictionary import open_dictionary
+from emmc_rig.reconstruction.methods import METHODS
+from emmc_rig.report.drawing import (
     FAINT,
     INK,
     colours_of,
@@ -29,7 +30,7 @@ from emmc_rig.pages.drawing import (
     sheet,
     titled,
 )
-from emmc_rig.pages.page import (
+from emmc_rig.report.page import (
     Head,
     Section,
     embedded,
@@ -38,10 +39,9 @@ from emmc_rig.pages.page import (
     part,
     provenance_section,
 )
-from emmc_rig.processing.pool import opened_pool
-from emmc_rig.progress import Watcher
-from emmc_rig.reconstruction.methods import METHODS
 from emmc_rig.store.folders import result_folder
+from emmc_rig.store.pool import opened_pool
+from emmc_rig.store.results import write_metrics
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, machine, provenance
 from emmc_rig.study.stability.curves import (

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from emmc_rig.files.results import write_metrics
 from emmc_rig.model.files import write_text
-from emmc_rig.pages.page import Head, Section, framed, number, part, provenance_section
 from emmc_rig.progress import Watcher
+from emmc_rig.report.page import Head, Section, framed, number, part, provenance_section
 from emmc_rig.store.folders import result_folder
+from emmc_rig.store.results import write_metrics
 from emmc_rig.study.points import study_folder
 from emmc_rig.study.rows import csv_text, provenance
 from emmc_rig.study.tables import paper

@@ -1,0 +1,1 @@
+"""Captures: plans, their order, and the sequencer that fills a session."""

@@ -1,1 +1,0 @@
-"""Files read and written by name: cameras, scenes, captures, results."""

@@ -1,1 +1,0 @@
-"""Formats of light fields: `format` defines the class, `registry` lists all."""

@@ -1,0 +1,1 @@
+"""Formats of other programs; cameras, scenes and frames found by name."""

@@ -1,1 +1,0 @@
-"""Files of another program as a session."""

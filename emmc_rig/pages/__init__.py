@@ -1,1 +1,0 @@
-"""The pages and pictures of every report: templates, drawings, figures of a frame."""

@@ -1,0 +1,252 @@
+"""Whiteboards to Psi for the Python API: those of a session, or arrays of anybody's bench."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from emmc_rig.calibration.boards import BoardFrame, BoardSet
+from emmc_rig.calibration.frames import MeanFrame, average
+from emmc_rig.calibration.scale import Scale
+from emmc_rig.errors import AppError
+from emmc_rig.model.arguments import numbers_of, refusal, required
+from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.camera import Camera, Offset, Positive
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.settings import Settings, validated
+from emmc_rig.process.session_calibration import (
+    SessionCalibration,
+    calibrate_session,
+    calibration_metrics,
+)
+from emmc_rig.progress import Watcher
+from emmc_rig.session.board_sets import SessionBoards
+from emmc_rig.session.measured_psi import boards_outcome
+from emmc_rig.session.session import Session
+
+POSES_TAKE = "a list of dicts, one for each whiteboard, such as {'mask_um': (0, 0), 'shot': 0}"
+DARKS_TAKE = "an array (repeat, y, x), or such arrays by their exposure"
+LEAST_MOVED = 0.1
+"""Of a cell: masks are moved by several; of mm taken for um, a thousandth of that is left."""
+View = Annotated[int, Field(ge=0)]
+
+
+class Pose(Settings):
+    """How the bench stood before a whiteboard.
+
+    reference: the aperture open, and no mask in the beam. mask_um: where the mask stood, (x, y)
+    from where the camera's design centres it, None: as in its shot. view: the one (v, u) that a
+    pinhole opened, None: all. validation: used by no fit, to judge by. exposure_s: in any unit, the
+    same for all. taken_s: when, which shows drift.
+    """
+
+    renamed: ClassVar = {"held_out": "validation"}
+
+    reference: bool = False
+    mask_um: tuple[Offset, Offset] | None = None
+    shot: int = Field(default=0, ge=0)
+    view: tuple[View, View] | None = None
+    lamp: Literal["white", "red", "green", "blue"] = "white"
+    validation: bool = False
+    exposure_s: Positive = 1.0
+    taken_s: float = 0.0
+
+
+@overload
+def calibrate(
+    session: Session | str | Path,
+    method: str = "auto",
+    *,
+    route: str | None = None,
+    sensor: bool = False,
+    watcher: Watcher | None = None,
+) -> SessionCalibration: ...
+
+
+@overload
+def calibrate(
+    session: Sequence[ArrayLike] | np.ndarray,
+    method: Sequence[Mapping[str, Any]],
+    camera: Camera,
+    *,
+    darks: ArrayLike | Mapping[float, ArrayLike],
+) -> tuple[ImagingMatrix, SessionCalibration]: ...
+
+
+def calibrate(
+    session: Any,
+    method: Any = "auto",
+    camera: Camera | None = None,
+    *,
+    route: str | None = None,
+    darks: ArrayLike | Mapping[float, ArrayLike] | None = None,
+    sensor: bool = False,
+    watcher: Watcher | None = None,
+) -> SessionCalibration | tuple[ImagingMatrix, SessionCalibration]:
+    """Return Psi as whiteboards measure it: `calibrate(session)`, or arrays with their poses.
+
+    Arrays are calibrated by the methods of a session, and judged by those for validation. Of what a
+    session can hold besides, arrays have nothing: boards turned in their plane or with the lamp
+    moved, which tell uneven light from the lens; pinholes of several views at once; whiteboards
+    after the scene, besides what `taken_s` shows of drift. What was not watched for that, the
+    report says. Lamps of three colours are poses with their `lamp`.
+
+    `calibrate(session, method)` returns a calibration; its `psi` is the imaging matrix.
+    `calibrate(whiteboards, poses, camera, darks=darks)` returns that matrix and the calibration,
+    whose `frames(dn)` makes readings of the bench's raw frames. `save(folder)` of a calibration
+    writes psi.h5 with a report.
+
+    Args:
+        session: itself, or its folder. Or whiteboards, a list of arrays (repeat, y, x) in DN: at
+            least a reference, of two repeats, one for validation, and as many as the method needs:
+            through the open aperture with the mask in a few places, or through a pinhole of every
+            view.
+        method: parametric, mixed or free; `auto` tries all methods that the whiteboards suffice
+            for, and chooses. Or poses, a dict for each whiteboard with the keys of `Pose`.
+        camera: as designed, of arrays; its noise has the white level.
+        route: an earlier name of `method`.
+        darks: of arrays, (repeat, y, x) in DN, the lamp off, at one exposure, or by exposures.
+        sensor: the figures of a session's sensor too, from its darks and references.
+        watcher: is shown the progress of a session's.
+
+    Raises:
+        AppError: whiteboards without poses, of another size, or fewer than are needed; masks that
+            moved by so little that millimetres were given.
+        CalibrationError: whiteboards that are unfit: no lamp, another mask, saturated, unsteady.
+        ArgumentError: an argument of another type.
+    """
+    method = method if route is None else route
+    if camera is None and isinstance(method, str) and not isinstance(session, (list, np.ndarray)):
+        return calibrate_session(session, method, sensor, watcher)
+    required(camera, Camera, "camera", "the camera as designed, emmc_rig.camera(...)")
+    assert camera is not None
+    return _of_arrays(session, method, camera, darks)
+
+
+@one_blas_thread()
+def _of_arrays(
+    whiteboards: Any, poses: Any, camera: Camera, darks: Any
+) -> tuple[ImagingMatrix, SessionCalibration]:
+    """Return Psi of arrays, and its calibration; see `calibrate`."""
+    started = time.perf_counter()
+    required(whiteboards, (list, tuple, np.ndarray), "whiteboards", "a list of arrays, DN")
+    required(poses, (list, tuple), "poses", POSES_TAKE)
+    if len(whiteboards) != len(poses):
+        raise AppError(f"{len(whiteboards)} whiteboards, and {len(poses)} poses: give one for each")
+    stood = [validated(Pose, pose, f"poses[{place}]", AppError) for place, pose in enumerate(poses)]
+    if darks is None:
+        raise refusal(darks, "darks", DARKS_TAKE)
+    _refuse_millimetres(stood, camera)
+    exposed = darks if isinstance(darks, Mapping) else {stood[0].exposure_s: darks}
+    dark = _dark_frames(exposed, camera)
+    boards = _sorted_boards(whiteboards, stood, camera, dark)
+    k, (rows, columns) = camera.sensor.binning, dark[0].mean_dn.shape
+    outcome = boards_outcome(camera, (k * rows, k * columns), boards, "poses: they have")
+    metrics = calibration_metrics(outcome, camera.title, "", "auto", started)
+    chosen = outcome.calibration
+    good = outcome.good if chosen.good is None else chosen.good
+    scale = Scale(chosen.psi, chosen.white_dn_per_s, dark, chosen.gain, good)
+    return chosen.psi, SessionCalibration(outcome, chosen, scale, metrics)
+
+
+def _dark_frames(darks: Mapping[float, ArrayLike], camera: Camera) -> tuple[MeanFrame, ...]:
+    """Return the mean dark frame of each exposure; raises AppError for different sizes."""
+    for exposure_s in darks:
+        required(exposure_s, Real, "an exposure of darks", "a number, as poses give it")
+    means = tuple(
+        _mean(frames, float(exposure_s), camera, f"darks at {exposure_s:g}", lit=False)
+        for exposure_s, frames in darks.items()
+    )
+    sizes = {mean.mean_dn.shape for mean in means}
+    if len(sizes) != 1:
+        raise AppError(f"darks: of {len(sizes)} sizes, {', '.join(map(str, sorted(sizes)))} pixels")
+    return means
+
+
+def _sorted_boards(
+    whiteboards: Sequence[ArrayLike],
+    poses: Sequence[Pose],
+    camera: Camera,
+    darks: tuple[MeanFrame, ...],
+) -> SessionBoards:
+    """Return the whiteboards of the fit, of the method free, and of validation.
+
+    Raises AppError for a whiteboard of another size than the darks, and without a reference.
+    """
+    references: dict[tuple[int, str], MeanFrame] = {}
+    sorted_in: dict[str, list[BoardFrame]] = {"open": [], "pinhole": [], "validation": []}
+    for place, (frames, pose) in enumerate(zip(whiteboards, poses, strict=True)):
+        name, size = f"whiteboards[{place}]", darks[0].mean_dn.shape
+        _refuse_beyond(pose, camera, name)
+        mean = _mean(frames, pose.exposure_s, camera, name, taken_s=pose.taken_s)
+        if mean.mean_dn.shape != size:
+            raise AppError(f"{name}: {mean.mean_dn.shape} pixels, the darks have {size}")
+        if pose.reference:
+            references[pose.shot, pose.lamp] = mean
+            continue
+        of_shot = camera.shots[pose.shot].offset_um
+        stage_um = pose.mask_um or next(iter(of_shot.values()), (0.0, 0.0))
+        kind = "validation" if pose.validation else "pinhole" if pose.view else "open"
+        sorted_in[kind].append(BoardFrame.held(mean, stage_um, pose.shot, pose.view, pose.lamp))
+    if not references:
+        raise AppError(
+            "poses: none is {'reference': True}, a whiteboard without the mask, aperture open"
+        )
+    # The white lamp's first: the sensor's gain follows from it.
+    white_first = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
+    every = BoardSet(darks, white_first, ())
+    fitted = [*sorted_in["open"], *(sorted_in["pinhole"] if sorted_in["open"] else ())]
+    return SessionBoards(
+        *(
+            every.with_frames(frames) if frames else None
+            for frames in (fitted, sorted_in["pinhole"], sorted_in["validation"])
+        ),
+        turned={},
+    )
+
+
+def _mean(
+    frames: Any,
+    exposure_s: float,
+    camera: Camera,
+    name: str,
+    taken_s: float = 0.0,
+    lit: bool = True,
+) -> MeanFrame:
+    takes = "DN, an array (repeat, y, x) or (y, x)"
+    array = numbers_of(frames, name, takes)
+    if array.ndim not in (2, 3) or not array.size:
+        raise refusal(frames, name, takes)
+    if not np.isfinite(array).all():
+        raise AppError(f"{name}: holds values that are not finite")
+    repeats = array.reshape(-1, *array.shape[-2:])
+    white_dn = camera.sensor.noise.white_level_dn
+    return average(repeats, exposure_s, white_dn, name, taken_s, lit)
+
+
+def _refuse_millimetres(poses: Sequence[Pose], camera: Camera) -> None:
+    """Raise AppError where the mask moved, but by less than calibration can use."""
+    moved_um = max((abs(at) for pose in poses for at in pose.mask_um or ()), default=0.0)
+    cell_um = min((mask.cell_um for mask in camera.masks.values()), default=0.0)
+    if 0 < moved_um < LEAST_MOVED * cell_um:
+        raise AppError(
+            f"poses: the mask moves by {moved_um:g} um at most, and its cells are {cell_um:g} um "
+            "wide: mask_um is in um; were these mm?"
+        )
+
+
+def _refuse_beyond(pose: Pose, camera: Camera, name: str) -> None:
+    """Raise AppError where the camera has no such shot or view."""
+    if pose.shot >= len(camera.shots):
+        raise AppError(
+            f"{name}: shot {pose.shot}, the camera has shots 0 to {len(camera.shots) - 1}"
+        )
+    if pose.view and any(at >= count for at, count in zip(pose.view, camera.views, strict=True)):
+        raise AppError(f"{name}: view {pose.view}, the camera has {camera.views} views from 0")

@@ -1,0 +1,1 @@
+"""Pages and pictures of every report: templates, drawings, figures of a frame."""

@@ -1,0 +1,318 @@
+"""The calibration as one HTML page that opens offline: what was chosen and why, and how sure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from emmc_rig.calibration.choice import HeldOut
+from emmc_rig.calibration.routes import Outcome
+from emmc_rig.calibration.sensor import SensorSheet
+from emmc_rig.model.files import write_text
+from emmc_rig.report.display import finite, round_up
+from emmc_rig.report.drawing import ACCENT, INK, drawn_map, sheet, svg_of, titled
+from emmc_rig.report.page import (
+    Card,
+    Head,
+    Section,
+    data_address,
+    fragment,
+    framed,
+    part,
+    provenance_section,
+    typed,
+)
+
+Array = NDArray[np.floating]
+RESIDUAL_SCALE = 5.0
+DETAIL_PX = 40
+"""Side of the piece of a slice of Psi that is shown pixel for pixel."""
+THUMBNAIL_PX = 120
+"""Side of a whole slice."""
+MAP_PX = 640
+"""Longest side of a residual map; larger ones are shown averaged."""
+GOOD_CHI2 = 1.5
+"""Validation residual, in variances of the noise, above which something is not modelled."""
+GOOD_BAD_PIXELS = 0.02
+"""Share of pixels, from which on a reconstruction is doubted (`reconstruction.verdict.rules`)."""
+PSI_SHOWN = (
+    "How much of the light that an open camera gathers each pixel gets from each view, first shot: "
+    "one tile for each view. An open camera gets 1 / number of views from each."
+)
+SURE = 2.0
+"""Deviations by which a parameter differs from the design before the page says so."""
+
+
+class _Parameter(NamedTuple):
+    """How a fitted parameter is written: in units of `unit`, each `per_unit` of the fit's.
+
+    design: its value as designed, in the fit's units; None where it differs from mask to mask. of:
+    the part of the camera to blame for a difference.
+    """
+
+    words: str
+    unit: str
+    of: str
+    per_unit: float = 1.0
+    design: float | None = 0.0
+
+
+PARAMETERS = {
+    "offset_x_um": _Parameter("Mask's offset, x", "um", "the mount"),
+    "offset_y_um": _Parameter("Mask's offset, y", "um", "the mount"),
+    "rotation_rad": _Parameter("Mask's rotation", "mrad", "the mount", 1e-3),
+    "scale": _Parameter("Scale of the mask's cells", "% of design", "the mask", 0.01, 1.0),
+    "skew": _Parameter("Mask's skew", "mrad", "the mask", 1e-3),
+    "distance_share": _Parameter("Mask's distance", "% from the design's", "the mount", 0.01),
+    "distortion_um": _Parameter("Distortion at the corner", "um", "the lens"),
+    "blur_um": _Parameter("Blur of the mask's edges", "um", "the mask"),
+    "clear": _Parameter("Transmittance of open cells", "%", "the mask", 0.01, None),
+    "leak": _Parameter("Transmittance of closed cells", "%", "the mask", 0.01, None),
+    "vignetting": _Parameter("Vignetting", "%", "the lens", 0.01),
+    "falloff": _Parameter("Falloff over the aperture", "%", "the lens", 0.01),
+    "tilt_x_rad": _Parameter("Mask's tilt, x", "mrad", "the mount", 1e-3),
+    "tilt_y_rad": _Parameter("Mask's tilt, y", "mrad", "the mount", 1e-3),
+    "bow_um": _Parameter("Mask's bow at the corner", "um", "the mask"),
+    "glass_um": _Parameter("Glass between mask and sensor", "um", "the mount"),
+}
+
+
+def write_calibration_report(
+    path: Path,
+    outcome: Outcome,
+    metrics: Mapping,
+    sensor: SensorSheet | None = None,
+) -> None:
+    """Write the page whole or not at all.
+
+    metrics: as `emmc_rig.calibrate` makes them.
+    """
+    unwatched = [text.removeprefix("not measured: ") for text in outcome.unwatched]
+    psi, relative_deviation = _psi(outcome)
+    chosen = outcome.judged[outcome.chosen]
+    sections = [
+        *_listed("found", "Found and taken into account", outcome.findings),
+        *_listed("unwatched", "Not measured", unwatched),
+        Section("psi", "Psi", psi),
+        Section(
+            "residuals", "Residuals", _residuals(chosen),
+            about="Whiteboards kept from the fit, less what this calibration predicts of them.",
+        ),
+        Section(
+            "methods", "Calibration methods", _methods(outcome),
+            about=f"Why {outcome.chosen} was chosen, and what the others predict.",
+        ),
+    ]  # fmt: skip
+    if outcome.parametric is not None:
+        about = "Placement and shape of the mask, each figure with its standard deviation."
+        sections.append(Section("fit", "Mask as fitted", _fit(metrics), about=about))
+    if sensor is not None:
+        about = "Gain, noise and linearity after EMVA 1288."
+        sections.append(Section("sensor", "Sensor", _sensor(sensor), about=about))
+    sections.append(provenance_section(_provenance(metrics)))
+    title = f"Calibration of {metrics['camera']}"
+    text = framed(
+        title, sections=sections, styles=["calibration.css"], head=_head(outcome, metrics),
+        lead=part("cards", _cards(outcome, metrics, relative_deviation)),
+    )  # fmt: skip
+    write_text(path, text)
+
+
+def _head(outcome: Outcome, metrics: Mapping) -> Head:
+    """Return whether the whiteboards agree with the Psi chosen, and what to measure again."""
+    agrees = outcome.judged[outcome.chosen].chi2 < GOOD_CHI2
+    words = "This calibration does not describe the bench"
+    if agrees:
+        words = "You can use this calibration"
+        words += ", and make it better" if outcome.advice else ""
+    good, use = agrees and not outcome.advice, "emmc_rig.reconstruct(psi, report.frames(dn))"
+    if metrics["session"]:
+        use = f"emmc-rig reconstruct {typed(metrics['session'])}"
+    advice = outcome.advice or [f"get the light field with this Psi: `{use}`"]
+    return Head(words, outcome.why, advice, "good" if good else "watch")
+
+
+def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> list[Card]:
+    judged, bad = outcome.judged[outcome.chosen], metrics["bad_pixels"]
+
+    def card(label: str, value: str, note: str, good: bool) -> Card:
+        return Card(label, value, note, "good" if good else "watch")
+
+    return [
+        card(
+            "Validation residual", f"{judged.chi2:.2f} x noise",
+            f"mean square, over the noise's variance; good: below {GOOD_CHI2:g}",
+            judged.chi2 < GOOD_CHI2,
+        ),
+        Card(
+            "Deviation of Psi", f"{relative_deviation:.2%}",
+            "standard deviation of its coefficients, over their root mean square",
+        ),
+        card(
+            "Excluded pixels", f"{bad:.2%}",
+            f"found bad; good: below {GOOD_BAD_PIXELS:.0%}", bad < GOOD_BAD_PIXELS,
+        ),
+    ]  # fmt: skip
+
+
+def _methods(outcome: Outcome) -> str:
+    heads = (
+        "Calibration method", "Frames", "Validation residual, x noise",
+        f"Good (below {GOOD_CHI2:g})", "Residual, of the signal",
+    )  # fmt: skip
+    rows = [
+        (name, outcome.frames[name], f"{judged.chi2:.2f}",
+         "yes" if judged.chi2 < GOOD_CHI2 else "no", f"{judged.relative_error:.3%}")
+        for name, judged in outcome.judged.items()
+    ]  # fmt: skip
+    chosen = list(outcome.judged).index(outcome.chosen)
+    return part("table", heads, rows, numbers=True, chosen=chosen)
+
+
+def _listed(name: str, title: str, lines: Sequence[str]) -> list[Section]:
+    """Return the section of some lines; none without any."""
+    return [Section(name, title, part("bullets", lines))] if lines else []
+
+
+def _fit(metrics: Mapping) -> str:
+    undecided = metrics["fit"]["undecided"]
+    rows = [
+        _fitted(parameter, metrics["parameters"][name], name in undecided)
+        for name, parameter in PARAMETERS.items()
+    ]
+    return fragment("calibration_fit.html", fit=metrics["fit"], rows=rows, good_chi2=GOOD_CHI2)
+
+
+def _fitted(parameter: _Parameter, found: Mapping[str, float], undecided: bool) -> tuple[str, ...]:
+    """Return a parameter as a row: name, value with deviation, and their meaning."""
+    value, deviation = found["value"] / parameter.per_unit, found["deviation"] / parameter.per_unit
+    digits = max(0, 1 - math.floor(math.log10(deviation))) if deviation > 0 else 2
+    written = f"{value:.{digits}f} ± {deviation:.{digits}f} {parameter.unit}"
+    if undecided:
+        return parameter.words, written, "not known from these whiteboards: taken as designed"
+    if parameter.design is None:
+        return parameter.words, written, "measured; Psi has it"
+    away = abs(value - parameter.design / parameter.per_unit)
+    if away <= SURE * deviation:
+        return parameter.words, written, "as designed, within its deviation"
+    return parameter.words, written, f"{parameter.of}, not an error: Psi has it"
+
+
+def _residuals(judged: HeldOut) -> str:
+    """Return the residuals of a prediction: a map (pixel_y, pixel_x), and kinds of whiteboards.
+
+    The kinds are in a table, the worst first.
+    """
+    figure, (axes,) = sheet(1, 7.0, 4.6, label="pixel y")
+    height, width = judged.residual.shape
+    drawn_map(
+        axes, _shrunk(judged.residual, MAP_PX), (-RESIDUAL_SCALE, RESIDUAL_SCALE),
+        "validation whiteboard less prediction,\nstandard deviations of the noise", "RdBu_r",
+        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+    )  # fmt: skip
+    titled(axes, judged.route, "pixel x")
+    order = sorted(judged.groups.items(), key=lambda item: -item[1])
+    rows = [(name, f"{value:.2f}") for name, value in order]
+    heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
+    return _drawn({"Residual map": figure}) + part("table", heads, rows, numbers=True)
+
+
+def _drawn(figures: Mapping[str, Figure]) -> str:
+    addresses = {name: data_address(svg_of(figure), ".svg") for name, figure in figures.items()}
+    return part("drawings", addresses)
+
+
+def _psi(outcome: Outcome) -> tuple[str, float]:
+    """Return slices of Psi and of its deviation, (v, u, y, x) of the first shot, as pictures.
+
+    The second is the root mean square deviation of that shot's coefficients over theirs.
+    """
+    psi, deviation = outcome.calibration.psi, outcome.calibration.deviation
+    views = psi.light_field_shape[:2]
+    slices: list[list[Array]] = [[], [], []]
+    squares = np.zeros(2)
+    for v, u in np.ndindex(views):  # one view in memory at a time
+        planes = [finite(of[0, v, u]) for of in (psi.weights, deviation)]
+        squares += [np.square(plane, dtype=np.float64).sum() for plane in planes]
+        weights, spread = (plane.sum(axis=1) for plane in planes)
+        shown = _shrunk(weights, THUMBNAIL_PX), _centre(weights), _centre(spread)
+        for found, tile in zip(slices, shown, strict=True):
+            found.append(tile)
+    titles = (
+        "Weights, whole field",
+        f"Weights, the middle {slices[1][0].shape[1]} x {slices[1][0].shape[0]} pixels",
+        "Their standard deviation, same pixels",
+    )
+    figure, panels = sheet(3, 4.9, 4.2, label="view v")
+    for axes, tiles, title in zip(panels, slices, titles, strict=True):
+        height, width = tiles[0].shape
+        whole = np.full((views[0] * (height + 2), views[1] * (width + 2)), np.nan, np.float32)
+        for tile, (v, u) in zip(tiles, np.ndindex(views), strict=True):
+            whole[v * (height + 2) :, u * (width + 2) :][:height, :width] = tile
+        top = round_up(float(np.nanpercentile(whole, 99.9)))
+        label = "share of the open camera's light" if axes is not panels[-1] else "the same unit"
+        drawn_map(axes, whole, (0, top), label, "gray" if axes is not panels[-1] else "magma")
+        axes.set_xticks(
+            [(u + 0.5) * (width + 2) for u in range(views[1])], map(str, range(views[1]))
+        )
+        axes.set_yticks(
+            [(v + 0.5) * (height + 2) for v in range(views[0])], map(str, range(views[0]))
+        )
+        titled(axes, title, "view u")
+    relative_deviation = float(np.sqrt(squares[1] / max(squares[0], 1e-30)))
+    return part("lead", PSI_SHOWN) + _drawn({"Psi": figure}), relative_deviation
+
+
+def _centre(view: Array) -> Array:
+    height, width = view.shape
+    top, left = max((height - DETAIL_PX) // 2, 0), max((width - DETAIL_PX) // 2, 0)
+    return view[top : top + DETAIL_PX, left : left + DETAIL_PX]
+
+
+def _shrunk(view: Array, longest_px: int) -> Array:
+    """Return a picture (y, x) averaged down where a side is longer."""
+    height, width = view.shape
+    shrink = min(1.0, longest_px / max(height, width))
+    size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+    return np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _sensor(sheet_: SensorSheet) -> str:
+    (first, (transfer,)), (second, (linearity,)) = (
+        sheet(1, 4.8, label=label)
+        for label in ("temporal variance, DN²", "deviation from the line, %")
+    )
+    curve = sheet_.curve
+    transfer.plot(curve.mean_dn, curve.variance_dn2, "o", color=ACCENT, markersize=4)
+    grid = np.linspace(0, max(curve.mean_dn), 50)
+    line = sheet_.dark_variance_dn2 + sheet_.gain_dn_per_electron * grid
+    transfer.plot(grid, line, color=INK, linewidth=1)
+    titled(transfer, "Photon transfer", "signal above the dark, DN")
+    linearity.plot(curve.exposure_s, sheet_.linearity_residual, "o", color=ACCENT, markersize=4)
+    linearity.axhline(0, color=INK, linewidth=0.8)
+    titled(linearity, "Linearity", "exposure, s")
+    heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
+    rows = [
+        (name, f"{value:.5g}", "" if deviation is None else f"{deviation:.2g}", unit)
+        for name, value, deviation, unit in sheet_.rows()
+    ]
+    table = part("table", heads, rows, numbers=True)
+    return table + _drawn({"Photon transfer curve": first, "Linearity": second})
+
+
+def _provenance(metrics: Mapping) -> dict[str, str]:
+    return {
+        "command": metrics["command"],
+        "camera": metrics["camera"],
+        "size": "x".join(map(str, metrics["size"])),
+        "session": metrics["session"],
+        "seconds to calibrate": f"{metrics['calibration_seconds']:.1f}",
+        **metrics["versions"],
+    }

@@ -1,0 +1,341 @@
+"""One self-contained HTML page from the outcome of a run; it opens offline and asks for nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.formats.format import Export
+from emmc_rig.model.camera import Camera
+from emmc_rig.model.files import write_text
+from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
+from emmc_rig.reconstruction.verdict.rules import NOISE, UNEXPLAINED
+from emmc_rig.report.display import (
+    PART_PIXELS,
+    DisplayCurve,
+    finite,
+    heat,
+    png_of,
+    reduced,
+    round_up,
+)
+from emmc_rig.report.page import Card, estimated, framed, light_field_head
+from emmc_rig.report.viewer import poster, viewer_data
+from emmc_rig.store.results import stated_words
+
+Array = NDArray[np.floating]
+EXPLAINED = 1 - UNEXPLAINED.doubt
+"""Share of the detail of validation readings below which the verdict is doubt."""
+FRAME_PIXELS = 1_500_000
+"""Of all frames together, and of the error map; larger ones are shown smaller."""
+
+
+@dataclass(frozen=True)
+class ReportContent:
+    """What the report shows. Pictures are linear, float, nominally in [0, 1].
+
+    Shapes: light fields (v, u, y, x, c) with c 1 or 3; frames (shot, y, x); whiteboards (y, x).
+    metrics: as in metrics.json. maps: what is laid over the picture in the viewer, by name, see
+    `Export`. described: the camera, where Psi knows it. source: the result's folder, as typed.
+    """
+
+    title: str
+    estimate: Array
+    metrics: Mapping[str, Any]
+    frames: Array | None = None
+    described: Camera | None = None
+    truth: Array | None = None
+    whiteboards: Sequence[tuple[str, Array]] = ()
+    stage_s: Mapping[str, float] = field(default_factory=dict)
+    source: str = ""
+    maps: Mapping[str, NDArray] = field(default_factory=dict)
+
+
+def write_report(path: str | Path, content: ReportContent) -> None:
+    """Write the page to `path`, whole or not at all.
+
+    Raises OSError when the folder cannot be written.
+    """
+    write_text(Path(path), render(content))
+
+
+def render(content: ReportContent) -> str:
+    """Return the page as text."""
+    rows, columns, height, width, _ = content.estimate.shape
+    disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
+    axes, listed = axes_of(content.metrics), _figures(content.metrics)
+    total_s, longest_s = (max(of(content.stage_s.values() or [0]), 1e-12) for of in (sum, max))
+    frames = content.frames
+    shots = content.metrics.get("shots", 0 if frames is None else len(frames))
+    export = Export(
+        content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
+        view_axes=axes,
+    )  # fmt: skip
+    return framed(
+        content.title,
+        head=light_field_head(content.metrics, content.source),
+        template="report.html",
+        content=content,
+        styles=("viewer.css",),
+        warnings=_warnings(content),
+        cards=_cards(content),
+        cfa=None if content.described is None else content.described.sensor.cfa_name,
+        frames=None if frames is None else _frames(frames),
+        whiteboards=[
+            (label, _frames(frame[None])["pictures"][0]) for label, frame in content.whiteboards
+        ],
+        parallax=shows_parallax(axes),
+        picture=picture_name(axes),
+        views={"rows": rows, "columns": columns, "height": height, "width": width},
+        error=None if content.truth is None else _error(content.estimate, content.truth),
+        shots="1 shot" if shots == 1 else f"{shots} shots",
+        timings=[
+            (name, f"{s / longest_s:.1%}", f"{s:.2f} s ({s / total_s:.0%})")
+            for name, s in content.stage_s.items()
+        ],
+        total_s=sum(content.stage_s.values()),
+        figures=[row for row in listed if not row["of_method"]],
+        of_method=[row for row in listed if row["of_method"]],
+        provenance=_provenance(content),
+        data={"viewer-data": viewer_data(export, most_pixels=PART_PIXELS)},
+        poster=poster(export, PART_PIXELS),
+        scripts=("viewer.js",),
+    )
+
+
+def _frames(frames: Array) -> dict[str, Any]:
+    """Return frames (shot, y, x) as pictures on a common scale, and the ends of the scale."""
+    frames = finite(frames)
+    curve = DisplayCurve.fitted_to(frames)
+    small = reduced(frames[None, ..., None], FRAME_PIXELS)[0, ..., 0]
+    return {
+        "pictures": [png_of(curve.encode(frame)) for frame in small],
+        "shape": frames.shape,
+        "least": frames.min(),
+        "mean": frames.mean(),
+        "greatest": frames.max(),
+    }
+
+
+def _error(estimate: Array, truth: Array) -> dict[str, object]:
+    """Return the error averaged over views and colours as a picture, and its scale."""
+    absolute = np.abs(finite(estimate) - finite(truth)).mean(axis=(0, 1, -1))
+    mean = reduced(absolute[None, None, ..., None], FRAME_PIXELS)[0, 0, ..., 0]
+    scale = round_up(float(np.percentile(mean, 99.5)))
+    return {
+        "scale": scale,
+        "picture": png_of(heat(DisplayCurve(1 / scale, 1.0).encode(mean))),
+    }
+
+
+class Figure(NamedTuple):
+    """How one metric is written: label, format, unit, and what it means."""
+
+    label: str
+    format: str = ""
+    unit: str = ""
+    meaning: str = ""
+
+
+ESTIMATES = "logarithm; the accuracy is estimated from it"
+FIGURES = {
+    "psnr_db": Figure("PSNR", ".2f", "dB", "peak 1, over all {picture}s, pixels and colours"),
+    "stated_db": Figure("Estimated accuracy", ".2f", "dB",
+        "PSNR, by the method, without the truth"),
+    "stated_interval_db": Figure("Its interval", ".1f", "dB",
+        "from and to; the true PSNR lies inside in 9 of 10 captures"),
+    "ssim": Figure("SSIM", ".4f", "",
+        "structural similarity, averaged over {picture}s; 1 is identical"),
+    "replicate_psnr_db": Figure("PSNR of the baseline", ".2f", "dB",
+        "the true {middle} in all places: below it, {lost}"),
+    "psi_relative_error": Figure("Calibration error", ".2%", "",
+        "|measured - exact| / |exact|, Euclidean norms"),
+    "exact_psi_psnr_db": Figure("PSNR with the exact Psi", ".2f", "dB",
+        "same frames, reconstructed without calibration"),
+    "calibration_cost_db": Figure("What calibration costs", "z.2f", "dB",
+        "PSNR with the exact Psi less PSNR with the measured"),
+    "design_relative_error": Figure("Relative error of the design", ".2e", "",
+        "|designed - exact| / |exact|: what Psi would be off by without calibration"),
+    "psi_mean_deviation": Figure("Mean standard deviation of Psi", ".2e", "",
+        "of a coefficient, as stated by the calibration"),
+    "noise_sigma": Figure("Noise of the readings", ".2e", "",
+        "their standard deviation, as the reconstruction assumed it; 1 is white"),
+    "saturated_share": Figure("Saturated readings", ".2%", "", "share excluded as clipped"),
+    "whiteboard_frames": Figure("Whiteboard frames", meaning="exposures taken to measure Psi"),
+    "status": Figure("Status", meaning="how the solver stopped"),
+    "advice": Figure("Advice", meaning="what the solver suggests"),
+    "steps": Figure("Steps", meaning="of the solver"),
+    "seconds": Figure("Time of the method", ".2f", "s", "without compilation"),
+    "compiling_seconds": Figure("Compilation", ".2f", "s", "of kernels, once for every version"),
+    "size": Figure("Size", meaning="height and width of a {picture}, pixels"),
+    "scene_provenance": Figure("Origin of the scene"),
+    "finer": Figure("Finer scene",
+        meaning="{picture}s and pixels of the simulated scene for each here"),
+    "parameters.noise_sigma": Figure("Noise", ".2e", "",
+        "standard deviation of a reading, as the method assumed it; 1 is white"),
+    "parameters.lowest_px": Figure("Lowest disparity", ".2f", "px per view", "of the centre view"),
+    "parameters.highest_px": Figure("Highest disparity", ".2f", "px per view",
+        "of the centre view"),
+    "parameters.disparities": Figure("Disparities searched", meaning="how many were tried"),
+    "parameters.search_seconds": Figure("Search of disparities", ".2f", "s"),
+    "parameters.held_readings": Figure("Validation readings",
+        meaning="kept from the fit, to test it on"),
+    "parameters.at_end": Figure("Patches at the end of the range", ".1%", "",
+        "whose best disparity is the lowest or highest searched; good: at most 1 %"),
+    "parameters.dark_edge_px": Figure("Dark edge of the picture", ".0f", "px",
+        "the widest one, excluded from the fit: views do not reach there"),
+    "parameters.misfit": Figure("Unexplained residual", ".2f", "x noise",
+        "root mean square residual of the readings over their noise; good: about 1"),
+    "parameters.misfit_row": Figure("Row of the largest residual", ".0f", "px"),
+    "parameters.misfit_column": Figure("Column of the largest residual", ".0f", "px"),
+    "parameters.decided": Figure("Textured patches with a depth", ".0%", "",
+        "whose readings prefer one disparity; good: more than 25 %"),
+    "parameters.over_plain": Figure("Residual against total variation", ".2f", "",
+        "mean square residual of the validation readings beyond their noise, over that of total "
+        "variation; good: below 1"),
+    "parameters.stated_apart": Figure("Difference of two estimates", ".2f", "", ESTIMATES),
+    "parameters.stated_disparity": Figure("Uncertainty of disparity", ".2f", "", ESTIMATES),
+    "parameters.stated_spread": Figure("Spread between models", ".2f", "", ESTIMATES),
+    "parameters.stated_contrast": Figure("Contrast of the scene", ".2f", "", ESTIMATES),
+    "parameters.stated_tails_db": Figure("Subtracted for few large errors", ".2f", "dB",
+        "from the estimated accuracy"),
+    "parameters.stated_scale_db": Figure("Scale of the deviation", ".2f", "dB",
+        "against what the validation readings show"),
+    "parameters.stated_within_db": Figure("Half of the interval", ".2f", "dB",
+        "of the estimated accuracy; the true PSNR lies inside in 9 of 10 captures"),
+}  # fmt: skip
+"""By the name in metrics.json; a figure without a row here is listed under its own name. Braces:
+words of the view axes, {picture} and {middle}, and {lost}, the meaning of a negative margin."""
+PROVENANCE = {
+    "command": "Command line",
+    "commit": "Commit",
+    "threads": "Threads",
+    "seed": "Seed",
+    "source": "Frames",
+    "scene": "Scene",
+    "camera": "Camera",
+    "frames_sha256": "SHA-256 of the frames",
+    "psi_sha256": "SHA-256 of Psi",
+    "psi_file": "Psi",
+}
+"""Rows of where a result came from, by the name in metrics.json."""
+SHOWN_ELSEWHERE = {
+    "verdict", "versions", "warnings", "assumed", "estimated_from_frames", *PROVENANCE
+}  # fmt: skip
+
+
+def _number(value: object) -> float | None:
+    """The value as a float; None when it is not a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return None
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def _written(value: object, spec: str = "", unit: str = "") -> str:
+    """A value as text for the page, not escaped; a NaN is said, not hidden."""
+    if value is None:
+        return "not measured"
+    if value == "":
+        return "none"
+    if isinstance(value, float | np.floating) and not math.isfinite(value):
+        return "not a number" if math.isnan(value) else ("infinite" if value > 0 else "-infinite")
+    number = _number(value)
+    if number is None:
+        joined = isinstance(value, list | tuple)
+        return ", ".join(_written(item, spec) for item in value) if joined else str(value)
+    text = format(number, spec) if spec else (f"{number:.6g}" if isinstance(value, float) else "")
+    return f"{text or value} {unit}".rstrip()
+
+
+def _cards(content: ReportContent) -> list[Card]:
+    """Return the three figures that tell most, each with what is good; none is green in doubt."""
+    metrics = content.metrics
+    axes = axes_of(metrics)
+    fine = "good" if light_field_head(metrics).tone == "good" else ""
+    cards = []
+    psnr, baseline = _number(metrics.get("psnr_db")), _number(metrics.get("replicate_psnr_db"))
+    if psnr is not None:
+        note = f"root mean square error {10 ** (-psnr / 20):.1%} of white; the higher the better"
+        cards.append(Card("Accuracy (PSNR)", f"{psnr:.1f} dB", note))
+    if psnr is not None and baseline is not None:
+        note = f"the true {middle_name(axes)} in all places has {baseline:.1f} dB; good: above 0"
+        tone = fine if psnr > baseline else "bad"
+        cards.append(Card("Over the baseline", f"{psnr - baseline:+.1f} dB", note, tone))
+    stated = _number(metrics.get("stated_db"))
+    if stated is not None and psnr is None:
+        note = f"{stated_words(metrics)}, by the method itself; the higher the better"
+        cards.append(Card("Estimated accuracy", f"{stated:.1f} dB", note))
+    verdict = metrics.get("verdict")
+    evidence = verdict.get("features") or {} if isinstance(verdict, Mapping) else {}
+    explained, noise = _number(evidence.get("explained")), _number(evidence.get("noise"))
+    if explained is not None:
+        note = f"of the detail in validation readings, predicted; good: above {EXPLAINED:.0%}"
+        tone = fine if explained > EXPLAINED else "bad"
+        cards.append(Card("Explained", f"{max(explained, 0):.0%}", note, tone))
+    if noise is not None:
+        note = f"of the mean reading; good: below {NOISE.doubt:.0%}"
+        tone = fine if noise < NOISE.doubt else "watch"
+        cards.append(Card("Noise", f"{noise:.1%}", note, tone))
+    if content.stage_s:
+        cards.append(Card("Time", f"{sum(content.stage_s.values()):.1f} s", "from scene to page"))
+    return cards[:3]
+
+
+def _warnings(content: ReportContent) -> list[str]:
+    warnings = content.metrics.get("warnings") or ()
+    broken = int(content.estimate.size - np.count_nonzero(np.isfinite(content.estimate)))
+    more = f"The estimate holds {broken} values that are not finite; drawn black."
+    return [*warnings, *estimated(content.metrics), *([more] if broken else [])]
+
+
+def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, object]]:
+    rows = []
+    for key, value in metrics.items():
+        if not prefix and (
+            key in SHOWN_ELSEWHERE or (key == "seconds" and isinstance(value, dict))
+        ):
+            continue
+        if isinstance(value, Mapping):
+            rows += _flat(value, f"{prefix}{key}.")
+        else:
+            rows.append((f"{prefix}{key}", value))
+    return rows
+
+
+def _figures(metrics: Mapping[str, object]) -> list[dict[str, Any]]:
+    """Return the rows of the table of metrics."""
+    rows, axes = [], axes_of(metrics)
+    lost = "no parallax has been recovered" if shows_parallax(axes) else "they are not told apart"
+    words = {"picture": picture_name(axes), "middle": middle_name(axes), "lost": lost}
+    for key, value in _flat(metrics):
+        name = key.removeprefix("parameters.")
+        figure = FIGURES.get(key, Figure(name.replace("_", " ").capitalize()))
+        written = _written(value, figure.format, figure.unit)
+        label, meaning = figure.label, figure.meaning
+        if key in FIGURES:
+            label, meaning = label.format(**words), meaning.format(**words)
+        rows.append({
+            "key": key, "label": label, "value": written, "meaning": meaning,
+            "of_method": name != key,
+        })  # fmt: skip
+    return rows
+
+
+def _provenance(content: ReportContent) -> dict[str, object]:
+    known, camera = content.metrics, content.described
+    rows = {label: known.get(key) for key, label in PROVENANCE.items()}
+    if camera is not None:
+        rows |= {
+            "Description": camera.title,
+            "Reference": camera.reference,
+            "Colour filter": camera.sensor.cfa_name,
+        }
+    rows |= {f"Version of {name}": version for name, version in known.get("versions", {}).items()}
+    return {label: value for label, value in rows.items() if value not in (None, "")}

@@ -1,0 +1,173 @@
+"""metrics.json of a result: figures, command and versions; and figures formatted for people."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import h5py
+from numpy.typing import NDArray
+
+from emmc_rig.errors import WrongUsageError
+from emmc_rig.store.locks import command_line
+from emmc_rig.store.shards import ENDING, save_arrays
+from emmc_rig.version import __version__
+
+if TYPE_CHECKING:
+    from emmc_rig.model.frames import Frames
+    from emmc_rig.model.settings import Settings
+
+METRICS = "metrics.json"
+PSI_ASSUMED = (
+    "Psi is computed from the camera's description, not calibrated: the estimated accuracy "
+    "does not include its error, and a misplaced mask is noticed only if the frames show it"
+)
+_SECONDS = {"us": 1e-6, "ms": 1e-3, "": 1, "s": 1, "min": 60, "m": 60, "h": 3600}
+VERSIONED = ("numpy", "scipy", "numba", "h5py", "opencv-contrib-python-headless", "rawpy")
+
+
+def parse_size(
+    text: str | None, option: str = "size", example: str = "192x256"
+) -> tuple[int, int] | None:
+    """Return rows and columns from ROWSxCOLUMNS; raises AppError."""
+    if text is None:
+        return None
+    rows, cross, columns = text.lower().partition("x")
+    if not (cross and rows.isdigit() and columns.isdigit()):
+        raise WrongUsageError(f"{option} {text}: write ROWSxCOLUMNS, for instance {example}")
+    return int(rows), int(columns)
+
+
+def parse_psnr(text: str, option: str) -> float:
+    """Return the dB of "28dB" or "28"; raises AppError for anything else."""
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(db)?", text.strip().lower())
+    if match is None or not float(match[1]) > 0:
+        raise WrongUsageError(f"{option} {text}: write a PSNR, for instance 28dB")
+    return float(match[1])
+
+
+def parse_seconds(text: str | None, option: str) -> float | None:
+    """Return the seconds of "20ms", "0.02", "30s", "2min" or "1h"; raises WrongUsageError."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d+\.?\d*(?:e[+-]?\d+)?|\.\d+)\s*([a-z]*)", text.strip().lower())
+    if match is None or match[2] not in _SECONDS or not float(match[1]) > 0:
+        raise WrongUsageError(
+            f"{option} {text}: write a time above 0, in seconds or with a unit, for instance 0.02, "
+            "20ms or 2min"
+        )
+    return float(match[1]) * _SECONDS[match[2]]
+
+
+def write_metrics(folder: Path, metrics: Mapping[str, object]) -> None:
+    """Write metrics.json, with what made the figures: see `provenance` and `metrics_text`."""
+    (folder / METRICS).write_text(metrics_text({**provenance(), **metrics}), encoding="utf-8")
+
+
+def metrics_text(metrics: Mapping[str, object]) -> str:
+    """Return plain data as JSON; values that are not finite become null, as JSON has none."""
+    return json.dumps(_finite(metrics), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value
+
+
+def stated_words(metrics: Mapping[str, object]) -> str:
+    """Return "31.2 dB (29.8 to 33.0 in 9 of 10 captures)" by metrics.json; "" without it."""
+    stated_db, interval = metrics.get("stated_db"), metrics.get("stated_interval_db")
+    if not isinstance(stated_db, float):
+        return ""
+    match interval:
+        case [float(low), float(high)]:
+            return f"{stated_db:.1f} dB ({low:.1f} to {high:.1f} in 9 of 10 captures)"
+    return f"{stated_db:.1f} dB"
+
+
+def save_frames(path: Path, frames: Frames, **more: NDArray) -> None:
+    """Write frames with more arrays (shot, y, x), such as frames_dn, and exposures_s (shot,).
+
+    path: a Zarr group where it ends in .zarr, else an HDF5 file.
+    """
+    own = {"readings": frames.readings, "deviation": frames.deviation, "usable": frames.usable}
+    arrays = {**own, **more}
+    if path.suffix == ENDING:
+        save_arrays(path, arrays)
+        return
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file[name] = array
+
+
+def provenance(settings: Settings | None = None) -> dict[str, object]:
+    """Return what makes a figure again: command, versions, commit of a checkout, threads.
+
+    settings: only values other than the defaults are listed. Threads are those of compiled kernels.
+    """
+    known: dict[str, object] = {"command": command_line(), "versions": versions()}
+    if commit := _commit():
+        known["commit"] = commit
+    if numba := sys.modules.get("numba"):
+        known["threads"] = numba.get_num_threads()
+    if settings is not None:
+        known["settings"] = settings.model_dump(mode="json", exclude_defaults=True)
+    return known
+
+
+@cache
+def _commit() -> str:
+    """Return the commit that runs, `-dirty` after it where files differ; "" without a checkout."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return ""
+    git = ("git", "--no-optional-locks", "-C", str(root))
+    asked = (*git, "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty")
+    try:
+        return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {"emmc-rig": __version__, "python": platform.python_version(), **_library_versions()}
+
+
+@cache
+def _library_versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in VERSIONED}
+
+
+def shown_seconds(seconds: float) -> str:
+    """Return a duration for people."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 600:
+        return "{:.0f} min {:.0f} s".format(*divmod(round(seconds), 60))
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def shown_bytes(count: float) -> str:
+    """Return a size for people."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"

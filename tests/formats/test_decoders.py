@@ -1,0 +1,548 @@
+"""Every decoder of bytes from outside is called in one guarded place, and takes bounded memory."""
+
+import ast
+import io
+import json
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from fuzzing import FUZZ
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from emmc_rig.bench.device_config import parse_camera, parse_stage
+from emmc_rig.bench.rig_config import ImagedRig, rig_description
+from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.errors import RawFrameError
+from emmc_rig.drivers.raw import decode_raw
+from emmc_rig.errors import AppError
+from emmc_rig.formats.cameras import find_camera
+from emmc_rig.model.camera import build_imaging_matrix
+from emmc_rig.model.decoding.child import read_in_child
+from emmc_rig.model.errors import SensingError
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.store.psi import StoredPsi, save_shards
+
+ROOT = Path(__file__).parents[2]
+READING, RAW = "emmc_rig/model/reading.py", "drivers/raw.py"
+CHILD, TIFF, PICTURES = (
+    f"emmc_rig/model/decoding/{name}.py" for name in ("child", "tiff", "pictures")
+)
+GUARDED = {
+    "yaml": (READING, "emmc_rig/formats/yaml_edit.py"),  # whose text was parsed there before
+    "json.load": ("emmc_rig/model/json_text.py",),
+    "h5py.File": (READING,),
+    "cv2.im": (PICTURES, "emmc_rig/study/stability/sensor_faults.py"),  # faults: its own bytes
+    "PIL.Image.open": (PICTURES,),
+    "rawpy": (RAW,),
+    "tifffile": (RAW, "drivers/dng.py", TIFF),  # drivers/dng.py: its own bytes
+    "scipy.io": (CHILD,),
+    "OpenEXR": (CHILD,),
+    "zarr": ("emmc_rig/store/shards.py",),
+    # What a study and a film keep for themselves.
+    "numpy.load": ("emmc_rig/process/filming.py", CHILD),
+    "torch.load": (),
+    "pickle.load": (),
+    "imagecodecs": (),  # which tifffile calls
+    "imageio": (),
+}
+"""By decoder, the modules that may call it."""
+DECODERS = {
+    **{f"yaml.{name}": "yaml" for name in
+       ("load", "load_all", "safe_load", "safe_load_all", "full_load", "unsafe_load", "compose",
+        "parse", "scan")},
+    **{f"json.{name}": "json.load" for name in ("load", "loads", "JSONDecoder")},
+    "h5py.File": "h5py.File",
+    **{f"cv2.{name}": "cv2.im" for name in
+       ("imdecode", "imread", "imreadmulti", "imdecodemulti", "imdecodeanimation",
+        "imreadanimation")},
+    "PIL.Image.open": "PIL.Image.open",
+    "PIL.Image.Exif": "PIL.Image.open",
+    **{f"rawpy.{name}": "rawpy" for name in ("imread", "RawPy")},
+    **{f"tifffile.{name}": "tifffile" for name in ("imread", "TiffFile", "memmap")},
+    "scipy.io.loadmat": "scipy.io",
+    "OpenEXR.File": "OpenEXR",
+    **{f"zarr.{name}": "zarr" for name in ("open", "open_group", "open_array", "load")},
+    "numpy.load": "numpy.load",
+    "torch.load": "torch.load",
+    **{f"imagecodecs.{name}": "imagecodecs" for name in ("imread", "tiff_decode", "png_decode")},
+    **{f"{name}.{read}": "imageio" for name in ("imageio", "imageio.v2", "imageio.v3")
+       for read in ("imread", "mimread", "volread", "imopen", "get_reader")},
+    **{f"pickle.{name}": "pickle.load" for name in ("load", "loads", "Unpickler")},
+}  # fmt: skip
+
+
+def decoder_calls(source):
+    """(line, full name) of a module's uses of decoders, also under other names by import."""
+    tree = ast.parse(source)
+    names = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for entry in node.names:
+                names[entry.asname or entry.name.split(".")[0]] = (
+                    entry.name if entry.asname else entry.name.split(".")[0]
+                )
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            for entry in node.names:
+                names[entry.asname or entry.name] = f"{node.module}.{entry.name}"
+
+    def full(node):
+        if isinstance(node, ast.Name):
+            return names.get(node.id, "")
+        if isinstance(node, ast.Attribute):
+            return f"{full(node.value)}.{node.attr}"
+        return ""
+
+    harmless = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            first = node.args[0] if node.args else None
+            if full(node.func) == "json.loads" and isinstance(first, ast.Call):
+                if full(first.func) == "json.dumps":
+                    harmless.add(node.func)
+            elif full(node.func) == "h5py.File" and [
+                entry.value for entry in node.args[1:2] if isinstance(entry, ast.Constant)
+            ] == ["w"]:
+                harmless.add(node.func)
+        for part in ("annotation", "returns"):
+            if isinstance(note := getattr(node, part, None), ast.expr):
+                harmless.update(ast.walk(note))
+    return [
+        (node.lineno, full(node))
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Attribute, ast.Name))
+        and full(node) in DECODERS
+        and node not in harmless
+    ]
+
+
+@pytest.mark.slow
+def test_no_module_but_the_guarded_ones_calls_a_decoder():
+    found = []
+    for package in ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            name = path.relative_to(ROOT).as_posix()
+            for line, decoder in decoder_calls(path.read_text(encoding="utf-8")):
+                if name not in GUARDED[DECODERS[decoder]]:
+                    found.append(f"{name}:{line} {decoder}")
+    assert not found
+
+
+@pytest.mark.parametrize(
+    ("source", "calls"),
+    [
+        ("import yaml\nyaml.safe_load(x)", ["yaml.safe_load"]),
+        ("from yaml import safe_load as read\nread(x)", ["yaml.safe_load"]),
+        ("import json as j\nread = j.loads", ["json.loads"]),
+        ("import json\njson.loads(json.dumps(x))", []),
+        ("import h5py as h\nh.File(x, 'w')\nh.File(x)\nh.File(x, 'r+')", ["h5py.File"] * 2),
+        ("import h5py\ndef f(x: h5py.File) -> h5py.File: ...", []),
+        ("def f():\n    from rawpy import imread\n    return imread(x)", ["rawpy.imread"]),
+        ("import scipy.io\nscipy.io.loadmat(x)", ["scipy.io.loadmat"]),
+    ],
+)  # fmt: skip
+def test_a_decoder_is_recognised_by_whatever_name_it_is_called(source, calls):
+    assert [name for _, name in decoder_calls(source)] == calls
+
+
+# Memory and time, each measured in a process of its own
+
+
+WATCHED = """
+import json, resource, sys, time
+from pathlib import Path
+imports, call, path = sys.argv[1], sys.argv[2], Path(sys.argv[3])
+import cv2, PIL.Image
+exec(imports)
+def peak():
+    lines = open("/proc/self/status").read().splitlines()
+    return int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+def of_children():
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+earlier, before, started, said = of_children(), peak(), time.process_time(), ""
+try:
+    eval(call)
+except Exception as fault:
+    said = f"{type(fault).__name__}: {fault}"
+child = of_children() if of_children() > earlier else 0
+print(json.dumps([said, max(peak() - before, child) / 1e3, time.process_time() - started]))
+"""
+
+
+def watched(imports, call, path):
+    """What a call says, the megabytes it takes at most, itself or its child, and CPU seconds."""
+    command = [sys.executable, "-W", "ignore", "-c", WATCHED, imports, call, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    said, megabytes, seconds = json.loads(done.stdout)
+    assert "\n" not in said
+    return said, megabytes, seconds
+
+
+VIEWS = "from emmc_rig.model.lightfield import load_views", "load_views(path)"
+HDF5 = "from emmc_rig.model.lightfield import load_hdf5", "load_hdf5(path)"
+MASK = (
+    "from emmc_rig.model.masks import Picture",
+    "Picture(kind='picture', path=path).draw(1, 4, 4, 10.0)",
+)
+SETTINGS = "from emmc_rig.model.reading import read_yaml", "read_yaml(path, ValueError)"
+SCENE = "from emmc_rig.formats.scenes import open_scene", "open_scene(str(path))"
+
+
+def png(columns, rows, depth, kind, interlace, data, damage=0):
+    def chunk(name, content):
+        body = name + content
+        checksum = zlib.crc32(body) ^ (damage if name == b"IHDR" else 0)
+        return struct.pack(">I", len(content)) + body + struct.pack(">I", checksum)
+
+    header = struct.pack(">IIBBBBB", columns, rows, depth, kind, 0, 0, interlace)
+    palette = chunk(b"PLTE", bytes(6)) if kind == 3 else b""
+    parts = chunk(b"IHDR", header) + palette + chunk(b"IDAT", zlib.compress(data))
+    return b"\x89PNG\r\n\x1a\n" + parts + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (png(600, 447_392, 1, 3, 1, bytes(1_800_000)), "pixels, more than 1842 bytes can hold"),
+        (png(16_384, 16_384, 255, 2, 0, bytes(1_800_000)), "255 bits a sample of colour type 2"),
+        (png(16_384, 16_384, 8, 5, 0, bytes(1_800_000)), "8 bits a sample of colour type 5"),
+        (png(8, 8, 8, 2, 0, bytes(200), damage=1), "cut short or damaged"),
+    ],
+    ids=["unpacks to too much", "depth", "colour type", "checksum"],
+)
+def test_a_png_is_checked_whole_before_it_is_unpacked(tmp_path, content, complaint):
+    (tmp_path / "view_0_0.png").write_bytes(content)
+    said, megabytes, seconds = watched(*VIEWS, tmp_path)
+    assert said.startswith("SceneError: ")
+    assert complaint in said
+    assert (megabytes < 50, seconds < 2) == (True, True), (megabytes, seconds)
+
+
+def test_a_mask_of_another_format_that_claims_too_much_is_not_unpacked(tmp_path):
+    path = tmp_path / "mask.bmp"
+    head = struct.pack("<IHHI", 54, 0, 0, 54)
+    sizes = struct.pack("<IiiHHIIiiII", 40, 9_500, 9_500, 1, 24, 0, 0, 0, 0, 0, 0)
+    path.write_bytes(b"BM" + head + sizes)
+    said, megabytes, _ = watched(*MASK, path)
+    assert "9500 x 9500 pixels, more than 54 bytes can hold" in said
+    assert megabytes < 50
+
+
+def deflated(size_bytes, head=b""):
+    """As many zeros behind a head, packed by deflate, a thousandth of it in memory."""
+    packer = zlib.compressobj(9)
+    parts = [packer.compress(head)]
+    parts += [packer.compress(bytes(2**20)) for _ in range(size_bytes // 2**20)]
+    return b"".join([*parts, packer.compress(bytes(size_bytes % 2**20)), packer.flush()])
+
+
+def hdf5(path, shape, chunk, dtype, packed, filters):
+    """A file with one chunk as it is packed; filters: as often as deflate is to be undone."""
+    with h5py.File(path, "w") as file:
+        made = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        made.set_chunk(chunk)
+        for _ in range(filters):
+            made.set_deflate(9)
+        space = h5py.h5s.create_simple(shape, (h5py.h5s.UNLIMITED,) * len(shape))
+        kind = h5py.h5t.py_create(np.dtype(dtype))
+        data_set = h5py.h5d.create(file.id, b"light_field", kind, space, made)
+        data_set.write_direct_chunk((0,) * len(shape), packed)
+
+
+WHOLE = (3, 3, 1024, 2900, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shape", "chunk", "dtype", "packed", "filters", "complaint"),
+    [
+        (WHOLE, WHOLE, "u1", 80_179_200, 1, "does not fit into its file"),
+        (WHOLE, WHOLE, "f4", 320_716_800, 1, "does not fit into its file"),
+        ((2, 2, 8, 8, 3), WHOLE, "f4", 320_716_800, 1, "chunks of 3.21e+08 bytes"),
+        ((2, 2, 8, 8, 3), (2, 2, 8, 8, 3), "u1", 600_000_000, 2, "in another way"),
+    ],
+    ids=["codes", "floats", "chunk larger than its data", "packed twice"],
+)
+def test_hdf5_is_checked_before_it_is_unpacked(
+    tmp_path, shape, chunk, dtype, packed, filters, complaint
+):
+    path = tmp_path / "scene.h5"
+    data = deflated(packed)
+    hdf5(path, shape, chunk, dtype, zlib.compress(data) if filters == 2 else data, filters)
+    said, megabytes, seconds = watched(*HDF5, path)
+    assert said.startswith("SceneError: ")
+    assert complaint in said
+    assert (megabytes < 50, seconds < 2) == (True, True), (megabytes, seconds)
+
+
+@pytest.mark.parametrize("packing", [{"scaleoffset": 0}, {"compression": "szip"}])
+def test_a_filter_that_allocates_what_the_file_says_is_refused(tmp_path, packing):
+    path = tmp_path / "scene.h5"
+    with h5py.File(path, "w") as file:
+        try:
+            file.create_dataset("light_field", data=np.zeros((2, 2, 8, 8, 3), "i4"), **packing)
+        except ValueError:
+            pytest.skip("this HDF5 packs no szip")
+    said, _, _ = watched(*HDF5, path)
+    assert "packed in another way than by gzip or lzf, once; copy it again" in said.replace(")", "")
+
+
+def test_samples_that_are_no_light_are_counted_in_little_memory(tmp_path):
+    with h5py.File(tmp_path / "scene.h5", "w") as file:
+        file["light_field"] = np.full((2, 2, 1000, 1300, 3), 7, np.float32)
+    said, megabytes, _ = watched(*HDF5, tmp_path / "scene.h5")
+    assert "15600000 samples are not in [0, 1], the first 7 at view (0, 0), y 0, x 0" in said
+    assert megabytes < 250
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("[" + "1, " * 1_300_000 + "1]", "larger than 1 MB: not settings"),
+        ("[" * 900_000, "nest"),
+        ("a: 1" + ":1" * 400_000, "a number of 800001 characters"),
+    ],
+    ids=["flat", "deep", "a number"],
+)
+def test_settings_that_are_no_settings_are_refused_at_once(tmp_path, text, complaint):
+    path = tmp_path / "plan.yaml"
+    path.write_text(text)
+    said, megabytes, seconds = watched(*SETTINGS, path)
+    assert complaint in said
+    assert (megabytes < 60, seconds < 2) == (True, True), (megabytes, seconds)
+
+
+@pytest.mark.slow
+def test_the_largest_file_of_settings_takes_moderate_memory(tmp_path):
+    path = tmp_path / "mask.yaml"
+    path.write_text("[" + "1," * 499_000 + "1]")
+    said, megabytes, _ = watched(*SETTINGS, path)
+    assert (said, megabytes < 300) == ("", True), megabytes
+
+
+def tiff(rows, columns):
+    """A TIFF of zeros, float32 RGB, in one strip."""
+    strip = deflated(12 * rows * columns)
+    tags = [
+        (256, 4, columns), (257, 4, rows), (258, 3, 32), (259, 3, 8), (262, 3, 2), (273, 4, 200),
+        (277, 3, 3), (278, 4, rows), (279, 4, len(strip)), (339, 3, 3),
+    ]  # fmt: skip
+    entries = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags)
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4)
+    return head.ljust(200, b"\0") + strip
+
+
+def mat(shape):
+    """A MAT file of zeros, uint16."""
+    size = 2 * int(np.prod(shape))
+    dims = struct.pack("<II5i4x", 5, 20, *shape)
+    body = struct.pack("<IIII", 6, 8, 11, 0) + dims + struct.pack("<HH4s", 1, 2, b"LF")
+    inner = struct.pack("<II", 14, len(body) + 8 + size) + body + struct.pack("<II", 4, size)
+    packed = deflated(size, inner)
+    head = b"MATLAB 5.0".ljust(124) + struct.pack("<H2s", 0x0100, b"IM")
+    return head + struct.pack("<II", 15, len(packed)) + packed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("views/view_0_0.tif", lambda: tiff(8000, 8000)),
+        ("light_field.mat", lambda: mat((3, 3, 4000, 4000, 3))),
+    ],
+)
+def test_decoders_without_a_limit_get_one(tmp_path, name, make):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(make())
+    asked = path.parent if name.startswith("views/") else path
+    said, megabytes, _ = watched(*SCENE, asked)
+    assert said.startswith(("AppError: ", "SceneError: "))
+    assert "it unpacks to more than a file of its size can hold" in said
+    assert megabytes < 850, megabytes
+
+
+@pytest.mark.slow
+def test_a_zarr_group_without_its_shards_is_not_read_whole(tmp_path):
+    zarr = pytest.importorskip("zarr", reason="needs the extra `zarr`")
+    group = zarr.create_group(tmp_path / "scene.zarr", zarr_format=3)
+    group.create_array("light_field", shape=(3, 3, 2000, 3000, 3), dtype="f4")
+    said, megabytes, _ = watched(*SCENE, tmp_path / "scene.zarr")
+    assert said.startswith("SceneError: ")
+    assert "does not fit into its files" in said
+    assert megabytes < 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_a_view_whose_name_holds_another_number_is_named_at_once(tmp_path, ending):
+    for name in ("view_0_0", "view_0_1", "view_99999_99999"):
+        (tmp_path / f"{name}.{ending}").write_bytes(png(2, 2, 8, 2, 0, bytes(14)))
+    said, megabytes, seconds = watched(*SCENE, tmp_path)
+    assert (
+        f"3 views do not fill 100000x100000, as view_99999_99999.{ending} asks for; names are "
+        "view_ROW_COL, rows and columns counted from 0: rename it or move it away"
+    ) in said
+    assert (megabytes < 300, seconds < 10) == (True, True), (megabytes, seconds)
+
+
+@pytest.mark.slow
+def test_a_folder_of_hci_that_claims_many_views_is_refused_at_once(tmp_path):
+    (tmp_path / "input_Cam000.png").write_bytes(png(2, 2, 8, 2, 0, bytes(14)))
+    (tmp_path / "parameters.cfg").write_text("[extrinsics]\nnum_cams_x=99999\nnum_cams_y=999\n")
+    said, megabytes, _ = watched(*SCENE, tmp_path)
+    assert "1 files input_Cam###.png, but parameters.cfg says 999x99999" in said
+    assert megabytes < 300
+
+
+# Specifications of devices
+
+CHARACTERS = "[]{}:,=*&!|>%@`'\"\\\n\t\0\ud800é#?-~1.e "
+SPECS = (
+    "zaber:/dev/x,microstep_um=0.5", "grbl:/dev/x,tolerance_um=5", "apt:/dev/x,actuator=Z825B",
+    "mm:x.cfg,homes=no", "stage.yaml", "x:1,a=b",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@given(
+    st.sampled_from(SPECS),
+    st.lists(
+        st.tuples(st.integers(0, 40), st.integers(0, 3), st.text(CHARACTERS, max_size=3)),
+        max_size=4,
+    ),
+)
+@settings(max_examples=300 * FUZZ, deadline=None)
+@example("zaber:/dev/x,microstep_um=", [(26, 0, "[1")])
+@example("zaber:/dev/x,microstep_um=", [(26, 0, "\x00")])
+@example("zaber:/dev/x,microstep_um=", [(26, 0, "&a [*a]")])
+def test_whatever_a_device_is_called_it_is_understood_or_refused_in_one_line(spec, changes):
+    for place, cut, put in changes:
+        spec = spec[:place] + put + spec[place + cut :]
+    for read in (
+        parse_stage,
+        parse_camera,
+        lambda entry: rig_description(entry, ImagedRig(scene="near-planar")),
+    ):
+        said = ""
+        try:
+            read(spec)
+        except AppError as fault:
+            said = str(fault)
+        assert "\n" not in said
+
+
+# Psi and RAW files
+
+
+def flipped_camera(path):
+    """Flip bytes of the camera's text in a saved Psi, so that it is no UTF-8."""
+    data = path.read_bytes()
+    place = data.index(b'"title"')
+    path.write_bytes(data[:place] + b"\xff\xfe" + data[place + 2 :])
+
+
+def test_a_psi_whose_camera_is_no_text_any_more_is_damaged(tmp_path):
+    psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), (16, 16))
+    path = tmp_path / "psi.h5"
+    psi.save(path)
+    flipped_camera(path)
+    for read in (lambda: ImagingMatrix.load(path), StoredPsi(path).verify, StoredPsi(path).load):
+        with pytest.raises(SensingError, match=r"psi\.h5: damaged \(its checksum differs\)"):
+            read()
+
+
+def test_a_psi_in_shards_whose_camera_is_no_text_any_more_is_damaged(tmp_path):
+    pytest.importorskip("zarr", reason="needs the extra `zarr`")
+    psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), (16, 16))
+    save_shards(psi, tmp_path / "psi.zarr")
+    about = tmp_path / "psi.zarr/zarr.json"
+    about.write_text(about.read_text().replace('\\"title', "\\ud800title", 1))
+    with pytest.raises(SensingError, match=r"damaged \(its checksum differs\)"):
+        StoredPsi(tmp_path / "psi.zarr").verify()
+
+
+@pytest.mark.parametrize("change", [{"binning": 0}, {"weights": (2, 3)}])
+def test_a_psi_of_another_shape_is_refused_when_it_is_opened(tmp_path, change):
+    path = tmp_path / "psi.h5"
+    build_imaging_matrix(find_camera("rgbw-bayer-1shot"), (16, 16)).save(path)
+    with h5py.File(path, "a") as file:
+        if "binning" in change:
+            file.attrs["binning"] = 0
+        else:
+            del file["weights"]
+            file["weights"] = np.zeros(change["weights"])
+    for read in (ImagingMatrix.load, StoredPsi):
+        with pytest.raises(SensingError) as fault:
+            read(path)
+        assert "\n" not in str(fault.value)
+
+
+class _Rawpy:
+    """A decoder that fails in a way of its own."""
+
+    def __init__(self, fault):
+        self.fault = fault
+
+    def imread(self, stream):
+        raise self.fault
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [RuntimeError("RAW image is not flat"), OSError("x\ny"), KeyError(b"cfa"), RecursionError()],
+)
+def test_whatever_libraw_raises_is_a_frame_that_cannot_be_decoded(monkeypatch, fault):
+    monkeypatch.setattr("emmc_rig.drivers.raw.rawpy", _Rawpy(fault))
+    with pytest.raises(RawFrameError, match="LibRaw cannot decode it") as refused:
+        decode_raw(b"FUJIFILMCCD-RAW " + bytes(200))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_dng_of_colour_pixels_is_refused_as_such():
+    file = io.BytesIO()
+    tags = [(50706, "B", 4, (1, 4, 0, 0), True), (50708, "s", 0, "test", True)]
+    tifffile.imwrite(
+        file, np.full((64, 80, 3), 900, np.uint16), photometric=34892, extratags=tags, metadata=None
+    )
+    with pytest.raises(RawFrameError, match="it holds colour pixels, not one mosaic"):
+        decode_raw(file.getvalue())
+
+
+def test_a_raw_file_that_claims_more_than_its_bytes_hold_is_not_unpacked(tmp_path):
+    data = bytearray(encode_dng(np.zeros((64, 80), np.uint16), "rggb", 0, 4095, 0.01))
+    with tifffile.TiffFile(stream := io.BytesIO(data), mode="r+") as tiff:
+        tags = tiff.pages.first.tags
+        tags[259].overwrite(34892)  # lossy, of which nothing says how short it may be
+        tags[256].overwrite(20_000)
+        tags[257].overwrite(20_000)
+    (tmp_path / "x.dng").write_bytes(stream.getvalue())
+    said, megabytes, _ = watched(
+        "from emmc_rig.drivers.raw import decode_raw",
+        "decode_raw(path.read_bytes())",
+        tmp_path / "x.dng",
+    )
+    assert "cannot hold 20000x20000 pixels" in said
+    assert megabytes < 100
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+def test_arrays_come_from_the_child_whether_or_not_python_buffers_its_output(
+    tmp_path, monkeypatch, buffered
+):
+    """PYTHONUNBUFFERED, set on many machines, makes another kind of file of the child's output."""
+    if buffered:
+        monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    else:
+        monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    np.savez(tmp_path / "a.npz", frames=np.arange(12).reshape(3, 4))
+    found, _ = read_in_child("npz", [tmp_path / "a.npz"])
+    np.testing.assert_array_equal(found, np.arange(12).reshape(3, 4))

@@ -1,0 +1,99 @@
+"""Every page has one head: the verdict, then what to do next."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emmc_rig.formats.format import Export
+from emmc_rig.reconstruction.verdict.rules import LEVELS
+from emmc_rig.report.page import light_field_head, typed
+from emmc_rig.report.viewer import render_viewer
+from emmc_rig.study.chart.charting import chart_page
+from emmc_rig.study.stability.stability_run import stability_page
+from emmc_rig.study.tables.tables_page import tables_page
+
+NOT_ASKED: Any = None
+"""The study, where nothing was measured."""
+
+
+def head_of(page):
+    """Return the words of the first thing in the page's main part."""
+    main = page[page.index("<main>") :].removeprefix("<main>").lstrip()
+    assert main.startswith("<aside class="), main[:80]
+    assert 'aria-label="Verdict"' in main[:80]
+    return main[: main.index("</aside>")]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        lambda: tables_page([], {}, [], {}),
+        lambda: chart_page(NOT_ASKED, [], {}, {}),
+        lambda: stability_page([], [], []),
+    ],
+    ids=["tables", "chart", "stability"],
+)
+def test_a_page_with_nothing_measured_still_says_what_to_do_next(page):
+    head = head_of(page())
+    assert "What to do next" in head
+    assert "<code>emmc-rig " in head
+
+
+def test_a_viewer_of_a_scene_has_the_head_too(light_field):
+    head = head_of(render_viewer(Export("a", "", light_field, source="my views")))
+    assert "No verdict" in head
+    assert "<code>emmc-rig figure &#39;my views&#39;</code>" in head
+
+
+def test_a_result_in_memory_is_offered_no_command_without_a_path():
+    head = light_field_head({"verdict": {"level": "trust", "reasons": []}})
+    assert head.next
+    assert not any("emmc-rig" in line for line in head.next)
+
+
+@pytest.mark.parametrize(("found_db", "tone"), [(20.0, "watch"), (22.0, "good")])
+def test_a_trusted_result_below_the_baseline_is_not_shown_as_good(found_db, tone):
+    verdict = {"level": "trust", "reasons": []}
+    head = light_field_head({"verdict": verdict, "psnr_db": found_db, "replicate_psnr_db": 21.5})
+    assert head.tone == tone
+    below = "1.5 dB worse than the baseline (centre view in all places)" in head.why
+    assert below == (tone == "watch") == ("trust" not in head.level)
+    assert "the frames, Psi and the noise agree" in head.why
+
+
+def test_every_level_of_a_verdict_is_a_sentence_of_a_head():
+    for level in LEVELS:
+        head = light_field_head({"verdict": {"level": level, "reasons": []}})
+        assert level in head.level.lower()
+        assert (head.tone == "good") == (level == "trust")
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ({}, "agree with it"),
+        ({"stated_db": None, "stated_interval_db": None}, "agree with it"),
+        ({"stated_db": 31.24}, "agree with it; estimated accuracy 31.2 dB"),
+        (
+            {"stated_db": 31.24, "stated_interval_db": [29.81, 33.02]},
+            "agree with it; estimated accuracy 31.2 dB (29.8 to 33.0 in 9 of 10 captures)",
+        ),
+    ],
+    ids=["none by an earlier version", "no method's", "no interval", "interval"],
+)
+def test_the_head_says_the_stated_psnr_with_its_interval(stated, words):
+    head = light_field_head({"verdict": {"level": "trust", "reasons": []}, **stated})
+    assert head.why == f"the frames, Psi and the noise {words}"
+
+
+def test_a_path_is_typed_short_below_this_folder_and_quoted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert typed(tmp_path / "one/two") == "one/two"
+    assert typed("my own") == "'my own'"
+    assert typed(tmp_path.parent) == str(tmp_path.parent)
+
+
+@pytest.fixture(scope="module")
+def light_field():
+    return np.random.default_rng(0).random((3, 3, 24, 32, 3), dtype=np.float32)
