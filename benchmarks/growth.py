@@ -14,8 +14,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 from emmc_rig.reconstruction.methods import MethodSettings
-from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point
-from emmc_rig.study.chart.measure import measured
+from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point, measured
 from emmc_rig.study.trial import Capture
 
 METHODS = {

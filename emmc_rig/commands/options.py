@@ -41,6 +41,16 @@ ExportSizeOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="of the random scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
+FastOption = Annotated[
+    bool,
+    typer.Option("--fast", help="small crops, few points: minutes instead of hours or days"),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", min=1, help="processes that share the work", rich_help_panel=PARALLEL
+    ),
+]
 ClusterOption = Annotated[
     str | None,
     typer.Option(

@@ -19,14 +19,15 @@ from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
 from emmc_rig.reconstruction.sparse import SparseSettings
 from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.store.jobs import digest_of
-from emmc_rig.study.tables import paper, tables_page, tables_study
+from emmc_rig.study.tables import paper, tables_study
 from emmc_rig.study.tables.cells import PARTS, Cell, Setup, cells_of, chosen_parts, scenes_of
-from emmc_rig.study.tables.tables_page import COLUMNS, run_tables
 from emmc_rig.study.tables.tables_study import (
+    CSV,
     FAST,
     TablesSettings,
     TablesStudy,
     check_dictionary,
+    grid_of,
     middle,
     scene_specs,
 )
@@ -169,12 +170,17 @@ def small_dictionary():
         yield few
 
 
+def carried_out(scenes, folder, parts=PARTS):
+    study = TablesStudy(QUICK, folder, parts, scene_specs(scenes))
+    study.carry_out(Watcher())
+    return study
+
+
 @pytest.fixture(scope="module")
 def whole(scenes, tmp_path_factory):
     """All tables and figures of two tiny scenes."""
     folder = tmp_path_factory.mktemp("whole") / "out"
-    outcome = run_tables(scenes, folder, None, QUICK, Watcher())
-    return folder, outcome
+    return folder, carried_out(scenes, folder)
 
 
 @pytest.fixture
@@ -189,7 +195,7 @@ def test_every_cell_is_one_row_of_the_csv(whole):
         rows = list(csv.DictReader(file))
     cells = {cell for part in PARTS for cell in cells_of(part, list(NAMES))}
     assert len(rows) == len(cells) == 18 + 21 + 36
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == TablesStudy.columns[CSV]
     printed = [row for row in rows if row["paper_psnr_db"]]
     assert {row["scene"] for row in printed} == {"dragons"}
     row = next(r for r in printed if (r["scenario"], r["method"]) == ("i", "tv-dict"))
@@ -203,9 +209,8 @@ def test_every_cell_is_one_row_of_the_csv(whole):
 
 
 def test_the_page_is_whole_and_asks_for_nothing(whole):
-    folder, outcome = whole
-    assert outcome.page == folder / "tables.html"
-    text = outcome.page.read_text()
+    folder, _ = whole
+    text = (folder / "tables.html").read_text()
     assert "{{" not in text
     assert not Page(text).foreign
     for part in PARTS:
@@ -235,7 +240,7 @@ def test_grids_hold_means_and_the_papers_numbers(whole):
 def test_a_mean_is_over_the_scenes_that_were_measured():
     cells = {Cell(scene, Setup("i", 3), "tv"): {"psnr_db": db} for scene, db in
              (("attic", 20.0), ("cave", 23.0), ("den", None))}  # fmt: skip
-    grid = tables_page.grid_of(TABLE_3, cells, ["attic", "cave", "den", "shed"])
+    grid = grid_of(TABLE_3, cells, ["attic", "cave", "den", "shed"])
     rows = {name: first for name, first, *_ in grid.rows}
     assert (rows["mean, TV alone"], rows["shed, TV alone"]) == ("21.50", "–")
     assert rows["mean, Dict-ADMM"].startswith("–")
@@ -247,7 +252,7 @@ def test_a_second_run_does_nothing_again_and_leaves_foreign_files(whole, scenes,
     before = (folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes()
     for name in ("estimate_patches", "scored", "trial_of"):
         monkeypatch.setattr(tables_study, name, None)
-    again = run_tables(scenes, folder, None, QUICK, Watcher())
+    again = carried_out(scenes, folder)
     assert again.grids == outcome.grids
     assert before == ((folder / "tables.csv").read_bytes(), (folder / "cells.jsonl").read_bytes())
     assert (folder / "mine.txt").read_text() == "keep"
@@ -261,7 +266,8 @@ def a_study(scenes, out, settings=QUICK):
 
 def test_sharing_the_coded_patches_changes_no_result(scenes, tmp_path):
     study = a_study(scenes, tmp_path / "out")
-    results = study.measure(Watcher())
+    study.carry_out(Watcher())
+    results = study.results
     for method in ("dict-admm", "tv-dict"):
         cell = Cell("dragons", Setup("ii", 1, noisy=True), method)
         made, dictionary = study.trial(cell), study.dictionary(1)
@@ -336,7 +342,7 @@ def test_a_scene_too_small_or_of_other_views_is_reported_before_anything_is_meas
     ):
         save_hdf5(tmp_path / name / f"{name}.h5", views, {})
         with pytest.raises(Exception, match=why):
-            a_study(tmp_path / name, tmp_path / "out").measure(Watcher())
+            a_study(tmp_path / name, tmp_path / "out").planned()
 
 
 def test_the_middle_is_cut_to_whole_pixels():
@@ -367,6 +373,6 @@ def test_a_stop_or_a_full_disk_while_writing_is_one_line(
     def failing(*_):
         raise fault
 
-    monkeypatch.setattr(tables_page, "grid_of", failing)
+    monkeypatch.setattr(tables_study, "grid_of", failing)
     stopped, _, err = run("--scenes", scenes, "--only", "table2", "--fast")
     assert (stopped, reported in one_line(err)) == (code, True)

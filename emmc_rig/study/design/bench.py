@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import yaml
 from pydantic import Field, model_validator
 
 from emmc_rig.errors import AppError
@@ -120,8 +119,3 @@ def load_bench(path: Path | None) -> DesignBench:
     if path is None:
         return DesignBench()
     return validated(DesignBench, read_yaml(path, AppError), str(path), AppError)
-
-
-def bench_text(bench: DesignBench) -> str:
-    """Return a bench as YAML."""
-    return yaml.safe_dump(bench.model_dump(mode="json"), sort_keys=False, default_flow_style=None)
