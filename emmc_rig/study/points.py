@@ -132,13 +132,14 @@ class Study(Generic[P]):
 
     results: by point, plain data; one with `failed` says why there are no figures, and is measured
     again the next time if its `keep` is False. left_out: points that cannot be measured, and why.
-    seconds: of the last run.
+    started: time of the study's making, perf_counter. seconds: from then until the page is written.
     """
 
     settings: Any
     folder: Path
     results: dict[P, dict] = field(default_factory=dict, init=False)
     left_out: dict[P, str] = field(default_factory=dict, init=False)
+    started: float = field(default_factory=time.perf_counter, init=False)
     seconds: float = field(default=0.0, init=False)
 
     command: ClassVar[str] = "study"
@@ -237,14 +238,13 @@ class Study(Generic[P]):
         Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
         and the errors of the layers below; measured points are kept in each case.
         """
-        started = time.perf_counter()
         points = self.planned()
         with study_folder(self.folder, self.journal, self.command) as self.folder:
             shared = workers is not None or cluster is not None
             with opened_pool(workers or 1, cluster) if shared else nullcontext() as pool:
                 self.run(points, watcher, pool)
             watcher.begin("draw", None)
-            self.seconds = time.perf_counter() - started
+            self.seconds = time.perf_counter() - self.started
             with result_folder(self.folder, self.command, adds=True) as new:
                 self.write(new)
 

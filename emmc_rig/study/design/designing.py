@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -272,7 +273,7 @@ def run_design(
 
     Raises AppError for a folder that holds something else, and errors of scenes for wrong input.
     """
-    scenes = tuple(scenes) or SCENES
+    started, scenes = time.perf_counter(), tuple(scenes) or SCENES
     check_scene_names(scenes)
     with study_folder(out, DesignStudy.journal, DesignStudy.command):
         found = search(bench, watcher)
@@ -289,6 +290,7 @@ def run_design(
         theory_db[name] = expected(camera, psi, bench.disparities_px).psnr_db
         watcher.step(name)
     study = DesignStudy(bench, out, found, cameras, theory_db, scenes, size or SIZE_PX, seed)
+    study.started = started
     study.carry_out(watcher)
     return study
 
