@@ -1,7 +1,7 @@
 """The engine of every study: points are measured one by one, kept, and drawn on a page.
 
-A study is a subclass of `Study`: its points, what each is measured by, the columns of its CSV files
-and the sections of its page. A point is identified by a digest of everything that it depends on, so
+A study is a subclass of `Study`, with points, their measurement, columns of CSV files and sections
+of a page. A point is identified by a digest of everything that it depends on, so
 that changed settings never reuse old results. The journal has one JSON line for each point; a line
 torn by a crash is ignored, and a stopped study resumes.
 """

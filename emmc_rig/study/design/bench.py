@@ -33,7 +33,7 @@ class Maker(Settings):
 
 
 class DesignBench(Settings):
-    """The bench: what is mounted, what can be, and what is to be seen.
+    """The bench: parts that are mounted, masks that fit, and the scene to see.
 
     cells_um: sides to try (default: from the smallest printable to three times that).
     size: of the pictures, samples; the mask file covers them at every shot.

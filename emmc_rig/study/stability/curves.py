@@ -1,4 +1,4 @@
-"""Measured points as curves, one per fault and method; where each of them breaks, and drawings.
+"""Measured points as curves, one per fault and method; their breaking points and drawings.
 
 A place on a sweep is an index into its strengths, with a fraction between two of them.
 """
@@ -128,7 +128,7 @@ def curves(results: Mapping[Point, dict]) -> list[Curve]:
 def _curve(
     name: str, scenes: Sequence[str], fault: str, method: str, results: Mapping[Point, dict]
 ) -> Curve | None:
-    """Return one curve; of several scenes those that have every strength that any has."""
+    """Return one curve, averaged over the scenes with the most strengths measured."""
     by_scene = {
         scene: {
             point.strength: point
