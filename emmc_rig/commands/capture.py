@@ -151,11 +151,11 @@ def _run(
     other_devices: bool,
 ) -> None:
     from emmc_rig.captures.control import Control, pressed_keys
-    from emmc_rig.captures.estimate import Estimate
     from emmc_rig.captures.events import Listener
     from emmc_rig.captures.run import FrontEnd, asked_folder, capture_session
+    from emmc_rig.captures.schedule import Estimate
     from emmc_rig.commands.capture_display import CaptureDisplay
-    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+    from emmc_rig.session.brightness import exposure_reasons, shot_exposures
     from emmc_rig.session.journal import ended
     from emmc_rig.session.session import REPORT
     from emmc_rig.store.results import shown_bytes, shown_seconds

@@ -18,9 +18,9 @@ import yaml
 from programs import done, one_line, program, refused, wait_until
 
 from emmc_rig.drivers.raw import decode_raw
-from emmc_rig.session.listing import sessions_in
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
+from emmc_rig.session.verify import sessions_in
 
 RIG = ["--rig", "simulated", "--scene", "near-planar", "--size", "24x32"]
 PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
