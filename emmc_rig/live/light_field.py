@@ -45,8 +45,7 @@ from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.report.display import PART_PIXELS
 from emmc_rig.report.viewer import viewer_data
 from emmc_rig.session.brightness import is_dark
-from emmc_rig.session.measured_psi import session_scale
-from emmc_rig.session.scales import open_scale
+from emmc_rig.session.measured_psi import open_scale, session_scale
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import is_session
 
