@@ -17,7 +17,7 @@ from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.process.cost import task_bytes
-from emmc_rig.reconstruction.settings import BlockSettings
+from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.tiles import Grid
 from emmc_rig.store.pool import Ceiling, Processes, WorkersError
 
