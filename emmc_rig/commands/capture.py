@@ -16,9 +16,7 @@ from rich.console import Console
 
 from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
 from emmc_rig.commands.options import (
-    SIMULATED as SIMULATED_PANEL,
-)
-from emmc_rig.commands.options import (
+    SIMULATED_PANEL,
     HostOption,
     RigOption,
     RigSceneOption,
@@ -36,13 +34,11 @@ if TYPE_CHECKING:
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.session.session import Session
 
-OptionalPath = Path | None
-
 
 def capture(
     context: typer.Context,
     plan: Annotated[
-        OptionalPath, typer.Argument(help="a plan (YAML), or a session to go on with")
+        Path | None, typer.Argument(help="a plan (YAML), or a session to go on with")
     ] = None,
     new: Annotated[
         str | None, typer.Option("--new", help="write a commented plan for this camera, and exit")
@@ -101,7 +97,7 @@ def capture(
         ),
     ] = False,
     host: HostOption = "127.0.0.1",
-    out: Annotated[OptionalPath, out_option("PLAN-session")] = None,
+    out: Annotated[Path | None, out_option("PLAN-session")] = None,
 ) -> None:
     """Capture a plan's frames on a rig.
 
