@@ -6,7 +6,6 @@ import pytest
 from mask_frames import BLACK, CAMERAS, SIZE, WHITE, bench_frame, frame_of
 
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.locator import edge_direction
 from emmc_rig.calibration.repeats import Repeats, repeats_of
 from emmc_rig.captures import focus
 from emmc_rig.captures.focus import REMEMBERED_S, FocusMeter, sharpness
@@ -97,7 +96,7 @@ def test_cameras_without_one_mask_that_throws_a_shadow_say_so(name):
 
 
 @pytest.mark.slow
-def test_a_mask_turned_by_five_degrees_is_found_by_its_edges():
+def test_a_mask_turned_by_five_degrees_is_measured():
     camera = CAMERAS["rgbw-mono"]
     frame = bench_frame(camera, rotation_deg=-5.0)
     place = MaskGauge(camera, frame.mosaic.shape).measure(frame)
@@ -127,12 +126,6 @@ def test_nothing_is_said_of_the_mask_in_a_dark_picture_or_through_other_filters(
         gauge.measure(frame_of(np.full(SIZE, 2000), "bggr"))
     with pytest.raises(CalibrationError, match="72x96"):
         gauge.measure(frame_of(np.full((8, 8), 2000)))
-
-
-def test_edges_in_all_directions_have_no_straightness():
-    noise = np.random.default_rng(0).normal(size=(300, 400)).astype(np.float32)
-    assert edge_direction(noise)[1] < 0.1
-    assert edge_direction(np.ones((20, 20), np.float32)) == (0.0, 0.0)
 
 
 def noisy(blur, seed, level=1500.0, sigma=40.0, shape=(120, 160)):

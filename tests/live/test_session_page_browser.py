@@ -114,7 +114,7 @@ class Asking(SessionPage):
     def ask(self, what):
         asks = {"asked": what}
         self.event(Event("pause", {"reason": what}, asks))
-        self.wishes.put(self.state()["asked"])
+        self.wishes.put(self.state.snapshot()["asked"])
         self.control.until_answered()
         self.event(Event("resume", {"seconds": 0.0}, asks))
 
