@@ -9,6 +9,7 @@ import typer
 
 from emmc_rig.commands.options import (
     DictionaryOption,
+    FastOption,
     MethodsOption,
     OutOption,
     ScenesOption,
@@ -24,9 +25,7 @@ def chart(
         list[str] | None,
         typer.Option("--camera", help="a shipped camera or a YAML file; may repeat"),
     ] = None,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="small crops, few points: minutes instead of hours")
-    ] = False,
+    fast: FastOption = False,
     method: MethodsOption = None,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import DictionaryOption, OutOption, SeedOption
+from emmc_rig.commands.options import DictionaryOption, FastOption, OutOption, SeedOption
 from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 
 
@@ -19,9 +19,7 @@ def tables(
     only: Annotated[
         str | None, typer.Option("--only", help="some of table2, table3, table4; commas between")
     ] = None,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="small crops: minutes instead of days")
-    ] = False,
+    fast: FastOption = False,
     dictionary: DictionaryOption = None,
     seed: SeedOption = 0,
     out: OutOption = Path("emmc-tables"),

@@ -12,12 +12,16 @@ from emmc_rig.captures.focus import REMEMBERED_S, FocusMeter, sharpness
 from emmc_rig.live.alignment import MaskGauge
 from emmc_rig.model.camera import Camera
 
-WITH_SHADOW = sorted(
+KINDS = (
+    "moving-colour-mask", "rgbw-bayer-1shot", "rgbw-mono", "scenario-i-rgb", "sensor-side-binary",
+)  # fmt: skip
+"""Cameras whose masks differ in what the shadow looks like: coloured or not, through filters or
+without, near the sensor or far. The other shipped cameras have one of these masks' kinds."""
+WITHOUT_SHADOW = sorted(
     name
     for name, camera in CAMERAS.items()
-    if [mask.distance_mm < camera.lens.distance_mm for mask in camera.masks.values()] == [True]
+    if [mask.distance_mm < camera.lens.distance_mm for mask in camera.masks.values()] != [True]
 )
-WITHOUT_SHADOW = sorted(CAMERAS.keys() - set(WITH_SHADOW))
 
 
 def with_pattern(**pattern):
@@ -29,8 +33,8 @@ def with_pattern(**pattern):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", WITH_SHADOW)
-def test_the_mask_of_every_shipped_camera_is_measured_to_a_tenth_of_a_degree_and_per_cent(name):
+@pytest.mark.parametrize("name", KINDS)
+def test_a_mask_of_every_kind_is_measured_to_a_tenth_of_a_degree_and_per_cent(name):
     camera = CAMERAS[name]
     truth = {"offset_um": (11.0, -7.0), "rotation_deg": 0.7, "stretch": 0.9965}
     frame = bench_frame(camera, **truth)
@@ -69,7 +73,7 @@ def test_how_a_mask_repeats_follows_from_its_cells(cells, expected):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offset_um", [(11.0, -7.0), (60.0, -110.0), (170.0, 20.0)])
+@pytest.mark.parametrize("offset_um", [(60.0, -110.0), (170.0, 20.0)])
 def test_a_mask_that_repeats_is_placed_but_for_its_repeats(offset_um):
     camera = with_pattern(kind="tile", cells=RANDOM[:8, :8].tolist())
     place = MaskGauge(camera, SIZE).measure(bench_frame(camera, offset_um=offset_um))

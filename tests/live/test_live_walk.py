@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,13 +14,13 @@ import numpy as np
 import pytest
 import yaml
 from browsers import MARKS, complaints, drawn, on_screen, wait
+from programs import PROGRAM
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.webdriver.common.by import By
 
 pytestmark = MARKS
 PATIENCE_S = 60
-PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
 WIDTHS = {"desktop": 1600, "phone": 390}
 
 

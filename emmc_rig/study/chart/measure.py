@@ -16,7 +16,7 @@ from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import ModelError
-from emmc_rig.process.memory import forget_peak, peak_memory_mib
+from emmc_rig.process.cost import forget_peak, peak_memory_mib
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.study.chart.chart_points import ChartSettings, Point
 from emmc_rig.study.points import Results, Study

@@ -17,9 +17,9 @@ from matplotlib.lines import Line2D
 
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.model.files import write_text
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.dictionary import open_dictionary
 from emmc_rig.reconstruction.methods import METHODS
 from emmc_rig.report.drawing import (
     FAINT,
