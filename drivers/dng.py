@@ -157,7 +157,7 @@ def _file_tags(
 
 
 def _colour_tags(cfa: str) -> list[Tag]:
-    """Return the tags of the Bayer phase, or of the one that stands in for another tile."""
+    """Return the tags of a Bayer phase; `STAND_IN_PHASE` for a tile that is not Bayer."""
     pattern = BAYER_PATTERNS.get(cfa, BAYER_PATTERNS[STAND_IN_PHASE])
     return [
         (33421, SHORT, 2, (2, 2), True),

@@ -146,7 +146,7 @@ _MESSAGES: tuple[tuple[re.Pattern, Callable[[re.Match], Message | None]], ...] =
     (re.compile(r"\[([A-Za-z0-9]+):(.*)\]"), lambda found: Feedback(found[1], found[2])),
     (re.compile(r"|(?:>|\$N).*"), lambda found: None),
 )
-"""Every message but the status: pattern of its line, and how it is read.
+"""Patterns of the lines of all messages but the status, each with its reader.
 
 The last is an empty line, or a startup line that Grbl lists or ran at boot.
 """

@@ -1,4 +1,4 @@
-"""An axis of unknown or contradicted scale never moves; any other goes to its target."""
+"""An axis never moves while its scale is unknown or contradicted."""
 
 from dataclasses import replace
 
