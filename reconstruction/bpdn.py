@@ -211,12 +211,15 @@ class _Solver(ABC):
         self.begin()
 
     @abstractmethod
-    def begin(self) -> None: ...
+    def begin(self) -> None:
+        """Set the state of the iteration, and `done` where no step is needed."""
 
     @abstractmethod
-    def step(self) -> None: ...
+    def step(self) -> None:
+        """Advance the state and `steps`; set `done` where further steps are needless."""
 
     def result(self) -> Code:
+        """Return the code reached."""
         return Code(self.beta, self.steps, True)
 
 

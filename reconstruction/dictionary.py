@@ -294,6 +294,7 @@ class _PlaneSamples(NamedTuple):
 def _plane_samples(
     views: tuple[int, int], patch: tuple[int, int], disparity: float
 ) -> _PlaneSamples:
+    """Return y - d (v - V // 2), x - d (u - U // 2), y and x from the patch's middle."""
     v, u, y, x = np.meshgrid(
         np.arange(views[0]) - views[0] // 2,
         np.arange(views[1]) - views[1] // 2,
