@@ -32,7 +32,7 @@ CHUNK_BYTES = 1 << 20
 BLUR_PX, CHROMA_BLUR_PX = 0.7, 1.0
 """Deviation of edges, lines and spots: as sharp as a pixel allows, and softer in colour."""
 SAME = 0.995
-"""|cosine| of two atoms from which on they are one."""
+"""|cosine| of two atoms above which the second repeats the first."""
 FAINT = 1e-2
 """Root mean square of a texture less its mean, of values about 1, below which it is left out."""
 

@@ -21,6 +21,7 @@ from emmc_rig.reconstruction.differences import norm_squared, planar_variation
 
 Array = NDArray[np.floating]
 SMALLEST_RELATIVE_MU = 2e-5
+"""Of mu for a brightness of 1 and no noise, see `relative_mu`."""
 DARK = 0.1
 """Share of the light that a mask passes, below which settings follow from those of a brighter."""
 BLUR_SAMPLES = 4.0

@@ -402,7 +402,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     what, remedy = _in_words(cause, strength)
     surfaces_fail = e.parameters.get("over_plain", 0.0) > UNLIKE_SURFACES
     if displaced != "trust" and strength > LEAST_STRENGTH:
-        yield Reason(shift, moved, DRIFT, max(displaced, weak, key=LEVELS.index))
+        yield Reason(shift, moved, DRIFT, LEVELS[max(map(LEVELS.index, (displaced, weak)))])
     elif weak != "trust":
         yield Reason(what, strength, remedy, weak)
     elif cause.name == "gamma" and GAMMA.level(cause.surely) != "trust":
@@ -449,7 +449,7 @@ def _causes(e: Evidence) -> dict[str, Cause]:
 
 
 def _likeliest(causes: Mapping[str, Cause]) -> Cause:
-    """Return the cause that alone explains most; NO_CAUSE if it is not sure.
+    """Return the cause that alone explains most; NO_CAUSE if it differs from none by chance.
 
     Contrast, which names no cause, only where it explains clearly more.
     """
