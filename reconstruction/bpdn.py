@@ -103,7 +103,7 @@ EMPTY = Code(np.zeros(0, np.float32), 0.0, True)
 
 @dataclass(frozen=True, eq=False)
 class SensedDictionary:
-    """A sensed dictionary, and what solvers compute from it once for all its patches.
+    """A sensed dictionary, with the norms and inverses that all its patches share.
 
     atoms: (atom, padded measurement) float32, C-contiguous. data: (patch, padded measurement), the
     readings of all patches that will be coded. noise_sigma: standard deviation of a reading.
@@ -193,7 +193,7 @@ def ridge_inverse(atoms: Array32, ridge: float) -> Array32:
 
 
 class _Solver(ABC):
-    """The iteration of one patch: construction begins it, `step` advances it until it is `done`.
+    """The iteration of one patch, from `begin` by `step` to `result`.
 
     steps: passes over all atoms so far. most_steps: their limit. tolerance: norm of the residual
     that noise leaves.
@@ -211,12 +211,15 @@ class _Solver(ABC):
         self.begin()
 
     @abstractmethod
-    def begin(self) -> None: ...
+    def begin(self) -> None:
+        """Set the state of the iteration, and `done` where no step is needed."""
 
     @abstractmethod
-    def step(self) -> None: ...
+    def step(self) -> None:
+        """Advance the state and `steps`; set `done` where further steps are needless."""
 
     def result(self) -> Code:
+        """Return the code reached."""
         return Code(self.beta, self.steps, True)
 
 
@@ -244,7 +247,7 @@ class _Minimiser(_Solver):
         residual = self.data - shrunk
         return float(0.5 * (self.data.astype(np.float64) @ self.data - residual @ residual))
 
-    def close(self, objective: float, dual: float) -> None:
+    def set_gap(self, objective: float, dual: float) -> None:
         """Set the gap between F and a dual value, and whether it is small enough."""
         self.gap = (objective - dual) / objective if objective > 0 else 0.0
         self.done = self.gap <= self.settings.rtol
@@ -262,7 +265,7 @@ def _largest(values: Array, wanted: int) -> NDArray[np.bool_]:
 
 
 class _Admm(_Minimiser):
-    """ADMM on a growing working set S; its inner steps are those of `bpdn_kernels.split`.
+    """ADMM on a growing working set S; `bpdn_kernels.split` shows the mathematics of its steps.
 
     Begin: FIRST_STEPS steps on all atoms from w = 0; S = the 2 m largest |w_j| of m measurements.
     Step:
@@ -302,7 +305,7 @@ class _Admm(_Minimiser):
         self.w[self.working] = w
         self.steps += run.steps * share + 1
         correlation = np.abs(self.atoms @ self.dual_point)
-        self.close(run.objective, self.dual(self.dual_point, float(correlation.max())))
+        self.set_gap(run.objective, self.dual(self.dual_point, float(correlation.max())))
         outside = np.where(self.working, 0, correlation)
         joining = _largest(outside, len(self.data)) & (outside >= self.eta)
         if not joining.any():
@@ -342,7 +345,7 @@ class _Ista(_Minimiser):
         overshot = (ahead - new) @ (new - self.beta) > 0
         self.before, self.beta = self.beta, new
         fitted_before, self.fitted = self.fitted, new @ self.atoms
-        self.close(self.objective(self.fitted), self.best_dual)
+        self.set_gap(self.objective(self.fitted), self.best_dual)
         self.steps += 1
         if self.accelerated:
             t = 1.0 if overshot else self.t
@@ -375,7 +378,7 @@ class _Lars(_Minimiser):
         self.correlation = self.atoms @ self.data
         self.weights, self.signs = np.zeros((2, len(self.atoms)))
         self.chosen: list[int] = []
-        # Dependent atoms add nothing to those chosen, until one of these leaves.
+        # Dependent atoms are combinations of chosen atoms, until a chosen atom leaves.
         self.dependent: list[int] = []
         # Resting atoms left at this level, and must not join before it falls.
         self.resting: list[int] = []
@@ -451,7 +454,7 @@ class _Lars(_Minimiser):
         fitted = self.beta @ self.atoms
         residual = self.data - fitted
         dual = self.dual(residual, float(np.abs(self.atoms @ residual).max()))
-        self.close(self.objective(fitted), dual)
+        self.set_gap(self.objective(fitted), dual)
         limit = LARS_GAP if self.steps < self.most_steps else self.settings.rtol
         return Code(self.beta, self.steps, self.gap <= limit, self.eta, self.gap)
 

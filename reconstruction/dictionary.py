@@ -32,7 +32,7 @@ CHUNK_BYTES = 1 << 20
 BLUR_PX, CHROMA_BLUR_PX = 0.7, 1.0
 """Deviation of edges, lines and spots: as sharp as a pixel allows, and softer in colour."""
 SAME = 0.995
-"""|cosine| of two atoms from which on they are one."""
+"""|cosine| of two atoms above which the second repeats the first."""
 FAINT = 1e-2
 """Root mean square of a texture less its mean, of values about 1, below which it is left out."""
 
@@ -294,6 +294,7 @@ class _PlaneSamples(NamedTuple):
 def _plane_samples(
     views: tuple[int, int], patch: tuple[int, int], disparity: float
 ) -> _PlaneSamples:
+    """Return y - d (v - V // 2), x - d (u - U // 2), y and x from the patch's middle."""
     v, u, y, x = np.meshgrid(
         np.arange(views[0]) - views[0] // 2,
         np.arange(views[1]) - views[1] // 2,

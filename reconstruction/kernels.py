@@ -1,6 +1,6 @@
 """Fused loops of primal-dual DV_K, total variation included, on the axes (v, u, y, colour, x).
 
-The mathematics is that of `tv`, in its names. `_descend` computes q, `pull_row` z, `fit_rows` L'
+`tv` states the mathematics and the symbols. `_descend` computes q, `pull_row` z, `fit_rows` L'
 and the relaxed L, `_dual_rows` the relaxed p. The dual variable p has axes (v, u, y, index, colour,
 x), one index for each derivative of `Stencils`, of the colours after multiplication by a 3 x 3
 metric.

@@ -21,6 +21,7 @@ from emmc_rig.reconstruction.differences import norm_squared, planar_variation
 
 Array = NDArray[np.floating]
 SMALLEST_RELATIVE_MU = 2e-5
+"""Of mu for a brightness of 1 and no noise, see `relative_mu`."""
 DARK = 0.1
 """Share of the light that a mask passes, below which settings follow from those of a brighter."""
 BLUR_SAMPLES = 4.0
@@ -90,11 +91,6 @@ class Problem:
         return self.rho * self.patch_term.weight[::k, ::k].astype(np.float64)
 
 
-def darkness(psi: ImagingMatrix) -> float:
-    """Return how much darker Psi is than the darkest for which settings were fitted; else 1."""
-    return min(1.0, max(psi.light_efficiency(), 1e-12) / DARK)
-
-
 def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float, order: int = 1) -> float:
     """Return mu for frames (of usable pixels), see `relative_mu`.
 
@@ -105,7 +101,7 @@ def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float, order: int 
     brightness = max(float(np.mean(frames)) / max(passed, 1e-12), 1e-12)
     views_v, views_u = psi.light_field_shape[:2]
     spread = np.sqrt(psi.shots) / (views_v * views_u * psi.binning)
-    dark = darkness(psi)
+    dark = min(1.0, max(passed, 1e-12) / DARK)
     return brightness * dark**2 * relative_mu(noise_sigma / dark / brightness, spread, order)
 
 

@@ -211,8 +211,9 @@ class _Coder:
         it, and its estimate is D beta.
         """
         sensing = batch.sensing
-        ends = np.cumsum([len(members) for members in batch.classes])
-        firsts = ends - [len(members) for members in batch.classes]
+        counts = np.array([len(members) for members in batch.classes])
+        ends = np.cumsum(counts)
+        firsts = ends - counts
         shape = len(batch.classes), len(self.atoms), sensing.data.shape[1]
         sensed = np.zeros(shape, dtype=np.float32)
         for shot, chosen in enumerate(batch.set_of_shot):

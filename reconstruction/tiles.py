@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import ceil, lcm
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +95,14 @@ def pixels_of(place: Place, binning: int) -> tuple[slice, slice, slice]:
     return slice(None), rows, columns
 
 
+class Overlap(NamedTuple):
+    """Where a block reaches into a place: in the light field, and the block's weights (y, x)."""
+
+    block: Block
+    place: Place
+    weight: NDArray[np.float32]
+
+
 @dataclass(frozen=True)
 class Grid:
     """The canonical grid of blocks of a light field.
@@ -142,23 +151,23 @@ class Grid:
 
     def block(self, row: int, column: int) -> Block:
         """Return a block by its row and column in the grid."""
+
+        def place(beyond: int) -> Place:
+            rows, columns = (
+                slice(max(edges[at] - beyond, 0), min(edges[at + 1] + beyond, length))
+                for edges, at, length in zip(self.edges, (row, column), self.size, strict=True)
+            )
+            return rows, columns
+
         halo = ceil(self.halo / self.multiple) * self.multiple
-        places: list[list[slice]] = [[], [], []]
         rows, columns = self.shape
         ends = row == 0, row == rows - 1, column == 0, column == columns - 1
-        sides: tuple[Side, ...] = tuple(
-            side for side, here in zip(SIDES, ends, strict=True) if here
-        )
-        for axis, at in enumerate((row, column)):
-            length = self.size[axis]
-            first, last = self.edges[axis][at : at + 2]
-            for place, more in zip(places, (self._blend + halo, self._blend, 0), strict=True):
-                place.append(slice(max(first - more, 0), min(last + more, length)))
-        outer, part, inner = ((rows, columns) for rows, columns in places)
-        return Block(row, column, outer, part, inner, sides)
+        sides: tuple[Side, ...] = tuple(side for side, at in zip(SIDES, ends, strict=True) if at)
+        outer, part = place(self._blend + halo), place(self._blend)
+        return Block(row, column, outer, part, inner=place(0), sides=sides)
 
     def _weight(self, axis: int, at: int, place: slice) -> NDArray[np.float32]:
-        """Return the weights along an axis of the at-th blocks, in a place."""
+        """Return the weights along an axis of the at-th blocks: ramps of 2 blend at their edges."""
         edges, blend = self.edges[axis], self._blend
         centre = np.arange(place.start, place.stop, dtype=np.float32) + np.float32(0.5)
         weight = np.ones_like(centre)
@@ -168,13 +177,10 @@ class Grid:
             weight *= 1 - np.clip((centre - (edges[at + 1] - blend)) / (2 * blend), 0, 1)
         return weight.astype(np.float32)
 
-    def overlapping(
-        self, place: Place, blended: bool = True
-    ) -> Iterator[tuple[Block, Place, NDArray[np.float32]]]:
-        """Yield the blocks whose parts reach into a place, their inner ones unless blended.
+    def overlapping(self, place: Place, blended: bool = True) -> Iterator[Overlap]:
+        """Yield the blocks whose parts reach into a place, in the order of the grid.
 
-        Each with the place they share, in the light field, and its weights there (y, x); in the
-        order of the grid.
+        blended: with the parts' overlaps; else of their inner ones.
         """
         for block in self.blocks:
             reach = block.part if blended else block.inner
@@ -184,7 +190,8 @@ class Grid:
             )
             if rows.start < rows.stop and columns.start < columns.stop:
                 down = self._weight(0, block.row, rows)
-                yield block, (rows, columns), np.outer(down, self._weight(1, block.column, columns))
+                across = self._weight(1, block.column, columns)
+                yield Overlap(block, (rows, columns), np.outer(down, across))
 
 
 Part = Callable[[Block, tuple], Array]

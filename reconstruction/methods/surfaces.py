@@ -61,6 +61,11 @@ def _solve(
     given: Given,
     settings: ShippedSettings,
 ) -> Reconstruction:
+    """Return the light field of a capture, or of a film's next frame.
+
+    chosen: makes the method's settings from those of `adaptive`. From two shots on, or where
+    surfaces fail, `adaptive` averages with sparse patches, fitted on demand.
+    """
     adaptive, psi = chosen(settings.adaptive), given.psi
     present = given.of_first_shot() if given.moving else given
 

@@ -18,8 +18,9 @@ from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 
 Array = NDArray[np.floating]
 PATCHED_MU, PATCHED_RHO = 3.0, 18.0
+"""Factors of mu and rho with a patch term, see `patched_weights`."""
 PATCH_AREA = 81
-"""Of the patches for which the weights were fitted: 9 x 9."""
+"""Samples of the patches for which the factors were fitted: 9 x 9."""
 
 
 def patched_weights(
@@ -48,11 +49,11 @@ def solve_tv_dict(given: Given, settings: ShippedSettings) -> Reconstruction:
     started = running_s()
     psi, dictionary = given.psi, given.needed_dictionary("tv-dict")
     frames = checked_inputs(psi, given.frames)
-    found = given.estimates or estimate_patches(
+    estimates = given.estimates or estimate_patches(
         psi, frames, dictionary, settings.sparse, given.on_step
     )
     first_s = running_s() - started
-    term = PatchTerm(found.light_field, found.weight)
+    term = PatchTerm(estimates.light_field, estimates.weight)
     readings = frames.readings[frames.usable]
     tv = patched_weights(settings.tv, settings.sparse, psi, readings, frames.noise_sigma)
     result = reconstruct_tv(psi, frames, tv, given.on_step, term)
@@ -62,8 +63,8 @@ def solve_tv_dict(given: Given, settings: ShippedSettings) -> Reconstruction:
         seconds=running_s() - started,
         parameters={
             **result.parameters,
-            "patches": len(found.atoms),
-            "atoms_per_patch": float(found.atoms.mean()),
+            "patches": len(estimates.atoms),
+            "atoms_per_patch": float(estimates.atoms.mean()),
             "first_stage_seconds": first_s,
         },
     )

@@ -223,6 +223,7 @@ def _shots(e: Evidence) -> Iterator[Reason]:
 
 
 def _left_out(e: Evidence) -> Iterator[Reason]:
+    """Shots that screening excluded; methods that need one shot suffer less."""
     if not e.left_out:
         return
     count = len(e.brightness)
@@ -239,6 +240,7 @@ def _left_out(e: Evidence) -> Iterator[Reason]:
 
 
 def _dark(brightness: Sequence[float]) -> Iterator[Reason]:
+    """Shots that saw no light, by each shot's brightness over the mean."""
     for shot, of_shot in enumerate(brightness, 1):
         if of_shot < DARK:
             remedy = f"capture it again, or reconstruct without shot {shot}"
@@ -342,6 +344,7 @@ def _coding(e: Evidence) -> Iterator[Reason]:
 
 
 def _colour(e: Evidence) -> Iterator[Reason]:
+    """Whether frames without colour filters show the colours."""
     if e.colour_error is not None and e.colour_error > COLOUR_ERROR:
         yield Reason(
             f"colours are uncertain by {e.colour_error:.0%} of the brightness: no pixel has a "
@@ -399,7 +402,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
     what, remedy = _in_words(cause, strength)
     surfaces_fail = e.parameters.get("over_plain", 0.0) > UNLIKE_SURFACES
     if displaced != "trust" and strength > LEAST_STRENGTH:
-        yield Reason(shift, moved, DRIFT, max(displaced, weak, key=LEVELS.index))
+        yield Reason(shift, moved, DRIFT, LEVELS[max(map(LEVELS.index, (displaced, weak)))])
     elif weak != "trust":
         yield Reason(what, strength, remedy, weak)
     elif cause.name == "gamma" and GAMMA.level(cause.surely) != "trust":
@@ -446,7 +449,7 @@ def _causes(e: Evidence) -> dict[str, Cause]:
 
 
 def _likeliest(causes: Mapping[str, Cause]) -> Cause:
-    """Return the cause that alone explains most; NO_CAUSE if it is not sure.
+    """Return the cause that alone explains most; NO_CAUSE if it differs from none by chance.
 
     Contrast, which names no cause, only where it explains clearly more.
     """
@@ -492,6 +495,7 @@ def _in_words(cause: Cause, strength: float) -> tuple[str, str]:
 
 
 def _compression(e: Evidence) -> Iterator[Reason]:
+    """Whether readings were stored with loss: JPEG, or few levels."""
     if e.blockiness is not None:
         yield Reason(
             "the readings were compressed in blocks of 8 x 8 pixels, as by JPEG",
@@ -510,6 +514,7 @@ def _compression(e: Evidence) -> Iterator[Reason]:
 
 
 def _pixels(e: Evidence) -> Iterator[Reason]:
+    """Shares of readings that are wrong or missing: several shots make up for each other's."""
     # A shadow elsewhere makes readings differ from their neighbours, too.
     weakest = _weakest(e)
     if weakest is None or weakest.value > 1 - STRENGTH_LOST.doubt / 2 or e.off > OFF.refuse:
@@ -556,6 +561,7 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
 
 
 def _noise(e: Evidence) -> Iterator[Reason]:
+    """Whether noise hides the scene: in the readings, or in the residual of held-out ones."""
     light = "add light, expose longer or capture more shots"
     if NOISE.level(e.noise) != "trust":
         yield Reason(
@@ -601,6 +607,7 @@ def _search(e: Evidence) -> Iterator[Reason]:
 
 
 def _misfit(e: Evidence) -> Iterator[Reason]:
+    """Whether the light field leaves far more than noise of the readings somewhere."""
     times = e.parameters.get("misfit", 0.0)
     row, column = (e.parameters.get(f"misfit_{axis}", 0.0) for axis in ("row", "column"))
     yield Reason(
@@ -613,6 +620,7 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
 
 
 def _fit(e: Evidence) -> Iterator[Reason]:
+    """Whether the light field predicts held-out readings, better than simple guesses do."""
     if e.parallax is not None and e.parallax < LEAST_PARALLAX:
         yield Reason(
             "scene treated as flat: the frames show no parallax, and all views are alike",

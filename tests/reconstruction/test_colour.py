@@ -1,4 +1,4 @@
-"""Colours without filters: what masks show of them, and how much of them is left to chance."""
+"""Colours without filters: their estimate from the masks, and its deviation."""
 
 import numpy as np
 import pytest

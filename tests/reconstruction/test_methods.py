@@ -1,4 +1,4 @@
-"""The methods by name: a new one is one module, which brings its own settings."""
+"""The methods by name: a module adds a method with its own settings."""
 
 import csv
 import os

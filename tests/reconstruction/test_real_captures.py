@@ -1,4 +1,4 @@
-"""Frames of real coded cameras that others built: what is foretold, and which Psi is refused."""
+"""Frames of real coded cameras: held-out readings are predicted, and a wrong Psi is refused."""
 
 from functools import cache
 

@@ -26,7 +26,7 @@ def screen(trial):
 
 
 def level_db(trial, method, screening):
-    """Return the PSNR by a method with or without screening, whose notes it must have or not."""
+    """Return the PSNR by a method, with screening or without; only screening adds notes."""
     frames = even_frames(trial.readings, trial.noise_sigma)
     settings = MethodSettings(screening=screening)
     result = reconstruct(method, trial.psi, frames, None, settings)

@@ -64,6 +64,10 @@ def mirrored(array, how, views, places):
     return np.ascontiguousarray(array[tuple(index)])
 
 
+def mirrored_frames(frames, how):
+    return np.stack([mirrored(f[None, None], how, (0, 1), (2, 3))[0, 0] for f in frames])
+
+
 @pytest.mark.parametrize("method", ["tv", "adaptive-fast"])
 @pytest.mark.parametrize("how", MIRRORS)
 def test_a_mirrored_camera_gives_the_mirrored_light_field(method, how):
@@ -71,23 +75,18 @@ def test_a_mirrored_camera_gives_the_mirrored_light_field(method, how):
     assert psi.colour is not None
     turned = ImagingMatrix(
         mirrored(psi.weights, how, (1, 2), (3, 5)),
-        np.stack([mirrored(map_[None, None], how, (0, 1), (2, 3))[0, 0] for map_ in psi.colour]),
+        mirrored_frames(psi.colour, how),
     )
     frames = noisy(psi, light_field, 0)
-    turned_frames = np.stack([mirrored(f[None, None], how, (0, 1), (2, 3))[0, 0] for f in frames])
     truth = mirrored(light_field, how, (0, 1), (2, 3))
-    np.testing.assert_allclose(turned @ truth, psi_frames(psi, light_field, how), atol=1e-5)
+    np.testing.assert_allclose(turned @ truth, mirrored_frames(psi @ light_field, how), atol=1e-5)
     found, mirror = (
         reconstruct(method, p, even_frames(f.astype(np.float32), NOISE)).light_field
-        for p, f in ((psi, frames), (turned, turned_frames))
+        for p, f in ((psi, frames), (turned, mirrored_frames(frames, how)))
     )
     back = mirrored(mirror, how, (0, 1), (2, 3))  # every mirror is its own inverse
     assert psnr_db(found, back) > psnr_db(found, light_field) + 6
     assert psnr_db(mirror, truth) == pytest.approx(psnr_db(found, light_field), abs=0.3)
-
-
-def psi_frames(psi, light_field, how):
-    return np.stack([mirrored(f[None, None], how, (0, 1), (2, 3))[0, 0] for f in psi @ light_field])
 
 
 @pytest.mark.parametrize("method", ["tv", "adaptive-fast"])

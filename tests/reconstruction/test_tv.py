@@ -1,4 +1,4 @@
-"""Total variation: its minimiser against another algorithm, its settings and refusals."""
+"""Total variation: the minimiser against another algorithm, settings and refusals."""
 
 import numpy as np
 import pytest
