@@ -71,7 +71,7 @@ class PlannedFit(NamedTuple):
 def _planned(
     survey: Survey, settings: AdaptiveSettings, second: search.Volume | None
 ) -> list[PlannedFit]:
-    """Return the fits of surfaces: one for each misfit, or one for each of two searches.
+    """Return the fits of surfaces: a fit for each misfit, or a fit for each of two searches.
 
     All but the last sweep the disparity (`sweep`); where the sweep goes wrong, the last fit, which
     keeps the patches' disparities, predicts held-out readings better. Of two searches both fits
