@@ -37,7 +37,7 @@ from emmc_rig.model.files import PART, whole_file, whole_folder
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix, SensingError
-from emmc_rig.process.memory import (
+from emmc_rig.process.cost import (
     BASE_BYTES,
     assumed_grid,
     own_bytes,
@@ -64,17 +64,18 @@ from emmc_rig.reconstruction.methods import (
 )
 from emmc_rig.reconstruction.verdict.rules import LEVELS
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.brightness import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
+from emmc_rig.session.measured_psi import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.session.readings import FilmPlace, film_frames, film_places
-from emmc_rig.session.scales import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import (
     kept_folder,
     result_folder,
 )
-from emmc_rig.store.jobs import Store, digest_of, kept_words, run_job, settled
+from emmc_rig.store.jobs import Store, kept_words, run_job, settled
 from emmc_rig.store.pool import Ceiling, Pool, opened_pool
+from emmc_rig.store.products import digest_of
 from emmc_rig.store.psi import PSI, StoredPsi
 from emmc_rig.store.result_files import read_metrics
 from emmc_rig.store.results import PSI_ASSUMED, write_metrics

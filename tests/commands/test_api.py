@@ -190,7 +190,7 @@ def test_public_names_are_functions_and_classes_and_no_folder_is_called_as_one()
     ("module", "unwanted"),
     [
         ("emmc_rig", ["numpy", "pydantic", "typer"]),
-        ("emmc_rig.capture", ["matplotlib"]),
+        ("emmc_rig.captures.run", ["matplotlib"]),
         ("emmc_rig.captures.sequencer", ["matplotlib"]),
         ("emmc_rig.cli", ["numpy", "scipy", "cv2", "numba", "matplotlib", "pydantic"]),
     ],
