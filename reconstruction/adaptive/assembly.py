@@ -39,11 +39,21 @@ FINEST = 32767
 
 
 class Cells(NamedTuple):
-    """boxes: (reading, 4), first row and column, height, and vectors of a row; height 0: rays.
-    starts: (reading + 1,), where each reading's rows begin. values: (row, LANES) int16, a vector
-    of a box, in units of `scales` (reading,); or a ray: its first tap, as an integer of 32 bits in
-    `taps` (row, 4), the fractions along y and x, and its weight, in `rays` (row, 4).
-    colour: Psi's map; binning: k; size: rows and columns of a texture; stored: colours of Psi."""
+    """Where readings see a texture: as boxes of cells, or ray by ray.
+
+    Attributes:
+        colour: Psi's map of colours, (shot, y, x).
+        binning: samples k along a pixel's side.
+        size: rows and columns of a texture.
+        stored: colours stored in Psi's weights, 1 or 3.
+        boxes: first row, first column, height and vectors of a row, (reading, 4); height 0: rays.
+        starts: where each reading's rows of `values` begin, (reading + 1,).
+        scales: units of a box's values, (reading,).
+        values: rows of a box, int16, (row, LANES); a reading of rays has a row for each ray.
+        rays: the same memory as float32, (row, 4): fractions along y and x in columns 1 and 2,
+            weight in column 3.
+        taps: the same memory as int32, (row, 4): index of the ray's first tap in column 0.
+    """
 
     colour: Any
     binning: Any
@@ -164,7 +174,13 @@ def _measure(weights, disparity, moved, margin, binning, size, first_row, last_r
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _lay(weights, disparity, moved, margin, laid, first_row, last_row):
-    """Set the cells of readings: boxes of taps, or rays."""
+    """Set the cells of readings: boxes of taps, or rays.
+
+    For each reading, over its rays that are not dark, of weight w and cubic taps W(fraction):
+
+        box(y, x) += w W_y W_x, then rounded to FINEST steps of its largest; or
+        rays(n) = (first tap, fraction along y, along x, w).
+    """
     colour, binning, size, stored, boxes, starts, scales, values, rays, taps_of = laid
     shots, views_v, views_u, _, _, columns = weights.shape
     pixels_y, pixels_x = weights.shape[3] // binning, columns // binning
@@ -225,10 +241,15 @@ def _lay(weights, disparity, moved, margin, laid, first_row, last_row):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _pass(laid, first_row, last_row, texture, frames, precision, missed):
-    """Add to a flat texture the adjoint of what a texture misses of frames, times precision.
+    """Add to a flat texture the adjoint of what a texture T misses of frames I, times precision.
 
-    frames, precision: (shot, pixel_y, pixel_x). The cells of a reading are read and returned while
-    the processor has them at hand. missed: empty: set frames to what they see instead.
+    For each reading p with cells A_p (a box, or rays):
+
+        share   = precision_p (I_p - A_p . T)
+        missed += share A_p
+
+    One pass reads and returns the cells of a reading, which then are in the processor's cache.
+    missed empty: frames are set to A_p . T instead. frames, precision: (shot, pixel_y, pixel_x).
     """
     colour, binning, size, stored, boxes, starts, scales, values, rays, taps = laid
     shots, pixels_y, pixels_x = frames.shape

@@ -24,21 +24,23 @@ BESIDE = 4
 as wide."""
 ALONG_PX = 6.0
 """Deviation of the blur along a line: it averages noise and colour filters."""
-DARKER = 0.15
+DARKER = 0.3
 """Share by which a line of an edge is darker than the lines within, at nine tenths of its length:
-0.39 to 0.94 on corners of four real light fields (begonia, bikes, buttercup, isochart), 0.15 where
-every second of its pixels is black (synthetic)."""
+0.39 to 0.94 on corners of four real light fields (begonia, bikes, buttercup, isochart). With 0.2
+the built-in scene `dark`, which has no edges, seems to have some in noise."""
 ALL_ALONG = 0.9
-"""Share of its length over which a line of an edge is darker: on these corners all of it; of a dark
-object that ends beside the picture's edge (dragons) 0.73."""
+"""Share of its length over which a line of an edge is darker: 1 on these corners, 0.73 for a dark
+object that ends beside the picture's edge (dragons)."""
 TINY = 1e-20
 
 
 @dataclass(frozen=True, eq=False)
 class DarkEdges:
-    """Attributes:
-    widths: in pixels, of the top, bottom, left and right edge (`SIDES`).
-    within: pixels that lie in an edge, (pixel_y, pixel_x).
+    """Edges that are no part of the scene.
+
+    Attributes:
+        widths: in pixels, of the top, bottom, left and right edge (`SIDES`).
+        within: pixels that lie in an edge, (pixel_y, pixel_x).
     """
 
     widths: tuple[int, int, int, int]
@@ -57,8 +59,8 @@ def _is_dark(seen: Array, readings: Array) -> bool:
     """Return whether the first of several lines is darker than the BESIDE lines after it.
 
     The lines within have the colours B(along, c) = sum(seen * readings) / sum(seen), blurred along
-    the line, sums over line and shot. The first line reads seen . B if it is as bright. It is dark
-    where its reading, weighted by the light it receives and blurred, is lower by more than DARKER.
+    the line, sums over line and shot. The first line reads seen . B if it is as bright. Where its
+    reading, weighted by the received light and blurred, is lower by more than DARKER, it is dark.
 
     seen: sums of Psi's rows, (line, shot, along, c). readings: (line, shot, along).
     """
@@ -86,7 +88,7 @@ def dark_edges(
     """Return the edges of the frames (shot, pixel_y, pixel_x) that are no part of the scene.
 
     None without any, and for frames of fewer than 8 BESIDE rows or columns. usable: readings that
-    count, of the frames' shape. sides: those that may have an edge.
+    count, of the frames' shape. sides: of the picture that may have an edge.
     """
     (shots, rows, columns), k = frames.shape, psi.binning
     if min(rows, columns) < 8 * BESIDE:

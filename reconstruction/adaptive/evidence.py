@@ -40,13 +40,17 @@ GROUPS = 16
 
 @dataclass(frozen=True)
 class TexturePrior:
-    """Covariances of textures: correlation length and blur in samples, and the kinds to compare.
+    """Covariances of textures, lengths in samples, and the kinds of texture to compare.
 
-    finer_px: lengths of further textures that evidence compares, as likely as the first. kinds: (a,
-    b) pairs: the variance of luminance (R + G + B) / sqrt(3) relative to the squared brightness,
-    and that of a chrominance over that of luminance. The first is next to flat. kept: how many of
-    them are compared at a patch's other probes after the first, and half as many of further
-    lengths (default all).
+    Attributes:
+        length_px: correlation length l.
+        finer_px: lengths of further textures that evidence compares, as likely as the first.
+        blur_px: of the optics, e.
+        kinds: pairs (a, b): variance of the luminance (R + G + B) / sqrt(3) over the squared
+            brightness, and variance of a chrominance over it. The first is next to flat.
+        kept: number of kinds compared at a patch's other probes after the first, half as many of
+            further lengths; None: all.
+        freedom: degrees of the Student t of the readings.
     """
 
     length_px: float = 3.0
@@ -141,9 +145,13 @@ def _spectrum(
 
 @dataclass(frozen=True, eq=False)
 class PatchEvidence:
-    """log_likelihood: (patch, disparity), constants (m/2 log 2 pi) left out, of the kinds of
-    texture that explain the patch best, the mean over lengths, -inf where not evaluated; kinds:
-    (patch, length), which of the prior's these are; kind: (patch,), that of the likeliest length.
+    """How well textures explain patches.
+
+    Attributes:
+        log_likelihood: (patch, disparity), without constants (m/2 log 2 pi): of the kind of texture
+            that explains the patch best, mean likelihood over lengths; -inf where not evaluated.
+        kinds: the best kind for each length, an index of the prior's kinds, (patch, length).
+        kind: the best kind for the likeliest length, (patch,).
     """
 
     log_likelihood: NDArray[np.float32]

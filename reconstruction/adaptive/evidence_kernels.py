@@ -46,16 +46,26 @@ LOGS = 8
 class Hypotheses(NamedTuple):
     """The readings, and the textures that may explain them.
 
-    weights, colour: Psi's. usable, data, variance: (shot, pixel_y, pixel_x), data being the
-    readings less those of the mean. places: (reading, 3), shot, and row and column of the pixel
-    from a patch's corner. binning: k. waves: (wave, ray), of which the rays' spectra are made, in
-    multiples of SIDE. pairs: (set, SIDE, 2), the pairs of readings, first >= second, SIDE of them
-    with pixels equally far apart a set; spots: (set, SIDE), where a pair lies in tiles. offsets:
-    (set,), how far apart, an index of tables. tables: (offset, texture, wave), the texture's
-    correlation; a texture is a length and a disparity: all disparities of the first length, ...
-    amplitudes, chromas: (kind,), variance of luminance, times a patch's scale, and of a chrominance
-    over that of luminance. trials: (trial, 3), in order: length of the texture, probe, and rank of
-    its kind among those tried before. freedom: of the Student t.
+    A texture is a length and a disparity: all disparities of the first length, then of the next.
+
+    Attributes:
+        weights: Psi's, (shot, v, u, y, stored colour, x).
+        colour: Psi's map of colours, (shot, y, x).
+        usable: readings that count, (shot, pixel_y, pixel_x).
+        data: readings less those of the smooth picture, (shot, pixel_y, pixel_x).
+        variance: of the readings, (shot, pixel_y, pixel_x).
+        places: shot, row and column of a reading from the patch's corner, (reading, 3).
+        binning: samples k along a pixel's side.
+        waves: of which the rays' spectra are made, (wave, ray), both in multiples of SIDE.
+        pairs: of readings, first >= second; the pairs of a set lie equally far apart, (set, SIDE,
+            2).
+        spots: where a pair lies in the tiles of the covariance, (set, SIDE).
+        offsets: how far the pairs of a set lie apart, an index of `tables`, (set,).
+        tables: spectrum of the textures' correlation, (offset, texture, wave).
+        amplitudes: of kinds, variance of luminance over a patch's scale, (kind,).
+        chromas: of kinds, variance of a chrominance over that of luminance, (kind,).
+        trials: length, probe and rank of the kinds to try, in order, (trial, 3).
+        freedom: degrees of the Student t.
     """
 
     weights: Any
@@ -154,6 +164,8 @@ def _analyse(waves, rays, starts, columns, spectra):
 def _correlate(given, spectra, starts, meetings, sums):
     """Set sums (hypothesis, part, tile), flat tiles, to the correlations of all pairs of readings.
 
+        sums_h(i, j) = sum_wave table_h(wave) Re, Im of (spectrum_i(wave) conj(spectrum_j(wave)))
+
     spectra: (part, reading, wave * lane), waves being cosines and sines by turns. starts:
     (hypothesis,), of its row of an offset's table. meetings: (pair, wave * lane), flat, to work in.
     The two chrominances are added in one part of the sums.
@@ -184,13 +196,19 @@ def _correlate(given, spectra, starts, meetings, sums):
 def _log_likelihood(
     sums, alike, mix, known, measured, freedom, tiles, values, product, square, out
 ):
-    """Set out (lane,) to the log-likelihoods of readings, known (2, reading, lane).
+    """Set out (lane,) to the log-likelihoods of readings, each lane a patch.
 
-    They are those of multivariate t distributions with `freedom` degrees and measured (lane,)
-    readings; constants are left out. The scale matrices are the variances that are known plus sums
-    (part, tile), the lower triangle in tiles (row, column, lane), row by row, all flat: sums times
-    mix (2, lane), flat. Where sums have a single part, the second is its product with alike, in
-    tiles. tiles, values: (reading, lane), flat, product, square: (lane,), to work in.
+    Of a multivariate t distribution with f = `freedom` degrees and m measured readings y, without
+    constants:
+
+        C = diag(variance) + mix_0 sums_0 + mix_1 sums_1      (luminance and chrominances)
+        C = L L^T                                             (tile by tile, row by row)
+        out = sum(log 1 / L_ii) - (f + m) / 2 log(1 + |L^-1 y|^2 / f)
+
+    sums: (part, tile entries), the lower triangle in tiles (row, column, lane). Where there is a
+    single part, sums_1 = sums_0 * alike, entry by entry. mix: (2 * lane,). known: data y and
+    variance, (2, reading, lane). measured: m, (lane,). Work space: tiles (the factor's), values
+    (reading * lane), product and square (lane,).
     """
     out[:] = 0
     product[:] = 1
@@ -211,6 +229,7 @@ def _log_likelihood(
             else:
                 tint = load_tile(sums[1], at)
             tile = combined(tile, tint, mix)
+            # C_ij - sum_k L_ik L_jk^T, then divided by L_jj^T, or factored on the diagonal.
             for k in range(j):
                 tile = less_products(tile, tiles, (first + k) * SIZE, (other + k) * SIZE)
             if j < i:
@@ -220,6 +239,7 @@ def _log_likelihood(
                 tile = factored(plus_diagonal(tile, variances, i * strip), np.float32(LEAST))
                 substitute(tile, values, i * strip)
             store_tile(tile, tiles, at)
+        # Diagonals of factors are stored inverted.
         for row in range(SIDE):
             at = (first + i) * SIZE + row * (SIDE + 1) * LANES
             value = values[(i * SIDE + row) * LANES : (i * SIDE + row + 1) * LANES]

@@ -1,8 +1,8 @@
 """Frame after frame of a film: what earlier frames showed is carried along by the scene's motion.
 
 Of the frame before, disparity, texture and beliefs about disparities are carried to the present by
-optical flow (`flow`). The present texture is then fitted not to the present frame alone, but to the
-last few: an earlier frame saw the present surfaces where the flow since then says (`OtherTime`). In
+optical flow (`times`). The present texture is then fitted to the present frame and to the last
+few: an earlier frame saw the present surfaces where the flow since then says (`OtherTime`). In
 the next frame the same point of a surface meets other cells of the mask: time is a code.
 
 Nothing carried is believed further than readings go. A reading of an earlier frame counts with the
@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,6 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction.adaptive import mixture, search
 from emmc_rig.reconstruction.adaptive.fits import Fits
-from emmc_rig.reconstruction.adaptive.flow import at_places, flow_between, sampled
 from emmc_rig.reconstruction.adaptive.joint import (
     FittedScene,
     TextureSettings,
@@ -48,9 +48,12 @@ from emmc_rig.reconstruction.adaptive.sweep import STRIDE, mean_around, swept
 from emmc_rig.reconstruction.adaptive.times import (
     HELD_WINDOW_PX,
     OtherTime,
+    at_places,
+    flow_between,
     of_samples,
     padded,
     rested,
+    sampled,
 )
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import Readings
@@ -119,8 +122,11 @@ ROOM_PX = 1.0
 class Rest:
     """What stands as long as the scene rests.
 
-    first: light field of the frame since which it rests; mean: of about `count` fits since, both as
-    `mixture.stored`. readings: of that frame, over the scale, (1, pixel_y, pixel_x).
+    Attributes:
+        first: light field of the frame since which the scene rests, as `mixture.stored`.
+        mean: of the light fields of about `count` fits since then, as `mixture.stored`.
+        readings: of the first frame, over the scale, (1, pixel_y, pixel_x).
+        count: of frames in the mean, at most LONGEST.
     """
 
     first: NDArray[np.uint16]
@@ -128,14 +134,25 @@ class Rest:
     readings: Array
     count: int = 1
 
+    @property
+    def next_count(self) -> int:
+        """Number of frames in the mean after one more."""
+        return min(self.count + 1, LONGEST)
+
 
 @dataclass(frozen=True, eq=False)
 class Known:
     """What a frame leaves for the next one.
 
-    scale: of the scene, see `Plain`. texture: (c, y, x), padded by `margin` as the centre view's
-    disparity `centre` (y, x). beliefs: about disparities. missed: least root mean square residual
-    of first frames, over their noise. earlier: the latest last.
+    Attributes:
+        scale: of the scene, see `Plain`.
+        margin: samples by which texture and centre are padded.
+        rest: what stands at rest.
+        texture: (c, y, x), padded.
+        centre: the centre view's disparity (y, x), padded.
+        beliefs: about disparities.
+        missed: least root mean square residual of first frames, over their noise.
+        earlier: frames before, the latest last.
     """
 
     scale: float
@@ -228,10 +245,20 @@ class Film:
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """The models of a frame: see `Plain`, `Fits`; beliefs about disparities; earlier: frames, with
-    the flow to it; moving: readings (shot, pixel_y, pixel_x) that were fitted where something
-    moves; parameters: what is reported of it; scene_left, beliefs_left: to the next frame; mean:
-    of what rests, see `Rest`; still: where the scene does (pixel_y, pixel_x)."""
+    """The models of a frame that follows others.
+
+    Attributes:
+        plain: readings and the light field without surfaces.
+        fits: the models.
+        beliefs: about disparities, after the fit.
+        earlier: frames before, with the flow to this one.
+        moving: readings that were fitted where something moves, (shot, pixel_y, pixel_x).
+        parameters: figures that the result reports.
+        scene_left: the scene that the next frame starts from.
+        beliefs_left: the beliefs that the next frame starts from.
+        mean: light field of what rests, see `Rest`.
+        still: where the scene rests, (pixel_y, pixel_x).
+    """
 
     plain: Plain
     fits: Fits
@@ -268,7 +295,37 @@ class Followed:
         resting = of_samples(self.still, light_field[0, 0]).astype(np.float32)
         first = _standing(before.rest.first, seen, disparity, resting)
         readings = np.where(self.still, before.rest.readings, self.plain.bright.frames)
-        return Rest(first, self.mean, readings, _count(before.rest))
+        return Rest(first, self.mean, readings, before.rest.next_count)
+
+
+class CarriedScene(NamedTuple):
+    """The surfaces of the frame before, carried to the present along a flow.
+
+    Attributes:
+        centre: disparity of the present centre view (y, x), padded.
+        texture: (c, y, x), padded.
+        missed: the present frame less what they predict, over the scale, (shot, pixel_y, pixel_x).
+    """
+
+    centre: Array
+    texture: Array
+    missed: Array
+
+
+class Motion(NamedTuple):
+    """Flows between the frame before and the present one, and where nothing moves.
+
+    Attributes:
+        there: flow from the frame before to the present one, (y, x, 2).
+        back: flow from the present frame to the one before, (y, x, 2).
+        still: where the readings rest, (pixel_y, pixel_x).
+        scene: the surfaces, carried along `back`.
+    """
+
+    there: Array
+    back: Array
+    still: NDArray[np.bool_]
+    scene: CarriedScene
 
 
 def followed(
@@ -277,40 +334,27 @@ def followed(
     settings: AdaptiveSettings,
     on_step: Callable[[int], None],
 ) -> Followed | None:
-    """Return the models of a frame that follows; None where the film begins anew with it."""
+    """Return the models of a frame that follows; None where the film begins anew with it.
+
+    1. Total variation of the present frame (`plain_of`), for flow and for held-out readings.
+    2. The scene of the frame before is carried along the flow; places that rest have none.
+    3. Where it predicts held-out readings worse than total variation does, the scene is new.
+    4. The texture is fitted to this frame and the last few, the disparity swept again on the way.
+    5. The fit is averaged with what stands at rest (`_models`).
+    """
     before, own, psi = film.known, film.settings, given.psi
     assert before is not None
-    margin = before.margin
+    margin, nearer = before.margin, 1 if settings.nearer == "larger" else -1
     plain = plain_of(given, before.scale, unseen_by(given), settings.start_steps)
     bright, used = plain.bright, given.usable & ~plain.held
-    nearer = 1 if settings.nearer == "larger" else -1
-
-    def carried_by(back: Array) -> tuple[Array, Array, Array]:
-        at = at_places(before.centre.shape) + padded(back, margin)
-        centre = sampled(before.centre, at)
-        texture = np.stack([sampled(colour, at, cubic=True) for colour in before.texture])
-        surfaces = surfaces_of(psi, centre, margin, nearer, len(texture))
-        return centre, texture, bright.frames - surfaces.forward(texture)
-
-    there, back = flow_between(before.earlier[-1].picture, plain.picture)
-    by_flow, by_rest = carried_by(back), carried_by(np.zeros_like(back))
-    missed, missed_still = (
-        mean_around(np.square(of), used.astype(np.float32)).sum(axis=0)
-        for *_, of in (by_flow, by_rest)
-    )
-    flows = missed_still > STILL * missed
-    still = _still(bright, before.rest.readings, used & before.earlier[-1].used, flows)
-    rests = still | ~flows
-    if rests.any():
-        there, back = rested(there, back, rests.astype(np.float32))
-        by_flow = carried_by(back)
-    centre, texture, foretold = by_flow
-    new = _share_new(foretold, plain)
+    there, back, still, carried_scene = _motion(before, plain, used, nearer)
+    centre, texture = carried_scene.centre, carried_scene.texture
+    new = _share_new(carried_scene.missed, plain)
     if new > NEW_SHARE:
         return None
     earlier = [frame.since(there, back) for frame in before.earlier[-own.earlier :]]
     seen = [frame.seen(centre, margin, texture, nearer, own.misfit) for frame in earlier]
-    carried_on = beliefs = _carried(before.beliefs, back, still, psi.binning)
+    carried_beliefs = beliefs = _carried(before.beliefs, back, still, psi.binning)
     fitted = replace(bright, usable=used)
 
     def again(texture: Array, surfaces: Surfaces) -> Array:
@@ -332,34 +376,88 @@ def followed(
         others=lambda *_: seen,
         margin=margin,
     )
-    scale = np.float32(before.scale)
     scene.surfaces.release()
-    light_field = scene.surfaces.light_field(scale * scene.texture)
-    own_fit = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
-    k, disparity = psi.binning, scene.surfaces.disparity
-    stays = of_samples(still, light_field[0, 0])
-    resting = stays.astype(np.float32)
-    slow = np.exp(-np.square(back / RESTING_PX).sum(axis=-1))
-    stands = resting if still.any() else slow
-    models = [
-        _standing(before.rest.mean, own_fit, disparity, resting * (1 - 1 / _count(before.rest))),
-        _standing(before.rest.first, own_fit, disparity, stands),
-    ]
-    residuals: list[Array] = [given.frames - psi.forward(mixture.values(model)) for model in models]
-    models.append(plain.plain)
-    residuals.append(plain.plain_residual)
-    fits = Fits(models, residuals, scene, with_patches=False, understated=UNDERSTATED)
-    moved = float(np.median(np.linalg.norm(there, axis=-1)))
-    parameters = {"flow_px": moved, "new_share": new, "still_share": float(still.mean())}
-    moving = used & (np.linalg.norm(back[::k, ::k], axis=-1) > RESTING_PX)
+    fits = _models(before, plain, scene, still, back)
+    stays = of_samples(still, scene.centre)
     scene_left = replace(
         scene,
         clean=np.where(np.pad(stays, margin, mode="edge"), texture, scene.clean),
         centre=np.where(stays, centre[inner], scene.centre),
     )
-    beliefs_left = _kept(carried_on, beliefs, still[::STRIDE, ::STRIDE])
-    left = scene_left, beliefs_left, models[0], still
-    return Followed(plain, fits, beliefs, earlier, moving, parameters, *left)
+    k = psi.binning
+    return Followed(
+        plain=plain,
+        fits=fits,
+        beliefs=beliefs,
+        earlier=earlier,
+        moving=used & (np.linalg.norm(back[::k, ::k], axis=-1) > RESTING_PX),
+        parameters={
+            "flow_px": float(np.median(np.linalg.norm(there, axis=-1))),
+            "new_share": new,
+            "still_share": float(still.mean()),
+        },
+        scene_left=scene_left,
+        beliefs_left=_kept(carried_beliefs, beliefs, still[::STRIDE, ::STRIDE]),
+        mean=fits.light_fields[0],
+        still=still,
+    )
+
+
+def _motion(before: Known, plain: Plain, used: NDArray[np.bool_], nearer: int) -> Motion:
+    """Return the flow since the frame before, 0 where the scene rests, and the scene it carries.
+
+    A place flows where the squared residual of the scene carried without flow exceeds STILL times
+    that of the scene carried with it, in the mean around. used: readings that are fitted.
+    """
+    bright = plain.bright
+
+    def carried_along(back: Array) -> CarriedScene:
+        at = at_places(before.centre.shape) + padded(back, before.margin)
+        centre = sampled(before.centre, at)
+        texture = np.stack([sampled(colour, at, cubic=True) for colour in before.texture])
+        surfaces = surfaces_of(bright.psi, centre, before.margin, nearer, len(texture))
+        return CarriedScene(centre, texture, bright.frames - surfaces.forward(texture))
+
+    there, back = flow_between(before.earlier[-1].picture, plain.picture)
+    scene, unmoved = carried_along(back), carried_along(np.zeros_like(back))
+    missed, missed_unmoved = (
+        mean_around(np.square(carried.missed), used.astype(np.float32)).sum(axis=0)
+        for carried in (scene, unmoved)
+    )
+    flows = missed_unmoved > STILL * missed
+    still = _still(bright, before.rest.readings, used & before.earlier[-1].used, flows)
+    rests = still | ~flows
+    if rests.any():
+        there, back = rested(there, back, rests.astype(np.float32))
+        scene = carried_along(back)
+    return Motion(there, back, still, scene)
+
+
+def _models(
+    before: Known, plain: Plain, scene: FittedScene, still: NDArray[np.bool_], back: Array
+) -> Fits:
+    """Return the models of a frame that follows: two of surfaces, and total variation.
+
+    The first is the mean of the fits while the scene rests. The second has the light field of the
+    first frame at rest where nothing moves. If nothing rests, that stands by exp(-|flow|^2 /
+    RESTING_PX^2). Elsewhere both are the present fit.
+    """
+    given, rest = plain.given, before.rest
+    light_field = scene.surfaces.light_field(np.float32(before.scale) * scene.texture)
+    fit = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
+    disparity, count = scene.surfaces.disparity, rest.next_count
+    resting = of_samples(still, light_field[0, 0]).astype(np.float32)
+    slow = np.exp(-np.square(back / RESTING_PX).sum(axis=-1))
+    models = [
+        _standing(rest.mean, fit, disparity, resting * (1 - 1 / count)),
+        _standing(rest.first, fit, disparity, resting if still.any() else slow),
+    ]
+    residuals: list[Array] = [
+        given.frames - given.psi.forward(mixture.values(model)) for model in models
+    ]
+    models.append(plain.plain)
+    residuals.append(plain.plain_residual)
+    return Fits(models, residuals, scene, with_patches=False, understated=UNDERSTATED)
 
 
 def _still(
@@ -377,10 +475,6 @@ def _still(
     )
     still = changed <= np.where(flows, *UNCHANGED) * noise
     return still & (np.mean(still | ~flows) >= CAMERA_RESTS)
-
-
-def _count(rest: Rest) -> int:
-    return min(rest.count + 1, LONGEST)
 
 
 def _standing(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +15,8 @@ from emmc_rig.reconstruction.adaptive import mixture, search
 from emmc_rig.reconstruction.adaptive.joint import FittedScene, solve
 from emmc_rig.reconstruction.adaptive.rays import Surfaces
 from emmc_rig.reconstruction.adaptive.refine import Seen
-from emmc_rig.reconstruction.adaptive.second import surfaces_fail
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
-from emmc_rig.reconstruction.adaptive.survey import Plain, Survey
+from emmc_rig.reconstruction.adaptive.survey import Plain, Survey, surfaces_fail
 from emmc_rig.reconstruction.adaptive.sweep import swept
 from emmc_rig.reconstruction.adaptive.times import OtherTime
 from emmc_rig.reconstruction.adaptive.uncertainty import (
@@ -36,10 +36,13 @@ variation's, given which readings to fit and the order in which its views lie.""
 class Fits:
     """The models of surfaces, and last one without: sparse patches or total variation.
 
-    light_fields: (v, u, y, x, c) of each, as `mixture.stored`; residuals: frames less what each
-    predicts, (shot, pixel_y, pixel_x). scene: the last of surfaces and texture, at the survey's
-    scale. with_patches: whether the last are patches. understated: by how much the spread of these
-    models understates the variance of their mean, beside that of a capture's.
+    Attributes:
+        light_fields: of each model, (v, u, y, x, c), as `mixture.stored`.
+        residuals: of each model, frames less what it predicts, (shot, pixel_y, pixel_x).
+        scene: the last fit of surfaces and texture, at the survey's scale.
+        with_patches: whether the last model is patches.
+        understated: ratio of the variance of these models' mean to what their spread says of it,
+            over that ratio for a capture's models.
     """
 
     light_fields: list[NDArray[np.uint16]]
@@ -47,6 +50,47 @@ class Fits:
     scene: FittedScene
     with_patches: bool
     understated: float = 1.0
+
+
+class PlannedFit(NamedTuple):
+    """A fit of surfaces to make.
+
+    Attributes:
+        beliefs: about disparities, of a search.
+        centre: disparity of the centre view to begin with, (y, x).
+        misfit: deviation of readings that no texture explains.
+        sweeps: whether the disparity is searched again with the texture.
+    """
+
+    beliefs: search.Volume
+    centre: Array
+    misfit: float
+    sweeps: bool
+
+
+def _planned(
+    survey: Survey, settings: AdaptiveSettings, second: search.Volume | None
+) -> list[PlannedFit]:
+    """Return the fits of surfaces: a fit for each misfit, or a fit for each of two searches.
+
+    All but the last sweep the disparity (`sweep`); where the sweep goes wrong, the last fit, which
+    keeps the patches' disparities, predicts held-out readings better. Of two searches both fits
+    sweep and have the first misfit: closer fits follow the errors of wide disparities (0.01 dB
+    worse on 12 crops).
+    """
+    first = settings.misfits[0]
+    if second is not None:
+        psi = survey.given.psi
+        centre = search.per_pixel(second, psi.size, psi.binning)
+        return [
+            PlannedFit(second, centre, first, True),
+            PlannedFit(survey.volume, survey.centre, first, True),
+        ]
+    last = len(settings.misfits) - 1
+    return [
+        PlannedFit(survey.volume, survey.centre, misfit, number < last)
+        for number, misfit in enumerate(settings.misfits)
+    ]
 
 
 def fitted_models(
@@ -57,59 +101,48 @@ def fitted_models(
     second: search.Volume | None = None,
     others: Sequence[OtherTime] = (),
 ) -> Fits:
-    """Return a fit of surfaces for each of `settings.misfits`, and one without any.
+    """Return the fits of surfaces that are planned (`_planned`), and a model without surfaces.
 
-    All fits of surfaces but the last search the disparity again with their texture (`sweep`); where
-    the sweep goes wrong, the last fit, which keeps the patches' disparities, predicts held-out
-    readings better. The first steps are those of the first fit: there the texture presumed is so
-    uncertain that the misfit matters little. on_step: called with the number of steps done.
+    Fits of the same disparities share the first steps: there the texture presumed is so uncertain
+    that the misfit matters little. The scene returned is of the first search: of a disperser
+    (smem/fern_root, a capture by others) the second predicts readings better with bands 0.9 px
+    apart, which the prism puts 2 px apart.
 
-    second: beliefs of a second search. Then there is a fit of the first misfit for each search, as
-    closer ones follow what wide disparities err by: with them 12 crops are 0.01 dB worse.
-    The scene returned is of the first search: of a disperser (smem/fern_root, a capture by others)
-    the second foretells readings better with bands 0.9 px apart, which the prism puts 2 px apart.
+    on_step: called with the number of steps done. second: beliefs of a second search. others:
+    frames of other times.
     """
     given, bright, held = survey.given, survey.bright, survey.held
-    scale = np.float32(survey.scale)
-    fitted = replace(bright, usable=given.usable & ~held)
-
-    def again(volume: search.Volume, texture: Array, surfaces: Surfaces) -> Array:
-        beliefs = swept(volume, fitted, texture, surfaces, settings)
-        return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
-
+    scale, first = np.float32(survey.scale), settings.misfits[0]
+    used = replace(bright, usable=given.usable & ~held)
     nearer = 1 if settings.nearer == "larger" else -1
-    first, size, k = settings.misfits[0], given.psi.size, given.psi.binning
-    if second is None:
-        *firsts, last = settings.misfits
-        planned = [(survey.volume, survey.centre, misfit, True) for misfit in firsts]
-        planned.append((survey.volume, survey.centre, last, False))
-    else:
-        planned = [
-            (second, search.per_pixel(second, size, k), first, True),
-            (survey.volume, survey.centre, first, True),
-        ]
     light_fields, residuals, scene, begun = [], [], None, None
-    for fit, (volume, centre, misfit, sweeps) in enumerate(planned):
+    for number, planned in enumerate(_planned(survey, settings, second)):
         # One layout of rays at a time: it is as large as the light field.
         scene = None
-        done = fit * settings.texture.steps
+        done, misfit = number * settings.texture.steps, planned.misfit
 
-        def then(padded: Array, margin: int, texture: Array, misfit: float = misfit) -> list[Seen]:
+        def again(texture: Array, surfaces: Surfaces, beliefs: search.Volume) -> Array:
+            found = swept(beliefs, used, texture, surfaces, settings)
+            return search.per_pixel(found, given.psi.size, given.psi.binning)
+
+        def seen_by_others(
+            padded: Array, margin: int, texture: Array, misfit: float = misfit
+        ) -> list[Seen]:
             at = padded, margin, texture, nearer, misfit, misfit / first
             return [other.seen(*at) for other in others]
 
         scene = solve(
             given.psi,
-            centre,
+            planned.centre,
             nearer,
             bright.frames,
             bright.precision(held, misfit),
             survey.picture,
             settings.texture,
             on_step=lambda step, done=done: on_step(done + step),
-            again=partial(again, volume) if sweeps else None,
+            again=partial(again, beliefs=planned.beliefs) if planned.sweeps else None,
             begun=begun,
-            others=then,
+            others=seen_by_others,
         )
         begun = scene.begun if second is None else None
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
@@ -131,10 +164,16 @@ def fitted_models(
 
 @dataclass(frozen=True, eq=False)
 class Mean:
-    """light_field: (v, u, y, x, c). shares: of the models, (model, pixel_y, pixel_x). sigma: its
-    standard deviation, None with too few held-out readings. over_plain: its mean square residual of
-    these beyond their noise, over total variation's; None without any. reported: parameters of what
-    is stated."""
+    """The mean of models.
+
+    Attributes:
+        light_field: (v, u, y, x, c).
+        shares: weights of the models, (model, pixel_y, pixel_x).
+        sigma: standard deviation, (v, u, y, x); None with too few held-out readings.
+        over_plain: mean square residual of the held-out readings beyond their noise, over total
+            variation's; None without any.
+        reported: figures that the result reports.
+    """
 
     light_field: Array
     shares: NDArray[np.float32]
@@ -184,7 +223,7 @@ def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
 
 
 def _add(variance: Array, unseen: Array, part: float, apart: Array) -> None:
-    """Add to a variance (v, u, y, x) that of a picture (y, x), and part of a squared difference."""
+    """Add to a variance (v, u, y, x) the variance `unseen` (y, x) and part * apart (v, u, y, x)."""
     unseen, share = unseen.astype(np.float32), np.float32(part)
 
     def work(at: tuple[int, int]) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +27,6 @@ Array = NDArray[np.floating]
 
 class TextureSettings(Settings):
     """Settings of the fit of texture and disparity."""
-
-    removed: ClassVar[tuple[str, ...]] = ("doubt",)
 
     steps: int = Field(default=16, ge=1)
     first_noise: float = Field(
@@ -57,11 +54,20 @@ class TextureSettings(Settings):
     room_px: float = Field(
         default=0.5, ge=0, description="by which sharpening may leave the disparity searched"
     )
+    doubt: float = Field(
+        default=0.025, gt=0, description="deviation of the texture when disparity is sharpened"
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Begun:
-    """The textures (c, y, x) after some steps: now, a step before, and that less its noise."""
+    """The textures after some steps of a fit, all (c, y, x), padded.
+
+    Attributes:
+        now: the texture.
+        before: the texture a step before.
+        clean: the texture a step before, less its noise.
+    """
 
     now: Array
     before: Array
@@ -70,8 +76,15 @@ class Begun:
 
 @dataclass(frozen=True, eq=False)
 class FittedScene:
-    """Surfaces, their texture (c, y, x), the same less its noise (`clean`), and the centre view's
-    disparity (y, x), without the margin that the textures have. begun: after the shared steps."""
+    """Surfaces and their texture.
+
+    Attributes:
+        surfaces: Psi of the surfaces.
+        texture: (c, y, x), padded by the surfaces' margin.
+        clean: the texture less its noise, (c, y, x), padded.
+        centre: disparity of the centre view, (y, x), without margin.
+        begun: textures after the shared steps, from which other fits of the scene continue.
+    """
 
     surfaces: Surfaces
     texture: Array
@@ -110,13 +123,27 @@ def solve(
 ) -> FittedScene:
     """Return the scene that explains the frames (shot, pixel_y, pixel_x).
 
-    centre: disparity of the centre view (y, x) to begin with. nearer: 1 when points of larger
-    disparity are in front, -1 when behind. precision: inverse variance of the readings, 0 where not
-    usable. picture: (y, x, c) to begin with, of one colour or three. again: returns the disparity
-    (y, x) of a texture (c, y, x) without noise, padded by a margin, given the present surfaces.
-    begun: textures of another fit of the same centre, to continue from. others: returns what other
-    times saw of a disparity (y, x) and its texture, padded by the margin between the two. margin:
-    instead of the least.
+    The deviation sigma of the texture falls geometrically from first_noise to last_noise. A step:
+
+        Y  = T + momentum (T - T_before)
+        C  = Y less white noise of deviation sigma               (`shrinkage.denoised`)
+        d  = swept with C at the steps `sweeps`                  (`again`)
+        d  = sharpened in every second of the last refine_steps  (`refine.refined`)
+        T' = argmin |S^-1/2 (Psi W_d T' - I)|^2 + |T' - C|^2 / sigma^2   (`refine.fitted`)
+
+    Args:
+        psi: of the capture.
+        centre: disparity of the centre view to begin with, (y, x).
+        nearer: 1 when points of larger disparity are in front, -1 when behind.
+        frames: I, (shot, pixel_y, pixel_x).
+        precision: inverse variance of the readings (1 / S), 0 where not usable, of this shape.
+        picture: texture to begin with, (y, x, c), of one colour or three.
+        settings: of the fit.
+        on_step: called with the number of steps done.
+        again: returns the disparity (y, x) of a padded texture C, given the present surfaces.
+        begun: textures of another fit of the same centre, to continue from after the shared steps.
+        others: returns what other times saw, given padded disparity, margin and texture.
+        margin: samples by which textures are padded, instead of the least.
     """
     if margin is None:
         margin = margin_of(psi, centre, settings.room_px)
@@ -126,42 +153,47 @@ def solve(
     surfaces = surfaces_of(psi, padded, margin, nearer, colours)
     rows_squared = np.einsum("ssyx->syx", psi.gram)
     now = np.pad(np.moveaxis(picture, -1, 0), ((0, 0), *around), mode="edge").astype(np.float32)
-    at = kept = begun or Begun(now, now, now)
+    textures = kept = begun or Begun(now, now, now)
     sigmas = np.geomspace(settings.first_noise, settings.last_noise, settings.steps)
     shared = min(settings.shared_steps, settings.steps - 1)
-    seen = others(padded, margin, at.clean)
+    seen = others(padded, margin, textures.clean)
     for step in range(0 if begun is None else shared, settings.steps):
         if step == shared:
-            kept = at
-        now, clean, sigma = at.now, at.clean, float(sigmas[step])
-        if step:
-            ahead = now + np.float32(settings.momentum) * (now - at.before)
-            clean = denoised(
-                ahead,
-                clean if step > 1 else ahead,
-                sigma,
-                settings.block_step,
-                step,
-                settings.threshold,
-                settings.chroma,
-                settings.reach,
-            )
+            kept = textures
+        now, sigma = textures.now, float(sigmas[step])
+        clean = _denoised(textures, sigma, step, settings) if step else textures.clean
         if again is not None and step in settings.sweeps:
             padded = searched = np.pad(again(clean, surfaces), around, "edge")
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
             seen = others(padded, margin, clean)
         left = settings.steps - 1 - step
         if step >= 2 and left < settings.refine_steps and left % 2 == 0:
-            doubted = precision / (1 + precision * sigma**2 * rows_squared)
+            # A reading's variance: its noise, and that of a texture of deviation `doubt`.
+            doubt = settings.doubt**2 * rows_squared
+            doubted = (precision / (1 + precision * doubt)).astype(np.float32)
             residual = frames - surfaces.forward(now)
-            padded = refined(
-                surfaces, padded, now, residual, doubted.astype(np.float32), settings.slope_px
-            )
+            padded = refined(surfaces, padded, now, residual, doubted, settings.slope_px)
             padded = np.clip(padded, searched - settings.room_px, searched + settings.room_px)
             surfaces = surfaces_of(psi, padded, margin, nearer, colours)
         fit = fitted(surfaces, frames, precision, clean, sigma, settings.fit_steps, seen)
-        at = Begun(fit, now, clean)
+        textures = Begun(fit, now, clean)
         if on_step is not None:
             on_step(step + 1)
     inner = np.s_[margin : margin + centre.shape[0], margin : margin + centre.shape[1]]
-    return FittedScene(surfaces, at.now, at.clean, np.ascontiguousarray(padded[inner]), kept)
+    found = np.ascontiguousarray(padded[inner])
+    return FittedScene(surfaces, textures.now, textures.clean, found, kept)
+
+
+def _denoised(textures: Begun, sigma: float, step: int, settings: TextureSettings) -> Array:
+    """Return the texture, carried on by the momentum, less noise of deviation sigma, (c, y, x)."""
+    ahead = textures.now + np.float32(settings.momentum) * (textures.now - textures.before)
+    return denoised(
+        ahead,
+        guide=textures.clean if step > 1 else ahead,
+        sigma=sigma,
+        step=settings.block_step,
+        first=step,
+        threshold=settings.threshold,
+        chroma=settings.chroma,
+        reach=settings.reach,
+    )

@@ -1,6 +1,8 @@
 """Vector instructions of kernels: boxes of cells, and the taps of single rays, on flat textures.
 
-Vectors are of `LANES` and of `TAPS` float32. No index is checked.
+Vectors are of `LANES` and of `TAPS` float32. No index is checked. With plain loops instead, which
+Numba 0.68 does not vectorise when they are so short, `adaptive` takes 26 % more time (96x128, one
+shot).
 """
 
 from __future__ import annotations

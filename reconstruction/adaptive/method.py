@@ -10,7 +10,7 @@ Edges that views do not reach are left out of what follows, and given back at th
 4. The texture is fitted to all frames at once, from total variation's centre view, with what
    repeats in the scene as prior, and the disparity is sharpened per pixel on the way (`joint`,
    `shrinkage`, `refine`, `sweep`).
-5. Where disparities are wide they are searched a second time, less sure (`second`).
+5. Where disparities are wide they are searched a second time, less sure (`survey`).
 6. Textures that follow the readings more or less closely, and sparse patches from two shots on or
    total variation, are averaged by how well they predict readings kept from all of them (`fits`,
    `mixture`), which also calibrate the standard deviation of the result (`uncertainty`).
@@ -35,13 +35,13 @@ from emmc_rig.reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
 from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
 from emmc_rig.reconstruction.adaptive.film import Film, followed
 from emmc_rig.reconstruction.adaptive.fits import Fits, Patches, averaged, fitted_models
-from emmc_rig.reconstruction.adaptive.second import searched_again
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.adaptive.survey import (
     Plain,
     checked,
     checked_disparity,
     plain_of,
+    searched_again,
     surveyed,
 )
 from emmc_rig.reconstruction.adaptive.times import OtherTime, moved, of_present, surveyed_together
@@ -69,7 +69,7 @@ def reconstruct_adaptive(
 
     disparity: of the centre view (y, x), where it is known, in place of the one searched. patches:
     see `Patches`; they are asked for from `settings.patches` shots on, or where surfaces fail
-    (`second`). film: that this is a frame of, see `reconstruction.result.Reconstruction.film`.
+    (`survey`). film: that this is a frame of, see `reconstruction.result.Reconstruction.film`.
     Raises ReconstructionError for inputs of shapes that disagree.
     """
     settings = settings or AdaptiveSettings()

@@ -61,6 +61,13 @@ def _shares(
     window_px: float,
     power: float,
 ) -> NDArray[np.float32]:
+    """Return the weights w_k of `shares_of`, for a window and a power.
+
+    Over the n held-out readings y in the window around a pixel, of noise variance s:
+
+        E_k = max(sum((y - Psi L_k)^2 - s) / n, sqrt(2 / n) mean(s))
+        w_k = E_k^-power / sum_j E_j^-power
+    """
     # The whole picture's mean square counts as one more reading at every place.
     readings = _around(held.astype(np.float64), window_px) + 1
     excess = []
@@ -132,9 +139,13 @@ def values(levels: NDArray[np.uint16]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """light_field: the mean of models, (v, u, y, x, c). spread: their variance about it, apart: the
-    squared difference between the mean and another light field; both (v, u, y, x), averaged over
-    colours."""
+    """The mean of models, and how they differ.
+
+    Attributes:
+        light_field: the mean, (v, u, y, x, c).
+        spread: variance of the models about it, (v, u, y, x), averaged over colours.
+        apart: squared difference between the mean and another light field, of this shape.
+    """
 
     light_field: NDArray[np.float32]
     spread: NDArray[np.float32]

@@ -66,13 +66,17 @@ def conjugate_gradients(
     steps: int,
     rtol: float = 1e-5,
 ) -> Array:
-    """Return the solution of A(x) + ridge x = rhs, (..., y, x), from x = 0.
+    """Return the solution x of A(x) + ridge x = rhs, (..., y, x), from x = 0.
 
-    A, symmetric and positive semidefinite, is given by subtract(x, sums), which subtracts A(x) from
-    the sum of sums[0] and sums[1], both of x's shape.
+        q = A(d) + ridge d,   a = r.r / d.q,   r' = r - a q
+        x = x + a d,          d = r' + (r'.r' / r.r) d
 
-    The square of the next residual r - s q follows from products of this one, so that a step is two
-    passes over memory: q and its products, then all updates.
+    r'.r' = r.r - 2 a r.q + a^2 q.q follows from the products of this step, so that a step is two
+    passes over memory: q and its products (`_applied`), then all updates (`_stepped`).
+
+    A, symmetric and positive semidefinite, is given by subtract(d, sums), which subtracts A(d) from
+    the sum of sums[0] and sums[1], both of d's shape. Stops after `steps`, or when |r| is rtol of
+    |rhs|.
     """
     sums = np.zeros((2, *rhs.shape), dtype=np.float32)
     solution, residual, direction = np.zeros_like(rhs), rhs.copy(), rhs.copy()
@@ -103,8 +107,13 @@ def conjugate_gradients(
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Frames of a texture through surfaces, and the inverse variance of their readings, 0 to leave
-    it out, both (shot, pixel_y, pixel_x)."""
+    """Frames of a texture through surfaces.
+
+    Attributes:
+        surfaces: Psi of the surfaces.
+        frames: (shot, pixel_y, pixel_x).
+        precision: inverse variance of the readings, 0 to leave one out, of this shape.
+    """
 
     surfaces: Surfaces
     frames: Array
@@ -147,7 +156,10 @@ def slopes(texture: Array) -> Array:
 
 
 def _smoothness(centre: Array, slope_px: float) -> tuple[Array, Array]:
-    """Return the weights of squared differences along y and x, for the Laplace prior."""
+    """Return the weights of squared differences along y and x, for the Laplace prior.
+
+    w = 1 / (slope_px sqrt(t^2 + EVEN_PX^2)) for a difference t: then w t^2 is about |t| / slope_px.
+    """
     return tuple(
         (1 / (slope_px * np.sqrt(np.square(np.diff(centre, axis=axis)) + EVEN_PX**2))).astype(
             np.float32
@@ -177,7 +189,14 @@ def refined(
     slope_px: float = 0.1,
     steps: int = 8,
 ) -> Array:
-    """Return the padded disparity (y, x) of the centre view after one step.
+    """Return the padded disparity (y, x) of the centre view after one Gauss-Newton step.
+
+    With the derivative J of the frames by the disparity d, the residual r, its variance S, and the
+    roughness R of squared differences with the weights of `_smoothness`, the step x solves
+
+        (J^T S^-1 J + R + 1 / TRUSTED_STEP_PX^2) x = J^T S^-1 r - R d,
+
+    clipped to TRUSTED_STEP_PX.
 
     texture: (c, y, x) of the centre view, padded. residual: the frames less what the texture
     explains; precision: inverse variance of it, both (shot, pixel_y, pixel_x).

@@ -3,7 +3,9 @@
 Small matrices of many problems are worked on side by side: a vector holds one entry of LANES
 matrices. A compiler does not keep a tile's vectors in registers throughout a sum, since what is
 stored might be what is read next; so these functions, which kernels call, are written in its own
-language. Products and factors then are bound by arithmetic, at two products a vector read.
+language. Products and factors then are bound by arithmetic, at two products a vector read: with
+plain loops over lanes for the Cholesky factor alone, `adaptive` takes 39 % more time (96x128, one
+shot).
 
 Matrices lie in flat float32 arrays, at an index: (row, column, lane) of a tile. The arguments
 `flat`, `table` and `vectors` are such arrays; nothing checks their bounds.

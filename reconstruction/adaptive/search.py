@@ -34,6 +34,7 @@ from emmc_rig.reconstruction.adaptive.evidence import (
     TexturePrior,
     patch_evidence,
 )
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
@@ -84,6 +85,9 @@ def compatibility(
 ) -> Array:
     """Return the joint prior of two neighbours' disparities, (L, L), symmetric, not normalised.
 
+        pairs(d, d') = (1 - jump) exp(-|d - d'| / slope_px) / n + jump L common(d) common(d')
+        common(d) ~ spacing_px / (1 + |d| / RARE_PX), which sums to 1
+
     slope_px: mean difference of neighbours on one object. jump: probability of another object,
     whose disparity is the rarer the larger. spacing_px: between disparities, if it varies.
     """
@@ -96,11 +100,22 @@ def compatibility(
 
 
 def _normalised(beliefs: Array) -> Array:
+    """Return beliefs (..., label) that sum to 1."""
     return beliefs / np.maximum(beliefs.sum(axis=-1, keepdims=True), 1e-30)
+
+
+PASSES = ((0, 1, False), (1, 1, True), (2, 0, False), (3, 0, True))
+"""Of a round of messages: their number, the axis they move along, and whether against its order."""
 
 
 def posteriors(evidence: Array, pairs: Array, rounds: int = 3) -> Array:
     """Return the probability of each label at each patch, (row, column, L), float32.
+
+    Sum-product belief propagation on the grid of patches, messages m, neighbours p -> q:
+
+        own_p(d)    = (1 - FLOOR) exp(evidence_p(d)) / sum + FLOOR / L
+        m_pq(d')    ~ sum_d pairs(d, d') own_p(d) prod_{r != q} m_rp(d)
+        belief_p(d) ~ own_p(d) prod_r m_rp(d)
 
     evidence: (row, column, L) log-likelihoods. pairs: (L, L), see `compatibility`.
     """
@@ -110,11 +125,11 @@ def posteriors(evidence: Array, pairs: Array, rounds: int = 3) -> Array:
     rows, columns, labels = own.shape
     messages = np.ones((4, rows, columns, labels), dtype=np.float32)
     for _ in range(rounds):
-        for into, axis, reverse in ((0, 1, False), (1, 1, True), (2, 0, False), (3, 0, True)):
+        for into, axis, reverse in PASSES:
             length = own.shape[axis]
             order = range(length - 1, 0, -1) if reverse else range(length - 1)
             ahead = -1 if reverse else 1
-            back = into ^ 1
+            back = into ^ 1  # The message from where this one goes: it must not return there.
             for at in order:
                 here = (at, slice(None)) if axis == 0 else (slice(None), at)
                 there = (at + ahead, slice(None)) if axis == 0 else (slice(None), at + ahead)
@@ -129,8 +144,13 @@ def posteriors(evidence: Array, pairs: Array, rounds: int = 3) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SearchData:
-    """The data of a search. residual: frames less those of the smooth picture, with the variance of
-    what no model explains in their noise; brightness: of that picture, (pixel_y, pixel_x)."""
+    """The data of a search.
+
+    Attributes:
+        residual: frames less those of the smooth picture; their noise includes the variance of what
+            no model explains.
+        brightness: of the smooth picture, (pixel_y, pixel_x).
+    """
 
     residual: Readings
     brightness: Array
@@ -145,11 +165,15 @@ class SearchData:
 class Volume:
     """Probabilities of disparities on a grid of patches.
 
-    centres: rows and columns of the patches' centres, in pixels. probability: (row, column,
-    disparity); evidence: theirs, log-likelihoods, -inf where excluded. kind: (row, column) of
-    the texture. decisive: (row, column), whether the patch's own evidence prefers any disparity.
-    at_end: share of deciding patches at the range's ends. between: the same of a grid between these
-    patches, of the same disparities.
+    Attributes:
+        disparities: the labels, in samples per view step, (disparity,).
+        centres: rows and columns of the patches' centres, in pixels.
+        probability: (row, column, disparity).
+        evidence: log-likelihoods, (row, column, disparity), -inf where excluded.
+        kind: of the texture, an index of `TexturePrior.kinds`, (row, column).
+        decisive: whether the patch's own evidence prefers any disparity, (row, column).
+        at_end: share of deciding patches at the range's ends.
+        between: the same for a second grid, between these patches, of the same disparities.
     """
 
     disparities: NDArray[np.float64]
@@ -165,27 +189,6 @@ class Volume:
     def grids(self) -> tuple[Volume, ...]:
         """This volume and, where there is a second grid, `between`: beliefs are their mean."""
         return (self,) if self.between is None else (self, self.between)
-
-
-def reading_side(shots: int) -> int:
-    """Return how many pixels wide a patch is: about as many readings for any number of shots."""
-    return max(4, round(8 / shots**0.5))
-
-
-def coarse_side(shots: int) -> int:
-    """Return how many pixels wide a patch of the coarse search is: there are few of them."""
-    return min(8, max(4, round(12 / shots**0.5)))
-
-
-def _evaluated(
-    data: SearchData, patches: EvidencePatches, disparities: Array, prior: TexturePrior
-) -> tuple[Array, NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Return evidence (row, column, disparity), kinds (row, column), and the corners' grid."""
-    rows, columns = patches.grid(data.psi.frames_shape[1:])
-    corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
-    found = evidence_at(data, patches, corners, disparities, prior)
-    shape = len(rows), len(columns)
-    return found.log_likelihood.reshape(*shape, -1), found.kind.reshape(shape), (rows, columns)
 
 
 def evidence_at(
@@ -216,57 +219,72 @@ def evidence_at(
 
 
 def _deciding(evidence: Array) -> NDArray[np.bool_]:
+    """Return which patches decide, of evidence (..., disparity), see DECISIVE."""
     mean = evidence.mean(axis=-1, where=np.isfinite(evidence))
     return evidence.max(axis=-1) - mean > DECISIVE
 
 
-def _reach(first_px: float, last_px: float, step_px: float) -> NDArray[np.float64]:
+def _steps(first_px: float, last_px: float, step_px: float) -> NDArray[np.float64]:
     """Return the disparities beyond the first, to the last, a step apart."""
     return np.arange(first_px + step_px, last_px + 1e-9, step_px)
 
 
 def _spacing(disparities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far each disparity lies from the next ones, in the mean."""
     return np.gradient(disparities) if len(disparities) > 1 else np.ones(len(disparities))
 
 
-def coarse(
-    data: SearchData, prior: TexturePrior, furthest_px: float, slope_px: float, jump: float
-) -> Volume:
-    """Return the coarse search over disparities up to `furthest_px` to both sides."""
-    side = coarse_side(data.psi.shots)
+def coarse(data: SearchData, prior: TexturePrior, settings: AdaptiveSettings) -> Volume:
+    """Return the coarse search over disparities up to `settings.furthest_px` to both sides.
+
+    1. Disparities up to START_PX: COARSE_STEP_PX apart up to NEAR_PX, beyond it FAR_STEP_PX.
+    2. Where a share of more than POSSIBLE of the deciding patches prefers the last two disparities
+       of a side, that side grows by START_PX; repeated until neither does.
+    """
+    furthest_px, shots = settings.furthest_px, data.psi.shots
+    side = min(8, max(4, round(12 / shots**0.5)))
     room = (min(data.psi.frames_shape[1:]) - 1) // (side - 1)
     patches = EvidencePatches(side, 3 * side // 2, min(COARSE_SPACING, max(room, 1)))
-    near = np.append(0.0, _reach(0, min(NEAR_PX, furthest_px), COARSE_STEP_PX))
-    beyond = np.concatenate([near, _reach(near[-1], min(START_PX, furthest_px), FAR_STEP_PX)])
+    grid = patches.grid(data.psi.frames_shape[1:])
+    shape = len(grid[0]), len(grid[1])
+    corners = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    near = np.append(0.0, _steps(0, min(NEAR_PX, furthest_px), COARSE_STEP_PX))
+    beyond = np.concatenate([near, _steps(near[-1], min(START_PX, furthest_px), FAR_STEP_PX)])
     known = np.concatenate([-beyond[:0:-1], beyond])
-    evidence, kind, grid = _evaluated(data, patches, known, prior)
+    first = evidence_at(data, patches, corners, known, prior)
+    evidence, kind = first.log_likelihood.reshape(*shape, -1), first.kind.reshape(shape)
     while True:
         deciding = _deciding(evidence)
-        pairs = compatibility(known, slope_px * patches.stride, jump, _spacing(known))
+        pairs = compatibility(
+            known, settings.slope_px * patches.stride, settings.jump, _spacing(known)
+        )
         chances = posteriors(evidence, pairs)
-        best = chances.argmax(axis=-1)
-        share = [
-            float(np.mean(best[deciding] <= 1)) if deciding.any() else 0.0,
-            float(np.mean(best[deciding] >= len(known) - 2)) if deciding.any() else 0.0,
+        best = chances.argmax(axis=-1)[deciding]
+        at_ends = [
+            float(np.mean(there)) if best.size else 0.0
+            for there in (best <= 1, best >= len(known) - 2)
         ]
         below, above = (
-            _reach(end, min(end + START_PX, furthest_px), FAR_STEP_PX)
-            if ends > POSSIBLE
+            _steps(end, min(end + START_PX, furthest_px), FAR_STEP_PX)
+            if share > POSSIBLE
             else known[:0]
-            for end, ends in zip((-known[0], known[-1]), share, strict=True)
+            for end, share in zip((-known[0], known[-1]), at_ends, strict=True)
         )
         if not len(below) + len(above):
             break
         further = -below[::-1], above
-        evaluated = [
-            _evaluated(data, patches, part, prior)[0] if len(part) else evidence[..., :0]
+        low, high = (
+            evidence_at(data, patches, corners, part, prior).log_likelihood.reshape(*shape, -1)
+            if len(part)
+            else evidence[..., :0]
             for part in further
-        ]
-        evidence = np.concatenate([evaluated[0], evidence, evaluated[1]], axis=-1)
+        )
+        evidence = np.concatenate([low, evidence, high], axis=-1)
         known = np.concatenate([further[0], known, further[1]])
     half = (patches.side - 1) * patches.spacing / 2
     centres = grid[0] + half, grid[1] + half
-    return Volume(known, centres, chances, evidence, kind, deciding, max(share))
+    return Volume(known, centres, chances, evidence, kind, deciding, max(at_ends))
 
 
 def _possible(
@@ -275,11 +293,10 @@ def _possible(
     grid: tuple[NDArray[np.int64], NDArray[np.int64]],
     labels: Array,
 ) -> NDArray[np.bool_]:
-    """Return which `labels` are near a likely disparity at or around each patch.
+    """Return which `labels` are near a likely disparity at or around each patch, (row, column,
+    label).
 
-    Shape (row, column, label).
-
-    grid: rows and columns of the patches' corners.
+    volume: of the coarse search. grid: rows and columns of the patches' corners.
     """
     around = 1.5 * np.diff(volume.centres[0]).max(initial=1.0)
     # The likeliest in any case: of many disparities all may be less than POSSIBLE.
@@ -291,6 +308,7 @@ def _possible(
         # The nearest in any case: on a small sensor one patch may be all that the rough search has.
         sides.append(apart <= np.maximum(around + patches.side / 2, apart.min(axis=1)[:, None]))
     near_row, near_column = sides
+    # Along rows first, then along columns: what is likely at any coarse patch nearby.
     rows = np.stack([likely[near].any(axis=0) for near in near_row])
     both = np.stack([rows[:, near].any(axis=1) for near in near_column], axis=1)
     apart = np.abs(labels - volume.disparities[:, None])
@@ -299,36 +317,38 @@ def _possible(
 
 
 def fine(
-    data: SearchData,
-    prior: TexturePrior,
-    rough: Volume,
-    stride: int,
-    step_px: float,
-    slope_px: float,
-    jump: float,
-    interleaved: bool = True,
+    data: SearchData, prior: TexturePrior, rough: Volume, settings: AdaptiveSettings
 ) -> Volume:
-    """Return the search of `step_px` among what the rough one left possible.
+    """Return the search of `settings.step_px` among what the rough one left possible.
 
-    interleaved: whether a second grid of patches lies between the first, see `Volume.between`.
+    1. Labels: multiples of step_px over the rough range. Each `every`-th, at most SMOOTH_PX apart,
+       is evaluated where it is possible at any patch of a tile; a finer label only where it may be
+       the best of a patch that decides (`_on_grid`).
+    2. Evidence of patches that do not decide is continued flatly, and large disparities made rarer.
+    3. Neighbours agree (`posteriors`), for each of one or two interleaved grids of patches.
     """
-    side = reading_side(data.psi.shots)
-    patches = EvidencePatches(side, min(stride, side))
+    shots, step_px = data.psi.shots, settings.step_px
+    # About as many readings a patch for any number of shots.
+    side = max(4, round(8 / shots**0.5))
+    patches = EvidencePatches(side, min(settings.stride, side))
     prior = replace(prior, kept=KEPT if prior.finer_px else None)
     low, high = rough.disparities[[0, -1]]
     every = max(1, int(SMOOTH_PX / step_px + 1e-9))
     ends = np.floor(low / step_px / every) * every, np.ceil(high / step_px / every) * every
     labels = np.arange(ends[0], ends[1] + 1) * step_px
-    firsts = (0, patches.stride // 2) if interleaved and patches.stride > 1 else (0,)
+
+    two = settings.interleaved and patches.stride > 1
+    firsts = (0, patches.stride // 2) if two else (0,)
     grids = [patches.grid(data.psi.frames_shape[1:], first) for first in firsts]
     asked = [_asked(_shared(_possible(rough, patches, grid, labels)), every) for grid in grids]
     used = _spanned(np.any([part.any(axis=(0, 1)) for part in asked], axis=0), every)
+
     # Large disparities average texture away: patches with hardly any fit them a little better.
     rare = np.log1p(np.abs(labels[used]) / RARE_PX).astype(np.float32)
     # Where patches overlap they count the same readings again.
     own = np.float32((patches.stride / side) ** 2)
-    pairs = compatibility(labels[used], slope_px * patches.stride, jump)
-
+    pairs = compatibility(labels[used], settings.slope_px * patches.stride, settings.jump)
+    half = (side - 1) / 2
     between = None
     for grid, wanted in zip(reversed(grids), reversed(asked), strict=True):
         evidence, kind, decisive = _on_grid(data, patches, grid, prior, labels, every, wanted)
@@ -336,14 +356,14 @@ def fine(
         evidence[~decisive] = _extended(evidence[~decisive])
         likely = evidence - np.where(decisive[..., None], np.float32(0), rare)
         between = Volume(
-            labels[used],
-            (grid[0] + (side - 1) / 2, grid[1] + (side - 1) / 2),
-            posteriors(likely * own, pairs),
-            evidence,
-            kind,
-            decisive,
-            rough.at_end,
-            between,
+            disparities=labels[used],
+            centres=(grid[0] + half, grid[1] + half),
+            probability=posteriors(likely * own, pairs),
+            evidence=evidence,
+            kind=kind,
+            decisive=decisive,
+            at_end=rough.at_end,
+            between=between,
         )
     assert between is not None
     return between

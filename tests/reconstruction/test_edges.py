@@ -21,9 +21,9 @@ def camera_psi(coded_psi):
 
 
 def darkened(light_field, k=1):
-    """Every second pixel of the last row black, and the first two columns but for a tenth."""
+    """Every second pixel of the last row black, others dim; a tenth of the first two columns."""
     out = light_field.copy()
-    out[:, :, -k:] *= (np.arange(out.shape[3]) // k % 2)[:, None]
+    out[:, :, -k:] *= 0.4 * (np.arange(out.shape[3]) // k % 2)[:, None]
     out[:, :, :, : 2 * k] *= 0.1
     return out
 

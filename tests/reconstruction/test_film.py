@@ -9,9 +9,14 @@ from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.film import Film
-from emmc_rig.reconstruction.adaptive.flow import at_places, flow_between, joined, sampled
 from emmc_rig.reconstruction.adaptive.joint import surfaces_of
-from emmc_rig.reconstruction.adaptive.times import OtherTime
+from emmc_rig.reconstruction.adaptive.times import (
+    OtherTime,
+    at_places,
+    flow_between,
+    joined,
+    sampled,
+)
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import Readings
 from emmc_rig.reconstruction.methods import reconstruct

@@ -10,11 +10,11 @@ import pytest
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import even_frames
-from emmc_rig.reconstruction.adaptive import fits, method, second
+from emmc_rig.reconstruction.adaptive import fits, method
+from emmc_rig.reconstruction.adaptive import survey as surveys
 from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
-from emmc_rig.reconstruction.adaptive.second import searched_again, surfaces_fail
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
-from emmc_rig.reconstruction.adaptive.survey import checked, surveyed
+from emmc_rig.reconstruction.adaptive.survey import checked, searched_again, surfaces_fail, surveyed
 from emmc_rig.study.trial import Capture, trial_of
 
 SIZE = (48, 56)
@@ -73,7 +73,7 @@ def test_one_shot_surfaces_fail_where_surfaces_miss_and_disparities_are_large(
     )
     # Of two fits of surfaces the better counts.
     assert surfaces_fail(unlike, [missed * plain, plain]) == takes
-    assert 4 * 1.7 < second.BESIDE * min(SIZE) < 4 * 4.0
+    assert 4 * 1.7 < surveys.BESIDE * min(SIZE) < 4 * 4.0
 
 
 def test_the_second_search_is_less_sure(survey):
