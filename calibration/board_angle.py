@@ -149,7 +149,14 @@ def board_over_angle(
 def _fit_turned_board(
     psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None
 ) -> _TurnedBoard:
-    """Return what a board says of the change of radiance; flat: the terms, (term, view)."""
+    """Return what a board says of the change of radiance; flat: the terms, (term, view).
+
+        reading = sum over views j of  psi_j (level_colour + sum over terms t of  c_t flat_tj)
+                  + slopes . move + noise
+
+    Least squares for the terms c, the colours' levels, and the mask's move in x and y; residuals
+    beyond CLIP deviations are left out, and the shadow is drawn anew after each move.
+    """
     sample = board.sampled(np.inf, SAMPLED, np.random.default_rng(0))
     channels, reading, deviation = sample.channels, sample.reading, sample.deviation
     y, x = sample.pixels.T
@@ -183,10 +190,10 @@ def _fit_turned_board(
         if np.abs(step).max() < 1e-3:
             break
     squares = float((weight * left**2).sum() / weight.sum())
-    # The levels of the colours and the mask's place are free: what is left determines the terms.
-    inside, outside = slice(0, size), slice(size, None)
-    solve_for_sense = np.linalg.solve(normal[outside, outside], normal[outside, inside])
-    information = normal[inside, inside] - normal[inside, outside] @ solve_for_sense
+    # The levels of the colours and the mask's place are free: their Schur complement is left.
+    terms, free = slice(0, size), slice(size, None)
+    explained = normal[terms, free] @ np.linalg.solve(normal[free, free], normal[free, terms])
+    information = normal[terms, terms] - explained
     moved_deviation = 0.0
     if slopes.shape[1]:
         covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) * max(squares, 1.0)

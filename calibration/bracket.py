@@ -51,6 +51,13 @@ def fuse(
     current is not known: the deviation counts DARK_ELECTRONS_PER_S. gain: its variance in the dark
     is that of the shortest dark.
 
+        w_k = t_k^2 / variance_k(rate),    rate = sum w_k (signal_k / t_k) / sum w_k
+        variance = 1 / sum w_k + sum over darks d of  (sum share_kd lever_k)^2 variance_d
+                   + (sum unknown_k lever_k)^2,    lever_k = w_k / (t_k sum w)
+
+    Sums over the frames k used, t their exposures, signal above the dark in DN; share_kd: of dark d
+    in what is subtracted from frame k; unknown: of the dark current.
+
     Raises CalibrationError for no frame, and for frames of another size than the darks.
     """
     if not frames_dn or len(frames_dn) != len(exposures_s):

@@ -204,11 +204,15 @@ def _blocks(
     inside = np.moveaxis(np.mgrid[:side, :side], 0, -1).reshape(-1, 2)
     pixels = np.array(corners)[:, None, :] + inside
     y, x = pixels[..., 0], pixels[..., 1]
-    colours, readings, deviation = (
-        array[:, y, x].transpose(1, 0, 2) for array in (channels, frames.readings, frames.deviation)
-    )
+
+    def at(array: NDArray) -> NDArray:
+        return array[:, y, x].transpose(1, 0, 2)
+
     return _Blocks(
-        pixels, colours, readings.astype(np.float64), np.square(deviation, dtype=np.float64)
+        pixels,
+        at(channels),
+        at(frames.readings).astype(np.float64),
+        np.square(at(frames.deviation), dtype=np.float64),
     )
 
 

@@ -22,7 +22,9 @@ from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]
 FINE_PX, COARSE_PX = 2.0, 4.0
+"""Knot distances of the splines, pixels."""
 FINE_SPREAD, COARSE_SPREAD, MEAN_SPREAD, CHROMA_SPREAD = 0.15, 0.3, 1.0, 0.15
+"""Of the splines' coefficients, as shares of the mean; only their ratios count."""
 FLOOR_SHARE = 0.02
 """Of a block's mean reading: what the prior does not describe (occlusion, fine texture)."""
 
@@ -31,9 +33,12 @@ FLOOR_SHARE = 0.02
 class Prior:
     """The planes' splines by disparity: the share of every grid point in every pixel of a view.
 
-    down, across: (disparity, view, pixel, spline), of every grid in turn. grids: (grid, 2), first
-    spline and number. spreads: per grid. Grids: fine, coarse, constant; coarse is also that of
-    the colours.
+    Grids: fine, coarse, constant; coarse is also that of the colours.
+
+    disparities_px: (disparity,), pixels per view step.
+    down, across: (disparity, view, pixel, spline), of every grid in turn, along either axis.
+    grids: (grid, 2), first spline and number.
+    side: pixels along a block.
     """
 
     disparities_px: NDArray[np.float64]
@@ -104,49 +109,79 @@ def _add_grid(coefficients, down, across, first, count, matrix, at):
                             matrix[row, at + i * count + k] += share * line[k]
 
 
+@njit(forceinline=True)
+def _block_covariances(coefficients, down, across, grids):
+    """Return the covariance of a block's readings by brightness, and by each colour: (n, n) each.
+
+        brightness: A diag(spread^2) A^T,    A = sum over colours of A_c
+        colour: CHROMA_SPREAD^2 sum over colours of A_c A_c^T,  without the fine grid
+
+    A_c: (n, spline), the splines through Psi of colour c. coefficients: (stored, shot, side^2, v,
+    u). down, across: (view, pixel, spline) at one disparity.
+    """
+    stored, shots, area = coefficients.shape[:3]
+    n = shots * area
+    fine, coarse = grids[0, 1] ** 2, grids[1, 1] ** 2
+    total = fine + coarse + 1
+    matrix = np.zeros((n, total))
+    chroma = np.zeros((n, n))
+    for c in range(stored):
+        own = np.zeros((n, total))
+        at = 0
+        for grid in range(3):
+            first, count = grids[grid, 0], grids[grid, 1]
+            _add_grid(coefficients[c], down, across, first, count, own, at)
+            at += count**2
+        matrix += own
+        coloured = own[:, fine:] * CHROMA_SPREAD
+        chroma += coloured @ coloured.T
+    matrix[:, :fine] *= FINE_SPREAD
+    matrix[:, fine : fine + coarse] *= COARSE_SPREAD
+    matrix[:, fine + coarse :] *= MEAN_SPREAD
+    return matrix @ matrix.T, chroma
+
+
+@njit(forceinline=True)
+def _profiled_evidence(covariance, values):
+    """Return -n/2 log(y^T K^-1 y) - 1/2 log|K|, by K = L L^T: |L^-1 y|^2 and the diagonal of L."""
+    n = len(values)
+    root = np.linalg.cholesky(covariance)
+    logarithm, squares = 0.0, 0.0
+    whitened = np.empty(n)
+    for i in range(n):
+        value = values[i]
+        for j in range(i):
+            value -= root[i, j] * whitened[j]
+        whitened[i] = value / root[i, i]
+        squares += whitened[i] ** 2
+        logarithm += np.log(root[i, i])
+    return -0.5 * n * np.log(max(squares, 1e-300)) - logarithm
+
+
 @njit(cache=True, parallel=True)
 def _compute_evidence(coefficients, colours, readings, noise, down, across, grids, chosen, found):
     """Set found (block, candidate) to each block's log evidence at its chosen disparities.
 
-    coefficients: (block, stored, shot, pixel, v, u); colours, readings, noise: (block, shot,
-    pixel). chosen: (block, candidate) indices of disparities.
+        K = brightness + chroma (between readings of one colour)
+            + scale (FLOOR_SHARE^2 + noise / level^2) on the diagonal
+
+    scale: mean variance by brightness; level: the block's mean reading. coefficients: (block,
+    stored, shot, pixel, v, u); colours, readings, noise: (block, shot, pixel). chosen: (block,
+    candidate), indices of disparities.
     """
     stored = coefficients.shape[1]
     blocks, shots, area = readings.shape
     n = shots * area
-    fine, coarse = grids[0, 1] ** 2, grids[1, 1] ** 2
-    total = fine + coarse + 1
     for block in prange(blocks):
         values = readings[block].copy().reshape(n)
+        variances = noise[block].copy().reshape(n)
+        colour = colours[block].copy().reshape(n)
         level = 0.0
         for i in range(n):
             level += values[i] / n
-        colour = colours[block].copy().reshape(n)
         for candidate in range(chosen.shape[1]):
             d = chosen[block, candidate]
-            matrix = np.zeros((n, total))
-            chroma = np.zeros((n, n))
-            for c in range(stored):
-                own = np.zeros((n, total))
-                at = 0
-                for grid in range(3):
-                    _add_grid(
-                        coefficients[block, c],
-                        down[d],
-                        across[d],
-                        grids[grid, 0],
-                        grids[grid, 1],
-                        own,
-                        at,
-                    )
-                    at += grids[grid, 1] ** 2
-                matrix += own
-                coloured = own[:, fine:] * CHROMA_SPREAD
-                chroma += coloured @ coloured.T
-            matrix[:, :fine] *= FINE_SPREAD
-            matrix[:, fine : fine + coarse] *= COARSE_SPREAD
-            matrix[:, fine + coarse :] *= MEAN_SPREAD
-            covariance = matrix @ matrix.T
+            covariance, chroma = _block_covariances(coefficients[block], down[d], across[d], grids)
             scale = 0.0
             for i in range(n):
                 scale += covariance[i, i] / n
@@ -155,19 +190,9 @@ def _compute_evidence(coefficients, colours, readings, noise, down, across, grid
                 for j in range(n):
                     if stored > 1 or colour[i] == colour[j]:
                         covariance[i, j] += chroma[i, j]
-                relative = noise[block].reshape(n)[i] / max(level * level, 1e-12)
+                relative = variances[i] / max(level * level, 1e-12)
                 covariance[i, i] += scale * (FLOOR_SHARE**2 + relative)
-            root = np.linalg.cholesky(covariance)
-            logarithm, squares = 0.0, 0.0
-            whitened = np.empty(n)
-            for i in range(n):
-                value = values[i]
-                for j in range(i):
-                    value -= root[i, j] * whitened[j]
-                whitened[i] = value / root[i, i]
-                squares += whitened[i] ** 2
-                logarithm += np.log(root[i, i])
-            found[block, candidate] = -0.5 * n * np.log(max(squares, 1e-300)) - logarithm
+            found[block, candidate] = _profiled_evidence(covariance, values)
 
 
 def log_evidence(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -180,19 +180,27 @@ def read_mask(
         )
     grid = _fit_grid(light, _find_bow(light, start))
     _check_count(_line_spectra(light, grid), cells)
-    values, sigma, spread, blur = _cell_values(light, grid, INNER)
-    fewer = _cell_values(light, grid, INNER_CHECK)[0]
-    sigma = np.hypot(sigma, np.sqrt(((fewer - values) ** 2).mean(axis=(0, 1))))
-    level, light_sigma, clear = _fit_light(values, grid)
+    seen, fewer = (_cell_values(light, grid, width) for width in (INNER, INNER_CHECK))
+    by_grid = np.sqrt(((fewer.values - seen.values) ** 2).mean(axis=(0, 1)))
+    lamp = _fit_light(seen.values, grid)
     inner = (slice(RING, -RING),) * 2
-    found, sigma, spread = (array[inner] / level[inner] for array in (values, sigma, spread))
+    found, sigma, spread = (
+        array[inner] / lamp.level[inner]
+        for array in (seen.values, np.hypot(seen.sigma, by_grid), seen.spread)
+    )
     if np.sqrt(((found - found.mean(axis=-1, keepdims=True)) ** 2).mean()) < GREY:
         found, spread = (array.mean(axis=-1, keepdims=True) for array in (found, spread))
         sigma = np.sqrt((sigma**2).mean(axis=-1, keepdims=True) / sigma.shape[-1])
     _check_face(found, ordered)
     defects = tuple(_defects(found, spread, ordered))
     return MaskReading(
-        found.astype(np.float32), sigma.astype(np.float32), light_sigma, blur, clear, grid, defects
+        cells=found.astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        light_sigma=lamp.sigma,
+        blur_cells=seen.blur,
+        clear=lamp.clear,
+        grid=grid,
+        defects=defects,
     )
 
 
@@ -221,21 +229,17 @@ def find_corners(light: Array, cells: tuple[int, int]) -> Array:
     whole = whole[(slice(kernel.shape[0], -kernel.shape[0]),) * 2]
     _, labels, stats, _ = cv2.connectedComponentsWithStats(whole)
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    points = np.argwhere((labels == largest) & (differs > 0))[:, ::-1].astype(float)
+    points = np.argwhere((labels == largest) & (differs > 0))[:, ::-1].astype(np.int32)
+    hull = cv2.convexHull(points)
     beside = points.min(axis=0) <= 1
     beyond = points.max(axis=0) >= np.array(light.shape[1::-1]) - 2
-    if beside.any() or beyond.any():
+    if beside.any() or beyond.any() or len(hull) < 4:
         raise nothing
-    angle = np.radians((cv2.minAreaRect(points.astype(np.float32))[2] + 45) % 90 - 45)
-    along = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
-    turned = points @ along.T
-    left, right, top, bottom = (
-        _side(turned[:, ::-1] if axis else turned, outward, cells[axis])
-        for axis, outward in ((0, -1), (0, 1), (1, -1), (1, 1))
-    )
-    pairs = ((left, top), (right, top), (right, bottom), (left, bottom))
-    middle = turned.mean(axis=0)
-    return np.array([_crossing(x_of, y_of, middle) for x_of, y_of in pairs]) @ along
+    # Half of the outer cells may look like the surround: the outermost ones decide.
+    corners = cv2.approxPolyN(hull, 4, ensure_convex=True).reshape(4, 2).astype(np.float64)
+    x, y = (corners - corners.mean(axis=0)).T
+    clockwise = corners[np.argsort(np.arctan2(y, x))]
+    return np.roll(clockwise, -int(clockwise.sum(axis=1).argmin()), axis=0)
 
 
 def _differs_from_surround(light: Array) -> NDArray[np.uint8]:
@@ -253,42 +257,6 @@ def _differs_from_surround(light: Array) -> NDArray[np.uint8]:
     differs = (difference > 0.3 * np.quantile(difference, 0.99)).astype(np.uint8)
     opened = cv2.morphologyEx(differs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return np.asarray(opened, np.uint8)
-
-
-def _side(points: Array, outward: int, count: int) -> NDArray[np.float64]:
-    """Return the quadratic (see polyval) of the outermost of points (x, y) as a function of y.
-
-    outward: -1 for the side of small x. Half of the outer cells may look like the surround: only
-    what lies outside of the last fit stays in the next.
-    """
-    low, high = points[:, 1].min(), points[:, 1].max()
-    bins = ((points[:, 1] - low) / (high - low + 1e-9) * 2 * count).astype(int)
-    outermost = np.full(2 * count, -np.inf)
-    np.maximum.at(outermost, bins, outward * points[:, 0])
-    y = low + (np.arange(2 * count) + 0.5) * (high - low) / (2 * count)
-    kept = np.isfinite(outermost) & (abs(np.linspace(-1, 1, 2 * count)) < 0.95)
-    y, x = y[kept], outermost[kept]
-    middle = y.mean()
-    use = np.ones(y.size, bool)
-    fit = np.polyfit(y - middle, x, 2)
-    tolerance = 0.15 * (high - low) / count
-    for _ in range(20):
-        beyond = x - np.polyval(fit, y - middle)
-        use = beyond > -tolerance
-        if use.sum() < 6:
-            break
-        fit = np.polyfit(y[use] - middle, x[use], 2)
-    straight = np.poly1d(outward * fit)(np.poly1d([1, -middle]))
-    return np.asarray(np.atleast_1d(straight.coeffs), np.float64)
-
-
-def _crossing(x_of: Array, y_of: Array, start: Array) -> Array:
-    """Return the point (x, y) with x = x_of(y) and y = y_of(x)."""
-    x, y = start
-    for _ in range(50):
-        x = np.polyval(x_of, y)
-        y = np.polyval(y_of, x)
-    return np.array([x, y])
 
 
 def _check_corners(corners: Array, photo: tuple[int, ...]) -> None:
@@ -434,11 +402,25 @@ def _fit_grid(light: Array, start: Grid) -> Grid:
     return grid_of(found.x)
 
 
-def _cell_values(light: Array, grid: Grid, width: float) -> tuple[Array, Array, Array, float]:
-    """Return cells and RING around them: values, their deviation, residual rms; and the blur.
+class _Cells(NamedTuple):
+    """Cells and RING around them, (row, column, colour), in the photograph's units."""
 
-    Arrays are (row, column, colour), in the photograph's units; the blur in cells. width: of a
-    cell, that is sampled.
+    values: Array
+    sigma: Array
+    """Standard deviation of the values, by noise."""
+    spread: Array
+    """Root mean square of the residuals within a cell."""
+    blur: float
+    """Standard deviation, cells."""
+
+
+def _cell_values(light: Array, grid: Grid, width: float) -> _Cells:
+    """Return the cells whose blurred boxes explain the samples within them best.
+
+        samples = D cells A^T + noise,    cells = D^+ samples (A^+)^T
+
+    D, A: what samples along columns and rows see of every cell, see `_blurred_boxes`; D^+ the
+    pseudoinverse. The blur leaves the least residual. width: of a cell, that is sampled.
     """
     count = int(np.clip(width * grid.pitch_px(), 3, 16))
     inside = 0.5 + width * ((np.arange(count) + 0.5) / count - 0.5)
@@ -460,7 +442,7 @@ def _cell_values(light: Array, grid: Grid, width: float) -> tuple[Array, Array, 
     gain = [np.linalg.norm(np.linalg.pinv(boxes), axis=1) for boxes in (down, across)]
     # A cubic sample between pixels has, on average, 0.7 of a pixel's variance.
     sigma = 0.7**-0.5 * rms * (gain[0][:, None] * gain[1])[..., None]
-    return values, sigma, rms, blur
+    return _Cells(values, sigma, rms, blur)
 
 
 def _blurred_boxes(cells: int, inside: Array, blur: float) -> NDArray[np.float64]:
@@ -481,10 +463,22 @@ def _fit_cells(seen: Array, down: Array, across: Array) -> tuple[Array, Array]:
     return cells, seen - np.einsum("yr,rck,xc->yxk", down, cells, across, optimize=True)
 
 
-def _fit_light(values: Array, grid: Grid) -> tuple[Array, float, float]:
-    """Return the light on cells and ring (row, column, colour), its deviation, the clear share.
+class _Lamp(NamedTuple):
+    """The light through clear parts."""
 
-    Raises CalibrationError where nothing is seen to be clear.
+    level: Array
+    """On cells and ring, (row, column, colour)."""
+    sigma: float
+    """Relative standard deviation, common to all cells."""
+    clear: float
+    """Share of cells that are clear."""
+
+
+def _fit_light(values: Array, grid: Grid) -> _Lamp:
+    """Return the light: a polynomial through the clear ring, if there is one, and clear cells.
+
+    Which cells are clear depends on the light: both in turn, four times. Raises CalibrationError
+    where nothing is seen to be clear.
     """
     rows, columns, _ = values.shape
     y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : columns * 1j]
@@ -512,7 +506,7 @@ def _fit_light(values: Array, grid: Grid) -> tuple[Array, float, float]:
     terms, count = (degree + 1) * (degree + 2) / 2, clear.sum(axis=(0, 1))
     rest = np.where(clear, values / level - 1, 0)
     light_sigma = float(np.sqrt((rest**2).sum(axis=(0, 1)) * terms).max() / count.min())
-    return level, light_sigma, float(among[inner].any(axis=-1).mean())
+    return _Lamp(level, light_sigma, float(among[inner].any(axis=-1).mean()))
 
 
 def _surface(values: Array, where: Flags, x: Array, y: Array, degree: int) -> NDArray[np.float64]:

@@ -126,8 +126,10 @@ def psi_deviation(
 ) -> NDArray[np.float32]:
     """Return the standard deviation of every coefficient, shaped as Psi's weights.
 
-    covariance: of the placement's parameters. astray2: variances of the views' own displacements
-    and softenings, see `Shadow.slopes_by_view`.
+        deviation^2 = s^T C s + sum over kinds k of  astray2_k t_k^2
+
+    s: the coefficient's derivatives by the placement's parameters, C: their covariance. t: by the
+    view's own displacements and softenings, see `Shadow.slopes_by_view`; astray2: their variances.
     """
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0)))[:, values > 0]
@@ -160,10 +162,12 @@ def drawn_pixels(mask: ShadowMask) -> tuple[NDArray[np.int64], NDArray[np.uint8]
 
 
 def psi_information(shadow: Shadow) -> tuple[NDArray[np.float64], float]:
-    """Return what turns a covariance of the placement into the error of Psi, and |Psi|^2.
+    """Return G, (parameter, parameter), and |Psi|^2, both per pixel.
 
-    The expected squared Frobenius error of Psi is trace(matrix covariance); both per pixel and
-    coefficient, from SAMPLED of them drawn at random, each seeing one colour.
+        G = mean over pixels of  sum over coefficients of  s s^T
+        trace(G C): expected squared Frobenius error of Psi per pixel, C the placement's covariance
+
+    s: a coefficient's derivatives. Of SAMPLED pixels drawn at random, each seeing one colour.
     """
     mask = shadow.mask
     chosen, channels = drawn_pixels(mask)

@@ -138,7 +138,12 @@ class PinholeWorth:
 def pinhole_worth(known: Parametric, boards: Sequence[Board], stated: float) -> PinholeWorth:
     """Return what whiteboards through the pinhole are worth beside `boards`, taken as the first.
 
-    stated: relative error of Psi; the part that is not by the placement stays.
+        information of a view = (sum s s^T - (sum s r)(sum s r)^T / (sum r^2 + v / unsteady2)) / v
+        error^2 = trace(G C) / |Psi|^2 + stays2,    C = (information of all whiteboards)^-1
+
+    Sums over the usable pixels; r: reading, s: its derivatives, v: its variance; what is subtracted
+    is the whiteboard's own brightness, of variance unsteady2. G: see `psi_information`. stated:
+    relative error of Psi now; stays2 is the part of its square that is not by the placement.
     """
     shadow, fit, board = known.shadow, known.fit, boards[0]
     mask = shadow.mask
@@ -166,11 +171,11 @@ def pinhole_worth(known: Parametric, boards: Sequence[Board], stated: float) -> 
     best = min(each, key=lambda view: error(total + each[view]))
     shares = shares_of_prior(fit.placement, fit.covariance, Tolerances())[len(SCALARS) :]
     return PinholeWorth(
-        float(np.sqrt(np.mean(np.square(shares)))) * Tolerances().aperture,
-        (int(best[0]), int(best[1])),
-        stated,
-        error(total + each[best]),
-        error(total + sum(each.values())),
+        weights=float(np.sqrt(np.mean(np.square(shares)))) * Tolerances().aperture,
+        view=(int(best[0]), int(best[1])),
+        now=stated,
+        with_best=error(total + each[best]),
+        every=error(total + sum(each.values())),
     )
 
 

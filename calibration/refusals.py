@@ -271,7 +271,12 @@ def refuse_tilted_board(
 
 
 def _fit_gradient(shadow: Shadow, board: Board) -> tuple[Array, float]:
-    """Return by how much a whiteboard's brightness changes down and across, and how sure."""
+    """Return by how much a whiteboard's brightness changes down and across, and the deviation.
+
+        reading = shadow (level_colour + down (y / rows - 1/2) + across (x / columns - 1/2)) + noise
+
+    Relative to the level; outliers beyond four deviations are left out.
+    """
     sample = board.sampled(np.inf, SAMPLED_GRADIENT, np.random.default_rng(0))
     (rows, columns), (y, x), channels = board.reading.shape, sample.pixels.T, sample.channels
     at = shadow.readings(sample.pixels, channels, *board.opening)

@@ -30,18 +30,14 @@ def design():
 
 
 class FaultyBench(WhiteboardBench):
-    """A bench whose readings are changed: fault(reading, setting, masks_in, how many before)."""
+    """A bench whose readings are changed: fault(reading, setting, masks_in)."""
 
     fault = None
-    taken = 0
     longer = 1.0
 
     def reading(self, setting, masks_in=True):
-        self.taken += 1
         read = super().reading
-        if self.fault is None:
-            return read(setting, masks_in)
-        return self.fault(read, setting, masks_in, self.taken)
+        return self.fault(read, setting, masks_in) if self.fault else read(setting, masks_in)
 
     def board_exposure_s(self):
         return self.longer * super().board_exposure_s()
@@ -85,38 +81,28 @@ def moved(um):
 
 
 def when(chosen, change):
-    """Return a fault of the frames chosen (by setting, masks in), others as they are."""
+    """Return a fault of the frames chosen (see CHOSEN), others as they are."""
 
-    def fault(read, setting, masks_in, taken):
-        if chosen(setting, masks_in):
+    def fault(read, setting, masks_in):
+        if CHOSEN[chosen](setting, masks_in):
             return change(read, setting, masks_in)
         return read(setting, masks_in)
 
     return fault
 
 
-def unlit(read, setting, masks_in):
-    return 0 * read(setting, masks_in)
-
-
-def bare(read, setting, masks_in):
-    return read(setting, False)
-
-
-def tilted(read, setting, masks_in):
-    return read(setting, masks_in) * (1 + 0.1 * np.linspace(-0.5, 0.5, SIZE[1]))
-
-
-def tilted_a_little(read, setting, masks_in):
-    return read(setting, masks_in) * (1 + 0.03 * np.linspace(-0.5, 0.5, SIZE[1]))
+def tilted(share):
+    """The light rises by this share from left to right."""
+    slope = 1 + share * np.linspace(-0.5, 0.5, SIZE[1])
+    return lambda read, setting, masks_in: read(setting, masks_in) * slope
 
 
 def brighter(times):
     return lambda read, setting, masks_in: times * read(setting, masks_in)
 
 
-def bright_part(read, setting, masks_in):
-    return read(setting, masks_in) * np.where(np.arange(SIZE[1]) < 8, 2.5, 1.0)
+def bare(read, setting, masks_in):
+    return read(setting, False)
 
 
 def through(**changes):
@@ -129,42 +115,21 @@ def mirrored(read, setting, masks_in):
     return read(replace(setting, pinhole=(v, CAMERA.views[1] - 1 - u)), masks_in)
 
 
-def every(setting, masks_in):
-    return setting.lamp != "off"
-
-
-def references(setting, masks_in):
-    return setting.lamp != "off" and not masks_in
-
-
-def boards(setting, masks_in):
-    return masks_in
-
-
-def of_view(setting, masks_in):
-    return masks_in and setting.pinhole == VIEW
-
-
-def pinholes(setting, masks_in):
-    return masks_in and setting.pinhole is not None
-
-
-def elsewhere(setting, masks_in):
-    return masks_in and setting.stage_um == STAGE_KINDS_UM[1]
-
-
-def darks(setting, masks_in):
-    return setting.lamp == "off"
-
-
-def coloured(setting, masks_in):
-    return setting.lamp not in ("off", "white")
-
-
 def dim_light(read, setting, masks_in):
     return 0.02 * read(replace(setting, lamp="white"), masks_in)
 
 
+CHOSEN = {
+    "every": lambda setting, masks_in: setting.lamp != "off",
+    "darks": lambda setting, masks_in: setting.lamp == "off",
+    "references": lambda setting, masks_in: setting.lamp != "off" and not masks_in,
+    "coloured": lambda setting, masks_in: setting.lamp not in ("off", "white"),
+    "boards": lambda setting, masks_in: masks_in,
+    "pinholes": lambda setting, masks_in: masks_in and setting.pinhole is not None,
+    "one view": lambda setting, masks_in: masks_in and setting.pinhole == VIEW,
+    "elsewhere": lambda setting, masks_in: masks_in and setting.stage_um == STAGE_KINDS_UM[1],
+}
+UNLIT, BRIGHT_PART = brighter(0.0), brighter(np.where(np.arange(SIZE[1]) < 8, 2.5, 1.0))
 BAD = {
     "another mask": ({"camera": other_pattern()}, "not the mask of the design"),
     "another cell": ({"camera": with_mask(cell_um=40.0)}, "not the mask of the design"),
@@ -172,26 +137,32 @@ BAD = {
     "other filters": ({"camera": with_sensor(cfa="grbg")}, "of another camera, whose colour"),
     "half of another day": ({"other": moved(12.0)}, "it moved between them, or"),
     "half of a moved bench": ({"other": moved(120.0)}, "times as bright as the others suggest"),
-    "dimmer references": ({"fault": when(references, brighter(0.8))}, "taken with less light"),
+    "dimmer references": ({"fault": when("references", brighter(0.8))}, "taken with less light"),
     "saturated": ({"longer": 3.0}, "reference whiteboard, white lamp: saturated below the white"),
-    "one view saturated": ({"fault": when(of_view, brighter(75))}, r"\(0, 1\).*: saturated below"),
-    "a part saturated": ({"fault": when(every, bright_part)}, "saturated below the white level"),
-    "lamp off": ({"fault": when(every, unlit)}, "reference .* is the lamp on"),
-    "lamp off once": ({"fault": when(of_view, unlit)}, r"\(0, 1\).* is dark; is the lamp on"),
-    "lamp on in darks": ({"fault": when(darks, dim_light)}, "the dark frames have 2%"),
-    "lamp without colours": ({"fault": when(coloured, through(lamp="white"))}, "did not change"),
-    "mask missing": ({"fault": when(every, bare)}, "is the mask in the beam"),
-    "mask missing once": ({"fault": when(of_view, bare)}, r"\(0, 1\).*is the mask in the beam"),
-    "mask missing elsewhere": ({"fault": when(elsewhere, bare)}, "is the mask in the beam"),
-    "aperture closed": ({"fault": when(boards, unlit)}, "and the aperture open"),
+    "one view saturated": (
+        {"fault": when("one view", brighter(75))},
+        r"\(0, 1\).*: saturated below",
+    ),
+    "a part saturated": ({"fault": when("every", BRIGHT_PART)}, "saturated below the white level"),
+    "lamp off": ({"fault": when("every", UNLIT)}, "reference .* is the lamp on"),
+    "lamp off once": ({"fault": when("one view", UNLIT)}, r"\(0, 1\).* is dark; is the lamp on"),
+    "lamp on in darks": ({"fault": when("darks", dim_light)}, "the dark frames have 2%"),
+    "lamp without colours": ({"fault": when("coloured", through(lamp="white"))}, "did not change"),
+    "mask missing": ({"fault": when("every", bare)}, "is the mask in the beam"),
+    "mask missing once": ({"fault": when("one view", bare)}, r"\(0, 1\).*is the mask in the beam"),
+    "mask missing elsewhere": ({"fault": when("elsewhere", bare)}, "is the mask in the beam"),
+    "aperture closed": ({"fault": when("boards", UNLIT)}, "and the aperture open"),
     "aperture half closed": (
-        {"fault": when(references, through(pinhole=(1, 1)))},
+        {"fault": when("references", through(pinhole=(1, 1)))},
         "not through the whole aperture",
     ),
-    "views mirrored": ({"fault": when(pinholes, mirrored)}, "they are mirrored left to right"),
-    "board tilted": ({"fault": when(boards, tilted)}, "10% from left to right: the white board"),
+    "views mirrored": ({"fault": when("pinholes", mirrored)}, "they are mirrored left to right"),
+    "board tilted": (
+        {"fault": when("boards", tilted(0.1))},
+        "10% from left to right: the white board",
+    ),
     "board tilted a little": (
-        {"fault": when(boards, tilted_a_little)},
+        {"fault": when("boards", tilted(0.03))},
         "3% from left to right: the white board",
     ),
     "board tilted throughout": (
@@ -233,7 +204,10 @@ def test_they_are_refused_where_every_coefficient_is_measured_as_well(name):
     ("changes", "words"),
     [
         ({"camera": with_mask(distance_mm=0.132)}, r"distance differs from the design by \+1[23]"),
-        ({"fault": when(references, brighter(1.2))}, "7[89]% of the light through: if they should"),
+        (
+            {"fault": when("references", brighter(1.2))},
+            "7[89]% of the light through: if they should",
+        ),
     ],
 )
 def test_what_every_coefficient_follows_is_named_where_each_is_measured(changes, words):

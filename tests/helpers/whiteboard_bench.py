@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -42,9 +42,8 @@ VERIFY_UM = (-207.0, 118.0)
 class Setting:
     """One whiteboard to take: how the bench stands, and how many frames.
 
-    stage_um: beyond the shot's own offset of the mask. came_from: the side, +1 where an axis moved
-    up to its place. board_turn_deg: how the white board is turned. window: by how many cells the
-    plate's window is moved.
+    stage_um: beyond the shot's own offset of the mask. board_turn_deg: how the white board is
+    turned. window: by how many cells the plate's window is moved.
     """
 
     shot: int = 0
@@ -52,39 +51,12 @@ class Setting:
     lamp: str = "white"
     stage_um: tuple[float, float] = (0.0, 0.0)
     repeats: int = 2
-    came_from: tuple[int, int] = (1, 1)
     board_turn_deg: float = 0.0
     window: Window = CENTRED
 
     def views_open(self, views: tuple[int, int]) -> NDArray[np.bool_]:
         """Return which views (v, u) it opens."""
         return views_open(views, self.pinhole, self.window)
-
-
-@dataclass(frozen=True)
-class StageFaults:
-    """How a mask stage strays: scale and turn of its axes, backlash, repeatability, in um."""
-
-    scale: float = 1.0
-    rotation_deg: float = 0.0
-    backlash_um: tuple[float, float] = (0.0, 0.0)
-    repeatability_um: float = 0.0
-
-    def real_um(
-        self, sent_um: tuple[float, float], came_from: tuple[int, int]
-    ) -> tuple[float, float]:
-        """Return where the stage stands when sent to a place from a side; the same each time."""
-        turn = np.deg2rad(self.rotation_deg)
-        x, y = sent_um
-        key = [round(value * 1e3) & 0xFFFFFFFF for value in (x, y)]
-        strays = np.random.default_rng([*key, *(side + 1 for side in came_from)])
-        off = strays.normal(0, 1, 2) * self.repeatability_um
-        # Places approached from below are where the stage says.
-        off += np.array(self.backlash_um) * (np.array(came_from) - 1) / 2
-        return (
-            float(self.scale * (np.cos(turn) * x - np.sin(turn) * y) + off[0]),
-            float(self.scale * (np.sin(turn) * x + np.cos(turn) * y) + off[1]),
-        )
 
 
 @dataclass(frozen=True)
@@ -95,7 +67,6 @@ class BenchTruth(Flaws):
     optics: OpticsFlaws = ORDINARY_BENCH.optics
     sensor: SensorFlaws = ORDINARY_BENCH.sensor
     rays_per_view: int = RAYS_PER_VIEW
-    stage: StageFaults = StageFaults()
 
 
 @dataclass
@@ -140,8 +111,7 @@ class WhiteboardBench:
         return self.bench.readings()
 
     def _stand(self, setting: Setting, masks_in: bool) -> None:
-        real = self.truth.stage.real_um(self.sent_um(setting), setting.came_from)
-        self._at_um["mask_x"], self._at_um["mask_y"] = real
+        self._at_um["mask_x"], self._at_um["mask_y"] = self.sent_um(setting)
         if setting.pinhole is None:
             lens = self.camera.lens
             side_um = window_side_um(self.camera.views, lens.aperture_cell_um)
@@ -188,16 +158,11 @@ class WhiteboardBench:
             self.seconds,
         )
 
-    def capture(
-        self,
-        settings: Sequence[Setting],
-        on_frame: Callable[[str], None] = lambda label: None,
-        leave_out: Collection[str] = (),
-    ) -> BoardSet:
+    def capture(self, settings: Sequence[Setting]) -> BoardSet:
         """Return dark frames, references, and the whiteboards asked for, in their order.
 
         Between them the first whiteboard of the open aperture is looked at again, and without masks
-        at several exposures before and at one after: the checks. leave_out: of WATCHES.
+        at several exposures before and at one after: the checks.
         """
         board_s = self.board_exposure_s()
         views = self.camera.views
@@ -216,40 +181,33 @@ class WhiteboardBench:
             dark = darks[frame.exposure_s].mean_dn
             checks.append(check_of(frame, masks_in, dark, self._channels, turn))
 
-        references = self._references(settings, board_s, on_frame, "colours" not in leave_out)
-        watched = "lamp" not in leave_out
+        references = self._references(settings, board_s)
         lamp = settings[0].lamp
         plain = Setting(lamp=lamp, board_turn_deg=turn)
-        for exposure_s in series * ("response" not in leave_out) + [board_s] * watched:
+        for exposure_s in [*series, board_s]:
             frame = self._frames(plain, exposure_s, False, 2, "response")
             seen_again(False, frame)
         frames = []
         again = Setting(lamp=lamp, repeats=1, board_turn_deg=turn)
         for place, setting in enumerate(settings):
-            if watched and place % CHECK_EVERY == 0:
+            if place % CHECK_EVERY == 0:
                 seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))
             exposure_s = exposed_s(setting)
             label = f"whiteboard, shot {setting.shot + 1}, {setting.pinhole or 'open aperture'}"
             frame = self._frames(setting, exposure_s, True, setting.repeats, label)
-            on_frame(label)
             sent = self.sent_um(setting)
             frames.append(
                 BoardFrame.held(
                     frame, sent, setting.shot, setting.pinhole, setting.lamp, setting.window
                 )
             )
-        if watched:
-            seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))
-            seen_again(False, self._frames(plain, board_s, False, 2, "reference"))
+        seen_again(True, self._frames(again, board_s, True, 1, "the lamp's level"))
+        seen_again(False, self._frames(plain, board_s, False, 2, "reference"))
         both = tuple(before_and_after(dark, self._dark(t)) for t, dark in darks.items())
         return BoardSet(both, references, tuple(frames), tuple(checks))
 
     def _references(
-        self,
-        settings: Sequence[Setting],
-        board_s: float,
-        on_frame: Callable[[str], None],
-        coloured: bool,
+        self, settings: Sequence[Setting], board_s: float
     ) -> dict[tuple[int, str], MeanFrame]:
         """Return the open whiteboards without masks; shots behind the same filter share one.
 
@@ -261,9 +219,7 @@ class WhiteboardBench:
         def taken(shot: int, lamp: str, repeats: int) -> MeanFrame:
             label = f"reference, shot {shot + 1}, {lamp} lamp"
             setting = Setting(shot, lamp=lamp, board_turn_deg=turn)
-            frame = self._frames(setting, board_s, False, repeats, label)
-            on_frame(label)
-            return frame
+            return self._frames(setting, board_s, False, repeats, label)
 
         shots = self.camera.shots
         for shot, lamp in product(
@@ -276,7 +232,7 @@ class WhiteboardBench:
             ]
             known = alike[0] if alike else taken(shot, lamp, REFERENCE_REPEATS)
             references[shot, lamp] = known
-        if coloured and self._channels.max() < len(LAMP_COLOURS) and turn == 0:
+        if self._channels.max() < len(LAMP_COLOURS) and turn == 0:
             for lamp in LAMP_COLOURS:
                 if (0, lamp) not in references:
                     references[0, lamp] = taken(0, lamp, COLOUR_REPEATS)
@@ -303,7 +259,7 @@ class WhiteboardBench:
         return np.stack(found)
 
     def exact_psi(self, design: ImagingMatrix) -> ImagingMatrix:
-        """Return the true Psi in the form of a design: of the one colour that it stores, or all."""
+        """Return the true Psi in the form of a design: of each pixel's own colour, or all."""
         true = self.true_psi()
         if design.colour is not None:
             own = design.colour[:, None, None, :, None, :].astype(np.int64)
