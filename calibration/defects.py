@@ -26,10 +26,15 @@ from emmc_rig.model.compiling import njit
 
 Array = NDArray[np.floating]
 SPLITS = 2
+"""Grains along a cell."""
 SUPPORT = 6.0
+"""Deviations of a grain's loss, from which on it is taken up: of a million by chance none."""
 SIZE = 0.4
+"""Standard deviation of the prior of a loss, as a share of what the grain passes."""
 ROUNDS = 3
+"""Grains beside a large loss show only when that is known."""
 CHUNK = 16_384
+"""Pixels whose influences are held at once."""
 LARGEST_SHARE = 0.02
 """Of the mask's grains; more are no defects but a wrong placement."""
 

@@ -24,13 +24,17 @@ from emmc_rig.calibration.repeats import vertex
 from emmc_rig.calibration.robust import correlation, deviation_of, tukey_weights
 from emmc_rig.calibration.shadow import SEARCH_UM, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.local_mean import local_mean
+from emmc_rig.model.frames import local_mean
 
 Array = NDArray[np.floating]
 CROP_PX = 160
+"""Sides of the picture's middle that `search` correlates."""
 LEAST_CORRELATION = 0.3
+"""Of frame and shadow, below which the mask is not the design's."""
 CLEAR_CORRELATION = 0.6
+"""From which on no other rotation is tried, and a mirrored mask is named."""
 ROTATIONS_DEG = (0.5, -0.5, 1.0, -1.0, 1.5, -1.5, 2.0, -2.0)
+"""A quarter of a degree moves the rim of CROP_PX by a third of a pixel."""
 ORIENTATIONS = {
     "mirrored left to right": lambda cells: cells[:, :, ::-1],
     "mirrored top to bottom": lambda cells: cells[:, ::-1],
@@ -49,6 +53,7 @@ LEVEL_CELLS = 8.0
 LEAST_LEVEL = 0.05
 """Of the mean: what is darker has no contrast to see."""
 POSE = ("offset_x_um", "offset_y_um", "rotation_rad", "scale")
+"""Parameters of the placement that `refine` fits."""
 OFFSETS = POSE[:2]
 SOFT_EDGES = 0.1
 """Of a cell: how soft edges are taken to be before they are fitted."""

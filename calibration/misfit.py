@@ -25,9 +25,13 @@ from emmc_rig.calibration.whiteboard import Calibration
 
 Array = NDArray[np.floating]
 LIKE_SLOPES = 6
+"""Groups of coefficients alike in slope, of as many pixels each."""
 AROUND_PX = 7
+"""Side of a pixel's surroundings, over which the misfit is averaged."""
 SURE = 3.0
+"""Standard deviations, from which on an excess over the noise is no chance."""
 TILE = 2
+"""Pixels from one to the next of the same colour in a Bayer mosaic."""
 OUTLIER2 = 36.0
 """Squared deviations beyond which one coefficient is no longer the model's."""
 

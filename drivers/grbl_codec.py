@@ -16,7 +16,6 @@ LINE_LENGTH = 80
 
 STATUS_QUERY = b"?"
 FEED_HOLD = b"!"
-CYCLE_START = b"~"
 SOFT_RESET = b"\x18"
 JOG_CANCEL = b"\x85"
 

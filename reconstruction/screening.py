@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.choices import smooth_guess
+from emmc_rig.reconstruction.problem import smooth_guess
 
 Array = NDArray[np.floating]
 DARK_SHARE = 0.02

@@ -24,15 +24,15 @@ from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.reconstruction.adaptive.settings import SIDES, Side
 from emmc_rig.reconstruction.adaptive.survey import contrast_of
-from emmc_rig.reconstruction.choices import choose_mu, choose_primal_step, contrast, smooth_guess
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import check_frames
+from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings, find_method, reconstruct
 from emmc_rig.reconstruction.methods.variational import patched_weights
+from emmc_rig.reconstruction.problem import choose_mu, choose_primal_step, contrast, smooth_guess
 from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
 from emmc_rig.reconstruction.screening import screened
-from emmc_rig.reconstruction.settings import BlockSettings
 from emmc_rig.reconstruction.sparse import SparseSettings
 from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, judged_together
 from emmc_rig.reconstruction.verdict.rules import Verdict

@@ -16,18 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.bench.hands import APERTURE, MASK, NoAttendant, hole_name
-from emmc_rig.bench.hardware import RigType
+from emmc_rig.bench.hardware import Rig, RigType
 from emmc_rig.calibration.boards import Board, channels_of
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import Location, frame_board, locate, starting_placement
 from emmc_rig.calibration.openings import views_open
 from emmc_rig.calibration.shadow import SEARCH_UM, ShadowMask, shadow_mask
 from emmc_rig.captures.checks import FrameRefusedError
+from emmc_rig.captures.plan import Plan
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.settings import validated
+from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session
 
 LONGEST_PX = 96
 """Of the middle of a frame, along either side: more tells a place hardly better."""
@@ -237,3 +241,20 @@ class HandPlaces:
         channels = channels_of(self._layout, bench.shot)
         opening = opened, (x_um, y_um), bench.shot
         return frame_board(mosaic, black_dn, frame.white_level_dn, channels, opening)
+
+
+def places_in_session(session: Session, rig: Rig, plan: Plan) -> HandPlaces:
+    """Return what finds the places of hands, knowing the mask from a stored whiteboard if any.
+
+    Raises AppError where a frame of the session cannot be read.
+    """
+    hands = rig.hands if plan.checks.places_by_hand else frozenset()
+    camera = validated(Camera, session.camera, str(session.folder), AppError)
+    places = HandPlaces(camera, rig.camera.shape, hands)
+    by_id = {frame.id: frame for frame in session.frames}
+    for name, entry in session.stored.items() if hands else ():
+        if name in by_id and places.shows(by_id[name]):
+            places.stand(by_id[name], decode_frame(session.read(name), entry))
+            places.set_anew()
+            break
+    return places

@@ -50,6 +50,11 @@ class Control:
         """Whether frames are to be taken once more."""
         return bool(self._again)
 
+    @property
+    def halting(self) -> bool:
+        """Whether somebody wants something else than the next frame."""
+        return self.stopping or self.paused or self.again
+
     def pop_again(self) -> list[str]:
         """Return the frames to take once more, and forget them."""
         ids, self._again = self._again, []

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
 from emmc_rig.captures.checks import FrameRefusedError
@@ -53,6 +53,15 @@ class Sent:
     gain: float | None = None
 
 
+class Asked(NamedTuple):
+    """When an exposure was asked for."""
+
+    wall: str
+    """By the time of day, ISO 8601."""
+    clock_s: float
+    """On the clock of the rig, in seconds."""
+
+
 class Spans:
     """The seconds from the start of a run in which each step of a frame began and ended."""
 
@@ -74,12 +83,12 @@ class Spans:
 class Devices:
     """Stage, camera and attendant of a rig, as a capture by a plan uses them.
 
-    asked: when the last exposure was, by the time of day (`wall`) and on the rig's clock.
+    asked: when the last exposure was. homings: how often the stage was homed.
     """
 
     def __init__(self, rig: Rig, plan: Plan, wall: Callable[[], str] = wall_time) -> None:
         self._rig, self._plan, self._wall = rig, plan, wall
-        self.asked = "", 0.0
+        self.asked = Asked("", 0.0)
         self.camera = rig.camera
         self.sent = Sent()
         self.homings = 0
@@ -212,9 +221,13 @@ class Devices:
         """Expose one frame where everything stands."""
         self._rig.about_to_expose(planned.id)
         self.set_camera(planned, exposure_s)
-        self.asked = self._wall(), self._rig.clock.now_s()
+        self.ask()
         frame = self.camera.snap()
         return frame, figures(frame)
+
+    def ask(self) -> None:
+        """Remember that an exposure is asked for now."""
+        self.asked = Asked(self._wall(), self._rig.clock.now_s())
 
     def focus(
         self, planned: PlannedFrame, exposure_s: float, span_um: float, stopped: Callable[[], bool]

@@ -13,11 +13,9 @@ from statistics import median
 
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.captures.metering import metered_exposure_s
 from emmc_rig.captures.order import APPROACH_UM
-from emmc_rig.captures.plan import METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.captures.plan import METERING_EXPOSURE_S, Plan
 from emmc_rig.drivers.stage import needs_approach
-from emmc_rig.session.journal import FrameEntry, MeteredEntry
 from emmc_rig.session.planned import PlannedFrame
 
 DOWNLOAD_BYTES_PER_S = 40e6
@@ -29,7 +27,6 @@ MOVE_S = 0.2
 """A move's acceleration, polling and settling."""
 LEARNT_FROM = 9
 """The number of latest frames whose median cost counts: a single frame may have waited long."""
-ANY_LIMITS = (0.0, float("inf"))
 
 
 @dataclass(frozen=True)
@@ -135,30 +132,6 @@ def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
     period_s = 0.0 if plan.film is None else 1 / plan.film.rate
     size = 2 * rows * columns
     return Pace(speeds_um_s, plan.settle_s, size, waits, rig.hands, asks, period_s)
-
-
-def known_exposures(
-    plan: Plan, meterings: Mapping[str, FrameEntry], decided: MeteredEntry | None
-) -> Callable[[PlannedFrame], float | None]:
-    """Return what says a frame's exposure, None where nothing determines it yet.
-
-    meterings: journal lines of metering frames. decided: what metering of the scene asks for.
-    """
-    level = (plan.whiteboards or Boards()).level
-
-    def exposure_s(frame: PlannedFrame) -> float | None:
-        if frame.exposure_s is not None:
-            return frame.exposure_s
-        if frame.is_exposed_as_shots:
-            chosen = {} if decided is None else decided.exposures_s
-            shot = frame.bench.shot
-            return chosen[shot] * frame.light if shot in chosen else None
-        entry = meterings.get(frame.metered_by or "")
-        if entry is None or entry.figures.bright_dn < 1:
-            return None
-        return metered_exposure_s(entry, level, frame.light, ANY_LIMITS)
-
-    return exposure_s
 
 
 def _move_s(step_um: float, speed_um_s: float) -> float:

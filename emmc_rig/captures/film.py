@@ -7,27 +7,38 @@ camera never waits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from itertools import groupby, pairwise
+from functools import partial
+from itertools import groupby, pairwise, takewhile
 from queue import Empty, Full, Queue
 from threading import Event
 from typing import Any, NamedTuple, Self
 
 from emmc_rig.bench.hardware import Rig
+from emmc_rig.captures.checks import check, is_same
+from emmc_rig.captures.control import Control
+from emmc_rig.captures.engine import Engine, Facts
 from emmc_rig.captures.estimate import pace_of
 from emmc_rig.captures.plan import Plan
+from emmc_rig.captures.recorder import Recorder
 from emmc_rig.drivers.camera import Camera as CameraDevice
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import CaptureError
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
+from emmc_rig.session.brightness import figures
+from emmc_rig.session.journal import DroppedEntry, FilmEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
+from emmc_rig.session.session import Session
 
 RING_BYTES = 256_000_000
 """Of frames that wait for the disk: some seconds of most cameras, little beside a result."""
 LEAST_ROOM = 2
+STAGE_READ_INTERVAL_S = 1.0
+"""How often the stage is read while a film streams: it stands still, and answers slowly."""
 ARRIVAL_POLL_S = 0.1
 """How soon a key counts while no frame comes."""
 SLOW_DISK = "the disk was too slow"
@@ -161,3 +172,143 @@ def room_for(camera: CameraDevice, clock: object) -> int:
     """
     rows, columns = camera.shape
     return max(LEAST_ROOM, RING_BYTES // (2 * rows * columns)) if clock is SYSTEM_CLOCK else 0
+
+
+class FilmRun:
+    """The frames of a film in one run: each is taken at its time, or dropped.
+
+    A segment is taken without a break, on a time of its own. take: takes a frame with as many
+    tries as it needs, its second argument as `Engine.take`'s `about`. finish: gets each frame that
+    the camera's stream brought.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        plan: Plan,
+        rig: Rig,
+        engine: Engine,
+        recorder: Recorder,
+        control: Control,
+        take: Callable[[PlannedFrame, Callable[[], Facts]], None],
+        finish: Callable[[PlannedFrame], None],
+    ) -> None:
+        assert plan.film is not None
+        self._session, self._rig, self._engine = session, rig, engine
+        self._recorder, self._control = recorder, control
+        self._take, self._finish = take, finish
+        self._plan, self._rate_hz = plan, plan.film.rate
+        self._segment = len(of_kind(session.journal.entries, FilmEntry)) - 1
+        # On the clock of the rig, when the first frame of the segment was asked for.
+        self._began_s: float | None = None
+
+    def take_segment(self, left: list[PlannedFrame]) -> None:
+        """Take a segment, until no frame is left or somebody halts it.
+
+        Taken and dropped frames leave `left`; those before the last stored frame are dropped.
+        Raises what the camera or stage raises, with the segment at its end.
+        """
+        self._recorder.flush()
+        stored = self._session.stored
+        film = [frame for frame in self._session.frames if frame.film is not None]
+        last = max((_place(frame) for frame in film if frame.id in stored), default=-1)
+        self._drop(left, last + 1, lambda place: INTERRUPTED)
+        if left:
+            is_streamed = streams(self._plan, self._engine.devices.camera)
+            (self._take_stream if is_streamed else self._take_steps)(left)
+        self._recorder.flush()
+
+    def _begin_segment(self, planned: PlannedFrame) -> None:
+        self._segment, self._began_s = self._segment + 1, None
+        self._recorder.note(FilmEntry(segment=self._segment, id=planned.id, rate_hz=self._rate_hz))
+
+    def _drop(self, left: list[PlannedFrame], end: int, why: Callable[[int], str]) -> None:
+        """Note that the frames left before a place are dropped; why: by place."""
+        gone = list(takewhile(lambda frame: _place(frame) < end, left))
+        del left[: len(gone)]
+        for reason, frames in groupby(gone, lambda frame: why(_place(frame))):
+            entry = DroppedEntry(ids=[frame.id for frame in frames], reason=reason)
+            self._recorder.note(entry, str(entry))
+
+    def _take_stream(self, left: list[PlannedFrame]) -> None:
+        """Take a segment from the camera's stream; the stage stands still."""
+        engine, devices, control = self._engine, self._engine.devices, self._control
+        now_s, first = self._recorder.now_s, left[0]
+        engine.set_up(first)
+        devices.set_camera(first, engine.exposure_s(first))
+        self._begin_segment(first)
+        read_s, beside = -STAGE_READ_INTERVAL_S, dict[str, Any]()
+        places = range(_place(first), _place(left[-1]) + 1)
+        room = room_for(devices.camera, self._rig.clock)
+        with Ring(devices.camera, self._rate_hz, places, room) as ring:
+            for arrived in ring:
+                if control.halting:
+                    ring.stop()
+                if arrived is None:
+                    continue
+                self._drop(left, arrived.place, ring.why_missing)
+                if now_s() - read_s >= STAGE_READ_INTERVAL_S:
+                    read_s = now_s()
+                    beside = engine.readings_of_stream(left[0])
+                devices.ask()
+                self._take_arrived(left, arrived, beside)
+        if not control.halting:
+            self._drop(left, places.stop, ring.why_missing)
+
+    def _take_arrived(self, left: list[PlannedFrame], arrived: Arrived, beside: Facts) -> None:
+        """Store the next frame left, or drop it where the camera sent one twice.
+
+        A segment's first must pass every check; a flash or darkness later is the scene's own.
+        """
+        engine, recorder = self._engine, self._recorder
+        planned, frame, found = left[0], arrived.frame, figures(arrived.frame)
+        recorder.emit_step("check", planned)
+        if arrived.film_s == 0:
+            check(planned, frame, found, engine.before, self._plan.checks)
+        if engine.before is not None and is_same(frame.mosaic, engine.before):
+            self._drop(left, arrived.place + 1, lambda place: SENT_TWICE)
+            return
+        left.pop(0)
+        recorder.emit_taken(planned, frame, found)
+        when = {"segment": self._segment, "film_s": arrived.film_s}
+        engine.hand_over(planned, frame, found, {}, **when, **beside)
+        self._finish(planned)
+
+    def _take_steps(self, left: list[PlannedFrame]) -> None:
+        """Take a segment frame by frame, the stage moving in between.
+
+        A frame whose time is over by more than half a period is dropped.
+        """
+        clock = self._rig.clock
+        self._begin_segment(left[0])
+        first = _place(left[0])
+        while left and not self._control.halting:
+            if self._began_s is not None and not self._rig.recorded_s:
+                due = first + (clock.now_s() - self._began_s) * self._rate_hz
+                self._drop(left, math.ceil(due - 0.5), lambda place: LATE)
+                if left and _place(left[0]) > due:
+                    # A hook is called before any axis moves.
+                    if not self._engine.has_hook and self._engine.devices.move(left[0]):
+                        continue
+                    wait_s = (_place(left[0]) - due) / self._rate_hz
+                    clock.sleep(min(wait_s, ARRIVAL_POLL_S))
+                    continue
+            if left:
+                self._engine.prepared = None
+                self._take(left[0], partial(self._when, left[0]))
+                left.pop(0)
+
+    def _when(self, planned: PlannedFrame) -> Facts:
+        """Return the segment of a frame, and its time in seconds from the segment's first."""
+        asked_s = self._engine.devices.asked.clock_s
+        if self._began_s is None:
+            self._began_s = asked_s
+        recorded = bool(self._rig.recorded_s)
+        film_s = _place(planned) / self._rate_hz if recorded else asked_s - self._began_s
+        return {"segment": self._segment, "film_s": film_s}
+
+
+def _place(frame: PlannedFrame) -> int:
+    """Return the place in time of a film's frame."""
+    assert frame.film is not None
+    return frame.film

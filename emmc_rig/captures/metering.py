@@ -11,14 +11,15 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from emmc_rig.captures.plan import Metering
+from emmc_rig.captures.plan import Boards, Metering, Plan
 from emmc_rig.drivers.camera import Limits
 from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.session.brightness import exposure_for_s
-from emmc_rig.session.journal import Figures, FrameEntry, MeteredEntry, of_kind
+from emmc_rig.session.journal import Figures, FrameEntry, MeteredEntry, metered, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
+ANY_LIMITS: Limits = (0.0, float("inf"))
 METERING_TRIES = 8
 METERABLE_LEVELS = (0.02, 0.95)
 """Of white, of a frame from which other exposures follow."""
@@ -31,33 +32,99 @@ LARGEST_RANGE = 8.0
 through masks, so that most scenes stay below 4."""
 
 
-def metered_exposure_s(metered: FrameEntry, level: float, light: float, limits_s: Limits) -> float:
+def metered_exposure_s(entry: FrameEntry, level: float, light: float, limits_s: Limits) -> float:
     """Return the exposure at which `light` times less light reads `level` of white.
 
-    metered: the journal line of the metering frame. Clipped to the camera's limits. Raises
+    entry: the journal line of the metering frame. Clipped to the camera's limits. Raises
     `CameraSettingError` where the board was dark.
     """
-    if metered.figures.bright_dn < 1:
+    if entry.figures.bright_dn < 1:
         raise CameraSettingError(
             "exposure", "cannot be metered, the board is dark: switch the lamp on"
         )
     low_s, high_s = limits_s
-    exposure_s = light * exposure_for_s(level, metered.exposure_s, metered.level)
+    exposure_s = light * exposure_for_s(level, entry.exposure_s, entry.level)
     return min(max(exposure_s, low_s), high_s)
 
 
-def first_meterings(session: Session) -> dict[str, FrameEntry]:
-    """Return the first journal line of every metering frame.
+class Exposures:
+    """The exposures of a plan's frames, as far as its session's metering frames determine them.
 
-    The first counts even where its file is damaged by now: frames that follow are exposed like the
-    frames before.
+    session: None where none was begun: then only exposures that the plan states are known.
     """
-    ids = {frame.id for frame in session.frames if frame.kind == "metering"}
-    found: dict[str, FrameEntry] = {}
-    for entry in of_kind(session.journal.entries, FrameEntry):
-        if entry.id in ids:
-            found.setdefault(entry.id, entry)
-    return found
+
+    def __init__(self, plan: Plan, session: Session | None = None) -> None:
+        self._plan, self._session = plan, session
+        frames = () if session is None else session.frames
+        self._saturating = _may_saturate(frames)
+        # The first line of each metering frame counts, even where its file is damaged by now:
+        # frames that follow are exposed like the frames before.
+        self._meterings: dict[str, FrameEntry] = {}
+        planned = {frame.id: frame for frame in frames}
+        entries = () if session is None else of_kind(session.journal.entries, FrameEntry)
+        for entry in entries:
+            if entry.id in planned:
+                self.learn(planned[entry.id], entry)
+
+    def learn(self, planned: PlannedFrame, entry: FrameEntry) -> None:
+        """Remember the journal line of a frame if it is a metering frame."""
+        if planned.kind == "metering":
+            self._meterings.setdefault(planned.id, entry)
+
+    @property
+    def decided(self) -> MeteredEntry | None:
+        """What metering of the scene asks for; None while that is open."""
+        return None if self._session is None else metered(self._session.journal.entries)
+
+    def exposure_s(self, planned: PlannedFrame, limits_s: Limits = ANY_LIMITS) -> float | None:
+        """Return a frame's exposure; None where nothing determines it yet.
+
+        limits_s: of the camera. Raises `CameraSettingError` where the metered board was dark.
+        """
+        if planned.exposure_s is not None:
+            return planned.exposure_s
+        if planned.is_exposed_as_shots:
+            decided, shot = self.decided, planned.bench.shot
+            if decided is None or shot not in decided.exposures_s:
+                return None
+            return decided.exposures_s[shot] * planned.light
+        entry = self._meterings.get(planned.metered_by or "")
+        if entry is None:
+            return None
+        level = (self._plan.whiteboards or Boards()).level
+        return metered_exposure_s(entry, level, planned.light, limits_s)
+
+    def known_s(self, planned: PlannedFrame) -> float | None:
+        """Return a frame's exposure for an estimate; None as long as its metering is open."""
+        try:
+            return self.exposure_s(planned)
+        except CameraSettingError:
+            return None
+
+    def decide(self, limits_s: Limits) -> MeteredEntry:
+        """Return what metering of the scene asks for; raises `CameraSettingError` if it is dark."""
+        assert self._session is not None
+        limits_s = limits_s[0], min(limits_s[1], self._plan.longest_s)
+        return asked_of_scene(self._session.frames, self._meterings, self._plan.metering, limits_s)
+
+    def may_saturate(self, planned: PlannedFrame) -> bool:
+        """Whether saturated pixels of a frame are no fault."""
+        return planned.id in self._saturating
+
+
+def _may_saturate(frames: Iterable[PlannedFrame]) -> set[str]:
+    """Return the ids of metering frames, and of those with a shorter exposure in their bracket."""
+
+    def exposed(frame: PlannedFrame) -> float:
+        return frame.light if frame.exposure_s is None else frame.exposure_s
+
+    shots = [frame for frame in frames if frame.kind == "shot"]
+    shortest: dict[int, float] = {}
+    for frame in shots:
+        shot = frame.bench.shot
+        shortest[shot] = min(exposed(frame), shortest.get(shot, exposed(frame)))
+    longer = {frame.id for frame in shots if exposed(frame) != shortest[frame.bench.shot]}
+    return longer.union(frame.id for frame in frames if frame.kind == "metering")
 
 
 def asked_of_scene(

@@ -22,11 +22,11 @@ from emmc_rig.captures.by_hand import with_hands
 from emmc_rig.captures.checks import refuse_impossible
 from emmc_rig.captures.control import Control, interruptible
 from emmc_rig.captures.devices import identity_of
-from emmc_rig.captures.estimate import Estimate, known_exposures, pace_of
+from emmc_rig.captures.estimate import Estimate, pace_of
 from emmc_rig.captures.events import Listener, OnEvent, RunEnd, emit_end
 from emmc_rig.captures.expand import expand
 from emmc_rig.captures.film import refuse_impossible_film
-from emmc_rig.captures.metering import first_meterings
+from emmc_rig.captures.metering import Exposures
 from emmc_rig.captures.order import ordered
 from emmc_rig.captures.plan import Plan, load_plan, planned_camera
 from emmc_rig.captures.replay import missing_words, replaying, there
@@ -42,7 +42,7 @@ from emmc_rig.model.files import SYSTEM_DISK, Disk
 from emmc_rig.model.settings import validated
 from emmc_rig.progress import Watcher
 from emmc_rig.report.session_sheet import quick_pictures, write_sheet
-from emmc_rig.session.journal import UntilEntry, metered
+from emmc_rig.session.journal import UntilEntry
 from emmc_rig.session.lock import held
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import (
@@ -189,10 +189,7 @@ def estimated(
     session: Session | None = None,
 ) -> Estimate:
     """Return what frames will take."""
-    meterings = {} if session is None else first_meterings(session)
-    decided = None if session is None else metered(session.journal.entries)
-    known = known_exposures(plan, meterings, decided)
-    return pace_of(rig, plan).estimate(frames, known)
+    return pace_of(rig, plan).estimate(frames, Exposures(plan, session).known_s)
 
 
 def refuse_small_disk(out: Path, expected: Estimate, disk: Disk = SYSTEM_DISK) -> None:

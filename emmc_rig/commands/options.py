@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -41,9 +41,26 @@ ExportSizeOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="of the random scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
+
+
+def out_option(default: str) -> Any:
+    """Return the option --out of a command whose default folder depends on its arguments."""
+    return typer.Option("--out", help=f"folder to write (default: {default})")
+
+
+TruthOption = Annotated[
+    str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
+]
+MethodOption = Annotated[
+    str | None, typer.Option("--method", help="see `reconstruct --list` (default: adaptive)")
+]
 FastOption = Annotated[
     bool,
     typer.Option("--fast", help="small crops, few points: minutes instead of hours or days"),
+]
+ZarrOption = Annotated[
+    bool,
+    typer.Option("--zarr", help="write Zarr, for large light fields", rich_help_panel=PARALLEL),
 ]
 WorkersOption = Annotated[
     int | None,
@@ -71,6 +88,15 @@ ScenesOption = Annotated[
 ]
 MethodsOption = Annotated[
     list[str] | None, typer.Option("--method", help="only this method; may repeat")
+]
+HostOption = Annotated[
+    str, typer.Option("--host", help="address to serve the page at, for instance for a phone")
+]
+StageOption = Annotated[
+    str | None,
+    typer.Option(
+        "--stage", help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file"
+    ),
 ]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")

@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import (
+    DEFAULT_CAMERA,
+    CameraOption,
     ClusterOption,
     DictionaryOption,
     FastOption,
@@ -23,12 +25,7 @@ from emmc_rig.commands.output import give_result, show_study, show_table, shown_
 
 def stability(
     scene: ScenesOption = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            "--camera", help="a shipped camera or a YAML file (default: rgbw-bayer-3shots)"
-        ),
-    ] = None,
+    camera: CameraOption = DEFAULT_CAMERA,
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this fault; may repeat")
     ] = None,
@@ -51,7 +48,6 @@ def stability(
     """
     from emmc_rig.store.results import parse_size
     from emmc_rig.study.stability.stability_study import (
-        CAMERA,
         StabilityStudy,
         stability_settings,
     )
@@ -61,7 +57,7 @@ def stability(
         return
     check_workers(workers, cluster)
     settings = stability_settings(
-        fast, scene or [], parse_size(size), camera=camera or CAMERA, faults=tuple(fault or []),
+        fast, scene or [], parse_size(size), camera=camera, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
     )  # fmt: skip
     study = StabilityStudy(settings, out)

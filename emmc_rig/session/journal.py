@@ -27,12 +27,16 @@ from emmc_rig.store.results import shown_seconds
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one frame: share of saturated pixels; mean, 99.9th percentile, median above black, DN."""
+    """How bright a frame is, by some ten thousand of its pixels."""
 
     saturated: float
+    """Share of the pixels, from 0 to 1."""
     mean_dn: float
+    """Mean above black, DN."""
     bright_dn: float
+    """99.9th percentile above black, DN, without hot pixels."""
     median_dn: float = 0.0
+    """Median above black, DN."""
 
 
 class Entry(BaseModel):
@@ -49,114 +53,142 @@ class Entry(BaseModel):
 
 
 class TimedEntry(Entry):
-    """An entry that says when it was noted, by the time of day."""
+    """An entry that says when it was noted."""
 
     wall: str = ""
+    """Time of day, ISO 8601, to the millisecond."""
 
 
 class CreatedEntry(Entry):
-    """The session was begun: SHA-256 of the frozen files, frames taken whatever metering says."""
+    """The session was begun."""
 
     kind: Literal["created"] = "created"
     format: int = 1
+    """Version of the session's format."""
     sha256: dict[str, str]
+    """SHA-256 of each frozen file, hexadecimal, by name."""
     frames: int
+    """Number of frames that are taken whatever metering asks for."""
 
 
 class AmendedEntry(TimedEntry):
-    """Another plan holds from here on; kept: frames stored then."""
+    """Another plan holds from here on."""
 
     kind: Literal["amended"] = "amended"
     plan: int
+    """Number of the amendment, from 1."""
     sha256: dict[str, str]
+    """SHA-256 of each file of the amendment, hexadecimal, by name."""
     frames: int
+    """Number of frames that the plan takes whatever metering asks for."""
     kept: int = 0
+    """Number of frames stored by then."""
     changes: list[str] = []
+    """Differences of the plans, in words."""
 
     def __str__(self) -> str:
         return f"{self.wall}: plan {self.plan} holds: {'; '.join(self.changes)}"
 
 
 class RunEntry(TimedEntry):
-    """A capture was started, on these devices.
-
-    environment: units, by the names of what is read beside frames. between: the plan's hook, its
-    file and SHA-256.
-    """
+    """A capture was started, on these devices."""
 
     kind: Literal["run"] = "run"
     versions: dict[str, Any] = {}
+    """Versions of this program and its libraries."""
     command: str = ""
     resumed: bool = False
+    """Whether frames were stored before."""
     camera: dict[str, Any]
+    """Maker, model, serial number, shape (rows, columns) and colour filters."""
     camera_settings: dict[str, Any] = {}
     stage: dict[str, Any] = {}
+    """By axis: identity, limits_um, speed_um_s and zero_um."""
     environment: dict[str, str] = {}
+    """Units of what is read beside the frames, by name."""
     between: dict[str, str] = {}
+    """The plan's hook: its name, file and the file's SHA-256."""
 
     def __str__(self) -> str:
         return f"{self.wall}: {self.command}"
 
 
 class ImportedEntry(TimedEntry):
-    """The frames are of files that another program wrote.
-
-    files: by path, the SHA-256 of their bytes. notes: assumptions for values that no file states.
-    """
+    """The frames are of files that another program wrote."""
 
     kind: Literal["imported"] = "imported"
     files: dict[str, str]
+    """SHA-256 of each file, hexadecimal, by path."""
     notes: list[str] = []
+    """Assumptions for values that no file states, in words."""
 
     def __str__(self) -> str:
         return "; ".join((f"{self.wall}: {len(self.files)} files imported", *self.notes))
 
 
 class FrameEntry(Entry):
-    """A frame is stored.
-
-    run: counted from 1. plan: number of the amendment that it was taken by. camera_sha256: of the
-    camera's own bytes, where `file` is a DNG of the mosaic that holds them. read_um: readings of
-    the axes; of an axis moved by hand its place in the frame, with `deviation_um`. wall,
-    monotonic_s: when its exposure was asked for, by the time of day and on the clock of the rig.
-    stands_um: where axes of the stage read to stand that no plan moves. temperatures_c: of stage
-    and camera, environment: of other sources, whose units the run's line has. segment: of a film's
-    frame, see `FilmEntry`; film_s: when it was exposed, in seconds from the segment's first.
-    spans_s: by step, its begin and end in seconds of the run.
-    """
+    """A frame is stored."""
 
     kind: Literal["frame"] = "frame"
     id: str
     file: str
+    """Name in the session's folder of frames."""
     bytes: int
+    """Size of the file."""
     sha256: str
+    """Of the file, hexadecimal."""
     run: int = 0
+    """Number of the run that took it, from 1."""
     plan: int = 0
+    """Number of the amendment that it was taken by; 0: the plan that the session began with."""
     shape: tuple[int, int]
+    """Rows and columns, pixels."""
     cfa: str
+    """Colour filters of the first 2x2 pixels, row by row: "rggb"."""
     black_level_dn: list[list[float]]
+    """Black level, DN, of each place in the tile of colour filters."""
     white_level_dn: int
+    """Reading of a saturated pixel, DN."""
     exposure_s: float
+    """As the camera states it, s."""
     gain: float
+    """A factor, 1 at the camera's lowest."""
     camera_time_s: float | None = None
+    """On the camera's clock, s; None where the camera states no time."""
     host_time_s: float | None = None
+    """When the frame arrived, on this computer's clock, s; of an imported frame its time."""
     metadata: dict[str, Any] = {}
+    """What else the camera states with the frame."""
     camera_sha256: str | None = None
+    """Of the camera's own bytes, where `file` is a DNG of the mosaic that holds them."""
     lamp: str = ""
+    """Colour of the lamp, or "off"."""
     commanded_um: dict[str, float] = {}
+    """Planned place of each axis, um from its zero."""
     read_um: dict[str, float] = {}
+    """Reading of each axis, um from its zero; of an axis moved by hand its place in the frame."""
     deviation_um: dict[str, float] = {}
+    """Standard deviation, um, of the place of each axis moved by hand."""
     figures: Figures
     triggered: bool = False
     attempts: int = 1
+    """Number of tries that the frame took."""
     wall: str = ""
+    """When its exposure was asked for, time of day, ISO 8601."""
     monotonic_s: float | None = None
+    """When its exposure was asked for, on the clock of the rig, s."""
     stands_um: dict[str, float] = {}
+    """Reading, um, of each axis of the stage that no plan moves."""
     temperatures_c: dict[str, float] = {}
+    """Of stage and camera, degrees Celsius."""
     environment: dict[str, float] = {}
+    """Readings of other sources, in the units that the run's line has."""
     segment: int | None = None
+    """Of a film's frame: its segment, see `FilmEntry`."""
     film_s: float | None = None
+    """Of a film's frame: when it was exposed, s from the first frame of its segment."""
     spans_s: dict[str, tuple[float, float]] = {}
+    """Begin and end of each step, s from the begin of the run."""
 
     @property
     def black_dn(self) -> float:
@@ -181,11 +213,13 @@ class DiscardedEntry(Entry):
 
 
 class MeteredEntry(TimedEntry):
-    """The scene was metered: exposure by shot, longer frames `asked` for."""
+    """The scene was metered."""
 
     kind: Literal["metered"] = "metered"
     exposures_s: dict[int, float]
+    """Exposure of each metered shot, s, by its number."""
     asked: list[str]
+    """Ids of the longer frames of brackets that the scene needs."""
 
     def __str__(self) -> str:
         by_exposure: dict[float, list[str]] = {}
@@ -204,27 +238,38 @@ class UntilEntry(TimedEntry):
 
     kind: Literal["until"] = "until"
     target_db: float
+    """PSNR, dB."""
 
     def __str__(self) -> str:
         return f"{self.wall}: shots are taken until the estimated accuracy is {self.target_db:g} dB"
 
 
 class DecidedEntry(TimedEntry):
-    """What the shots so far give, and which follows; next: None where no more are needed."""
+    """The accuracy that the shots so far give, and which shot follows."""
 
     kind: Literal["decided"] = "decided"
     run: int = 0
+    """Number of the run, from 1."""
     shots: list[int]
+    """Shots taken so far, from 0."""
     stated_db: float
+    """Estimated PSNR of their light field, dB."""
     target_db: float
+    """PSNR that was asked for, dB."""
     next: int | None
+    """Shot to take next; None where no more are needed."""
     why: str = ""
     expected_db: dict[int, float] = {}
+    """Expected PSNR with each further shot, dB, which earlier versions noted."""
     spared: list[int]
+    """Planned shots that are not needed."""
     spared_frames: int
+    """Number of their frames."""
     method: str = ""
+    """Method of reconstruction."""
     advice: str = ""
     spans_s: dict[str, tuple[float, float]] = {}
+    """Begin and end of the decision, s from the begin of the run."""
 
     def __str__(self) -> str:
         taken = ", ".join(str(shot + 1) for shot in self.shots)
@@ -253,6 +298,7 @@ class ResumedEntry(TimedEntry):
 
     kind: Literal["resumed"] = "resumed"
     seconds: float
+    """How long it waited, s."""
 
     def __str__(self) -> str:
         return f"{self.wall}: after {shown_seconds(self.seconds)}"
@@ -263,9 +309,12 @@ class RetryEntry(Entry):
 
     kind: Literal["retry"] = "retry"
     id: str
+    """Of the frame; "home" for homing."""
     fault: str
     attempt: int
+    """Number of the fault among those in a row, from 1."""
     at_s: float = 0.0
+    """Seconds from the begin of the run."""
 
     def __str__(self) -> str:
         return f"{self.id}, attempt {self.attempt}: {self.fault}"
@@ -277,9 +326,13 @@ class ComparedEntry(Entry):
     kind: Literal["registered", "refused"]
     id: str
     x_px: float
+    """Shift to the right, px."""
     y_px: float
+    """Shift downwards, px."""
     likeness: float
+    """Correlation with the stored frame, at most 1."""
     limit_px: float = 0.0
+    """Largest shift that is allowed, px."""
 
     def __str__(self) -> str:
         return (
@@ -289,18 +342,21 @@ class ComparedEntry(Entry):
 
 
 class HookEntry(TimedEntry):
-    """The plan's hook was called before frame `id`, "" after the last, and noted this.
-
-    fault: what ended the capture there, "" where nothing did.
-    """
+    """The plan's hook was called."""
 
     kind: Literal["hook"] = "hook"
     id: str = ""
+    """Of the frame that follows; "" after the last frame."""
     name: str = ""
+    """As the plan names the hook."""
     notes: dict[str, Any] = {}
+    """What the hook noted."""
     fault: str = ""
+    """What ended the capture there; "" where nothing did."""
     at_s: float = 0.0
+    """Begin, s from the begin of the run."""
     seconds: float = 0.0
+    """Duration, s."""
 
     def __str__(self) -> str:
         when = f"before {self.id}" if self.id else "after the last frame"
@@ -308,20 +364,23 @@ class HookEntry(TimedEntry):
 
 
 class FocusEntry(TimedEntry):
-    """The focus axis was brought to where the scene is sharpest, before frame `id`.
-
-    place_um: where it is, to deviation_um; None where no peak was seen, see `fault`: then the axis
-    stands where it did, from_um.
-    """
+    """The focus axis was brought to where the scene is sharpest."""
 
     kind: Literal["focus"] = "focus"
     id: str
+    """Of the frame that follows."""
     from_um: float
+    """Position before, um; where no peak was seen the axis is there again."""
     place_um: float | None = None
+    """Position where the scene is sharpest, um; None where no peak was seen."""
     deviation_um: float | None = None
+    """Standard deviation of `place_um`, um."""
     fault: str = ""
+    """Why no peak was seen; "" where it was."""
     at_s: float = 0.0
+    """Begin, s from the begin of the run."""
     seconds: float = 0.0
+    """Duration, s."""
 
     def __str__(self) -> str:
         if self.place_um is None:
@@ -331,27 +390,31 @@ class FocusEntry(TimedEntry):
 
 
 class SourceEntry(TimedEntry):
-    """A source of the rig's environment failed, or gives values again (fault "")."""
+    """A source of the rig's environment failed, or gives values again."""
 
     kind: Literal["source"] = "source"
     name: str
     fault: str = ""
+    """"" where it gives values again."""
 
     def __str__(self) -> str:
         return f"{self.wall}: {self.name}: {self.fault or 'gives values again'}"
 
 
 class FilmEntry(TimedEntry):
-    """A segment of a film begins, from frame `id` on: time goes on within it without a break.
+    """A segment of a film begins: time goes on within it without a break.
 
-    segment: counted from 0. The first begins with the film, the next after each interruption, in
-    which the scene may have changed.
+    The first begins with the film, the next after each interruption, in which the scene may have
+    changed.
     """
 
     kind: Literal["film"] = "film"
     segment: int
+    """Number of the segment, from 0."""
     id: str
+    """Of its first frame."""
     rate_hz: float
+    """Frames per second."""
 
     def __str__(self) -> str:
         return f"{self.wall}: film, segment {self.segment + 1} begins with {self.id}"
@@ -362,6 +425,7 @@ class DroppedEntry(TimedEntry):
 
     kind: Literal["dropped"] = "dropped"
     ids: list[str]
+    """Of the frames, in the order of time."""
     reason: str = ""
 
     def __str__(self) -> str:
@@ -374,6 +438,7 @@ class CompleteEntry(TimedEntry):
 
     kind: Literal["complete"] = "complete"
     frames: int = 0
+    """Number of frames."""
 
     def __str__(self) -> str:
         return f"{self.wall}: every frame verified"

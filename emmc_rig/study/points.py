@@ -23,9 +23,10 @@ from emmc_rig.model.json_text import parse_json
 from emmc_rig.progress import Watcher
 from emmc_rig.report.page import Head, Section, framed, number, provenance_section
 from emmc_rig.store.folders import Listing, refuse_edited, refuse_inside_session, result_folder
-from emmc_rig.store.jobs import Store, digest_of, kept_words, run_job
+from emmc_rig.store.jobs import Store, kept_words, run_job
 from emmc_rig.store.journal import Lines
 from emmc_rig.store.pool import Pool, opened_pool
+from emmc_rig.store.products import digest_of
 from emmc_rig.store.results import write_metrics
 from emmc_rig.study.rows import csv_text, plain, provenance
 from emmc_rig.version import __version__

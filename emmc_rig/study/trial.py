@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.formats.scenes import Scene, zoomed_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.dictionary import Dictionary, open_dictionary
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
 from emmc_rig.reconstruction.result import Reconstruction
 from emmc_rig.simulators.raycaster import World

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from emmc_rig.reconstruction.method import Given, Method, cost_words
+from emmc_rig.reconstruction.method import Given, Method, ShippedSettings, cost_words
 from emmc_rig.reconstruction.result import Reconstruction
-from emmc_rig.reconstruction.settings import ShippedSettings
 from emmc_rig.reconstruction.sparse import SparseSettings, reconstruct_sparse
 
 

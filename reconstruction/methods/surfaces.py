@@ -17,10 +17,9 @@ from emmc_rig.reconstruction.adaptive.method import (
 )
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
 from emmc_rig.reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
-from emmc_rig.reconstruction.method import Given, Method, Sensitivity, cost_words
+from emmc_rig.reconstruction.method import Given, Method, Sensitivity, ShippedSettings, cost_words
 from emmc_rig.reconstruction.methods.variational import solve_tv_dict
 from emmc_rig.reconstruction.result import Reconstruction
-from emmc_rig.reconstruction.settings import ShippedSettings
 from emmc_rig.reconstruction.sparse import SparseSettings
 
 PATCH_RTOL, PATCH_STEPS = 1e-2, 100

@@ -16,10 +16,9 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.reconstruction.colour import unseen_colour
 from emmc_rig.reconstruction.result import SCALE, Reconstruction
-from emmc_rig.reconstruction.verdict.compression import blockiness, quantised
 from emmc_rig.reconstruction.verdict.displaced import displaced
 from emmc_rig.reconstruction.verdict.kept import compare_held_out, over_baselines
-from emmc_rig.reconstruction.verdict.pixels import pixel_figures
+from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
 from emmc_rig.reconstruction.verdict.shadow import Relief, relief, shadow
 from emmc_rig.reconstruction.verdict.shots import Motion, compared
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.choices import choose_mu
+from emmc_rig.reconstruction.problem import choose_mu
 from emmc_rig.reconstruction.tv import few_steps
-from emmc_rig.reconstruction.verdict.pixels import neighbours
+from emmc_rig.reconstruction.verdict.readings import neighbours
 from emmc_rig.reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]

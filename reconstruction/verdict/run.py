@@ -21,10 +21,10 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import shows_parallax
 from emmc_rig.reconstruction.adaptive.film import Film
-from emmc_rig.reconstruction.choices import choose_mu
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.methods import MethodSettings, find_method, reconstruct
+from emmc_rig.reconstruction.problem import choose_mu
 from emmc_rig.reconstruction.result import Progress, Reconstruction
 from emmc_rig.reconstruction.screening import screened
 from emmc_rig.reconstruction.tv import few_steps

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.local_mean import local_mean
+from emmc_rig.model.frames import local_mean
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.choices import smooth_guess
+from emmc_rig.reconstruction.problem import smooth_guess
 
 Array = NDArray[np.floating]
 SMOOTH_PX = 4.0

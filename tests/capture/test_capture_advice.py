@@ -29,8 +29,8 @@ import emmc_rig.drivers.errors
 from emmc_rig import cli
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.rig_config import opened_rig
+from emmc_rig.captures import engine
 from emmc_rig.captures import run as capture_run
-from emmc_rig.captures import sequencer
 from emmc_rig.captures.checks import SaturatedError
 from emmc_rig.captures.retries import HOPELESS
 from emmc_rig.drivers.dng import encode_dng
@@ -668,7 +668,7 @@ def more_shots_of_changing_patterns(bench):
 
 @walk(" frames are still to be taken")
 def a_stop_after_the_frame(bench):
-    honest = sequencer.check
+    honest = engine.check
 
     def stopping(planned, *rest):
         if planned.id == "dark-0-r1":
@@ -676,7 +676,7 @@ def a_stop_after_the_frame(bench):
         return honest(planned, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequencer, "check", stopping)
+        patch.setattr(engine, "check", stopping)
         line = bench.refused()
     bench.finish = ("capture", "plan-session")
     yield line

@@ -10,12 +10,11 @@ from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
 from emmc_rig.captures.control import Control
-from emmc_rig.captures.estimate import Pace, known_exposures
+from emmc_rig.captures.estimate import Pace
 from emmc_rig.captures.events import Listener
-from emmc_rig.captures.metering import first_meterings
+from emmc_rig.captures.metering import Exposures
 from emmc_rig.captures.plan import load_plan
 from emmc_rig.captures.sequencer import Sequencer
-from emmc_rig.session.journal import metered
 
 PLAN = {
     "camera": "rgbw-bayer-2shots",
@@ -120,11 +119,10 @@ def test_the_estimate_knows_what_was_metered(plan):
     first = emmc.capture(plan, quick_rig())
     planned, pace = load_plan(plan), Pace({}, 0.0, 1000)
     frames = [frame for frame in first.frames if not frame.is_optional]
-    unknown = pace.estimate(frames, known_exposures(planned, {}, None))
+    unknown = pace.estimate(frames, Exposures(planned).known_s)
     assert unknown.guessed == sum(frame.exposure_s is None for frame in frames)
     truly_s = sum(entry.exposure_s for entry in first.stored.values())
-    decided = metered(first.journal.entries)
-    known = pace.estimate(frames, known_exposures(planned, first_meterings(first), decided))
+    known = pace.estimate(frames, Exposures(planned, first).known_s)
     assert known.guessed == 0
     assert known.exposing_s == pytest.approx(truly_s, rel=0.02)
     assert unknown.exposing_s < truly_s / 2

@@ -10,10 +10,10 @@ import pytest
 import typer
 
 from emmc_rig import cli
-from emmc_rig.commands.advice import HOME, WORDS, in_shell
+from emmc_rig.commands.output import HOME, WORDS, in_shell
 from emmc_rig.drivers.errors import LimitExceededError, NotHomedError, StalledError
 from emmc_rig.errors import AppError
-from emmc_rig.model.advice import Advice
+from emmc_rig.model.errors import Advice
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]

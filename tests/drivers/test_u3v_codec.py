@@ -4,6 +4,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
+from fuzzing import fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.drivers.errors import CameraFormatError, DriverError
@@ -177,7 +178,7 @@ def damaged(random):
     return bytes(raw)
 
 
-def test_no_bytes_make_a_decoder_fail_outside_the_drivers_errors(fuzz):
+def test_no_bytes_make_a_decoder_fail_outside_the_drivers_errors():
     def check(seed):
         raw = damaged(Random(seed))
         for decode in DECODERS:

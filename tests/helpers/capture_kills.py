@@ -16,7 +16,7 @@ from pathlib import Path
 
 from capture_rigs import begun, plan_and_camera, still_rig
 
-from emmc_rig.captures import writer
+from emmc_rig.captures import recorder
 from emmc_rig.captures.between import Between
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.errors import AppError
@@ -45,7 +45,7 @@ def hook(rig, frame, note):
     note(power_w=0.5, frame=None if frame is None else frame.id)
 
 
-WATCHED = frozenset(module.__file__ for module in (files, lines, journal, lock, session, writer))
+WATCHED = frozenset(module.__file__ for module in (files, lines, journal, lock, session, recorder))
 
 
 class Countdown(Watcher):

@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from browsers import MARKS, complaints, open_browser
+from programs import PROGRAM
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
 from selenium.common.exceptions import StaleElementReferenceException
@@ -23,7 +23,6 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
 PATIENCE_S = 120
-PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
 WIDTHS = {"desktop": 1600, "phone": 390}
 
 

@@ -4,7 +4,6 @@ import http.client
 import json
 import re
 import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from asked_person import manned
+from programs import PROGRAM
 
 import emmc_rig as emmc
 from emmc_rig.captures.control import Control
@@ -261,9 +261,6 @@ def test_enter_at_the_terminal_answers_too():
     control.until_answered(lambda: next(keys))
     assert next(keys, None) is None
     assert not control.answered
-
-
-PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
 
 
 @pytest.mark.slow

@@ -22,8 +22,8 @@ from emmc_rig.process.block_tasks import BlockJob, BlockTask
 from emmc_rig.process.captures import opened_capture
 from emmc_rig.process.reconstructing import reconstruct_undrawn
 from emmc_rig.progress import Watcher
+from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings
-from emmc_rig.reconstruction.settings import BlockSettings
 from emmc_rig.reconstruction.tiles import CaptureSurvey, Grid
 from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.store import pool as pools

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from pools import Here, StoppedHereError, children
-from programs import program
+from programs import PROGRAM, program
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError, WrongUsageError
@@ -23,7 +22,7 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.process import block_tasks
 from emmc_rig.process.captures import opened_capture
-from emmc_rig.process.memory import parse_memory
+from emmc_rig.process.cost import parse_memory
 from emmc_rig.process.reconstructing import load_settings, reconstruct_undrawn
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.store.folders import result_folder
@@ -133,8 +132,7 @@ def test_a_capture_of_one_block_comes_out_as_without_workers(place):
 def command(place, out, *more):
     return subprocess.Popen(
         [
-            sys.executable, "-c", "from emmc_rig.cli import main; raise SystemExit(main())",
-            "reconstruct", str(place / "frames"), "--method", "tv", "--settings",
+            *PROGRAM, "reconstruct", str(place / "frames"), "--method", "tv", "--settings",
             str(place / "blocks.yaml"), "--out", str(place / out), *map(str, more),
         ],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

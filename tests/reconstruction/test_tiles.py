@@ -11,9 +11,9 @@ from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.settings import SIDES, AdaptiveSettings
 from emmc_rig.reconstruction.dictionary import dct_dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
 from emmc_rig.reconstruction.result import Reconstruction, Status
-from emmc_rig.reconstruction.settings import BlockSettings
 from emmc_rig.reconstruction.sparse import SparseSettings
 from emmc_rig.reconstruction.tiles import (
     CaptureSurvey,

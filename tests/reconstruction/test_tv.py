@@ -8,9 +8,8 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.reconstruction.choices import choose_mu
 from emmc_rig.reconstruction.errors import ReconstructionError
-from emmc_rig.reconstruction.problem import colour_metric
+from emmc_rig.reconstruction.problem import choose_mu, colour_metric
 from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 from emmc_rig.simulators.scenes import render
 

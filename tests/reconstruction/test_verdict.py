@@ -25,7 +25,6 @@ from emmc_rig.reconstruction.result import Reconstruction, Status
 from emmc_rig.reconstruction.screening import screened
 from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, judged_together
-from emmc_rig.reconstruction.verdict.compression import blockiness, quantised
 from emmc_rig.reconstruction.verdict.displaced import _tiled, displaced
 from emmc_rig.reconstruction.verdict.evidence import Evidence, FittedFrames, gathered
 from emmc_rig.reconstruction.verdict.kept import (
@@ -34,7 +33,7 @@ from emmc_rig.reconstruction.verdict.kept import (
     missed_readings,
     over_baselines,
 )
-from emmc_rig.reconstruction.verdict.pixels import pixel_figures
+from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
 from emmc_rig.reconstruction.verdict.rules import LEVELS, verdict_from
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.reconstruction.verdict.shadow import Relief, relief, shadow, tile_edges

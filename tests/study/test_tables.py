@@ -17,7 +17,7 @@ from emmc_rig.reconstruction.dictionary import Dictionary, dct_dictionary
 from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
 from emmc_rig.reconstruction.sparse import SparseSettings
 from emmc_rig.reconstruction.tv import TVSettings
-from emmc_rig.store.jobs import digest_of
+from emmc_rig.store.products import digest_of
 from emmc_rig.study.tables import paper, tables_study
 from emmc_rig.study.tables.cells import PARTS, Cell, Setup, cells_of, chosen_parts, scenes_of
 from emmc_rig.study.tables.tables_study import (

@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from emmc_rig.process.memory import forget_peak, peak_memory_mib
+from emmc_rig.process.cost import forget_peak, peak_memory_mib
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, find_method, installed_methods
 from emmc_rig.simulators.scenes import STILL_SCENES
 from emmc_rig.study.rows import available_cores

@@ -16,9 +16,9 @@ from pydantic import Field
 
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.model.lightfield import replicate_centre
 from emmc_rig.model.settings import Settings
+from emmc_rig.reconstruction.dictionary import open_dictionary
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, find_method
 from emmc_rig.reconstruction.sparse import SparseSettings
 from emmc_rig.report.drawing import colours_of
