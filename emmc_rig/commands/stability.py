@@ -47,10 +47,7 @@ def stability(
     The same command goes on where it stopped.
     """
     from emmc_rig.store.results import parse_size
-    from emmc_rig.study.stability.stability_study import (
-        StabilityStudy,
-        stability_settings,
-    )
+    from emmc_rig.study.stability.stability_study import StabilityStudy, stability_settings
 
     if faults:
         _list_faults()

@@ -295,14 +295,14 @@ class TablesStudy(Study[Cell]):
         size = "whole views" if cut is None else f"the middle {cut[0]}×{cut[1]} pixels"
         lead = part("lead", "PSNR in dB, the paper's after the bar.")
         return Report(
-            _head(self.results),
-            [
+            head=_head(self.results),
+            about=[
                 f"{len(self.results)} reconstructions of {', '.join(self.scenes)}; {size}, "
                 "5×5 views, PSNR with peak 1 over all views, pixels and colours.",
                 "Equal total exposure for every setup; frames are made with the Psi that "
                 "reconstructs them, as in the paper.",
             ],
-            [
+            sections=[
                 Section(
                     f"table-{index}",
                     grid.title,
@@ -311,15 +311,15 @@ class TablesStudy(Study[Cell]):
                 )
                 for index, grid in enumerate(grids)
             ],
-            {CSV: self._rows()},
-            {
+            rows={CSV: self._rows()},
+            metrics={
                 "cells": len(self.results),
                 "seconds": self.seconds,
                 "scenes": self.scenes,
                 "tables": {grid.title: [grid.heads, *grid.rows] for grid in grids},
                 "settings": self.settings.model_dump(mode="json"),
             },
-            {f"Scene {name}": spec for name, spec in self.scenes.items()},
+            sources={f"Scene {name}": spec for name, spec in self.scenes.items()},
         )
 
     def _rows(self) -> list[dict[str, object]]:
