@@ -152,6 +152,7 @@ class StabilityStudy(Study[Point]):
             "capture": trial.capture.identity(),
             "fault": trial.fault,
             "strength": trial.strength,
+            "method": point.method,
             **method_inputs(point.method, self.settings.dictionary),
             "settings": _settings().model_dump(mode="json"),
         }
