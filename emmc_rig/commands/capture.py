@@ -16,9 +16,7 @@ from rich.console import Console
 
 from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
 from emmc_rig.commands.options import (
-    SIMULATED as SIMULATED_PANEL,
-)
-from emmc_rig.commands.options import (
+    SIMULATED_PANEL,
     HostOption,
     RigOption,
     RigSceneOption,
@@ -31,18 +29,16 @@ from emmc_rig.progress import Event, Watcher
 
 if TYPE_CHECKING:
     from emmc_rig.captures.control import Control
-    from emmc_rig.captures.estimate import Estimate
     from emmc_rig.captures.events import RunEnd
+    from emmc_rig.captures.schedule import Estimate
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.session.session import Session
-
-OptionalPath = Path | None
 
 
 def capture(
     context: typer.Context,
     plan: Annotated[
-        OptionalPath, typer.Argument(help="a plan (YAML), or a session to go on with")
+        Path | None, typer.Argument(help="a plan (YAML), or a session to go on with")
     ] = None,
     new: Annotated[
         str | None, typer.Option("--new", help="write a commented plan for this camera, and exit")
@@ -101,7 +97,7 @@ def capture(
         ),
     ] = False,
     host: HostOption = "127.0.0.1",
-    out: Annotated[OptionalPath, out_option("PLAN-session")] = None,
+    out: Annotated[Path | None, out_option("PLAN-session")] = None,
 ) -> None:
     """Capture a plan's frames on a rig.
 
@@ -230,7 +226,7 @@ def _estimate_words(expected: Estimate, most: str) -> str:
 
 def _say_complete(session: Session, outcome: RunEnd) -> None:
     """Print the counts of frames, reasons against the exposures, and the path of the page."""
-    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+    from emmc_rig.session.brightness import exposure_reasons, shot_exposures
     from emmc_rig.session.journal import ended
     from emmc_rig.session.session import REPORT
     from emmc_rig.store.results import shown_seconds

@@ -12,7 +12,7 @@ import typer
 
 from emmc_rig.commands.modes import given_names, refuse
 from emmc_rig.commands.options import (
-    SIMULATED,
+    SIMULATED_PANEL,
     HostOption,
     MethodOption,
     RigOption,
@@ -47,7 +47,7 @@ def live(
         typer.Option(
             "--design",
             help="the camera whose masks are in it, see `emmc-rig cameras`",
-            rich_help_panel=SIMULATED,
+            rich_help_panel=SIMULATED_PANEL,
         ),
     ] = "rgbw-bayer-1shot",
     scene: RigSceneOption = "deep-occlusions",

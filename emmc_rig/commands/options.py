@@ -11,7 +11,7 @@ DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
 SIZE_VARIABLE = "EMMC_SIZE"
 """Environment variable: the --size where none is given, so that everything can be tried small."""
-SIMULATED, PARALLEL = "Simulated rig", "Large light fields"
+SIMULATED_PANEL, PARALLEL_PANEL = "Simulated rig", "Large light fields"
 """Panels of the help for options that few commands' users need."""
 
 SceneOption = Annotated[
@@ -60,12 +60,14 @@ FastOption = Annotated[
 ]
 ZarrOption = Annotated[
     bool,
-    typer.Option("--zarr", help="write Zarr, for large light fields", rich_help_panel=PARALLEL),
+    typer.Option(
+        "--zarr", help="write Zarr, for large light fields", rich_help_panel=PARALLEL_PANEL
+    ),
 ]
 WorkersOption = Annotated[
     int | None,
     typer.Option(
-        "--workers", min=1, help="processes that share the work", rich_help_panel=PARALLEL
+        "--workers", min=1, help="processes that share the work", rich_help_panel=PARALLEL_PANEL
     ),
 ]
 ClusterOption = Annotated[
@@ -73,7 +75,7 @@ ClusterOption = Annotated[
     typer.Option(
         "--cluster",
         help="tcp://HOST:PORT of a Dask scheduler, instead of --workers",
-        rich_help_panel=PARALLEL,
+        rich_help_panel=PARALLEL_PANEL,
     ),
 ]
 DictionaryOption = Annotated[
@@ -104,7 +106,7 @@ RigOption = Annotated[
 RigSceneOption = Annotated[
     str,
     typer.Option(
-        "--scene", help="what its camera looks at, as in `demo`", rich_help_panel=SIMULATED
+        "--scene", help="what its camera looks at, as in `demo`", rich_help_panel=SIMULATED_PANEL
     ),
 ]
 RigSizeOption = Annotated[
@@ -113,7 +115,7 @@ RigSizeOption = Annotated[
         "--size",
         envvar=SIZE_VARIABLE,
         help="ROWSxCOLUMNS of the light field",
-        rich_help_panel=SIMULATED,
+        rich_help_panel=SIMULATED_PANEL,
     ),
 ]
 

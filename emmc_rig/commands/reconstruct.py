@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from emmc_rig.commands.options import (
-    PARALLEL,
+    PARALLEL_PANEL,
     ClusterOption,
     DictionaryOption,
     MethodOption,
@@ -67,7 +67,7 @@ def reconstruct(
         typer.Option(
             "--memory",
             help="most memory of all processes together, as 2GiB",
-            rich_help_panel=PARALLEL,
+            rich_help_panel=PARALLEL_PANEL,
         ),
     ] = None,
     budget: Annotated[

@@ -169,7 +169,6 @@ def block_task(task: BlockTask) -> Generator[tuple[str, None], None, None]:
 
     Raises AppError naming the block where it fails, and OSError where it cannot be written.
     """
-    started = running_s()
     try:
         solved = _solved(task)
     except ERRORS as fault:
@@ -189,7 +188,6 @@ def block_task(task: BlockTask) -> Generator[tuple[str, None], None, None]:
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
             "variance": _variance(task.block, solved.arrays),
-            "seconds": running_s() - started,
             "peak_mib": peak_memory_mib(),
         },
     )
@@ -241,7 +239,7 @@ class BlockFiles(Store[None, DoneBlock]):
             method=task.job.method,
             light_field=np.empty((0, 0, 0, 0, 3), np.float32),
             objective=(),
-            seconds=kept["seconds"],
+            seconds=0.0,  # those of all blocks together are measured, see `Blocks`
             **figures,
         )
         evidence = kept["evidence"]

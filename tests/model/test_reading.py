@@ -46,7 +46,7 @@ def one_line(fault):
 
 
 def done_or_refused(call, error):
-    """Whether a call succeeds; it may raise `error` with one line, and nothing else."""
+    """Return whether a call succeeds; the only exception allowed is `error`, of one line."""
     try:
         call()
     except error as fault:

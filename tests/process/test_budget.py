@@ -48,7 +48,7 @@ def test_a_budget_takes_the_most_accurate_within_it(monkeypatch):
 @pytest.fixture(scope="module")
 def capture():
     """Psi and noisy frames of a built-in scene, larger than the window that is timed."""
-    size = (128, 160)
+    size = (64, 96)
     psi = find_camera("scenario-ii-cfa").psi(size)
     truth = render("deep-occlusions", size=size).light_field.astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 0.004, psi.frames_shape)
@@ -58,7 +58,8 @@ def capture():
 
 @pytest.mark.slow
 @pytest.mark.timing("compares two times")
-def test_the_time_of_a_window_predicts_that_of_the_whole(capture):
+def test_the_time_of_a_window_predicts_that_of_the_whole(capture, monkeypatch):
+    monkeypatch.setattr(cost, "WINDOW", 48)
     psi, frames = capture
     timed(psi, frames)  # compiles
     expected = timed(psi, frames)

@@ -17,8 +17,8 @@ from emmc_rig.captures.plan import load_plan
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session import frame_means
-from emmc_rig.session.frame_means import camera_of
+from emmc_rig.session import board_sets
+from emmc_rig.session.board_sets import camera_of
 from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import Session
 from emmc_rig.simulators.bench import MountingErrors
@@ -94,7 +94,7 @@ def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured,
     out = captured / "sensor"
     assert exit_code("calibrate", captured / "session", "--sensor", "--out", out) == 0
     reported = capsys.readouterr().out
-    # The series ends below saturation: what follows from it is no more than a bound.
+    # The series of exposures ends below saturation, which gives a lower bound of the capacity.
     assert "Saturation capacity, at least" in reported
     figures = json.loads((out / "sensor.json").read_text())
     noise = find_camera("rgbw-bayer-1shot").sensor.noise
@@ -176,7 +176,7 @@ def used_psi(folder):
 
 @pytest.fixture
 def own_session(captured, tmp_path):
-    """A copy of the session, without what other tests made of it."""
+    """A copy of the session, without calibrations and reconstructions of other tests."""
     left_out = shutil.ignore_patterns("calibration", "reconstruction")
     return Path(shutil.copytree(captured / "session", tmp_path / "session", ignore=left_out))
 
@@ -193,7 +193,7 @@ def decoded_by(monkeypatch, *words):
         return call
 
     monkeypatch.setattr(Session, "__init__", counted("opened", Session.__init__))
-    monkeypatch.setattr(frame_means, "decode_frame", counted("decoded", frame_means.decode_frame))
+    monkeypatch.setattr(board_sets, "decode_frame", counted("decoded", board_sets.decode_frame))
     code, out, err = program(*words)
     assert code == 0, err
     monkeypatch.undo()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from pools import held_bytes
+from pools import children, held_bytes
 from programs import PROGRAM
 
 from emmc_rig.commands.simulate import simulate_into
@@ -90,14 +90,6 @@ def peaks_mib(process):
     ended.set()
     watch.join()
     return peaks, err
-
-
-def children(process):
-    try:
-        text = Path(f"/proc/{process}/task/{process}/children").read_text()
-    except OSError:
-        return []
-    return [int(word) for word in text.split()]
 
 
 @pytest.mark.slow

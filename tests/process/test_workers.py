@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import time
+from itertools import count
 from pathlib import Path
 
 import h5py
@@ -83,6 +84,14 @@ def test_the_truth_and_the_verdict_cover_all_blocks(place):
     assert 10 < metrics["psnr_db"] < 40
     assert metrics["verdict"]["features"]["kept"] > 30
     assert content(place / "compared") == content(place / "alone")
+
+
+def test_the_seconds_of_blocks_are_those_from_the_first_to_the_last(place, monkeypatch):
+    """A clock that a second passes on whenever it is read: before all blocks, and after them."""
+    monkeypatch.setattr(block_tasks, "running_s", count().__next__)
+    metrics = here(place, "timed", Here())
+    assert metrics["blocks"] == [2, 3]
+    assert metrics["seconds"] == 1
 
 
 @pytest.mark.slow

@@ -281,7 +281,7 @@ def test_an_edit_after_a_kill_between_two_moves_is_kept_and_reported(out, name):
         assert (out / name).read_text() == "edited"
     (out / name).rename(out.parent / "mine")
     failing_command(out)
-    # What had taken its place is where its owner moved it, everything else is the new result.
+    # The moved file is where its owner put it; all other files are those of the new result.
     moved = {name} & {"light_field.h5"}
     written = {other: (out / other).read_text() for other in NEW if other not in moved}
     assert written == {other: text for other, text in NEW.items() if other not in moved}
