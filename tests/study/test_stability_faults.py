@@ -5,13 +5,12 @@ import pytest
 from view_files import save_views
 
 from emmc_rig.calibration.placement import designed_placement
-from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.simulators import changes
 from emmc_rig.simulators.scenes import render
 from emmc_rig.study.points import NotApplicableError
-from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
+from emmc_rig.study.stability.faults import FAULTS, Point
 from emmc_rig.study.stability.mask_faults import misplaced_psi
 from emmc_rig.study.stability.scene_faults import flicker_gains
 from emmc_rig.study.trial import Capture
@@ -261,8 +260,3 @@ def test_equal_seeds_make_equal_trials():
     trial, same, other = (made("bad-pixels", 10, seed=seed) for seed in (1, 1, 2))
     assert np.array_equal(trial.readings, same.readings)
     assert not np.array_equal(trial.readings, other.readings)
-
-
-def test_a_misspelt_fault_names_the_nearest():
-    with pytest.raises(AppError, match="did you mean 'mask-shift'"):
-        find_fault("maskshift")

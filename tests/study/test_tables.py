@@ -329,7 +329,7 @@ def test_a_scene_too_small_or_of_other_views_is_reported_before_anything_is_meas
     ):
         save_hdf5(tmp_path / name / f"{name}.h5", views, {})
         with pytest.raises(Exception, match=why):
-            a_study(tmp_path / name, tmp_path / "out").planned()
+            a_study(tmp_path / name, tmp_path / "out").check_input()
 
 
 def test_the_middle_is_cut_to_whole_pixels():

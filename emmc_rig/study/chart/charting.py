@@ -241,11 +241,11 @@ class ChartStudy(Study[Point]):
             for chart in every
         }
         return Report(
-            _head(every[0]),
-            self._about(load, loads[-1] > available_cores() + 0.5, len(done)),
-            [self._section(chart, draw_chart(chart, colours, drawn)) for chart in every],
-            {CSV: [_row(*pair) for pair in self.results.items()]},
-            {
+            head=_head(every[0]),
+            about=self._about(load, loads[-1] > available_cores() + 0.5, len(done)),
+            sections=[self._section(chart, draw_chart(chart, colours, drawn)) for chart in every],
+            rows={CSV: [_row(*pair) for pair in self.results.items()]},
+            metrics={
                 "points": len(self.results),
                 "seconds": self.seconds,
                 "machine": machine(),
@@ -254,7 +254,7 @@ class ChartStudy(Study[Point]):
                 "left_out": self.excluded(),
                 "settings": self.settings.model_dump(mode="json"),
             },
-            {"Machine": machine(), "Load": load},
+            sources={"Machine": machine(), "Load": load},
         )
 
     def _about(self, load: str, busy: bool, done: int) -> list[str]:

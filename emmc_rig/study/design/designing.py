@@ -227,9 +227,13 @@ class DesignStudy(Study[Simulation]):
             "settings": described,
         }
         return Report(
-            head, [f"{masks}; {self.verdict}"], [_section(found, self.table)], {}, metrics,
-            {"Scenes": ", ".join(self.scenes)},
-        )  # fmt: skip
+            head=head,
+            about=[f"{masks}; {self.verdict}"],
+            sections=[_section(found, self.table)],
+            rows={},
+            metrics=metrics,
+            sources={"Scenes": ", ".join(self.scenes)},
+        )
 
 
 def _section(found: Search, simulated: Table) -> Section:

@@ -152,6 +152,7 @@ class StabilityStudy(Study[Point]):
             "capture": trial.capture.identity(),
             "fault": trial.fault,
             "strength": trial.strength,
+            "method": point.method,
             **method_inputs(point.method, self.settings.dictionary),
             "settings": _settings().model_dump(mode="json"),
         }
@@ -233,14 +234,17 @@ class StabilityStudy(Study[Point]):
         size = "whole views" if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
         scenes = ", ".join(Path(scene).stem for scene in settings.scenes)
         return Report(
-            _head(every),
-            [
+            head=_head(every),
+            about=[
                 f"{len(self.results)} points on {scenes}, {size}, through "
                 f"{Path(settings.camera).stem}; seed {settings.seed}."
             ],
-            _sections(every, new / DRAWN),
-            {POINTS_CSV: [_row(*pair) for pair in self.results.items()], BREAKS_CSV: breaks},
-            {
+            sections=_sections(every, new / DRAWN),
+            rows={
+                POINTS_CSV: [_row(*pair) for pair in self.results.items()],
+                BREAKS_CSV: breaks,
+            },
+            metrics={
                 "points": len(self.results),
                 "seconds": self.seconds,
                 "machine": machine(),
@@ -251,7 +255,7 @@ class StabilityStudy(Study[Point]):
                 "left_out": self.excluded(),
                 "settings": settings.model_dump(mode="json"),
             },
-            {"Machine": machine()},
+            sources={"Machine": machine()},
         )
 
 

@@ -7,6 +7,7 @@ colour filter array, (iii) monochrome. One full-colour image of (i) counts as th
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 Scenario = Literal["i", "ii", "iii"]
@@ -28,31 +29,35 @@ ALSO_CALLED = {"dragon": "dragons", "dragonandbunnies": "dragons", "dragonsandbu
 
 
 class Printed(NamedTuple):
-    """Where a number stands: scene, scenario, shots, k (r = 1/k^2), noise or not, method."""
+    """The place of a number in the tables; binning: k, r = 1/k^2."""
 
     scene: str
-    scenario: Scenario
+    scenario: str
     shots: int
     binning: int
     noisy: bool
     method: str
 
 
-# Columns: scene; Dict-ADMM and TV-Dict of (i), of (ii), and of (iii) with three shots.
+# A table begins with the scenario and the number of shots of each column. Those of Table II hold
+# Dict-ADMM and TV-Dict in turns. The last number of Seahorse in Table IV by Dict-ADMM is cut off in
+# the copy at hand.
 _TABLE_2_NOISE_FREE = """
+               i.3   i.3    ii.1  ii.1   iii.3 iii.3
 dragons        29.46 30.22  27.62 27.98  30.01 30.52
 dice           28.67 28.93  25.74 25.78  28.92 29.29
 fish           27.47 27.86  25.48 25.53  28.01 28.33
 messerschmitt  32.42 32.51  29.96 29.89  32.17 32.93
 """
 _TABLE_2_NOISY = """
+               i.3   i.3    ii.1  ii.1   iii.3 iii.3
 dragons        28.00 28.40  27.43 27.82  26.35 26.68
 dice           26.75 27.02  25.42 25.54  25.05 25.33
 fish           27.07 27.47  25.07 25.20  26.18 26.42
 messerschmitt  29.98 30.67  29.64 29.75  28.46 29.21
 """
-# Columns: scene; (i); (ii) with 1 to 3 shots; (iii) with 1 to 3 shots.
 _TABLE_3_DICT_ADMM = """
+           i.3    ii.1  ii.2  ii.3   iii.1 iii.2 iii.3
 seahorse   34.57  29.88 33.67 34.79  28.98 33.62 35.36
 rock       34.35  27.30 33.28 34.58  25.91 33.23 35.38
 cars       33.02  27.21 31.94 33.24  25.78 31.63 33.74
@@ -62,6 +67,7 @@ tulip      42.40  39.81 41.74 42.58  36.95 41.70 42.94
 buttercup  33.41  29.71 32.52 33.59  28.06 32.22 34.06
 """
 _TABLE_3_TV_DICT = """
+           i.3    ii.1  ii.2  ii.3   iii.1 iii.2 iii.3
 seahorse   35.05  29.92 33.16 35.26  29.12 34.08 36.05
 rock       34.47  27.15 33.23 34.69  25.83 33.30 35.62
 cars       33.16  27.12 31.98 33.37  25.78 31.75 33.96
@@ -70,9 +76,8 @@ whiterose  34.54  28.23 33.29 34.71  27.42 33.29 35.54
 tulip      44.52  40.83 43.03 44.47  37.71 43.91 45.61
 buttercup  33.60  29.64 32.67 33.76  28.06 32.37 34.28
 """
-# Columns: scene; (i) with 3, 6, 9, 12 shots; (ii) with 1 to 4 shots; (iii) with 1 to 4 shots. The
-# last number of Seahorse by Dict-ADMM is cut off in the copy at hand.
 _TABLE_4_DICT_ADMM = """
+           i.3   i.6   i.9   i.12   ii.1  ii.2  ii.3  ii.4   iii.1 iii.2 iii.3 iii.4
 seahorse   29.14 32.73 34.51 35.62  26.41 29.17 30.67 31.70  26.00 29.11 30.79 -
 rock       26.38 31.98 34.21 35.53  23.19 26.91 29.23 30.81  22.88 26.73 29.30 30.93
 cars       26.29 30.91 33.02 34.26  23.07 26.27 28.14 29.37  22.43 26.33 28.31 29.76
@@ -82,6 +87,7 @@ tulip      39.42 41.58 42.64 43.24  36.39 37.53 38.23 38.69  31.47 37.75 39.36 4
 buttercup  28.88 31.62 33.31 34.56  26.48 28.00 28.88 29.62  24.32 28.19 29.54 30.44
 """
 _TABLE_4_TV_DICT = """
+           i.3   i.6   i.9   i.12   ii.1  ii.2  ii.3  ii.4   iii.1 iii.2 iii.3 iii.4
 seahorse   29.25 33.05 35.02 36.28  26.44 29.23 30.79 31.86  26.21 29.27 31.03 32.25
 rock       26.42 32.06 34.39 35.79  23.14 26.85 29.19 30.80  22.86 26.68 29.29 30.97
 cars       26.33 30.98 33.16 34.46  23.07 26.27 28.16 29.42  22.49 26.35 28.38 29.83
@@ -91,46 +97,30 @@ tulip      40.14 43.41 44.99 45.99  37.25 38.32 39.00 39.45  31.64 38.80 40.91 4
 buttercup  28.94 31.71 33.46 34.75  26.44 28.00 28.90 29.66  24.29 28.22 29.61 30.53
 """
 
-_Shots = list[tuple[Scenario, int]]
-_SHOTS_2: _Shots = [("i", 3), ("ii", 1), ("iii", 3)]
-_SHOTS_3: _Shots = [
-    ("i", 3), ("ii", 1), ("ii", 2), ("ii", 3), ("iii", 1), ("iii", 2), ("iii", 3),
-]  # fmt: skip
-_SHOTS_4: _Shots = [
-    ("i", 3), ("i", 6), ("i", 9), ("i", 12),
-    ("ii", 1), ("ii", 2), ("ii", 3), ("ii", 4),
-    ("iii", 1), ("iii", 2), ("iii", 3), ("iii", 4),
-]  # fmt: skip
-_Column = tuple[Scenario, int, str]
 
-
-def _columns(shots: _Shots, *methods: str) -> list[_Column]:
-    return [(scenario, count, method) for scenario, count in shots for method in methods]
-
-
-_BLOCKS: tuple[tuple[str, list[_Column], int, bool], ...] = (
-    (_TABLE_2_NOISE_FREE, _columns(_SHOTS_2, "dict-admm", "tv-dict"), 1, False),
-    (_TABLE_2_NOISY, _columns(_SHOTS_2, "dict-admm", "tv-dict"), 1, True),
-    (_TABLE_3_DICT_ADMM, _columns(_SHOTS_3, "dict-admm"), 1, False),
-    (_TABLE_3_TV_DICT, _columns(_SHOTS_3, "tv-dict"), 1, False),
-    (_TABLE_4_DICT_ADMM, _columns(_SHOTS_4, "dict-admm"), 2, False),
-    (_TABLE_4_TV_DICT, _columns(_SHOTS_4, "tv-dict"), 2, False),
-)
-
-
-def _printed() -> dict[Printed, float]:
+def _printed(text: str, methods: Sequence[str], binning: int, noisy: bool) -> dict[Printed, float]:
+    """Return the numbers of a table; its columns hold the methods in turns."""
+    head, *lines = text.strip("\n").split("\n")
+    columns = [word.split(".") for word in head.split()]
+    by_column = [*methods] * (len(columns) // len(methods))
     found = {}
-    for text, columns, binning, noisy in _BLOCKS:
-        for line in text.split("\n")[1:-1]:
-            scene, *values = line.split()
-            for (scenario, shots, method), value in zip(columns, values, strict=True):
-                if value != "-":
-                    place = Printed(scene, scenario, shots, binning, noisy, method)
-                    found[place] = float(value)
+    for line in lines:
+        scene, *values = line.split()
+        for (scenario, shots), method, value in zip(columns, by_column, values, strict=True):
+            if value != "-":
+                place = Printed(scene, scenario, int(shots), binning, noisy, method)
+                found[place] = float(value)
     return found
 
 
-PSNR_DB = _printed()
+PSNR_DB = {
+    **_printed(_TABLE_2_NOISE_FREE, ("dict-admm", "tv-dict"), 1, False),
+    **_printed(_TABLE_2_NOISY, ("dict-admm", "tv-dict"), 1, True),
+    **_printed(_TABLE_3_DICT_ADMM, ("dict-admm",), 1, False),
+    **_printed(_TABLE_3_TV_DICT, ("tv-dict",), 1, False),
+    **_printed(_TABLE_4_DICT_ADMM, ("dict-admm",), 2, False),
+    **_printed(_TABLE_4_TV_DICT, ("tv-dict",), 2, False),
+}
 
 
 def known_as(name: str) -> str | None:

@@ -21,6 +21,7 @@ from pydantic import Field
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
+from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction import methods as solvers
 from emmc_rig.reconstruction.bpdn import BPDNSettings
 from emmc_rig.reconstruction.dictionary import Dictionary
@@ -30,6 +31,7 @@ from emmc_rig.reconstruction.sparse import PatchEstimates, SparseSettings, estim
 from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.report.page import Head, Section, number, part
 from emmc_rig.simulators.scenes import STILL_SCENES
+from emmc_rig.store.pool import Pool
 from emmc_rig.study.points import Report, Results, Study, Table
 from emmc_rig.study.rows import SMALLEST_PX, dictionary_identity
 from emmc_rig.study.scores import scored
@@ -203,7 +205,18 @@ class TablesStudy(Study[Cell]):
         return opened
 
     def planned(self) -> list[Cell]:
-        """Return the cells; raises AppError for a dictionary or a scene that does not fit."""
+        """Return the cells."""
+        return self.cells
+
+    def run(
+        self, points: Iterable[Cell], watcher: Watcher, pool: Pool | None = None
+    ) -> dict[Cell, dict]:
+        """Measure cells as every study does, after the dictionary and the scenes are checked."""
+        self.check_input()
+        return super().run(points, watcher, pool)
+
+    def check_input(self) -> None:
+        """Raise AppError for a dictionary or a scene that does not fit."""
         for binning in {cell.setup.binning for cell in self.cells}:
             self.dictionary(binning)
         for cell in {cell.scene: cell for cell in self.cells}.values():
@@ -213,7 +226,6 @@ class TablesStudy(Study[Cell]):
                     f"{cell.scene}: {rows}x{columns} pixels, needs {SMALLEST_PX}x{SMALLEST_PX} or "
                     "more; leave the scene out"
                 )
-        return self.cells
 
     def capture(self, cell: Cell) -> Capture:
         """Return the capture of a cell, of the whole scene."""
@@ -295,14 +307,14 @@ class TablesStudy(Study[Cell]):
         size = "whole views" if cut is None else f"the middle {cut[0]}×{cut[1]} pixels"
         lead = part("lead", "PSNR in dB, the paper's after the bar.")
         return Report(
-            _head(self.results),
-            [
+            head=_head(self.results),
+            about=[
                 f"{len(self.results)} reconstructions of {', '.join(self.scenes)}; {size}, "
                 "5×5 views, PSNR with peak 1 over all views, pixels and colours.",
                 "Equal total exposure for every setup; frames are made with the Psi that "
                 "reconstructs them, as in the paper.",
             ],
-            [
+            sections=[
                 Section(
                     f"table-{index}",
                     grid.title,
@@ -311,15 +323,15 @@ class TablesStudy(Study[Cell]):
                 )
                 for index, grid in enumerate(grids)
             ],
-            {CSV: self._rows()},
-            {
+            rows={CSV: self._rows()},
+            metrics={
                 "cells": len(self.results),
                 "seconds": self.seconds,
                 "scenes": self.scenes,
                 "tables": {grid.title: [grid.heads, *grid.rows] for grid in grids},
                 "settings": self.settings.model_dump(mode="json"),
             },
-            {f"Scene {name}": spec for name, spec in self.scenes.items()},
+            sources={f"Scene {name}": spec for name, spec in self.scenes.items()},
         )
 
     def _rows(self) -> list[dict[str, object]]:
