@@ -247,6 +247,12 @@ def test_what_differs_between_two_plans_is_named():
     assert differences(plan, plan) == []
     assert differences(other, plan) == ["settle_s is 0.5, not 0.0"]
     assert differences(plan, plan_of(shots=[{}]))[0] == "shots has 3 entries, not 1"
+    assert differences(plan_of(shots=[{}]), plan) == ["shots has 1 entries, not 3"]
+    # What one plan has as a mapping or list, and the other as a single value.
+    assert differences(plan_of(darks=None), plan)[0].startswith("darks is null, not {")
+    assert differences(plan, plan_of(darks=None))[0].endswith(", not null")
+    every, few = (plan_of(whiteboards={"views": views}) for views in ("all", [[2, 2]]))
+    assert differences(every, few) == ['whiteboards.views is "all", not [[2, 2]]']
 
 
 def test_a_key_of_earlier_versions_is_read_under_its_new_name_and_not_beside_it():

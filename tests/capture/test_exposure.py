@@ -14,7 +14,7 @@ from emmc_rig.captures.control import Control
 from emmc_rig.captures.faults import GaveUpError
 from emmc_rig.captures.metering import BRACKET_STEP, METERABLE_LEVELS, asked_of_scene
 from emmc_rig.captures.plan import Metering
-from emmc_rig.captures.run import _frozen, planned_frames
+from emmc_rig.captures.run import planned_frames
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.formats.scenes import fine_scene
@@ -195,7 +195,7 @@ def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
     planned = planned_frames(request_for(Path("/disk"), text), rig)
     edit = amendment(session, edited, camera, session.rig, planned)
     assert edit is not None
-    session = session.amend(_frozen(request_for(Path("/disk"), text), edit.frames), edit.changes)
+    session = session.amend(request_for(Path("/disk"), text).frozen(edit.frames), edit.changes)
     assert Sequencer(session, edited, rig).run().complete
     taken_s = [session.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)]
     assert taken_s[1] == taken_s[2] == pytest.approx(taken_s[0] / 2, rel=0.02)
