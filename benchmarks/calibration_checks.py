@@ -93,7 +93,7 @@ COMPARED_ROWS, FRAME_S, SEED, LEAST_LOST_DB = 32, 0.5, 0, 0.2
 PROGRAM = """\
 import atexit, time
 from emmc_rig.cli import main
-from emmc_rig.process.memory import peak_memory_mib
+from emmc_rig.process.cost import peak_memory_mib
 atexit.register(lambda: print(peak_memory_mib(), time.process_time()))
 main()
 """

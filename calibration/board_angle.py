@@ -31,9 +31,12 @@ from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]
 SIGNIFICANT = 4.0
+"""Standard deviations, from which on a board counts as uneven: by chance once in 16 000."""
 LEAST_UNEVENNESS = 1e-3
+"""Relative, of the board over angle: less is left alone."""
 ROUNDS = 4
 CLIP = 4.0
+"""Robust deviations at which residuals are clipped: pixels of normal noise keep theirs."""
 SAMPLED = 500_000
 """Pixels at most: of more the board's unevenness is known to 1e-5."""
 CLEARLY = 12.0

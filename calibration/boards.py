@@ -19,6 +19,7 @@ from emmc_rig.model.sensing import PsiLayout
 Array = NDArray[np.floating]
 LAMP_COLOURS = ("red", "green", "blue")
 DARKEST_REFERENCE_DN = 50.0
+"""Above the dark: with rounding of 1 DN a ratio is known to 1 % of it and better."""
 
 
 Opening = tuple[NDArray[np.bool_], tuple[float, float], int]

@@ -26,7 +26,9 @@ from emmc_rig.calibration.frames import (
 
 Array = NDArray[np.floating]
 ROUNDS = 3
+"""Of rate and variance in turn."""
 SAFETY_SIGMAS = 4.0
+"""Below white, that a predicted reading must lie: noise exceeds them once in 30 000."""
 QUANTISATION_DN2 = 1 / 12
 """Least variance of a frame: a sensor without any noise still rounds."""
 

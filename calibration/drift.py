@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,28 +35,43 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
+
+
+class Kind(NamedTuple):
+    """A kind of drift of the mask."""
+
+    parameter: str
+    """Of the placement; values are in its unit."""
+    spread: float
+    """Standard deviation of the prior, around where a search begins."""
+    words: str
+
+
 KINDS = {
-    "shift_x_um": ("offset_x_um", 30.0, "a shift in x"),
-    "shift_y_um": ("offset_y_um", 30.0, "a shift in y"),
-    "rotation_rad": ("rotation_rad", 0.006, "a turn"),
-    "scale": ("scale", 0.005, "a change of scale"),
-    "distance_share": ("distance_share", 0.05, "a change of distance"),
-    "tilt_x_rad": ("tilt_x_rad", 0.003, "a tilt in x"),
-    "tilt_y_rad": ("tilt_y_rad", 0.003, "a tilt in y"),
+    "shift_x_um": Kind("offset_x_um", 30.0, "a shift in x"),
+    "shift_y_um": Kind("offset_y_um", 30.0, "a shift in y"),
+    "rotation_rad": Kind("rotation_rad", 0.006, "a turn"),
+    "scale": Kind("scale", 0.005, "a change of scale"),
+    "distance_share": Kind("distance_share", 0.05, "a change of distance"),
+    "tilt_x_rad": Kind("tilt_x_rad", 0.003, "a tilt in x"),
+    "tilt_y_rad": Kind("tilt_y_rad", 0.003, "a tilt in y"),
 }
-"""Of drift: parameter of the placement, deviation of the prior around the start of the search, and
-words."""
-CROSSTALK_SPREAD = 0.05
+CROSSTALK_SPREAD, BRIGHTNESS_SPREAD = 0.05, 0.1
+"""Standard deviations of the priors: of the light in other colours, and of a later shot's."""
 MOST_STEPS = 12
+"""Gauss-Newton steps of a climb."""
 WIDENING = 2
 """The part of the picture that steps are taken on, from one climb to the next."""
 LOCAL_PX = 3.0
 """Deviation of the local mean: twice a cell, whose shadow is to be left."""
 START_PX = 96
+"""Side of the middle of the picture where a search begins."""
 TURN_STEP_DEG, SCALE_STEP = 1.0, 0.015
 """Of which a half moves the rim of START_PX by less than half a pixel."""
 SPARE = 1.5
 """Times the range: shifts looked at, to know one beyond it."""
+DARK_SHARE = 0.05
+"""Of the bright pixels' reading: a darker block is mostly noise."""
 DECOYS = 12
 LEAST_SURE = 6.0
 """Standard deviations of the decoys' evidence: chosen from hundreds of places, noise reaches 4."""
@@ -91,12 +107,15 @@ class DriftSettings(Settings):
 class Drift:
     """What has drifted since the calibration.
 
-    values, deviations: by KINDS, then "crosstalk", what the filters let through of other colours
-    beyond what the calibration has (where pixels see one), and the brightness of shots 2, 3, ...
-    (relative). displacement: of the shadow, root mean square over the picture, pixels; by kind
-    likewise. chi2: the drift squared over its covariance; probability: of more on a Psi that fits.
-    beyond_search: the mask is farther off than was asked to search. recognised: the place explains
-    the captures better than places where the mask cannot be, by so many standard deviations.
+    values, deviations: by KINDS, then "crosstalk", the share of other colours that the filters pass
+        beyond the calibration's (where pixels see one colour), and "brightness_2", ... of the later
+        shots (relative).
+    displacement_px: of the shadow, root mean square over the picture. by_kind_px: by each kind.
+    chi2: the drift squared over its covariance. probability: of more on a Psi that fits.
+    placement: the mask's, corrected.
+    beyond_search: the mask is farther off than was asked to search.
+    recognised: the place explains the captures better than places where the mask cannot be, by so
+        many standard deviations.
     """
 
     values: dict[str, float]
@@ -138,14 +157,18 @@ class Drift:
         largest = max(self.by_kind_px, key=lambda kind: self.by_kind_px[kind])
         return (
             f"Psi no longer fits: the shadow has moved by {self.displacement_px:.2f} pixels, most "
-            f"of it {KINDS[largest][-1]} ({self.by_kind_px[largest]:.2f} pixels); use the "
+            f"of it {KINDS[largest].words} ({self.by_kind_px[largest]:.2f} pixels); use the "
             f"corrected Psi, or calibrate again ({self.searched})"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Blocks of the captures: pixels (block, side^2, 2), and per shot what they read."""
+    """Blocks of the captures.
+
+    pixels: (block, side^2, 2), row and column. colours, readings, noise: (block, shot, side^2): the
+    colour that a pixel sees or ANY_COLOUR, its reading, and the variance of that.
+    """
 
     pixels: NDArray[np.int64]
     colours: NDArray[np.uint8]
@@ -153,6 +176,7 @@ class _Blocks:
     noise: Array
 
     def some(self, chosen: NDArray[np.intp]) -> _Blocks:
+        """Return the blocks of these indices."""
         return _Blocks(
             self.pixels[chosen], self.colours[chosen], self.readings[chosen], self.noise[chosen]
         )
@@ -168,51 +192,85 @@ def _blocks(
 ) -> _Blocks:
     """Return blocks on a jittered grid whose pixels are all usable and not dark.
 
-    channels: the colour that each pixel sees, or ANY_COLOUR, (shot, pixel_y, pixel_x). half_px:
-    from the middle of the picture, along either axis.
+    channels: the colour that each pixel sees, or ANY_COLOUR, (shot, pixel_y, pixel_x). count: about
+    so many. half_px: from the middle of the picture, along either axis.
     """
-    sizes = [
-        min(n, max(int(2 * half_px), 4 * side)) if half_px < n else n for n in frames.shape[1:]
-    ]
-    rows, columns = sizes
-    above, before = ((n - m) // 4 * 2 for n, m in zip(frames.shape[1:], sizes, strict=True))
-    across = max(int(np.sqrt(count * columns / rows)), 1)
-    down = max(count // across, 1)
-    found = []
-    floor = 0.05 * float(np.percentile(frames.readings[frames.usable], 90))
-    for i in range(down):
-        for j in range(across):
-            for _ in range(4):
-                top = above + int((i + rng.random()) * (rows - side) / down) // 2 * 2
-                left = before + int((j + rng.random()) * (columns - side) / across) // 2 * 2
-                place = (slice(None), slice(top, top + side), slice(left, left + side))
-                if frames.usable[place].all() and frames.readings[place].mean() > floor:
-                    found.append((top, left))
-                    break
-    if len(found) < 8:
+    corners = _block_corners(frames, side, count, rng, half_px)
+    if len(corners) < 8:
         raise CalibrationError(
-            f"only {len(found)} blocks of {side} x {side} pixels are lit, unsaturated and without "
-            "bad pixels: these captures cannot show a drift"
+            f"only {len(corners)} blocks of {side} x {side} pixels are lit, unsaturated and "
+            "without bad pixels: these captures cannot show a drift"
         )
     inside = np.moveaxis(np.mgrid[:side, :side], 0, -1).reshape(-1, 2)
-    pixels = np.array(found)[:, None, :] + inside
+    pixels = np.array(corners)[:, None, :] + inside
     y, x = pixels[..., 0], pixels[..., 1]
-
-    def at(array: NDArray) -> NDArray:
-        return array[:, y, x].transpose(1, 0, 2)
-
+    colours, readings, deviation = (
+        array[:, y, x].transpose(1, 0, 2) for array in (channels, frames.readings, frames.deviation)
+    )
     return _Blocks(
-        pixels,
-        at(channels),
-        at(frames.readings).astype(np.float64),
-        np.square(at(frames.deviation), dtype=np.float64),
+        pixels, colours, readings.astype(np.float64), np.square(deviation, dtype=np.float64)
+    )
+
+
+def _block_corners(
+    frames: Frames, side: int, count: int, rng: np.random.Generator, half_px: float
+) -> list[tuple[int, int]]:
+    """Return the first row and column of each block, even numbers: colour filters repeat by 2.
+
+    In each part of the grid four places are tried.
+    """
+    whole = frames.shape[1:]
+    rows, columns = (min(n, max(int(2 * half_px), 4 * side)) if half_px < n else n for n in whole)
+    above, before = (whole[0] - rows) // 4 * 2, (whole[1] - columns) // 4 * 2
+    across = max(int(np.sqrt(count * columns / rows)), 1)
+    down = max(count // across, 1)
+    corners = []
+    darkest = DARK_SHARE * float(np.percentile(frames.readings[frames.usable], 90))
+    for i, j in np.ndindex(down, across):
+        for _ in range(4):
+            top = above + int((i + rng.random()) * (rows - side) / down) // 2 * 2
+            left = before + int((j + rng.random()) * (columns - side) / across) // 2 * 2
+            place = (slice(None), slice(top, top + side), slice(left, left + side))
+            if frames.usable[place].all() and frames.readings[place].mean() > darkest:
+                corners.append((top, left))
+                break
+    return corners
+
+
+class _Unknowns(NamedTuple):
+    """What is searched: the drift by KINDS, the crosstalk, and the brightness of later shots."""
+
+    names: list[str]
+    spreads: Array
+    """Standard deviations of the prior."""
+    steps: Array
+    """Of differences, in each unknown's unit."""
+
+
+def _unknowns(mask: ShadowMask, sees_one_colour: bool, shots: int) -> _Unknowns:
+    """Return the unknowns; a step of the mask's moves its shadow by 0.02 pixels at most."""
+    step_um = 0.02 * mask.pitch_um * mask.binning
+    half_um = max(mask.size) / 2 * mask.pitch_um
+    far_um = max(max(mask.views) - 1, 1) / 2 * mask.aperture_cell_um
+    # A tilt moves the corner of the outermost view by tilt half_um far_um / lens_um.
+    tilt = min(step_um * mask.lens_um / (far_um * half_um), 1e-3)
+    names, spreads = list(KINDS), [kind.spread for kind in KINDS.values()]
+    steps = [step_um, step_um, step_um / half_um, step_um / half_um, 0.02, tilt, tilt]
+    if sees_one_colour:
+        names, spreads, steps = [*names, "crosstalk"], [*spreads, CROSSTALK_SPREAD], [*steps, 0.01]
+    later = range(1, shots)
+    return _Unknowns(
+        names + [f"brightness_{shot + 1}" for shot in later],
+        np.array(spreads + [BRIGHTNESS_SPREAD for _ in later]),
+        np.array(steps + [0.005 for _ in later]),
     )
 
 
 class _Search:
     """Evidence of the blocks as a function of the drift, and the prior of that.
 
-    origin, penalty: mean and inverse covariance of the prior. steps: of differences.
+    The drift is normal about `origin`, with the inverse covariance `penalty`. steps: of
+    differences. farthest: of a step of the climb.
     """
 
     def __init__(
@@ -221,12 +279,12 @@ class _Search:
         placement: Placement,
         stages: Stages,
         prior: Prior,
-        spreads: Array,
-        steps: Array,
+        unknowns: _Unknowns,
     ) -> None:
         self.mask, self.placement, self.stages, self.prior = mask, placement, stages, prior
-        self.penalty, self.steps = np.diag(1 / np.square(spreads)), steps
-        self.origin, self.farthest = np.zeros(len(spreads)), 3 * spreads
+        self.steps, self.origin = unknowns.steps, np.zeros(len(unknowns.spreads))
+        self.penalty = np.diag(1 / np.square(unknowns.spreads))
+        self.farthest = 3 * unknowns.spreads
 
     def begin(self, blocks: _Blocks, origin: Array, candidates: int | None = None) -> None:
         """Take these blocks, each with the disparities that explain it best at the origin.
@@ -302,14 +360,19 @@ class _Search:
 def drifted(placement: Placement, drift: Array) -> Placement:
     """Return the placement after a drift (in the order of KINDS; what follows is ignored)."""
     changes = {
-        name: getattr(placement, name) + float(value)
-        for (name, *_), value in zip(KINDS.values(), drift, strict=False)
+        kind.parameter: getattr(placement, kind.parameter) + float(value)
+        for kind, value in zip(KINDS.values(), drift, strict=False)
     }
     return replace(placement, **changes)
 
 
 def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> float:
     """Return the root mean square displacement of the shadow over picture and views, pixels.
+
+    A ray from x to the lens point u meets the mask at xi = (1 - rho) x + rho u. To first order
+
+        displacement = shift + turn (-xi_y, xi_x) + scale xi - farther (u - x)
+        farther = (distance_share d + tilt . x) / D
 
     drift: in the order of KINDS, missing values 0; values beyond KINDS are ignored.
     """
@@ -321,9 +384,9 @@ def displacement_px(mask: ShadowMask, placement: Placement, drift: Array) -> flo
     shift_x, shift_y, turn, scale, distance, tilt_x, tilt_y = np.resize(
         [*drift, *[0.0] * len(KINDS)], len(KINDS)
     )
-    more = (distance * mask.distance_um + tilt_x * xx + tilt_y * yy) / mask.lens_um
-    moved_x = shift_x - turn * xi_y + scale * xi_x - more * (uu - xx)
-    moved_y = shift_y + turn * xi_x + scale * xi_y - more * (vv - yy)
+    farther = (distance * mask.distance_um + tilt_x * xx + tilt_y * yy) / mask.lens_um
+    moved_x = shift_x - turn * xi_y + scale * xi_x - farther * (uu - xx)
+    moved_y = shift_y + turn * xi_x + scale * xi_y - farther * (vv - yy)
     pixel_um = mask.pitch_um * mask.binning
     return float(np.sqrt(np.mean(moved_x**2 + moved_y**2))) / pixel_um
 
@@ -347,70 +410,72 @@ def find_drift(
     shots = frames.shape[0]
     channels = np.full(frames.shape, ANY_COLOUR, np.uint8) if colour is None else colour
     rng = np.random.default_rng(settings.seed)
+    # The evidence of a block costs the cube of its readings.
     side = settings.block_px if shots < 3 else max(settings.block_px - 2, 4)
     disparities = np.linspace(
         -settings.disparity_px, settings.disparity_px, settings.disparity_steps
     )
+    unknowns = _unknowns(mask, colour is not None, shots)
     prior = plane_prior(mask.views, side, disparities)
-    pixel_um = mask.pitch_um * mask.binning
-    half_um = max(mask.size) / 2 * mask.pitch_um
-    step = 0.02 * pixel_um
-    far_um = max(max(mask.views) - 1, 1) / 2 * mask.aperture_cell_um
-    lean = min(step * mask.lens_um / (far_um * half_um), 1e-3)
-    names, spreads = list(KINDS), [spread for _, spread, _ in KINDS.values()]
-    steps = [step, step, step / half_um, step / half_um, 0.02, lean, lean]
-    if colour is not None:
-        names, spreads, steps = [*names, "crosstalk"], [*spreads, CROSSTALK_SPREAD], [*steps, 0.01]
-    names += [f"brightness_{shot + 1}" for shot in range(1, shots)]
-    every_step = np.array(steps + [0.005] * (shots - 1))
-    every_spread = np.array(spreads + [0.1] * (shots - 1))
-    search = _Search(mask, placement, stages, prior, every_spread, every_step)
+    search = _Search(mask, placement, stages, prior, unknowns)
 
-    def climbed(blocks: _Blocks, start: Array) -> tuple[Array, int, bool]:
-        search.begin(blocks, start, settings.candidates)
-        return _ascend(search, start, settings.tolerance)
+    def blocks_within(half_px: float) -> _Blocks:
+        return _blocks(frames, channels, side, settings.coarse_blocks, rng, half_px)
 
-    half_px, widest_px = START_PX / 2, max(frames.shape[1:]) / 2
-    blocks = _blocks(frames, channels, side, settings.coarse_blocks, rng, half_px)
-    starts = _starting_drifts(frames, channels[0], mask, placement, stages, settings, len(names))
-    tried = [climbed(blocks, start)[0] for start in starts]
+    half_px = START_PX / 2
+    blocks = blocks_within(half_px)
+    starts = _starting_drifts(
+        frames, channels[0], mask, placement, stages, settings, len(unknowns.names)
+    )
+    tried = [_climb(search, blocks, start, settings).drift for start in starts]
     search.begin(blocks, starts[0])
     drift = max(tried, key=search.total)
-    while WIDENING * half_px < widest_px:
+    while WIDENING * half_px < max(frames.shape[1:]) / 2:
         half_px *= WIDENING
-        blocks = _blocks(frames, channels, side, settings.coarse_blocks, rng, half_px)
-        drift = climbed(blocks, drift)[0]
+        drift = _climb(search, blocks_within(half_px), drift, settings).drift
     blocks = _blocks(frames, channels, side, settings.blocks, rng)
-    drift, steps_taken, converged = climbed(blocks, drift)
-    drift, covariance = _newton_step(search, drift)
+    climb = _climb(search, blocks, drift, settings)
+    drift, covariance = _newton_step(search, climb.drift)
     recognised = _margin_over_decoys(search, blocks, drift, settings, rng)
-    count = len(KINDS)
+    return _describe(search, unknowns, drift, covariance, climb, recognised, settings)
+
+
+def _describe(
+    search: _Search,
+    unknowns: _Unknowns,
+    drift: Array,
+    covariance: NDArray[np.float64],
+    climb: _Climb,
+    recognised: float,
+    settings: DriftSettings,
+) -> Drift:
+    """Return the result: chi2 = drift^T covariance^-1 drift of the mask's own unknowns."""
+    mask, count = search.mask, len(KINDS)
     mask_alone = drift[:count]
     statistic = float(mask_alone @ np.linalg.solve(covariance[:count, :count], mask_alone))
     probability = float(chdtrc(count, statistic))
-    moved = displacement_px(mask, placement, mask_alone)
-    reach = np.array(
-        [settings.search_px * pixel_um] * 2
-        + [np.deg2rad(settings.search_deg), settings.search_scale]
-    )
+    moved_px = displacement_px(mask, search.placement, mask_alone)
+    farthest_um = settings.search_px * mask.pitch_um * mask.binning
+    farthest = [farthest_um, farthest_um, np.deg2rad(settings.search_deg), settings.search_scale]
+    deviations = np.sqrt(np.diag(covariance))
     return Drift(
-        dict(zip(names, map(float, drift), strict=True)),
-        dict(zip(names, map(float, np.sqrt(np.diag(covariance))), strict=True)),
-        moved,
-        {
-            kind: displacement_px(mask, placement, np.where(np.arange(count) == k, mask_alone, 0))
+        values=dict(zip(unknowns.names, map(float, drift), strict=True)),
+        deviations=dict(zip(unknowns.names, map(float, deviations), strict=True)),
+        displacement_px=moved_px,
+        by_kind_px={
+            kind: displacement_px(mask, search.placement, np.eye(count)[k] * mask_alone)
             for k, kind in enumerate(KINDS)
         },
-        statistic,
-        probability,
-        probability < settings.false_alarms and moved > settings.harmless_px,
-        drifted(placement, drift),
-        steps_taken,
-        "converged" if converged else "step limit reached",
-        f"searched: shifts up to {settings.search_px:g} pixels, turns up to "
+        chi2=statistic,
+        probability=probability,
+        drifted=probability < settings.false_alarms and moved_px > settings.harmless_px,
+        placement=drifted(search.placement, drift),
+        steps=climb.steps,
+        status="converged" if climb.converged else "step limit reached",
+        searched=f"searched: shifts up to {settings.search_px:g} pixels, turns up to "
         f"{settings.search_deg:g} degrees, scales up to {settings.search_scale:.0%}",
-        bool((np.abs(drift[: len(reach)]) > reach).any()),
-        recognised,
+        beyond_search=bool((np.abs(drift[: len(farthest)]) > farthest).any()),
+        recognised=recognised,
     )
 
 
@@ -477,34 +542,52 @@ def _margin_over_decoys(
     return float((search.total(drift) - np.mean(evidence)) / max(np.std(evidence), 1e-9))
 
 
-def _ascend(search: _Search, drift: Array, tolerance: float) -> tuple[Array, int, bool]:
-    """Return the drift after Gauss-Newton steps on the blocks' scores, their count, converged."""
+class _Climb(NamedTuple):
+    """The end of Gauss-Newton steps."""
+
+    drift: Array
+    steps: int
+    converged: bool
+
+
+def _climb(search: _Search, blocks: _Blocks, start: Array, settings: DriftSettings) -> _Climb:
+    """Return the drift after Gauss-Newton steps on the blocks' scores from a start.
+
+        s_b = d(evidence of block b) / d(drift),    S = sum of the s_b
+        H = sum (s_b - mean s)(s_b - mean s)^T + P
+        step = H^-1 (S - P (drift - origin)),  halved until the posterior rises
+
+    P the prior's inverse covariance. Centred scores: far from the peak their mean is larger than
+    their scatter. The last step is small in standard deviations.
+    """
+    search.begin(blocks, start, settings.candidates)
+    drift, tolerance = start, settings.tolerance
     for taken in range(1, MOST_STEPS + 1):
-        slopes = search.scores(drift, central=False)
-        value = search.posterior(drift)
-        # Centred: far from the peak the mean slope is larger than the scatter.
-        centred = slopes - slopes.mean(axis=0)
+        scores = search.scores(drift, central=False)
+        here = search.posterior(drift)
+        centred = scores - scores.mean(axis=0)
         matrix = centred.T @ centred + search.penalty
-        move = np.linalg.solve(matrix, slopes.sum(axis=0) - search.pull(drift))
+        move = np.linalg.solve(matrix, scores.sum(axis=0) - search.pull(drift))
         # Far from the peak a step may lead where no mask can be.
         move = np.clip(move, -search.farthest, search.farthest)
         deviations = np.sqrt(np.diag(np.linalg.inv(matrix)))
-        found = search.posterior(drift + move)
-        while found <= value:
+        while search.posterior(drift + move) <= here:
             move = move / 2
             if np.max(np.abs(move) / deviations) < tolerance / 4:
-                return drift, taken, True
-            found = search.posterior(drift + move)
+                return _Climb(drift, taken, True)
         drift = drift + move
         if np.max(np.abs(move) / deviations) < tolerance:
-            return drift, taken, True
-    return drift, MOST_STEPS, False
+            return _Climb(drift, taken, True)
+    return _Climb(drift, MOST_STEPS, False)
 
 
 def _newton_step(search: _Search, drift: Array) -> tuple[Array, NDArray[np.float64]]:
     """Return the drift after a last step, Newton's own, and its sandwich covariance.
 
-    Its derivatives are without the bias of the one-sided differences before.
+        step = H^-1 (S - P (drift - origin)),    covariance = H^-1 (sum s_b s_b^T + P) H^-1
+
+    H is minus the second derivative of the log posterior, the others as in `_climb`, by central
+    differences: without the bias of the one-sided before.
     """
     slopes = search.scores(drift, central=True)
     curvature = _curvature(search, drift)

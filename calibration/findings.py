@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from emmc_rig.calibration.board_angle import BoardAngle, Leaning
 from emmc_rig.calibration.boards import Board
 from emmc_rig.calibration.choice import HeldOut
+from emmc_rig.calibration.colours import Crosstalk
 from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
 from emmc_rig.calibration.levels import Levels
 from emmc_rig.calibration.placement import Placement
@@ -17,10 +18,13 @@ from emmc_rig.calibration.planning import PinholeWorth
 from emmc_rig.calibration.shadow import ShadowMask
 
 LARGEST_FLICKER = 0.01
+"""Of a whiteboard's brightness against the others: more is named."""
 LARGEST_MOVE_UM = 1.0
+"""Of the mask from its place: more is named."""
 FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
 """Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
 SIGNIFICANT = 5.0
+"""Standard deviations, from which on a parameter is named: by chance once in two million."""
 LEAST_MOVE_UM = 0.2
 NOTEWORTHY = {
     "tilt_x_rad": (
@@ -116,6 +120,14 @@ def unwatched(missing: Sequence[str]) -> list[str]:
         f"not measured: {what} ({cost}); add `{line}` under whiteboards in the plan"
         for what, cost, line in lacking
     ]
+
+
+def crosstalk_finding(seen: Crosstalk) -> str:
+    """Return what the colour filters pass of other colours."""
+    return (
+        f"the colour filters pass up to {seen.largest:.1%} of the other colours: Psi "
+        "has three colours for every pixel"
+    )
 
 
 def angle_findings(board: BoardAngle) -> list[str]:

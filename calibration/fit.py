@@ -29,14 +29,14 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import correlate1d
 
-from emmc_rig.calibration.boards import Board, Opening, Sample, unsteadiness2
+from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadiness2
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import register, starting_placement
 from emmc_rig.calibration.placement import (
@@ -54,7 +54,9 @@ from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
 CHUNK = 4096
+"""Pixels whose slopes are held at once: by 41 parameters 1.3 MB, about a core's cache."""
 FIRST_WINDOW_PX = 64
+"""Half a side: a turn of half a degree moves the window's corner by less than a pixel."""
 FEWEST_PIXELS = 400
 """Of a whiteboard, however many there are."""
 MOST_OF_PRIOR = 0.7
@@ -63,13 +65,14 @@ LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
 MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
+"""Of readings and fitted shadow."""
 OFFSETS = slice(0, 2)
+"""Where offset_x_um and offset_y_um lie in the placement's vector."""
 OWN = 3
 """Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
-FIRST_BRIGHTNESS, FIRST_MOVED_UM = 2e-3, 0.2
 BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
 MOVES_UM = np.geomspace(0.002, 10.0, 12)
-"""Widths of the whiteboards' own that are tried."""
+"""Widths of the whiteboards' own that are tried: the least are far below what noise shows."""
 LOOSE_UM = 0.5
 """Width of where a hand puts a pinhole, as a move of the mask: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
@@ -80,6 +83,7 @@ rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um.""
 CLEARLY_LIKELIER = 0.5
 """Difference of log evidence: less than this tells nothing."""
 WIDTH_ROUNDS = 2
+"""The widths depend on the fit and the fit on the widths: so many times in turn."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -116,8 +120,9 @@ class FitSettings(Settings):
 class BoardCheck:
     """How one whiteboard agrees with the fit of all: brightness and where its mask stood.
 
-    taken_s: when, on the clock of the capture. chi2: mean squared residual over the noise, of the
-    pixels that are no outliers. outliers: their share.
+    brightness: over that of the other whiteboards. moved_um: (x, y) of the mask, from its place;
+    moved_deviation_um: of either axis. taken_s: on the clock of the capture. chi2: mean squared
+    residual over the noise, of the pixels that are no outliers. outliers: their share.
     """
 
     name: str
@@ -134,14 +139,16 @@ class BoardCheck:
 class Fit:
     """The placement fitted, how sure it is, and how well it explains the whiteboards.
 
-    covariance: (parameter, parameter), in the order of `placement.vector()`. chi2: mean squared
-    residual over the noise without outliers. undecided: names of parameters that the prior decides
-    more than the whiteboards; more_boards: how many more of the same kinds would decide them
-    (MOST_MORE_BOARDS: no number of them). brightness_spread: by
-    which whiteboards differ among themselves, beyond what their repeats do; so do the references,
-    which the covariance does not count. moved_um: how far the mask stands from its place; so it
-    may in the shots of a scene, which the covariance counts. astray2: variances of the views' own
-    displacements and softenings.
+    covariance: (parameter, parameter), in the order of `placement.vector()`.
+    correlation: of the readings with the fitted shadow.
+    chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
+    undecided: names of parameters that the prior decides more than the whiteboards.
+    more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
+    brightness_spread: relative standard deviation of the whiteboards' brightness, beyond what their
+        repeats show; references vary likewise, which the covariance does not count.
+    moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
+        covariance counts.
+    astray2: (OF_VIEW,), variances of the views' own displacements and softenings, um^2.
     """
 
     placement: Placement
@@ -165,6 +172,18 @@ class Fit:
         return float(np.sqrt(self.covariance[index, index]))
 
 
+class _Widths(NamedTuple):
+    """Standard deviations of what whiteboards have of their own, about 0."""
+
+    brightness: float
+    """Relative."""
+    moved_um: float
+    """Of the mask, along either axis."""
+
+
+FIRST_WIDTHS = _Widths(brightness=2e-3, moved_um=0.2)
+
+
 @dataclass(frozen=True, eq=False)
 class _State:
     """The placement, and each whiteboard's own: (board, OWN)."""
@@ -173,7 +192,7 @@ class _State:
     own: NDArray[np.float64]
 
     def vector(self) -> NDArray[np.float64]:
-        """Return all parameters as one vector."""
+        """Return all parameters as one vector: of the placement, then of each whiteboard."""
         return np.concatenate([self.placement.vector(), self.own.ravel()])
 
     def moved(self, step: Array) -> _State:
@@ -187,61 +206,74 @@ class _State:
         views_open, (x, y), shot = board.opening
         return views_open, (x + float(self.own[index, 1]), y + float(self.own[index, 2])), shot
 
+    def brightness(self, index: int) -> float:
+        """Return the factor on the readings of one whiteboard."""
+        return float(1 + self.own[index, 0])
+
+    def places(self, index: int) -> NDArray[np.int64]:
+        """Return where the placement's and one whiteboard's own parameters lie in the vector."""
+        size = len(self.placement.vector())
+        return np.concatenate([np.arange(size), size + index * OWN + np.arange(OWN)])
+
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """Precisions and centres of all parameters."""
+    """Precisions and centres of all parameters, in the order of `_State.vector`."""
 
     precision: NDArray[np.float64]
     centre: NDArray[np.float64]
 
-    def loss(self, at: _State) -> float:
+    def loss(self, state: _State) -> float:
         """Return what the prior adds to the loss."""
-        return 0.5 * float(np.sum(self.precision * (at.vector() - self.centre) ** 2))
+        return 0.5 * float(np.sum(self.precision * (state.vector() - self.centre) ** 2))
 
 
-def _prior(
-    placement: Array, centre: Array, widths: tuple[float, float], own2: NDArray[np.float64]
-) -> _Prior:
-    """Return the prior of a placement (precisions, centre) and of the whiteboards' own.
+@dataclass(frozen=True, eq=False)
+class _BenchPrior:
+    """What is known before the fit, apart from the widths of the whiteboards' own.
 
-    own2: (board, OWN), variances beside the widths of all, see `_own_variances`.
+    precision, centre: of the placement, (parameter,). own2: (board, OWN), variances beside those of
+    the widths: brightness as repeats show it, and places of pinholes that hands put.
     """
-    own2 = own2 + np.square([widths[0], widths[1], widths[1]])
-    precision = np.concatenate([placement, 1 / own2.ravel()]).astype(np.float64)
-    return _Prior(precision, np.concatenate([centre, np.zeros(own2.size)]).astype(np.float64))
+
+    precision: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    own2: NDArray[np.float64]
+
+    def with_widths(self, widths: _Widths) -> _Prior:
+        """Return the prior of all parameters."""
+        own2 = self.own2 + np.square([widths.brightness, widths.moved_um, widths.moved_um])
+        return _Prior(
+            np.concatenate([self.precision, 1 / own2.ravel()]),
+            np.concatenate([self.centre, np.zeros(own2.size)]),
+        )
 
 
-def _own_variances(boards: Sequence[Board]) -> NDArray[np.float64]:
-    """Return variances of the whiteboards' own brightness, as repeats show it, and places."""
+def _bench_prior(
+    boards: Sequence[Board], camera: Camera, mask: ShadowMask, placement: Placement
+) -> _BenchPrior:
+    """Return the prior about the design, with the mask's offset where it was registered."""
+    centre = starting_placement(camera, mask).vector()
+    # A stage sits where it was found; the prior is for what whiteboards do not determine.
+    centre[OFFSETS] = placement.vector()[OFFSETS]
+    deviations = Tolerances().deviations(camera.views)
+    if any(board.loose for board in boards):
+        # Pinholes a little off their holes look like glass before the mask.
+        deviations[SCALARS.index("glass_um")] *= OF_LOOSE
     own2 = np.zeros((len(boards), OWN))
     own2[:, 0] = unsteadiness2(boards) / np.array([board.repeats for board in boards])
     own2[[board.loose for board in boards], 1:] = LOOSE_UM**2
-    return own2
+    return _BenchPrior(1 / deviations**2, centre, own2)
 
 
-def _all_residuals(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> list[Array]:
+def _all_residuals(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> list[Array]:
     """Return the residuals of every whiteboard's sample, in deviations."""
-    shadow, found = Shadow(mask, at.placement), []
+    shadow, residuals = Shadow(mask, state.placement), []
     for index, sample in enumerate(samples):
-        opening = at.opening(sample.board, index)
+        opening = state.opening(sample.board, index)
         predicted = shadow.readings(sample.pixels, sample.channels, *opening)
-        brighter = 1 + at.own[index, 0]
-        found.append((sample.reading - brighter * predicted) / sample.deviation)
-    return found
-
-
-def _join_slopes(read: Array, slope: Array, own: Array) -> NDArray[np.float64]:
-    """Return the slopes by the placement and by a whiteboard's own, (n, parameter + OWN)."""
-    brighter = 1 + own[0]
-    rows = [brighter * slope, read, brighter * slope[:, OFFSETS]]
-    return np.column_stack(rows).astype(np.float64, copy=False)
-
-
-def _parameter_places(at: _State, index: int) -> NDArray[np.int64]:
-    """Return where the placement's and one whiteboard's own parameters lie in the vector."""
-    size = len(at.placement.vector())
-    return np.concatenate([np.arange(size), size + index * OWN + np.arange(OWN)])
+        residuals.append((sample.reading - state.brightness(index) * predicted) / sample.deviation)
+    return residuals
 
 
 def _robust_spread(residuals: Sequence[Array]) -> float:
@@ -249,9 +281,54 @@ def _robust_spread(residuals: Sequence[Array]) -> float:
     return max(1.0, deviation_of(np.concatenate(residuals)))
 
 
+class _Chunk(NamedTuple):
+    """Some pixels of one whiteboard's sample."""
+
+    pixels: NDArray[np.int64]
+    """(n, 2), row and column."""
+    channels: NDArray[np.uint8]
+    """(n,), the colour that each pixel sees."""
+    opening: Opening
+    residual: Array
+    """(n,), in deviations."""
+    deviation: Array
+    """(n, 1), of a reading."""
+
+    def slopes(self, shadow: Shadow, brightness: float) -> tuple[Array, Array]:
+        """Return the shadow's readings (n,), and slopes of the whiteboard's, (n, parameter + OWN).
+
+        By the placement, the whiteboard's brightness, and the mask's move in x and y.
+        """
+        read, slope = shadow.with_slopes(self.pixels, self.channels, *self.opening)
+        return read, _with_own_slopes(read, slope, brightness)
+
+
+def _with_own_slopes(read: Array, slope: Array, brightness: float) -> NDArray[np.float64]:
+    rows = [brightness * slope, read, brightness * slope[:, OFFSETS]]
+    return np.column_stack(rows).astype(np.float64, copy=False)
+
+
+def _pixel_chunks(state: _State, sample: Sample, index: int, residual: Array) -> Iterator[_Chunk]:
+    """Yield the pixels of a sample, CHUNK at a time."""
+    opening = state.opening(sample.board, index)
+    for first in range(0, len(residual), CHUNK):
+        part = slice(first, first + CHUNK)
+        yield _Chunk(
+            sample.pixels[part],
+            sample.channels[part],
+            opening,
+            residual[part],
+            sample.deviation[part, None],
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _NormalEquations:
-    """Gauss-Newton normal equations, and what the residuals are like."""
+    """Gauss-Newton normal equations, and what the residuals are like.
+
+    spread: robust deviation of the residuals, in deviations. squares: sum of squared residuals of
+    the `kept` pixels that are no outliers, of `count`.
+    """
 
     matrix: NDArray[np.float64]
     gradient: NDArray[np.float64]
@@ -261,128 +338,198 @@ class _NormalEquations:
     count: int
 
 
-def _pixel_chunks(
-    at: _State, sample: Sample, index: int, residual: Array
-) -> Iterator[tuple[Any, Array, Array]]:
-    """Yield what `Shadow` takes of some pixels, their residuals, and their deviations (n, 1)."""
-    opening = at.opening(sample.board, index)
-    for first in range(0, len(residual), CHUNK):
-        part = slice(first, first + CHUNK)
-        how = sample.pixels[part], sample.channels[part], *opening
-        yield how, residual[part], sample.deviation[part, None]
+def _normal_equations(
+    mask: ShadowMask, state: _State, samples: Sequence[Sample]
+) -> _NormalEquations:
+    """Return the normal equations of all samples, chunk by chunk.
 
-
-def _normal_equations(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> _NormalEquations:
-    shadow = Shadow(mask, at.placement)
-    residuals = _all_residuals(mask, at, samples)
+    r = (reading - (1 + brightness) shadow) / deviation       of a pixel
+    spread = max(1, 1.4826 median |r|)
+    w = (1 - (r / (4.685 spread))^2)^2, 0 beyond                Tukey's weight
+    J = d((1 + brightness) shadow) / d(parameters) / (deviation spread)
+    matrix = sum w J^T J,    gradient = sum w J^T r / spread
+    """
+    shadow = Shadow(mask, state.placement)
+    residuals = _all_residuals(mask, state, samples)
     spread = _robust_spread(residuals)
-    size = len(at.vector())
+    size = len(state.vector())
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
     for index, sample in enumerate(samples):
-        places = _parameter_places(at, index)
-        for how, residual, deviation in _pixel_chunks(at, sample, index, residuals[index]):
-            read, slope = shadow.with_slopes(*how)
-            slope = _join_slopes(read, slope, at.own[index]) / (deviation * spread)
-            scaled = residual / spread
+        places = state.places(index)
+        for chunk in _pixel_chunks(state, sample, index, residuals[index]):
+            _, slope = chunk.slopes(shadow, state.brightness(index))
+            slope = slope / (chunk.deviation * spread)
+            scaled = chunk.residual / spread
             weight = tukey_weights(scaled)
             matrix[np.ix_(places, places)] += slope.T @ (slope * weight[:, None])
             gradient[places] += slope.T @ (weight * scaled)
             inside = weight > 0
-            squares += float((residual[inside] ** 2).sum())
+            squares += float((chunk.residual[inside] ** 2).sum())
             kept += int(inside.sum())
     count = sum(map(len, residuals))
     return _NormalEquations(matrix, gradient, spread, squares, kept, count)
 
 
+class _Descent(NamedTuple):
+    """The end of Levenberg-Marquardt steps."""
+
+    state: _State
+    steps: int
+    converged: bool
+    normal: _NormalEquations
+    """At the state."""
+
+
+def _descend(
+    mask: ShadowMask,
+    state: _State,
+    samples: Sequence[Sample],
+    prior: _Prior,
+    settings: FitSettings,
+) -> _Descent:
+    """Return the state after Levenberg-Marquardt steps on these samples.
+
+        loss(p) = sum rho(r(p) / spread) + 1/2 (p - centre)^T P (p - centre)
+        H = matrix + P,    (H + damping diag H) step = gradient + P (centre - p)
+
+    rho is Tukey's loss, P the prior's precision, the others as in `_normal_equations`. The damping
+    grows until the loss falls. The last step is small in standard deviations, or gains little.
+    """
+    damping = 1e-3
+    normal = _normal_equations(mask, state, samples)
+    for step in range(settings.max_steps):
+        pull = prior.precision * (prior.centre - state.vector())
+        loss = _loss(mask, state, samples, normal.spread, prior)
+        while True:
+            matrix = normal.matrix + np.diag(prior.precision)
+            matrix[np.diag_indices_from(matrix)] *= 1 + damping
+            trial = _step_within_limits(state, matrix, normal.gradient + pull)
+            trial_loss = _loss(mask, trial, samples, normal.spread, prior)
+            if trial_loss <= loss or damping > 1e6:
+                break
+            damping *= 8
+        damping = max(damping / 5, 1e-7)
+        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior.precision)
+        size = float(np.max(np.abs(trial.vector() - state.vector()) / deviations))
+        if trial_loss <= loss:
+            state = trial
+        normal = _normal_equations(mask, state, samples)
+        if size < settings.tolerance or loss - trial_loss < LEAST_GAIN:
+            return _Descent(state, step + 1, True, normal)
+    return _Descent(state, settings.max_steps, False, normal)
+
+
+def _loss(
+    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float, prior: _Prior
+) -> float:
+    residuals = _all_residuals(mask, state, samples)
+    return sum(tukey_loss(residual / spread) for residual in residuals) + prior.loss(state)
+
+
+def _step_within_limits(state: _State, matrix: Array, gradient: Array) -> _State:
+    """Return the state after a step; parameters at a limit are held, the others solved again."""
+    here = state.vector()
+    move = np.linalg.solve(matrix, gradient)
+    trial = state.moved(move)
+    held = np.abs(trial.vector() - here - move) > 1e-12
+    if not held.any():
+        return trial
+    free = ~held
+    move[held] = (trial.vector() - here)[held]
+    rest = gradient[free] - matrix[np.ix_(free, held)] @ move[held]
+    move[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
+    return state.moved(move)
+
+
+def _likeliest_widths(descent: _Descent, bench: _BenchPrior) -> _Widths:
+    """Return the widths of brightness and place that make the readings likeliest, at a fit.
+
+    With the readings linear in the parameters, x of them from the prior's centre, the log evidence
+    of widths is, but for a constant,
+
+        1/2 g^T H^-1 g - 1/2 log|H| + 1/2 log|P_own|,
+        H = matrix + P,    g = gradient + matrix x
+
+    P the prior's precision at these widths, P_own of the whiteboards' own.
+    """
+    normal, state = descent.normal, descent.state
+    away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
+    pull = normal.gradient + normal.matrix @ away
+
+    def evidence(widths: _Widths) -> float:
+        precision = bench.with_widths(widths).precision
+        factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
+        seen = np.linalg.solve(factor, pull)
+        own = precision[len(bench.precision) :]
+        return float(0.5 * seen @ seen - np.log(np.diag(factor)).sum() + 0.5 * np.log(own).sum())
+
+    tried = {_Widths(*pair): evidence(_Widths(*pair)) for pair in product(BRIGHTNESSES, MOVES_UM)}
+    best = max(tried, key=lambda widths: tried[widths])
+    least = _Widths(BRIGHTNESSES[0], MOVES_UM[0])
+    # A width that is hardly likelier than the smallest counts as 0.
+    likely = tried[best] - CLEARLY_LIKELIER
+    steady = tried[best._replace(brightness=least.brightness)] > likely
+    still = tried[best._replace(moved_um=least.moved_um)] > likely or best.moved_um < LEAST_MOVED_UM
+    return _Widths(
+        least.brightness if steady else best.brightness,
+        least.moved_um if still else best.moved_um,
+    )
+
+
+class _ViewTerms(NamedTuple):
+    """Normal equations of the views' own displacements and softenings, see `Shadow.slopes_by_view`.
+
+    all: placement and whiteboards' own. view: number of views times OF_VIEW.
+    """
+
+    mixed: NDArray[np.float64]
+    """(all, view x OF_VIEW): information between both kinds of parameters."""
+    own: NDArray[np.float64]
+    """(view x OF_VIEW, view x OF_VIEW): information of the views' own."""
+    pull: NDArray[np.float64]
+    """(view x OF_VIEW,): gradient of the log likelihood by the views' own."""
+
+
 def _view_terms(
-    mask: ShadowMask, at: _State, samples: Sequence[Sample], spread: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return what `bias_covariance` takes of the views' own displacements and softenings."""
-    shadow = Shadow(mask, at.placement)
-    size, own_size = len(at.vector()), OF_VIEW * mask.views[0] * mask.views[1]
-    mixed, own = np.zeros((size, own_size)), np.zeros((own_size, own_size))
-    pull = np.zeros(own_size)
-    residuals = _all_residuals(mask, at, samples)
+    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float
+) -> _ViewTerms:
+    """Return the normal equations of the views' own, at a fit; weights as in the placement's."""
+    shadow = Shadow(mask, state.placement)
+    size, own_size = len(state.vector()), OF_VIEW * mask.views[0] * mask.views[1]
+    terms = _ViewTerms(
+        np.zeros((size, own_size)), np.zeros((own_size, own_size)), np.zeros(own_size)
+    )
+    residuals = _all_residuals(mask, state, samples)
     for index, sample in enumerate(samples):
-        for how, residual, deviation in _pixel_chunks(at, sample, index, residuals[index]):
-            slope, by_view = shadow.slopes_by_view(*how)
-            slope = _join_slopes(shadow.readings(*how), slope, at.own[index])
-            scaled, scale = residual / spread, 1 / (deviation * spread)
+        for chunk in _pixel_chunks(state, sample, index, residuals[index]):
+            where = chunk.pixels, chunk.channels, *chunk.opening
+            slope, by_view = shadow.slopes_by_view(*where)
+            slope = _with_own_slopes(shadow.readings(*where), slope, state.brightness(index))
+            scaled, scale = chunk.residual / spread, 1 / (chunk.deviation * spread)
             slope, by_view = slope * scale, by_view * scale
             weighted = by_view * tukey_weights(scaled)[:, None]
-            mixed[_parameter_places(at, index)] += slope.T @ weighted
-            own += by_view.T @ weighted
-            pull += weighted.T @ scaled
-    return mixed, own, pull
+            terms.mixed[state.places(index)] += slope.T @ weighted
+            terms.own[...] += by_view.T @ weighted
+            terms.pull[...] += weighted.T @ scaled
+    return terms
 
 
-def _rows_covariance(
-    mask: ShadowMask, at: _State, samples: Sequence[Sample], spread: float, covariance: Array
-) -> NDArray[np.float64]:
-    """Return what rows that err alike add to the covariance, as the darks' repeats show it.
-
-    A row's error is its neighbour's to a share (autoregressive). Each whiteboard has its own;
-    those of the references and of the darks are in all whiteboards. What whole frames of light do
-    alike is counted beside.
-    """
-    size, height = len(covariance), len(samples[0].board.reading)
-    known = [rows for sample in samples if (rows := sample.board.rows) is not None]
-    if len(known) < len(samples):
-        return np.zeros((size, size))
-    own_dn2, next_dn2, noise_dn2, darks = (
-        float(np.mean([getattr(rows, name) for rows in known]))
-        for name in ("own_dn2", "next_dn2", "noise_dn2", "darks")
-    )
-    if not own_dn2 > SURE_ROWS * noise_dn2 * np.sqrt(2 / (height * max(darks - 1, 1))):
-        return np.zeros((size, size))
-    reach = min(ROWS_ALIKE, height - 1)
-    share = float(np.clip(next_dn2 / own_dn2, 0.0, MOST_ALIKE))
-    alike = share ** np.abs(np.arange(-reach, reach + 1))
-
-    def squared(by_row: Array) -> NDArray[np.float64]:
-        product = by_row.T @ correlate1d(by_row, alike, axis=0, mode="constant")
-        return np.asarray(product, np.float64)
-
-    def apart(by_row: Array) -> Array:
-        return by_row - by_row.mean(axis=0)
-
-    shadow = Shadow(mask, at.placement)
-    added, of_references = np.zeros((size, size)), np.zeros((height, size))
-    of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
-    for index, residual in enumerate(_all_residuals(mask, at, samples)):
-        sample, rows = samples[index], known[index]
-        by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
-        for how, left, deviation in _pixel_chunks(at, sample, index, residual):
-            read, slope = shadow.with_slopes(*how)
-            weight = tukey_weights(left / spread)[:, None] / np.square(deviation * spread)
-            pull = _join_slopes(read, slope, at.own[index]) * weight
-            where = how[0][:, :1], _parameter_places(at, index)
-            np.add.at(by_row, where, pull)
-            np.add.at(read_by_row, where, pull * read[:, None])
-        by_row, read_by_row = by_row / rows.white_dn[0], read_by_row / rows.white_dn[1]
-        added += squared(apart(by_row)) / sample.board.repeats
-        of_references += apart(read_by_row) / np.sqrt(rows.references)
-        of_darks[rows.exposure_s[0]] += by_row
-        of_darks[rows.exposure_s[1]] -= read_by_row
-    added += squared(of_references)
-    for by_row in of_darks.values():
-        added += squared(by_row) / darks
-    return np.asarray(own_dn2 * covariance @ added @ covariance, np.float64)
-
-
-def bias_covariance(
-    covariance: Array, mixed: Array, own: Array, pull: Array
+def _bias_covariance(
+    covariance: Array, terms: _ViewTerms
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
-    """Return what the views' own displacements and softenings add to the placement's covariance.
+    """Return what the views' own displacements and softenings add to a covariance C.
 
-    Beside it, the variances of these, by `Shadow.slopes_by_view`.
+    Beside it, their variances tau^2, (OF_VIEW,), um^2.
 
-    covariance: of placement and whiteboards without them, (parameter, parameter). mixed:
-    information between these and the views' own (see `Shadow.slopes_by_view`). own, pull:
-    information of the latter, and the gradient of the log likelihood by them, at the placement
-    fitted.
+        left = own - mixed^T C mixed         information that the placement leaves to the views' own
+        evidence(tau) = 1/2 q^T (1 + T left T)^-1 q - 1/2 log|1 + T left T|,    q = T pull
+        tau^2 = mean over the grid TAUS_UM, weighed by exp(evidence) and the half-t prior
+        added = C mixed diag(tau^2) mixed^T C
+
+    T is diag(tau), a tau of each kind (see KINDS). covariance: without the views' own.
     """
+    mixed, own, pull = terms
     left = own - mixed.T @ covariance @ mixed
     kind = np.resize(KINDS, len(pull))
     assert len(pull) % OF_VIEW == 0
@@ -404,37 +551,83 @@ def bias_covariance(
     return added, tuple(float(expected[place]) for place in KINDS)
 
 
-def _posterior(
-    mask: ShadowMask, at: _State, samples: Sequence[Sample], spread: float, prior: _Prior
-) -> float:
-    residuals = _all_residuals(mask, at, samples)
-    return sum(tukey_loss(residual / spread) for residual in residuals) + prior.loss(at)
+class _RowErrors(NamedTuple):
+    """How rows of a frame err alike, as the darks' repeats show it."""
+
+    own_dn2: float
+    """Variance of a row's common error in one frame."""
+    alike: Array
+    """(2 reach + 1,), correlation of rows by their distance: share^|distance|."""
+    darks: float
+    """Frames of the dark."""
 
 
-def _likeliest_widths(
-    normal: _NormalEquations, at: _State, placement: Array, centre: Array, own2: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Return the widths of brightness and place that make the readings likeliest, at a fit.
+def _row_errors(known: Sequence[Rows], height: int) -> _RowErrors | None:
+    """Return how rows err alike; None where no more than chance is seen."""
+    own_dn2, next_dn2, noise_dn2, darks = (
+        float(np.mean([getattr(rows, name) for rows in known]))
+        for name in ("own_dn2", "next_dn2", "noise_dn2", "darks")
+    )
+    if not own_dn2 > SURE_ROWS * noise_dn2 * np.sqrt(2 / (height * max(darks - 1, 1))):
+        return None
+    reach = min(ROWS_ALIKE, height - 1)
+    share = float(np.clip(next_dn2 / own_dn2, 0.0, MOST_ALIKE))
+    return _RowErrors(own_dn2, share ** np.abs(np.arange(-reach, reach + 1)), darks)
 
-    placement, centre: precisions and centre of the placement's prior. own2: see `_prior`.
+
+def _rows_covariance(
+    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float, covariance: Array
+) -> NDArray[np.float64]:
+    """Return what rows that err alike add to the covariance C.
+
+    A row's error is its neighbour's to a share (autoregressive): covariance own_dn2 A of the rows,
+    A_kl = share^|k - l|. An error e (row,) of a frame moves the parameters by C G^T e, with
+
+        G (row, parameter) = sum of w J / (deviation spread)^2 over the row's pixels, by a DN
+        added = own_dn2 C (sum over frames of G^T A G / repeats) C
+
+    Each whiteboard has errors of its own; those of the references and of the darks are in all
+    whiteboards, so that their G are summed first. What whole frames of light do alike is counted
+    beside: the mean over the rows is taken out.
     """
-    away = at.vector() - np.concatenate([centre, np.zeros(at.own.size)])
-    pull = normal.gradient + normal.matrix @ away
+    size, height = len(covariance), len(samples[0].board.reading)
+    known = [rows for sample in samples if (rows := sample.board.rows) is not None]
+    errors = _row_errors(known, height) if len(known) == len(samples) else None
+    if errors is None:
+        return np.zeros((size, size))
 
-    def evidence(widths: tuple[float, float]) -> float:
-        precision = _prior(placement, centre, widths, own2).precision
-        factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
-        seen = np.linalg.solve(factor, pull)
-        own = precision[len(placement) :]
-        return float(0.5 * seen @ seen - np.log(np.diag(factor)).sum() + 0.5 * np.log(own).sum())
+    def squared(by_row: Array) -> NDArray[np.float64]:
+        product = by_row.T @ correlate1d(by_row, errors.alike, axis=0, mode="constant")
+        return np.asarray(product, np.float64)
 
-    found = {widths: evidence(widths) for widths in product(BRIGHTNESSES, MOVES_UM)}
-    best = max(found, key=lambda widths: found[widths])
-    # A width that is hardly likelier than the smallest counts as 0.
-    still = best[1] < LEAST_MOVED_UM
-    still = still or found[best[0], MOVES_UM[0]] > found[best] - CLEARLY_LIKELIER
-    steady = found[BRIGHTNESSES[0], best[1]] > found[best] - CLEARLY_LIKELIER
-    return BRIGHTNESSES[0] if steady else best[0], MOVES_UM[0] if still else best[1]
+    def apart(by_row: Array) -> Array:
+        return by_row - by_row.mean(axis=0)
+
+    shadow = Shadow(mask, state.placement)
+    added, of_references = np.zeros((size, size)), np.zeros((height, size))
+    of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
+    for index, residual in enumerate(_all_residuals(mask, state, samples)):
+        sample, rows = samples[index], known[index]
+        # By an error of the whiteboard, and of its reference: a reading is their ratio.
+        by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
+        for chunk in _pixel_chunks(state, sample, index, residual):
+            read, slope = chunk.slopes(shadow, state.brightness(index))
+            weight = tukey_weights(chunk.residual / spread)[:, None]
+            pull = slope * (weight / np.square(chunk.deviation * spread))
+            where = chunk.pixels[:, :1], state.places(index)
+            np.add.at(by_row, where, pull)
+            np.add.at(read_by_row, where, pull * read[:, None])
+        white_dn, reference_dn = rows.white_dn
+        by_row, read_by_row = by_row / white_dn, read_by_row / reference_dn
+        added += squared(apart(by_row)) / sample.board.repeats
+        of_references += apart(read_by_row) / np.sqrt(rows.references)
+        exposure_s, reference_exposure_s = rows.exposure_s
+        of_darks[exposure_s] += by_row
+        of_darks[reference_exposure_s] -= read_by_row
+    added += squared(of_references)
+    for by_row in of_darks.values():
+        added += squared(by_row) / errors.darks
+    return np.asarray(errors.own_dn2 * covariance @ added @ covariance, np.float64)
 
 
 @one_blas_thread()
@@ -451,84 +644,112 @@ def fit_placement(
     without whiteboards, for a mask that is not the design's (with the correlation found), and
     where the fit does not explain what it was given. Not converging is a status.
     """
-    settings, tolerances = settings or FitSettings(), Tolerances()
+    settings = settings or FitSettings()
     if not boards:
         raise CalibrationError("no whiteboard with the mask in: capture at least one")
-    soft = starting_placement(camera, mask)
-    placement = start or register(max(boards, key=_contrast), mask, soft).placement
-    centre = soft.vector()
-    deviations = tolerances.deviations(camera.views)
-    if any(board.loose for board in boards):
-        # Pinholes a little off their holes look like glass before the mask.
-        deviations[SCALARS.index("glass_um")] *= OF_LOOSE
-    # A stage sits where it was found; the prior is for what whiteboards do not determine.
-    centre[OFFSETS] = placement.vector()[OFFSETS]
-    of_placement = 1 / deviations**2
-    widths = FIRST_BRIGHTNESS, FIRST_MOVED_UM
-    own2 = _own_variances(boards)
-    at = _State(placement, np.zeros((len(boards), OWN)))
-    rng = np.random.default_rng(settings.seed)
-    steps, converged = 0, False
-    normal = None
-    for half_px, limit in _widening_windows(mask, settings):
-        each = max(limit // len(boards), FEWEST_PIXELS)
-        samples = [board.sampled(half_px, each, rng) for board in boards]
-        prior = _prior(of_placement, centre, widths, own2)
-        at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
-        steps += taken
-    assert normal is not None
+    if start is None:
+        soft = starting_placement(camera, mask)
+        start = register(max(boards, key=_contrast), mask, soft).placement
+    bench, widths = _bench_prior(boards, camera, mask, start), FIRST_WIDTHS
+    state, steps = _State(start, np.zeros((len(boards), OWN))), 0
+    for samples in _widening_samples(boards, mask, settings):
+        descent = _descend(mask, state, samples, bench.with_widths(widths), settings)
+        state, steps = descent.state, steps + descent.steps
     for _ in range(WIDTH_ROUNDS):
-        widths = _likeliest_widths(normal, at, of_placement, centre, own2)
-        prior = _prior(of_placement, centre, widths, own2)
-        at, taken, converged, normal = _descend(mask, at, samples, prior, settings)
-        steps += taken
-    size = len(of_placement)
+        widths = _likeliest_widths(descent, bench)
+        descent = _descend(mask, state, samples, bench.with_widths(widths), settings)
+        state, steps = descent.state, steps + descent.steps
+    checks = tuple(_check_board(mask, state, sample, index) for index, sample in enumerate(samples))
+    _refuse_unexplained(alike := _fitted_correlation(mask, state, samples))
+    normal, placement = descent.normal, with_aperture_mean_one(state.placement)
+    covariance, astray2 = _covariance(mask, descent, samples, bench.with_widths(widths))
+    undecided, more = _find_undecided(placement, covariance, len(boards))
+    # A pinhole that a hand put a little off looks like a mask that moved, and is none.
+    firm = [check for check, board in zip(checks, boards, strict=True) if not board.loose]
+    moved_um = _farthest_um(widths.moved_um if len(firm) == len(checks) else 0.0, firm)
+    covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
+    return Fit(
+        placement=placement,
+        covariance=covariance,
+        correlation=alike,
+        chi2=normal.squares / max(normal.kept, 1),
+        outliers=1 - normal.kept / max(normal.count, 1),
+        steps=steps,
+        status="converged" if descent.converged else "step limit reached",
+        advice="" if descent.converged else "raise max_steps, or capture another whiteboard",
+        undecided=undecided,
+        more_boards=more,
+        boards=checks,
+        brightness_spread=float(widths.brightness),
+        moved_um=moved_um,
+        astray2=astray2,
+    )
+
+
+def _contrast(board: Board) -> float:
+    """Return how far above its noise a board varies."""
+    usable = board.usable
+    if not usable.any():
+        raise CalibrationError(f"{board.name}: no usable pixel")
+    return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
+
+
+def _widening_samples(
+    boards: Sequence[Board], mask: ShadowMask, settings: FitSettings
+) -> Iterator[list[Sample]]:
+    """Yield samples of all whiteboards, from windows that widen to the picture.
+
+    The last two are of the whole picture: of `first_pixels`, then of `pixels`.
+    """
+    rng = np.random.default_rng(settings.seed)
+    whole_px, half_px = max(mask.pixel_shape()) / 2, float(FIRST_WINDOW_PX)
+    windows = []
+    while half_px < whole_px:
+        windows.append((half_px, settings.first_pixels))
+        half_px *= 2
+    windows += [(whole_px, settings.first_pixels), (whole_px, settings.pixels)]
+    for half_px, pixels in windows:
+        each = max(pixels // len(boards), FEWEST_PIXELS)
+        yield [board.sampled(half_px, each, rng) for board in boards]
+
+
+def _covariance(
+    mask: ShadowMask, descent: _Descent, samples: Sequence[Sample], prior: _Prior
+) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+    """Return the placement's covariance, and the variances of the views' own, see `Fit`.
+
+    C = (matrix + P)^-1 of all parameters, and what the views' own and rows that err alike add.
+    """
+    state, normal = descent.state, descent.normal
     covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
-    terms = _view_terms(mask, at, samples, normal.spread)
-    of_views, astray2 = bias_covariance(covariance, *terms)
-    of_rows = _rows_covariance(mask, at, samples, normal.spread, covariance)
-    covariance = (covariance + of_views + of_rows)[:size, :size]
-    checks = tuple(_check_board(mask, at, sample, index) for index, sample in enumerate(samples))
-    alike = _fitted_correlation(mask, at, samples)
-    placement = with_aperture_mean_one(at.placement)
+    terms = _view_terms(mask, state, samples, normal.spread)
+    of_views, astray2 = _bias_covariance(covariance, terms)
+    of_rows = _rows_covariance(mask, state, samples, normal.spread, covariance)
+    size = len(state.placement.vector())
+    return (covariance + of_views + of_rows)[:size, :size], astray2
+
+
+def _refuse_unexplained(alike: float) -> None:
+    """Raise CalibrationError for a correlation of readings and fit that is too low."""
     if alike < LEAST_FIT_CORRELATION:
         raise CalibrationError(
             f"the fit does not explain the whiteboards: their correlation with the shadow of the "
             f"design is {alike:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use calibration method free"
         )
-    undecided, more = _find_undecided(placement, covariance, tolerances, len(boards))
-    kept = max(normal.kept, 1)
-    # A pinhole that a hand put a little off looks like a mask that moved, and is none.
-    firm = [check for check, board in zip(checks, boards, strict=True) if not board.loose]
-    moved_um = _farthest_um(widths[1] if len(firm) == len(checks) else 0.0, firm)
-    covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
-    return Fit(
-        placement,
-        covariance,
-        alike,
-        normal.squares / kept,
-        1 - normal.kept / max(normal.count, 1),
-        steps,
-        "converged" if converged else "step limit reached",
-        "" if converged else "raise max_steps, or capture another whiteboard",
-        undecided,
-        more,
-        checks,
-        float(widths[0]),
-        moved_um,
-        astray2,
-    )
 
 
 def _find_undecided(
-    placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances, boards: int
+    placement: Placement, covariance: NDArray[np.float64], boards: int
 ) -> tuple[tuple[str, ...], int]:
-    """Return the parameters that the prior decides, and how many more boards would decide them."""
-    shares = shares_of_prior(placement, covariance, tolerances)
+    """Return the parameters that the prior decides, and how many more boards would decide them.
+
+    share^-2 = 1 + have, the precision that `boards` whiteboards have added to the prior's; it grows
+    with their number. Decided: a share below MOST_OF_PRIOR.
+    """
+    shares = shares_of_prior(placement, covariance, Tolerances())
     rows, columns = np.shape(placement.aperture)
     names = zip(labels((rows, columns)), shares, strict=True)
-    # Precision beyond the prior's grows with the number of whiteboards.
     have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
     lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
     more = int(np.clip(np.ceil(lacking * boards), 0, MOST_MORE_BOARDS))
@@ -574,74 +795,9 @@ def shares_of_prior(
     return share
 
 
-def _widening_windows(mask: ShadowMask, settings: FitSettings) -> list[tuple[float, int]]:
-    """Return half sides of windows, in pixels, that widen to the picture, and how many pixels."""
-    whole = max(mask.pixel_shape()) / 2
-    half, found = float(FIRST_WINDOW_PX), []
-    while half < whole:
-        found.append((half, settings.first_pixels))
-        half *= 2
-    return [*found, (whole, settings.first_pixels), (whole, settings.pixels)]
-
-
-def _descend(
-    mask: ShadowMask,
-    at: _State,
-    samples: Sequence[Sample],
-    prior: _Prior,
-    settings: FitSettings,
-) -> tuple[_State, int, bool, _NormalEquations]:
-    """Return the state after Levenberg-Marquardt steps on these samples."""
-    damping = 1e-3
-    normal = _normal_equations(mask, at, samples)
-    for step in range(settings.max_steps):
-        pull = prior.precision * (prior.centre - at.vector())
-        value = _posterior(mask, at, samples, normal.spread, prior)
-        while True:
-            matrix = normal.matrix + np.diag(prior.precision)
-            matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            trial = _step_within_limits(at, matrix, normal.gradient + pull)
-            found = _posterior(mask, trial, samples, normal.spread, prior)
-            if found <= value or damping > 1e6:
-                break
-            damping *= 8
-        damping = max(damping / 5, 1e-7)
-        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior.precision)
-        size = float(np.max(np.abs(trial.vector() - at.vector()) / deviations))
-        if found <= value:
-            at = trial
-        normal = _normal_equations(mask, at, samples)
-        if size < settings.tolerance or value - found < LEAST_GAIN:
-            return at, step + 1, True, normal
-    return at, settings.max_steps, False, normal
-
-
-def _step_within_limits(at: _State, matrix: Array, gradient: Array) -> _State:
-    """Return the state after a step; parameters at a limit are held, the others solved again."""
-    here = at.vector()
-    move = np.linalg.solve(matrix, gradient)
-    trial = at.moved(move)
-    held = np.abs(trial.vector() - here - move) > 1e-12
-    if not held.any():
-        return trial
-    free = ~held
-    move[held] = (trial.vector() - here)[held]
-    rest = gradient[free] - matrix[np.ix_(free, held)] @ move[held]
-    move[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
-    return at.moved(move)
-
-
-def _contrast(board: Board) -> float:
-    """Return how far above its noise a board varies."""
-    usable = board.usable
-    if not usable.any():
-        raise CalibrationError(f"{board.name}: no usable pixel")
-    return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
-
-
-def _fitted_correlation(mask: ShadowMask, at: _State, samples: Sequence[Sample]) -> float:
+def _fitted_correlation(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> float:
     """Return the correlation of readings and fit, every colour of a whiteboard with its level."""
-    residuals = np.concatenate(_all_residuals(mask, at, samples))
+    residuals = np.concatenate(_all_residuals(mask, state, samples))
     reading, deviation = (
         np.concatenate([getattr(sample, name) for sample in samples])
         for name in ("reading", "deviation")
@@ -653,33 +809,35 @@ def _fitted_correlation(mask: ShadowMask, at: _State, samples: Sequence[Sample])
     return correlation(reading, reading - residuals * deviation, np.concatenate(channels))
 
 
-def _check_board(mask: ShadowMask, at: _State, sample: Sample, index: int) -> BoardCheck:
-    """Return how far one board's brightness and mask are off, the placement as fitted."""
-    shadow = Shadow(mask, at.placement)
-    board, own = sample.board, at.own[index]
-    opening = at.opening(board, index)
+def _check_board(mask: ShadowMask, state: _State, sample: Sample, index: int) -> BoardCheck:
+    """Return how far one board's brightness and mask are off, the placement as fitted.
+
+    Robust least squares of the board alone, without the prior of its own: the fit's values, of
+    which the prior has held back a part, and the steps (brightness, x, y) that are left.
+    """
+    shadow = Shadow(mask, state.placement)
+    board = sample.board
+    opening = state.opening(board, index)
     fitted, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
     rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
-    residual = (sample.reading - (1 + own[0]) * fitted) / sample.deviation
-    weight = np.ones(len(residual))
-    more = np.zeros(3)
-    matrix = np.eye(3)
+    residual = (sample.reading - state.brightness(index) * fitted) / sample.deviation
+    weight, step, matrix = np.ones(len(residual)), np.zeros(OWN), np.eye(OWN)
     for _ in range(8):
         matrix = rows.T @ (rows * weight[:, None])
-        more = np.linalg.solve(matrix, rows.T @ (weight * residual))
-        left = residual - rows @ more
+        step = np.linalg.solve(matrix, rows.T @ (weight * residual))
+        left = residual - rows @ step
         weight = tukey_weights(left / _robust_spread([left]))
-    found = own + more
+    brightness, x_um, y_um = map(float, state.own[index] + step)
     spread = _robust_spread([residual])
     inside = tukey_weights(residual / spread) > 0
-    deviation = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
+    brightness_deviation, *moved_deviations = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
     return BoardCheck(
-        board.name,
-        float(1 + found[0]),
-        float(deviation[0]),
-        (float(found[1]), float(found[2])),
-        float(deviation[1:].max()),
-        board.taken_s,
-        float(np.mean(residual[inside] ** 2)),
-        float(1 - inside.mean()),
+        name=board.name,
+        brightness=1 + brightness,
+        brightness_deviation=float(brightness_deviation),
+        moved_um=(x_um, y_um),
+        moved_deviation_um=float(max(moved_deviations)),
+        taken_s=board.taken_s,
+        chi2=float(np.mean(residual[inside] ** 2)),
+        outliers=float(1 - inside.mean()),
     )

@@ -14,9 +14,11 @@ Frame = NDArray[np.floating] | NDArray[np.integer]
 BAND_PIXELS = 2**20
 """Worked on at once: a dozen temporary arrays of them take 100 MB."""
 LARGEST_CLIPPED_SHARE = 1e-3
+"""Of the pixels: hot ones are fewer, a saturated frame has far more."""
 NEARLY_WHITE = 0.7
 """Of white, that a pixel reads beside one that light saturates."""
 LARGEST_FLICKER = 0.02
+"""Relative, between the repeats of a frame."""
 LARGEST_ROLLING = 0.007
 """Of the brightness: standard deviation of rows against their frame, between repeats."""
 SAME_EXPOSURE = 0.02

@@ -1,10 +1,15 @@
 """What lamp and sensor response did while whiteboards were taken, from boards seen more than once.
 
-A check is a board's mean level, seen again and again: with the aperture open and the masks in one
-place, or without masks, at one exposure or several. Its logarithm is the sum
-of the board's, the lamp's at that time, and the response's loss: log(level / exposure) = c_board +
-l(time) - b level. l is a line between knots in time, for every colour of pixels, and b a figure of
-the sensor; both are the linear least squares of all checks together.
+A check is the mean level of a board that is seen repeatedly: with the aperture open and the masks
+in one place, or without masks, at one exposure or several. For every colour of pixels
+
+    log(level / exposure_s) = c_board + l(taken_s) - b level
+
+with c_board the logarithm of the board's rate under the lamp of the first knot, l the lamp's
+logarithm (a line between knots in time, 0 at the first knot), and b the bend of the sensor's
+response, per DN, alike for all colours. All are the linear least squares of all checks together;
+b has the prior b level_brightest ~ N(0, BEND_PRIOR^2), and the lamp's second differences between
+knots N(0, CURVATURE_PRIOR^2).
 """
 
 from __future__ import annotations
@@ -20,8 +25,11 @@ from emmc_rig.calibration.frames import MeanFrame
 
 Array = NDArray[np.floating]
 CHANNELS = 4
+"""Red, green and blue pixels, and those that see all colours."""
 MOST_KNOTS = 8
+"""Of the lamp's line in time: a lamp warms up over minutes."""
 TRIMMED = 0.01
+"""Share of the pixels at either end that a check's mean leaves out: hot pixels saturate."""
 LEAST_DEVIATION = 5e-5
 """Of a check's logarithm: lamps and shutters flicker by that much at best."""
 BEND_PRIOR = 0.2
@@ -29,8 +37,11 @@ BEND_PRIOR = 0.2
 CURVATURE_PRIOR = 0.01
 """Of the lamp's second differences between knots."""
 SIGNIFICANT = 4.0
+"""Standard deviations: exceeded by chance once in 16 000."""
 LEAST_BEND = 5e-4
+"""Relative loss of the brightest check: ten times LEAST_DEVIATION."""
 LEAST_DRIFT = 5e-4
+"""Relative change of the lamp: ten times LEAST_DEVIATION."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +62,17 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """The lamp's logarithm at knots in time, (knot, channel), and the response's bend per DN.
+    """Lamp and response as fitted.
 
-    drift: peak to peak of the lamp over the checks, the largest of the colours. bend_known:
-    more than one exposure shows it. deviation: of the lamp's logarithm, typical; significance: of
-    the largest step of it from the first knot.
+    knots_s: (knot,), times on the clock of the capture.
+    lamp: (knot, channel), the lamp's logarithm, 0 at the first knot.
+    bend_per_dn, bend_deviation: of the response, and its standard deviation.
+    bend_known: boards were seen at several exposures.
+    brightest_dn: largest level of a check above the dark.
+    drift: peak to peak of the lamp's logarithm, the largest of the colours.
+    colour_drift: peak to peak of a colour against the mean of all.
+    deviation: standard deviation of the lamp's logarithm, median over knots and colours.
+    significance: largest change of the lamp since the first knot, in standard deviations.
     """
 
     knots_s: NDArray[np.float64]
@@ -113,7 +130,7 @@ def check_of(
     dark_dn, channels: (y, x), as `Levels.corrected`'s. turn_deg: of the white board.
     """
     board = f"{'masks in' if masks_in else 'without masks'}, turned by {turn_deg:g}"
-    # Hot pixels saturate, and would bend the mean. scipy.stats loads for a second: here only.
+    # Loaded here: scipy.stats takes a second.
     from scipy.stats import trim_mean
 
     above = (frame.mean_dn - dark_dn).astype(np.float64)
@@ -127,10 +144,67 @@ def check_of(
     return Check(board, frame.taken_s, frame.exposure_s, means, float(deviation), masks_in)
 
 
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Linear equations of checks and priors, scaled to unit deviation.
+
+    Unknowns, for each of `channels` in turn: c_board of every board, then the lamp's logarithm at
+    every knot but the first; last, the loss b level_brightest.
+
+    channels: the colours that some pixels see. lamp_places: the lamp's unknowns, by channel.
+    knots_s: (knot,). matrix: (equation, unknown). right: (equation,).
+    """
+
+    channels: NDArray[np.intp]
+    lamp_places: list[slice]
+    knots_s: NDArray[np.float64]
+    matrix: NDArray[np.float64]
+    right: NDArray[np.float64]
+
+
+def _equations(checks: Sequence[Check], boards: Sequence[str], brightest: float) -> _Equations:
+    """Return the equations of all checks, and the priors of the lamp's curvature and the bend."""
+    times = np.array([check.taken_s for check in checks])
+    levels = np.array([check.above_dn for check in checks])
+    channels = np.flatnonzero(np.isfinite(levels).all(axis=0))
+    count = int(np.clip(len(np.unique(times)) - len(boards), 2, MOST_KNOTS))
+    knots_s = np.linspace(times.min(), max(times.max(), times.min() + 1e-9), count)
+    # What every knot counts at every check: 1 at the knot, 0 at the others, lines between.
+    hats = np.stack([np.interp(times, knots_s, row) for row in np.eye(count)], axis=1)
+    per_channel = len(boards) + count - 1
+    size = len(channels) * per_channel + 1
+    lamp_places = [
+        slice(k * per_channel + len(boards), (k + 1) * per_channel) for k in range(len(channels))
+    ]
+    rows, values = [], []
+    for lamp, channel in zip(lamp_places, channels, strict=True):
+        for i, check in enumerate(checks):
+            row = np.zeros(size)
+            row[lamp.start - len(boards) + boards.index(check.board)] = 1
+            row[lamp] = hats[i, 1:]
+            row[-1] = -levels[i, channel] / brightest
+            deviation = max(check.deviation, LEAST_DEVIATION)
+            rows.append(row / deviation)
+            values.append(np.log(levels[i, channel] / check.exposure_s) / deviation)
+        for knot in range(1, count - 1):
+            second_difference = np.zeros(count)
+            second_difference[knot - 1 : knot + 2] = 1, -2, 1
+            row = np.zeros(size)
+            row[lamp] = second_difference[1:]
+            rows.append(row / CURVATURE_PRIOR)
+            values.append(0.0)
+    bend = np.zeros(size)
+    bend[-1] = 1 / BEND_PRIOR
+    return _Equations(
+        channels, lamp_places, knots_s, np.stack([*rows, bend]), np.array([*values, 0.0])
+    )
+
+
 def fit_levels(checks: Sequence[Check]) -> Levels | None:
     """Return lamp and response from checks; None where no board was seen twice.
 
-    Raises CalibrationError for a dark board.
+    The deviations are those of least squares, (M^T M)^-1, times the residual where that is
+    larger than the noise stated. Raises CalibrationError for a dark board.
     """
     boards = sorted({check.board for check in checks})
     if len(checks) <= len(boards):
@@ -139,61 +213,30 @@ def fit_levels(checks: Sequence[Check]) -> Levels | None:
         raise CalibrationError(
             "a whiteboard that was seen again is dark: is the lamp on, and the aperture open?"
         )
-    times = np.array([check.taken_s for check in checks])
-    levels = np.array([check.above_dn for check in checks])
-    channels = np.flatnonzero(np.isfinite(levels).all(axis=0))
-    brightest = float(np.nanmax(levels))
-    repeats = len(np.unique(times))
-    count = int(np.clip(repeats - len(boards), 2, MOST_KNOTS))
-    knots = np.linspace(times.min(), max(times.max(), times.min() + 1e-9), count)
-    hats = np.stack([np.interp(times, knots, row) for row in np.eye(count)], axis=1)
-    per_channel = len(boards) + count - 1
-    size = len(channels) * per_channel + 1
-    rows, values = [], []
-    for k, channel in enumerate(channels):
-        for i, check in enumerate(checks):
-            row = np.zeros(size)
-            at = k * per_channel
-            row[at + boards.index(check.board)] = 1
-            row[at + len(boards) : at + per_channel] = hats[i, 1:]
-            row[-1] = -levels[i, channel] / brightest
-            deviation = max(check.deviation, LEAST_DEVIATION)
-            rows.append(row / deviation)
-            values.append(np.log(levels[i, channel] / check.exposure_s) / deviation)
-        for knot in range(1, count - 1):
-            row = np.zeros(size)
-            for step, share in ((-1, 1), (0, -2), (1, 1)):
-                if knot + step > 0:
-                    row[k * per_channel + len(boards) + knot + step - 1] = share
-            rows.append(row / CURVATURE_PRIOR)
-            values.append(0.0)
-    prior = np.zeros(size)
-    prior[-1] = 1 / BEND_PRIOR
-    matrix, right = np.stack([*rows, prior]), np.array([*values, 0.0])
+    brightest = float(np.nanmax([check.above_dn for check in checks]))
+    equations = _equations(checks, boards, brightest)
+    matrix, right, channels = equations.matrix, equations.right, equations.channels
     solution = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    freedom = max(len(checks) * len(channels) - len(solution), 1)
+    residual = float(np.sqrt(np.sum((right - matrix @ solution) ** 2) / freedom))
     covariance = np.linalg.pinv(matrix.T @ matrix)
-    left = right - matrix @ solution
-    freedom = max(len(checks) * len(channels) - size, 1)
-    residual = float(np.sqrt(np.sum(left**2) / freedom))
-    lamp = np.zeros((count, CHANNELS))
-    deviations, steps = [], []
-    for k, channel in enumerate(channels):
-        part = slice(k * per_channel + len(boards), (k + 1) * per_channel)
-        lamp[1:, channel] = solution[part]
-        deviations.append(np.sqrt(np.diag(covariance)[part]) * max(residual, 1.0))
-        steps.append(np.abs(lamp[1:, channel]))
+    deviation = np.sqrt(np.diag(covariance)) * max(residual, 1.0)
+    lamp = np.zeros((len(equations.knots_s), CHANNELS))
+    for place, channel in zip(equations.lamp_places, channels, strict=True):
+        lamp[1:, channel] = solution[place]
+    lamp_deviation = np.array([deviation[place] for place in equations.lamp_places])
+    seen = lamp[:, channels]
+    # One exposure of every board tells nothing of the bend.
     known = len({(check.board, check.exposure_s) for check in checks}) > len(boards)
-    spread = np.ptp(lamp[:, channels], axis=0)
-    differences = lamp[:, channels] - lamp[:, channels].mean(axis=1, keepdims=True)
     return Levels(
-        knots,
-        lamp,
-        float(solution[-1]) / brightest if known else 0.0,
-        float(np.sqrt(covariance[-1, -1])) * max(residual, 1.0) / brightest,
-        known,
-        brightest,
-        float(spread.max()),
-        float(np.ptp(differences, axis=0).max()),
-        float(np.median(deviations)),
-        float(np.max(np.array(steps) / np.array(deviations))),
+        knots_s=equations.knots_s,
+        lamp=lamp,
+        bend_per_dn=float(solution[-1]) / brightest if known else 0.0,
+        bend_deviation=float(deviation[-1]) / brightest,
+        bend_known=known,
+        brightest_dn=brightest,
+        drift=float(np.ptp(seen, axis=0).max()),
+        colour_drift=float(np.ptp(seen - seen.mean(axis=1, keepdims=True), axis=0).max()),
+        deviation=float(np.median(lamp_deviation)),
+        significance=float(np.max(np.abs(seen[1:].T) / lamp_deviation)),
     )

@@ -21,6 +21,7 @@ BAND_PIXELS = 2**14
 sees, take 22 MB."""
 Stages = Sequence[tuple[float, float]]
 SAMPLED = 3_000
+"""Pixels drawn to estimate means over the picture: their error is 1/sqrt(3000) = 2 %."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,7 @@ Array = NDArray[np.floating]
 DARK_FRAMES = 2
 REFERENCE_FRAMES = 4
 MOST_FRAMES = 400
+"""Of whiteboards in a plan."""
 MODEL_ERROR = 0.0022
 """Of Psi, relative: error of the fitted mask with its defects on the bench as it is shipped.
 

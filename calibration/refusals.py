@@ -53,8 +53,10 @@ FREE_GRADIENT = {True: 0.015, False: 0.1}
 """The same of the free route, whose whiteboards are many: benches within tolerances have
 at most 0.003 with the aperture open. Small pictures of few whiteboards show 0.02."""
 LARGEST_UNEVENNESS = 0.25
+"""Of the white board over angle: more is a tilted board."""
 LARGEST_DISAGREEMENT = 0.005
 SURE = 5.0
+"""Standard deviations, from which on a difference is no chance."""
 MIRRORED = 0.02
 """By which the views in another order must correlate better with the design's."""
 SAMPLED, SAMPLED_GRADIENT = 3_000, 200_000

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +39,7 @@ from emmc_rig.calibration.colours import (
     mixing,
     other_colours,
 )
-from emmc_rig.calibration.defects import find_defects, loss_variance
-from emmc_rig.calibration.dust import moved_dust
+from emmc_rig.calibration.defects import find_defects, loss_variance, moved_dust
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.fit import OFFSETS, fit_placement
 from emmc_rig.calibration.frames import MeanFrame
@@ -100,7 +100,7 @@ class Outcome:
 
     @property
     def calibration(self) -> Calibration:
-        """The chosen one."""
+        """Psi by the route chosen."""
         return self.calibrations[self.chosen]
 
 
@@ -126,319 +126,423 @@ def calibrate(
     references, by the degrees that the board was turned.
     Raises CalibrationError for whatever makes the whiteboards unfit.
     """
-    work = _Work(camera, design, set(routes), held_out, few, pinholes, dict(turned or {}), on_stage)
-    work.correct_lamp_and_response()
-    work.read_validation()
-    if not work.modelled or pinholes is not None:
-        work.compare_with_design()
-    if work.modelled:
-        work.fit_models()
-    if {"free", "combined"} & work.routes:
-        work.measure_views(empty, on_plane)
-    work.count_common_errors()
-    chosen, why = work.choose_route()
-    if work.crosstalk is not None:
-        work.separate_colours(work.crosstalk)
-    work.correct_board_and_views(chosen)
+    captured = _Whiteboards(held_out, few, pinholes, dict(turned or {}))
+    refusals.refuse_unfit(captured.sets)
+    good = np.logical_and.reduce([sensor_blemishes(boards) for boards in captured.sets])
+    steady, levels = _correct_lamp_and_response(captured, design)
+    task = _Task(
+        camera=camera,
+        design=design,
+        routes=frozenset(routes),
+        stages=shot_stages(camera),
+        captured=captured,
+        steady=steady,
+        crosstalk=crosstalk(steady.held_out, channels_of(design), good),
+        on_stage=on_stage,
+    )
+    readings = _Readings(good, _validation_readings(steady.held_out, design, good), [])
+    advice, findings = [], words.level_findings(levels)
+    shadow, modelled = None, _Modelled(readings, None)
+    if not task.modelled or pinholes is not None:
+        shadow, found = _compare_with_design(task, readings)
+        findings += found
+    if task.modelled:
+        modelled = _fit_models(task, readings)
+        readings, shadow = modelled.readings, modelled.shadow
+        advice += modelled.advice
+        findings += modelled.findings
+    psis = dict(modelled.psis)
+    if {"free", "combined"} & task.routes:
+        psis |= _measure_views(task, modelled, empty, on_plane)
+    _count_common_errors(task, modelled, psis)
+    judged = {name: psi.judged for name, psi in psis.items() if name in routes}
+    chosen, why = choose(list(judged.values()))
+    refusals.refuse_another_bench(chosen)
+    advice += _count_residual(chosen, psis[chosen.route].calibration)
+    calibrations = {name: psi.calibration for name, psi in psis.items()}
+    if task.crosstalk is not None:
+        findings.append(words.crosstalk_finding(task.crosstalk))
+        calibrations = _separate_colours(task, modelled, task.crosstalk, calibrations)
+    findings += _correct_board_and_views(task, modelled, shadow, calibrations, chosen.route)
     return Outcome(
-        chosen,
-        why,
-        {name: known for name, known in work.calibrations.items() if name in routes},
-        {name: held for name, held in work.judged.items() if name in routes},
-        work.frames,
-        work.models.get("parametric"),
-        work.models.get("mixed"),
-        work.good,
-        tuple(work.advice),
-        tuple(work.findings),
-        tuple(work.list_unwatched(chosen)),
-        work.crosstalk,
+        chosen=chosen.route,
+        why=why,
+        calibrations={name: known for name, known in calibrations.items() if name in routes},
+        judged=judged,
+        frames={name: psi.exposures for name, psi in psis.items()},
+        parametric=modelled.models.get("parametric"),
+        mixed=modelled.models.get("mixed"),
+        good=readings.good,
+        advice=tuple(advice),
+        findings=tuple(findings),
+        unwatched=tuple(_list_unwatched(task, modelled, levels, calibrations[chosen.route])),
+        crosstalk=task.crosstalk,
     )
 
 
-@dataclass
-class _Work:
-    """The whiteboards of a calibration, and the results of its steps.
+@dataclass(frozen=True, eq=False)
+class _Whiteboards:
+    """The sets of whiteboards of a calibration, see `calibrate`."""
 
-    sets: every set as captured; the others are as under a steady lamp after
-    `correct_lamp_and_response`. good: (pixel_y, pixel_x), pixels to use. judges, seen: held-out
-    whiteboards and those that are fitted, as readings. plain: the mask as designed. shadow: of the
-    mask as registered or fitted. bare: calibrations of the models without their misfit.
+    held_out: BoardSet
+    few: BoardSet | None
+    pinholes: BoardSet | None
+    turned: Mapping[float, BoardSet]
+
+    @property
+    def sets(self) -> list[BoardSet]:
+        """All sets."""
+        return [
+            self.held_out, *filter(None, (self.few, self.pinholes)), *self.turned.values()
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What every step of a calibration needs, and none changes.
+
+    captured, steady: the whiteboards as captured, and as under a steady lamp and a straight
+    response. stages: (x, y) of the mask in um, per shot. crosstalk: None for negligible crosstalk.
     """
 
     camera: Camera
     design: PsiLayout
-    routes: set[str]
-    held_out: BoardSet
-    few: BoardSet | None
-    pinholes: BoardSet | None
-    turned: dict[float, BoardSet]
+    routes: frozenset[str]
+    stages: Stages
+    captured: _Whiteboards
+    steady: _Whiteboards
+    crosstalk: Crosstalk | None
     on_stage: Callable[[str], None]
-    levels: Levels | None = None
-    crosstalk: Crosstalk | None = None
-    judges: list[Board] = field(default_factory=list)
-    seen: list[Board] = field(default_factory=list)
-    plain: ShadowMask | None = None
-    shadow: Shadow | None = None
-    models: dict[str, Parametric] = field(default_factory=dict)
-    bare: dict[str, Calibration] = field(default_factory=dict)
-    calibrations: dict[str, Calibration] = field(default_factory=dict)
-    judged: dict[str, HeldOut] = field(default_factory=dict)
-    frames: dict[str, int] = field(default_factory=dict)
-    advice: list[str] = field(default_factory=list)
-    findings: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.sets = [
-            self.held_out, *filter(None, (self.few, self.pinholes)), *self.turned.values()
-        ]  # fmt: skip
-        refusals.refuse_unfit(self.sets)
-        self.good = np.logical_and.reduce([sensor_blemishes(boards) for boards in self.sets])
-        self.stages = shot_stages(self.camera)
 
     @property
     def modelled(self) -> bool:
         """Whether a route asked for fits the mask."""
         return bool({"parametric", "mixed", "combined"} & self.routes)
 
+    def as_filtered(self, mask: ShadowMask) -> ShadowMask:
+        """Return the mask as the pixels see it through their colour filters."""
+        return mask if self.crosstalk is None else mixing(mask, self.crosstalk.seen)
+
+
+@dataclass(frozen=True, eq=False)
+class _Readings:
+    """Whiteboards as readings, and the pixels to use.
+
+    good: (pixel_y, pixel_x). judges: held out. seen: for the models' fits.
+    """
+
+    good: NDArray[np.bool_]
+    judges: list[Board]
+    seen: list[Board]
+
+    def without(self, pixels: NDArray[np.bool_]) -> _Readings:
+        """Return the same without these pixels, (pixel_y, pixel_x)."""
+        judges, seen = (
+            [board.without(pixels) for board in boards] for boards in (self.judges, self.seen)
+        )
+        return _Readings(self.good & ~pixels, judges, seen)
+
+
+class _RoutePsi(NamedTuple):
+    """Psi by one route."""
+
+    calibration: Calibration
+    judged: HeldOut
+    exposures: int
+    """Frames that the route used."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Modelled:
+    """The fits of the mask, by the routes that model it.
+
+    plain: the mask as designed. models: by route (parametric, mixed). bare: their calibrations
+    without the misfit in the deviations. psis: with it.
+    """
+
+    readings: _Readings
+    plain: ShadowMask | None
+    models: Mapping[str, Parametric] = field(default_factory=dict)
+    bare: Mapping[str, Calibration] = field(default_factory=dict)
+    psis: Mapping[str, _RoutePsi] = field(default_factory=dict)
+    advice: Sequence[str] = ()
+    findings: Sequence[str] = ()
+
     @property
-    def best_model(self) -> Parametric | None:
+    def best(self) -> Parametric | None:
         """The mask as fitted, with its defects where they are known."""
         return self.models.get("mixed") or self.models.get("parametric")
 
-    def correct_lamp_and_response(self) -> None:
-        """Fit lamp, response and crosstalk, and correct the whiteboards for the former two."""
-        channels = channels_of(self.design)
-        checks = dict.fromkeys(check for boards in self.sets for check in boards.checks)
-        self.levels = fit_levels(list(checks))
-        self.findings += words.level_findings(self.levels)
-        if self.levels is not None:
-            how = self.levels, channels, dict[int, MeanFrame]()
-            self.held_out = self.held_out.levelled(*how)
-            self.few = self.few and self.few.levelled(*how)
-            self.pinholes = self.pinholes and self.pinholes.levelled(*how)
-            self.turned = {turn: boards.levelled(*how) for turn, boards in self.turned.items()}
-        self.crosstalk = crosstalk(self.held_out, channels, self.good)
+    @property
+    def shadow(self) -> Shadow | None:
+        """That of the best."""
+        return None if self.best is None else self.best.shadow
 
-    def read_validation(self) -> None:
-        """Read the held-out whiteboards."""
-        self.judges = as_readings(self.held_out, self.design, self.good)
-        if not self.judges:
-            raise CalibrationError(
-                "no validation whiteboard: capture one more with the aperture open, to judge Psi by"
-            )
-        for board in self.judges:
-            refusals.refuse_without_mask(board)
 
-    def compare_with_design(self) -> None:
-        """Register the mask, and fit it where no route does: another mask or board is refused.
+def _correct_lamp_and_response(
+    captured: _Whiteboards, design: PsiLayout
+) -> tuple[_Whiteboards, Levels | None]:
+    """Return the whiteboards as under a steady lamp and a straight response, and what these did."""
+    levels = fit_levels(list(dict.fromkeys(c for boards in captured.sets for c in boards.checks)))
+    if levels is None:
+        return captured, None
+    how = levels, channels_of(design), dict[int, MeanFrame]()
+    steady = _Whiteboards(
+        captured.held_out.levelled(*how),
+        captured.few and captured.few.levelled(*how),
+        captured.pinholes and captured.pinholes.levelled(*how),
+        {turn: boards.levelled(*how) for turn, boards in captured.turned.items()},
+    )
+    return steady, levels
 
-        Cameras whose mask is not modelled are not compared. Of the whiteboards through the pinhole
-        the middle view and two corners' are enough. Only a fit distinguishes another distance and
-        references with less light from whiteboards that every coefficient follows.
-        """
-        try:
-            mask = shadow_mask(self.camera, self.design.size)
-        except CalibrationError:
-            return
-        if self.crosstalk is not None:
-            mask = mixing(mask, self.crosstalk.seen)
-        v, u = self.camera.views
-        wanted = [(v // 2, u // 2), (0, 0), (v - 1, u - 1)]
-        boards = self.pinholes or self.held_out
-        some = [frame for frame in boards.frames if frame.shot == 0 and frame.pinhole in wanted]
-        some.sort(key=lambda frame: wanted.index(frame.pinhole or wanted[0]))
-        seen = as_readings(boards.with_frames(some), self.design, self.good)
-        placement = refusals.refuse_another_mask(seen or self.judges, self.camera, mask)
-        self.shadow = Shadow(mask, placement)
-        refusals.refuse_tilted_board(self.shadow, self.judges, REGISTERED_MISS)
-        if self.modelled:
-            return
-        seen = [*seen, *self.judges]
-        start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
-        fit = fit_placement(seen, self.camera, mask, start=start)
-        refusals.refuse_odd_fit(fit, seen)
-        self.shadow = Shadow(mask, fit.placement)
-        refusals.refuse_tilted_board(self.shadow, seen, limits=refusals.FREE_GRADIENT)
-        # Smaller differences are left to the measured Psi: few whiteboards do not determine them.
-        self.findings += words.mask_findings(fit, ("distance_share", "clear"))
 
-    def fit_models(self) -> None:
-        """Fit the mask, its dust and defects, and calibrate by the fits."""
-        if self.few is None:
-            raise CalibrationError("the calibration method parametric was given no whiteboards")
-        self.on_stage("parametric fit")
-        self.seen = as_readings(self.few, self.design, self.good)
-        for board in self.seen:
-            refusals.refuse_without_mask(board)
-        self.plain = mask = shadow_mask(self.camera, self.design.size)
-        if self.crosstalk is not None:
-            mask = mixing(mask, self.crosstalk.seen)
-        fit = fit_placement(self.seen, self.camera, mask)
-        self.advice += words.fit_advice(fit)
-        refusals.refuse_odd_fit(fit, self.seen)
-        dusty = moved_dust(Shadow(mask, fit.placement), self.seen)
-        if dusty.any():
-            self.findings.append(words.dust_finding(dusty))
-            self.good = self.good & ~dusty
-            self.seen = [board.without(dusty) for board in self.seen]
-            self.judges = [board.without(dusty) for board in self.judges]
-            fit = fit_placement(self.seen, self.camera, mask, start=fit.placement)
-        self.findings += words.hands_findings(fit, self.seen, mask)
-        model = self.models["parametric"] = with_misfit(Parametric(fit, mask), self.seen)
-        if {"mixed", "combined"} & self.routes and self.design.binning == 1:
-            self.on_stage("defects of the mask")
-            mixed = _fit_with_defects(self.seen, self.camera, model)
-            self.models["mixed"] = with_misfit(mixed, self.seen)
-        for name, fitted in self.models.items():
-            missed = _missed_at_defects(fitted, [*self.seen, *self.judges])
-            model = replace(fitted, of_defects=missed)
-            self.on_stage(f"Psi, {name}")
-            self.bare[name] = self._calibration_by(model, self.few)
-            self.calibrations[name] = _with_misfit_variance(self.bare[name], model)
-            self.judged[name] = _judged_model(name, model, self.judges, self.seen)
-            self.frames[name] = self.few.exposures
-        best = self.models.get("mixed", model)
-        self.shadow = best.shadow
-        refusals.refuse_tilted_board(self.shadow, [*self.judges, *self.seen])
-        self.findings += words.mask_findings(best.fit)
-        self.findings += filter(None, [best.mask.repeats.words])
-
-    def _calibration_by(self, model: Parametric, boards: BoardSet) -> Calibration:
-        layout = self.design
-        psi = model.psi(layout, self.stages)
-        # Whiteboards of single views show what the model misses of each; sums, how far they stray.
-        astray2 = model.fit.astray2 if model.misfit is None else ()
-        covariance = model.fit.covariance
-        deviation = psi_deviation(model.shadow, layout, self.stages, covariance, astray2)
-        if model.defects is not None and model.defects.count:
-            deviation = _with_defect_variance(deviation, model, layout, self.stages)
-        white = np.stack([_white_dn_per_s(boards, layout, shot) for shot in range(layout.shots)])
-        return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), self.good)
-
-    def measure_views(self, empty: NewArray, on_plane: Callable[[str], None]) -> None:
-        """Measure every view through the pinhole, and combine that with the model."""
-        if self.pinholes is None:
-            raise CalibrationError("the calibration method free was given no whiteboards")
-        self.on_stage("Psi, free")
-        free = replace(measure_psi(self.pinholes, self.design, empty, on_plane), good=self.good)
-        best = self.best_model
-        if best is not None:
-            _correct_pinhole_places(free, best, self.seen, self.design)
-        at_first = (b for b in self.judges if b.shot == 0)
-        still = next((b for b in at_first if np.allclose(b.stage_um, self.stages[0])), None)
-        if still is None:
-            raise CalibrationError(
-                "the calibration method free is judged by an open whiteboard with the mask where "
-                "the first shot has it: capture a validation whiteboard there"
-            )
-        self._add_measured("free", free, still, self.pinholes)
-        if "combined" in self.routes and best is not None and self.few is not None:
-            self.on_stage("Psi, combined")
-            bare = self.bare.get("mixed") or self.bare["parametric"]
-            self._add_measured("combined", combined(free, bare, self.good), still, self.few)
-
-    def _add_measured(self, name: str, known: Calibration, still: Board, boards: BoardSet) -> None:
-        """Take up a measured Psi, judged by its sum over the views against an open whiteboard."""
-        predicted = predicted_by_psi(known.psi, still)
-        variance = prediction_variance(known.deviation, still, self.design.binning)
-        self.calibrations[name] = known
-        self.judged[name] = worst({"open aperture": judge(name, still, predicted, variance)})
-        self.frames[name] = boards.exposures
-
-    def count_common_errors(self) -> None:
-        """Add to the deviations what unsteady light and a mask that moves make of every Psi."""
-        parametric = self.models.get("parametric")
-        for name, known in self.calibrations.items():
-            add_error(known, self._unsteady(name))
-            if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
-                # A model's covariance has it.
-                covariance = np.zeros_like(parametric.fit.covariance)
-                covariance[OFFSETS, OFFSETS] = np.eye(2) * parametric.fit.moved_um**2
-                moved = psi_deviation(parametric.shadow, self.design, self.stages, covariance)
-                np.sqrt(np.square(known.deviation) + np.square(moved), out=known.deviation)
-
-    def _unsteady(self, route: str) -> float:
-        """Return the relative error that shutter and lamp leave in all of a Psi alike.
-
-        Every whiteboard is divided by the references. Their brightness changes from frame to frame,
-        as repeats show, by a variance that the number of frames divides; and slowly, as the fit
-        shows. A view that is measured through a pinhole has the error of its own frames beside.
-        """
-        shared = {id(frame): frame for boards in self.sets for frame in boards.references.values()}
-        references, dark_dn = list(shared.values()), self.sets[0].dark.mean_dn
-        repeats = [(reference.count, reference.unsteady2(dark_dn)) for reference in references]
-        fast2, slow2 = unsteadiness2([*self.judges, *self.seen], repeats), 0.0
-        if "parametric" in self.models:
-            slow2 = self.models["parametric"].fit.brightness_spread ** 2
-        spread2 = slow2 + fast2 * float(np.mean([1 / reference.count for reference in references]))
-        if route == "free":
-            frames = [frame for boards in self.sets for frame in boards.frames if frame.pinhole]
-            spread2 += slow2 + fast2 * float(np.mean([1 / frame.count for frame in frames]))
-        return float(np.sqrt(spread2))
-
-    def choose_route(self) -> tuple[str, str]:
-        """Return the route to use, and why in words."""
-        chosen, why = choose([held for name, held in self.judged.items() if name in self.routes])
-        refusals.refuse_another_bench(chosen)
-        if chosen.chi2 > LARGEST_CHI2:
-            missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
-            add_error(self.calibrations[chosen.route], missed)
-            self.advice.append(words.residual_advice(chosen))
-        return chosen.route, why
-
-    def separate_colours(self, seen: Crosstalk) -> None:
-        """Give every Psi three colours a pixel."""
-        self.findings.append(
-            f"the colour filters pass up to {seen.largest:.1%} of the other colours: Psi "
-            "has three colours for every pixel"
+def _validation_readings(
+    held_out: BoardSet, design: PsiLayout, good: NDArray[np.bool_]
+) -> list[Board]:
+    judges = as_readings(held_out, design, good)
+    if not judges:
+        raise CalibrationError(
+            "no validation whiteboard: capture one more with the aperture open, to judge Psi by"
         )
-        if self.plain is None or (best := self.best_model) is None:
-            raise CalibrationError(
-                "the colour filters pass other colours, and the calibration method free does not "
-                "show which: add open whiteboards, for the method parametric"
-            )
-        others = other_colours(best, self.plain, seen, self.design, self.stages)
-        for name, known in self.calibrations.items():
-            self.calibrations[name] = in_three_colours(known, others)
+    for board in judges:
+        refusals.refuse_without_mask(board)
+    return judges
 
-    def correct_board_and_views(self, chosen: str) -> None:
-        """Take the white board's unevenness out, and count what lamp or board may make of views."""
-        board = None
-        if self.turned:
-            open_boards = {
-                turn: as_readings(boards, self.design, self.good)[0]
-                for turn, boards in self.turned.items()
-            }
-            board = board_over_angle(self.calibrations[chosen].psi, open_boards, self.shadow)
-            refusals.refuse_uneven_board(board)
-            self.findings += words.angle_findings(board)
-            if board.uneven:
-                for known in self.calibrations.values():
-                    take_out(board, known)
-        if "parametric" in self.models:
-            model = self.models["parametric"]
-            leans = leaning(model.fit, model.mask, board)
-            self.findings += words.leaning_findings(leans, bool(self.turned))
-            for known in self.calibrations.values():
-                add_error(known, leans.lopsided)
 
-    def list_unwatched(self, chosen: str) -> list[str]:
-        """Return what no whiteboard measured, in words."""
-        sets, layout = self.sets, self.design
-        lamps = {lamp for boards in sets for _, lamp in boards.references}
-        watched = {
-            "lamp": any(check.masks_in for boards in sets for check in boards.checks),
-            "response": self.levels is not None and self.levels.bend_known,
-            "colours": layout.colour is None or layout.binning > 1 or lamps >= set(LAMP_COLOURS),
-            "turned": bool(self.turned),
+def _compare_with_design(task: _Task, readings: _Readings) -> tuple[Shadow | None, list[str]]:
+    """Return the registered mask's shadow and findings; another mask or board is refused.
+
+    Where no route fits the mask it is fitted here: only a fit distinguishes another distance and
+    references with less light from whiteboards that every coefficient follows. Cameras whose mask
+    is not modelled are not compared. Of the whiteboards through the pinhole the middle view and two
+    corners' are enough.
+    """
+    try:
+        mask = task.as_filtered(shadow_mask(task.camera, task.design.size))
+    except CalibrationError:
+        return None, []
+    v, u = task.camera.views
+    wanted = [(v // 2, u // 2), (0, 0), (v - 1, u - 1)]
+    boards = task.steady.pinholes or task.steady.held_out
+    some = [frame for frame in boards.frames if frame.shot == 0 and frame.pinhole in wanted]
+    some.sort(key=lambda frame: wanted.index(frame.pinhole or wanted[0]))
+    seen = as_readings(boards.with_frames(some), task.design, readings.good)
+    placement = refusals.refuse_another_mask(seen or readings.judges, task.camera, mask)
+    shadow = Shadow(mask, placement)
+    refusals.refuse_tilted_board(shadow, readings.judges, REGISTERED_MISS)
+    if task.modelled:
+        return shadow, []
+    seen = [*seen, *readings.judges]
+    start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
+    fit = fit_placement(seen, task.camera, mask, start=start)
+    refusals.refuse_odd_fit(fit, seen)
+    shadow = Shadow(mask, fit.placement)
+    refusals.refuse_tilted_board(shadow, seen, limits=refusals.FREE_GRADIENT)
+    # Smaller differences are left to the measured Psi: few whiteboards do not determine them.
+    return shadow, words.mask_findings(fit, ("distance_share", "clear"))
+
+
+def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
+    """Return the fits of the mask, its dust and defects, and Psi by them."""
+    few = task.steady.few
+    if few is None:
+        raise CalibrationError("the calibration method parametric was given no whiteboards")
+    task.on_stage("parametric fit")
+    readings = replace(readings, seen=as_readings(few, task.design, readings.good))
+    for board in readings.seen:
+        refusals.refuse_without_mask(board)
+    plain = shadow_mask(task.camera, task.design.size)
+    mask = task.as_filtered(plain)
+    fit = fit_placement(readings.seen, task.camera, mask)
+    advice, findings = words.fit_advice(fit), list[str]()
+    refusals.refuse_odd_fit(fit, readings.seen)
+    dusty = moved_dust(Shadow(mask, fit.placement), readings.seen)
+    if dusty.any():
+        findings.append(words.dust_finding(dusty))
+        readings = readings.without(dusty)
+        fit = fit_placement(readings.seen, task.camera, mask, start=fit.placement)
+    findings += words.hands_findings(fit, readings.seen, mask)
+    models = {"parametric": with_misfit(Parametric(fit, mask), readings.seen)}
+    if {"mixed", "combined"} & task.routes and task.design.binning == 1:
+        task.on_stage("defects of the mask")
+        mixed = _fit_with_defects(readings.seen, task.camera, models["parametric"])
+        models["mixed"] = with_misfit(mixed, readings.seen)
+    bare, psis = {}, {}
+    for name, fitted in models.items():
+        missed = _missed_at_defects(fitted, [*readings.seen, *readings.judges])
+        model = replace(fitted, of_defects=missed)
+        task.on_stage(f"Psi, {name}")
+        bare[name] = _calibration_by(model, task, few, readings.good)
+        psis[name] = _RoutePsi(
+            _with_misfit_variance(bare[name], model),
+            _judged_model(name, model, readings.judges, readings.seen),
+            few.exposures,
+        )
+    best = models.get("mixed", models["parametric"])
+    refusals.refuse_tilted_board(best.shadow, [*readings.judges, *readings.seen])
+    findings += words.mask_findings(best.fit)
+    findings += filter(None, [best.mask.repeats.words])
+    return _Modelled(readings, plain, models, bare, psis, advice, findings)
+
+
+def _calibration_by(
+    model: Parametric, task: _Task, boards: BoardSet, good: NDArray[np.bool_]
+) -> Calibration:
+    """Return Psi by a model, the deviations without its misfit."""
+    layout = task.design
+    psi = model.psi(layout, task.stages)
+    # Whiteboards of single views show what the model misses of each; sums, how far they stray.
+    astray2 = model.fit.astray2 if model.misfit is None else ()
+    covariance = model.fit.covariance
+    deviation = psi_deviation(model.shadow, layout, task.stages, covariance, astray2)
+    if model.defects is not None and model.defects.count:
+        deviation = _with_defect_variance(deviation, model, layout, task.stages)
+    white = np.stack([_white_dn_per_s(boards, layout, shot) for shot in range(layout.shots)])
+    return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
+
+
+def _measure_views(
+    task: _Task, modelled: _Modelled, empty: NewArray, on_plane: Callable[[str], None]
+) -> dict[str, _RoutePsi]:
+    """Return Psi with every view measured through the pinhole, and combined with the model's.
+
+    Judged by its sum over the views against an open whiteboard.
+    """
+    pinholes, few, readings = task.steady.pinholes, task.steady.few, modelled.readings
+    if pinholes is None:
+        raise CalibrationError("the calibration method free was given no whiteboards")
+    task.on_stage("Psi, free")
+    free = replace(measure_psi(pinholes, task.design, empty, on_plane), good=readings.good)
+    if modelled.best is not None:
+        _correct_pinhole_places(free, modelled.best, readings.seen, task.design)
+    at_first = (board for board in readings.judges if board.shot == 0)
+    still = next((b for b in at_first if np.allclose(b.stage_um, task.stages[0])), None)
+    if still is None:
+        raise CalibrationError(
+            "the calibration method free is judged by an open whiteboard with the mask where "
+            "the first shot has it: capture a validation whiteboard there"
+        )
+
+    def judged(name: str, known: Calibration, boards: BoardSet) -> _RoutePsi:
+        predicted = predicted_by_psi(known.psi, still)
+        variance = prediction_variance(known.deviation, still, task.design.binning)
+        held = worst({"open aperture": judge(name, still, predicted, variance)})
+        return _RoutePsi(known, held, boards.exposures)
+
+    psis = {"free": judged("free", free, pinholes)}
+    if "combined" in task.routes and modelled.best is not None and few is not None:
+        task.on_stage("Psi, combined")
+        bare = modelled.bare.get("mixed") or modelled.bare["parametric"]
+        psis["combined"] = judged("combined", combined(free, bare, readings.good), few)
+    return psis
+
+
+def _count_common_errors(task: _Task, modelled: _Modelled, psis: Mapping[str, _RoutePsi]) -> None:
+    """Add to the deviations, in place, what unsteady light and a mask that moves leave in Psi."""
+    parametric = modelled.models.get("parametric")
+    for name, psi in psis.items():
+        known = psi.calibration
+        add_error(known, _unsteady(task, modelled, name))
+        if name in ("free", "combined") and parametric is not None and parametric.fit.moved_um:
+            # A model's covariance has it.
+            covariance = np.zeros_like(parametric.fit.covariance)
+            covariance[OFFSETS, OFFSETS] = np.eye(2) * parametric.fit.moved_um**2
+            moved = psi_deviation(parametric.shadow, task.design, task.stages, covariance)
+            np.sqrt(np.square(known.deviation) + np.square(moved), out=known.deviation)
+
+
+def _unsteady(task: _Task, modelled: _Modelled, route: str) -> float:
+    """Return the relative error that shutter and lamp leave in all of a Psi alike.
+
+    Every whiteboard is divided by the references. Their brightness changes from frame to frame,
+    as repeats show, by a variance that the number of frames divides; and slowly, as the fit
+    shows. A view that is measured through a pinhole has the error of its own frames beside.
+    """
+    sets, readings = task.captured.sets, modelled.readings
+    shared = {id(frame): frame for boards in sets for frame in boards.references.values()}
+    references, dark_dn = list(shared.values()), sets[0].dark.mean_dn
+    repeats = [(reference.count, reference.unsteady2(dark_dn)) for reference in references]
+    fast2, slow2 = unsteadiness2([*readings.judges, *readings.seen], repeats), 0.0
+    if "parametric" in modelled.models:
+        slow2 = modelled.models["parametric"].fit.brightness_spread ** 2
+    spread2 = slow2 + fast2 * float(np.mean([1 / reference.count for reference in references]))
+    if route == "free":
+        frames = [frame for boards in sets for frame in boards.frames if frame.pinhole]
+        spread2 += slow2 + fast2 * float(np.mean([1 / frame.count for frame in frames]))
+    return float(np.sqrt(spread2))
+
+
+def _count_residual(chosen: HeldOut, known: Calibration) -> list[str]:
+    """Add a large residual to the deviations of the route chosen, in place; return the advice."""
+    if chosen.chi2 <= LARGEST_CHI2:
+        return []
+    missed = float(np.sqrt(max(1 - 1 / chosen.chi2, 0.0))) * chosen.relative_error
+    add_error(known, missed)
+    return [words.residual_advice(chosen)]
+
+
+def _separate_colours(
+    task: _Task, modelled: _Modelled, seen: Crosstalk, calibrations: Mapping[str, Calibration]
+) -> dict[str, Calibration]:
+    """Return every Psi with three colours a pixel."""
+    if modelled.plain is None or modelled.best is None:
+        raise CalibrationError(
+            "the colour filters pass other colours, and the calibration method free does not "
+            "show which: add open whiteboards, for the method parametric"
+        )
+    others = other_colours(modelled.best, modelled.plain, seen, task.design, task.stages)
+    return {name: in_three_colours(known, others) for name, known in calibrations.items()}
+
+
+def _correct_board_and_views(
+    task: _Task,
+    modelled: _Modelled,
+    shadow: Shadow | None,
+    calibrations: Mapping[str, Calibration],
+    chosen: str,
+) -> list[str]:
+    """Take the white board's unevenness out of every Psi, in place, and return the findings.
+
+    The deviations take up what lamp or board may make of the views.
+    """
+    findings, board, turned = list[str](), None, task.steady.turned
+    if turned:
+        open_boards = {
+            turn: as_readings(boards, task.design, modelled.readings.good)[0]
+            for turn, boards in turned.items()
         }
-        found = words.unwatched([name for name, known in watched.items() if not known])
-        best = self.best_model
-        if best is not None and all(board.views_open.all() for board in self.seen):
-            stated = self.calibrations[chosen].stated_error
-            found.append(words.views_assumed(pinhole_worth(best, self.seen, stated)))
-        return found
+        board = board_over_angle(calibrations[chosen].psi, open_boards, shadow)
+        refusals.refuse_uneven_board(board)
+        findings += words.angle_findings(board)
+        if board.uneven:
+            for known in calibrations.values():
+                take_out(board, known)
+    if "parametric" in modelled.models:
+        model = modelled.models["parametric"]
+        leans = leaning(model.fit, model.mask, board)
+        findings += words.leaning_findings(leans, bool(turned))
+        for known in calibrations.values():
+            add_error(known, leans.lopsided)
+    return findings
+
+
+def _list_unwatched(
+    task: _Task, modelled: _Modelled, levels: Levels | None, chosen: Calibration
+) -> list[str]:
+    """Return what no whiteboard measured, in words."""
+    sets, layout, seen = task.captured.sets, task.design, modelled.readings.seen
+    lamps = {lamp for boards in sets for _, lamp in boards.references}
+    watched = {
+        "lamp": any(check.masks_in for boards in sets for check in boards.checks),
+        "response": levels is not None and levels.bend_known,
+        "colours": layout.colour is None or layout.binning > 1 or lamps >= set(LAMP_COLOURS),
+        "turned": bool(task.captured.turned),
+    }
+    unwatched = words.unwatched([name for name, known in watched.items() if not known])
+    if modelled.best is not None and all(board.views_open.all() for board in seen):
+        worth = pinhole_worth(modelled.best, seen, chosen.stated_error)
+        unwatched.append(words.views_assumed(worth))
+    return unwatched
 
 
 def _fit_with_defects(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:

@@ -34,6 +34,7 @@ from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 Array = NDArray[np.floating]
 LARGEST_DARK_SHARE = 0.01
 IDEAL_DN = 1e6
+"""White of `ideal_boards`: rounding errors below 1e-6."""
 NewArray = Callable[[str, tuple[int, ...]], Any]
 Plane = tuple[tuple[int, int, int, int], NDArray[np.float32], NDArray[np.float32]]
 

@@ -270,23 +270,77 @@ class PositionMismatchError(DriverError):
         self.read_um = read_um
 
 
-class RawFrameError(DriverError):
+class _WordedError(DriverError):
+    """Root of errors that differ in their words alone, which their classes state.
+
+    says: the message, with a place for `reason`: what happened, or the device's name.
+    """
+
+    _says, _advice = "", ""
+
+    def __init_subclass__(cls, says: str = "", advice: str = "") -> None:
+        cls._says, cls._advice = says or cls._says, advice or cls._advice
+
+    def __init__(self, reason: str, advice: str = "") -> None:
+        super().__init__(self._says.format(reason), advice or self._advice)
+        self.reason = reason
+
+
+class RawFrameError(_WordedError, says="unusable RAW frame, {}", advice="capture it again"):
     """Camera bytes that are not the RAW frame they should be."""
 
-    def __init__(self, reason: str, advice: str = "capture it again") -> None:
-        super().__init__(f"unusable RAW frame, {reason}: {advice}")
-        self.reason = reason
 
-
-class UsbUnavailableError(DriverError):
+class UsbUnavailableError(
+    _WordedError,
+    says="USB cannot be used here ({})",
+    advice="reinstall libusb-package, and in a container pass /dev/bus/usb through",
+):
     """USB cannot be used on this computer at all."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(
-            f"USB cannot be used here ({reason}): reinstall libusb-package, and in a container "
-            "pass /dev/bus/usb through"
-        )
-        self.reason = reason
+
+class UsbPermissionError(
+    _WordedError,
+    says="no permission to open {}",
+    advice="install drivers/99-emmc-rig.rules in /etc/udev/rules.d, run `udevadm control --reload` "
+    "and plug the device in again",
+):
+    """The device is there but this user may not open it."""
+
+
+class UsbGoneError(
+    _WordedError,
+    says="{} went away",
+    advice="plug it in, switch it on, then open the device again",
+):
+    """The device was unplugged, or lost its power, while it was open."""
+
+
+class CardFullError(
+    _WordedError, says="the card of {} is full or missing", advice="empty or insert it"
+):
+    """The memory card has no room for another picture."""
+
+
+class CaptureError(_WordedError, says="no frame, {}", advice="capture it again"):
+    """The camera was released but gave no usable frame; the next may be taken."""
+
+
+class ExposureStoppedError(
+    _WordedError, says="{}: the exposure was broken off; take the frame again"
+):
+    """An exposure was broken off because somebody asked for it."""
+
+
+class CameraClosedError(_WordedError, says="{} was closed", advice="open it again"):
+    """The camera was closed by this program."""
+
+
+class CameraDescriptionError(
+    _WordedError,
+    says="unusable camera description, {}",
+    advice="update the camera's firmware, or use another camera",
+):
+    """The camera's own description of its features (GenICam) cannot be used."""
 
 
 class UsbNotFoundError(DriverError):
@@ -299,16 +353,6 @@ class UsbNotFoundError(DriverError):
         )
 
 
-class UsbPermissionError(DriverError):
-    """The device is there but this user may not open it."""
-
-    def __init__(self, device: str) -> None:
-        super().__init__(
-            f"no permission to open {device}: install drivers/99-emmc-rig.rules in "
-            "/etc/udev/rules.d, run `udevadm control --reload` and plug the device in again"
-        )
-
-
 class UsbClaimedError(DriverError):
     """Another program holds the device; `holders` are its name and process id, where known."""
 
@@ -316,15 +360,6 @@ class UsbClaimedError(DriverError):
         by = ", ".join(holders) if holders else "another program"
         super().__init__(f"{device} is claimed by {by}: {advice}")
         self.holders = holders
-
-
-class UsbGoneError(DriverError):
-    """The device was unplugged, or lost its power, while it was open."""
-
-    def __init__(self, device: str) -> None:
-        super().__init__(
-            f"{device} went away: plug it in, switch it on, then open the device again"
-        )
 
 
 class UsbStalledError(DriverError):
@@ -393,28 +428,6 @@ class CameraBusyError(DriverError):
         )
 
 
-class CardFullError(DriverError):
-    """The memory card has no room for another picture."""
-
-    def __init__(self, camera: str) -> None:
-        super().__init__(f"the card of {camera} is full or missing: empty or insert it")
-
-
-class CaptureError(DriverError):
-    """The camera was released but gave no usable frame; the next may be taken."""
-
-    def __init__(self, reason: str, advice: str = "capture it again") -> None:
-        super().__init__(f"no frame, {reason}: {advice}")
-        self.reason = reason
-
-
-class ExposureStoppedError(DriverError):
-    """An exposure was broken off because somebody asked for it."""
-
-    def __init__(self, camera: str) -> None:
-        super().__init__(f"{camera}: the exposure was broken off; take the frame again")
-
-
 class DownloadError(DriverError):
     """A picture is on the card but could not be fetched whole."""
 
@@ -431,24 +444,6 @@ class FolderCameraError(DriverError):
 
     def __init__(self, folder: str, reason: str) -> None:
         super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
-        self.reason = reason
-
-
-class CameraClosedError(DriverError):
-    """The camera was closed by this program."""
-
-    def __init__(self, camera: str) -> None:
-        super().__init__(f"{camera} was closed: open it again")
-
-
-class CameraDescriptionError(DriverError):
-    """The camera's own description of its features (GenICam) cannot be used."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(
-            f"unusable camera description, {reason}: update the camera's firmware, "
-            "or use another camera"
-        )
         self.reason = reason
 
 

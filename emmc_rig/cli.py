@@ -10,7 +10,6 @@ from typing import Annotated, Any, NoReturn, cast
 
 import typer
 
-from emmc_rig.commands.advice import in_shell
 from emmc_rig.commands.calibrate import calibrate
 from emmc_rig.commands.cameras import cameras
 from emmc_rig.commands.capture import capture
@@ -24,7 +23,7 @@ from emmc_rig.commands.import_ import import_
 from emmc_rig.commands.live import live
 from emmc_rig.commands.mask import mask
 from emmc_rig.commands.modes import ModalCommand
-from emmc_rig.commands.output import say
+from emmc_rig.commands.output import in_shell, say
 from emmc_rig.commands.reconstruct import reconstruct
 from emmc_rig.commands.session import app as session
 from emmc_rig.commands.simulate import simulate

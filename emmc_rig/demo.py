@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 import yaml
@@ -15,17 +16,18 @@ from numpy.typing import NDArray
 
 from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.bench.rig_config import SIMULATED
-from emmc_rig.calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
+from emmc_rig.calibration.whiteboard import Calibration, ideal_boards, lamps_needed, measure_psi
 from emmc_rig.captures.plan import Boards, Checks, Darks, Plan, PlannedShot
 from emmc_rig.captures.run import CaptureRequest, new_session, planned_frames
 from emmc_rig.captures.sequencer import Sequencer
-from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.formats.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.process.result import Result
 from emmc_rig.progress import Event, Watcher
+from emmc_rig.reconstruction.dictionary import open_dictionary
 from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from emmc_rig.reconstruction.result import Progress, Reconstruction
 from emmc_rig.reconstruction.verdict.rules import Verdict
@@ -48,7 +50,7 @@ SIZE = (108, 144)
 class DemoSettings:
     """What to run: scene and camera with their names, size (rows, columns) or None, seed.
 
-    method: see `reconstruction.methods`; dictionary: see `emmc_rig.formats.dictionaries`.
+    method: see `reconstruction.methods`; dictionary: see `emmc_rig.reconstruction.dictionary`.
     exact_psi: reconstruct with the exact Psi too, which shows what calibration costs.
     out: the folder as typed; named in what to do next.
     """
@@ -152,38 +154,23 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     with stages("capture", len(frames)):
         session = shown.enter_context(simulated_session(plan, camera, rig, watcher))
     with shown, stages("psi"):
-        boards = whiteboards(session)
-        calibration = measure_psi(boards, design)
-        chosen = (boards.frames[i] for i in (0, len(boards.frames) // 2, -1))
-        pictures = [(board.name, board.frame.mean_dn - calibration.dark_dn) for board in chosen]
-        lamps = lamps_needed(design)
-        exact = measure_psi(ideal_boards(_noise_free(session, rig, bench), lamps, design), design)
-        psi_error = calibration.psi.relative_difference(exact.psi)
-        design_error = design.relative_difference(exact.psi)
-        taken = shot_readings(session, scale_of(calibration, session))
-        of_shots = [some[0] for some in shot_frames(session).values()]
-        frames_dn = np.stack([raw.mosaic for raw in decoded(session, of_shots)])
-        exposures_s = np.array([exposure.exposures_s[0] for exposure in taken.exposures])
-    with stages("reconstruct"):
+        measured = _measured(session, rig, bench, design)
+    calibration, taken = measured.calibration, measured.taken
 
-        def light_field(psi: ImagingMatrix) -> tuple[Reconstruction, Verdict]:
-            return reconstruct_judged(
-                settings.method,
-                psi,
-                taken,
-                dictionary,
-                settings.solver,
-                lambda p: watcher.step(_progress_words(p)),
-            )
-
-        result = Result(
-            *light_field(calibration.psi), calibration.psi, taken,
-            None if dictionary is None else dictionary.kind, settings.solver,
+    def light_field(psi: ImagingMatrix) -> tuple[Reconstruction, Verdict]:
+        return reconstruct_judged(
+            settings.method, psi, taken, dictionary, settings.solver,
+            lambda p: watcher.step(_progress_words(p)),
         )  # fmt: skip
+
+    with stages("reconstruct"):
+        kind = None if dictionary is None else dictionary.kind
+        solved = light_field(calibration.psi)
+        result = Result(*solved, calibration.psi, taken, kind, settings.solver)
     exact_psnr = None
     if settings.exact_psi:
         with stages("exact Psi, for comparison"):
-            compared, _ = light_field(exact.psi)
+            compared, _ = light_field(measured.exact_psi)
             exact_psnr = psnr_db(compared.light_field, truth)
     with stages("evaluate"):
         psnr = psnr_db(result.light_field, truth)
@@ -194,8 +181,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
             "finer": [fine.aperture_factor, fine.pixel_factor],
             "camera": settings.camera_name,
             **result.compare(truth),
-            "psi_relative_error": psi_error,
-            "design_relative_error": design_error,
+            "psi_relative_error": calibration.psi.relative_difference(measured.exact_psi),
+            "design_relative_error": design.relative_difference(measured.exact_psi),
             "psi_mean_deviation": float(calibration.deviation.mean()),
             "exact_psi_psnr_db": exact_psnr,
             "calibration_cost_db": None if exact_psnr is None else exact_psnr - psnr,
@@ -206,18 +193,51 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         }
     with stages("write"):
         metrics["seconds"] = dict(stages.seconds)
-        result.write(folder, metrics, frames_dn=frames_dn, exposures_s=exposures_s)
+        result.write(
+            folder, metrics, frames_dn=measured.frames_dn, exposures_s=measured.exposures_s
+        )
         calibration.psi.save(folder / "psi.h5")
-        peak = max(float(np.percentile(board, 99.9)) for _, board in pictures)
         result.draw(
             folder, metrics, truth, settings.out,
             title=f"{settings.scene} through {settings.camera_name}",
-            whiteboards=[(label, board / peak) for label, board in pictures],
-            stage_s=metrics["seconds"],
+            whiteboards=measured.pictures, stage_s=metrics["seconds"],
         )  # fmt: skip
     metrics["seconds"] = dict(stages.seconds)
     write_metrics(folder, metrics)
     return metrics
+
+
+class _Measured(NamedTuple):
+    """What a demo's session measured.
+
+    exact_psi: by whiteboards without noise. taken: the readings of the shots. frames_dn: (shot,
+    pixel_y, pixel_x), exposures_s: (shot,). pictures: names of three whiteboards, and the boards
+    less the dark frame, 1 for white.
+    """
+
+    calibration: Calibration
+    exact_psi: ImagingMatrix
+    taken: Frames
+    frames_dn: NDArray[np.integer]
+    exposures_s: Array
+    pictures: list[tuple[str, Array]]
+
+
+def _measured(session: Session, rig: Rig, bench: Bench, design: ImagingMatrix) -> _Measured:
+    """Return Psi and the readings of the shots of a complete session."""
+    boards = whiteboards(session)
+    calibration = measure_psi(boards, design)
+    chosen = [boards.frames[i] for i in (0, len(boards.frames) // 2, -1)]
+    shown = [board.frame.mean_dn - calibration.dark_dn for board in chosen]
+    peak = max(float(np.percentile(picture, 99.9)) for picture in shown)
+    pictures = [(board.name, dn / peak) for board, dn in zip(chosen, shown, strict=True)]
+    ideal = ideal_boards(_noise_free(session, rig, bench), lamps_needed(design), design)
+    taken = shot_readings(session, scale_of(calibration, session))
+    of_shots = [frames[0] for frames in shot_frames(session).values()]
+    frames_dn = np.stack([raw.mosaic for raw in decoded(session, of_shots)])
+    exposures_s = np.array([exposure.exposures_s[0] for exposure in taken.exposures])
+    exact_psi = measure_psi(ideal, design).psi
+    return _Measured(calibration, exact_psi, taken, frames_dn, exposures_s, pictures)
 
 
 def demo_plan(settings: DemoSettings) -> Plan:

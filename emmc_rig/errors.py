@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.drivers.errors import DriverError
-from emmc_rig.model.advice import AdvisedError
-from emmc_rig.model.errors import ModelError
+from emmc_rig.model.errors import AdvisedError, ModelError
 from emmc_rig.reconstruction.errors import ReconstructionError
 
 

@@ -8,6 +8,8 @@ A step passes over it once, correlates every atom with a vector and sums the ato
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from emmc_rig.model.compiling import njit
@@ -67,17 +69,32 @@ def _splitting_pass(atoms, pull, threshold, relax, state, fitted):
     return largest, size
 
 
+class SplitRun(NamedTuple):
+    """steps: of ADMM on the given atoms. objective: eq. 8's value. gap: relative, to the dual."""
+
+    steps: int
+    objective: float
+    gap: float
+
+
 @njit(cache=True, fastmath=True, nogil=True)
 def split(atoms, inverse, data, eta, rho, relax, rtol, max_steps, state, dual_point):
-    """Run ADMM on `atoms` from its state w (atom,); return steps, objective, relative gap.
+    """Run ADMM on `atoms` from its state w (atom,), in place.
 
-    inverse: (A A^T + rho 1)^-1, by `factor`.
+    inverse: G = (A A^T + rho 1)^-1. dual_point: (measurement,), set to the last dual point.
 
     Scaled ADMM with over-relaxation, in Douglas-Rachford's one variable w = x + u per atom:
-    z = soft(w, eta / rho), u = w - z. With q = z - u the quadratic step is, by Woodbury,
-    x = q + A^T s, s = (A A^T + rho 1)^-1 (data - A q): one pass over the atoms, since A q =
-    2 A z - A w and A w follows from its own recursion. rho s, shrunk until no atom correlates
-    with it more than eta, is a dual point at no cost; the last is left in dual_point.
+
+        z = soft(w, eta / rho),  u = w - z,  q = z - u
+        x = q + A^T s,  s = G (I - A q)         (the quadratic step, by Woodbury)
+        w = w + relax (x - z)
+
+    A step passes over the atoms once: A q = 2 A z - A w, and A w has a recursion of its own,
+
+        A w = A w + relax (A z - A w + (I - A q) - rho s).
+
+    rho s, scaled down until no atom correlates with it by more than eta, is a dual point at no
+    cost.
     """
     length = data.size
     threshold = np.float32(eta / rho)
@@ -112,5 +129,5 @@ def split(atoms, inverse, data, eta, rho, relax, rtol, max_steps, state, dual_po
         if gap <= rtol or step + 1 == max_steps:
             for k in range(length):
                 dual_point[k] = shrink * pull[k]
-            return step + 1, objective, gap
-    return max_steps, objective, gap
+            return SplitRun(step + 1, objective, gap)
+    return SplitRun(max_steps, objective, gap)

@@ -30,11 +30,11 @@ def multi_indices(order: int) -> list[MultiIndex]:
     """Return the distinct multi-indices (x, y, u, v) of an order, x's own derivative first."""
     if order < 1:
         raise ReconstructionError(f"derivatives of order {order}: the order must be at least 1")
-    found = []
-    for x, y, u in product(range(order, -1, -1), repeat=3):
-        if x + y + u <= order:
-            found.append((x, y, u, order - x - y - u))
-    return found
+    return [
+        (x, y, u, order - x - y - u)
+        for x, y, u in product(range(order, -1, -1), repeat=3)
+        if x + y + u <= order
+    ]
 
 
 def fitting_indices(order: int, shape: tuple[int, ...]) -> list[MultiIndex]:
@@ -43,17 +43,17 @@ def fitting_indices(order: int, shape: tuple[int, ...]) -> list[MultiIndex]:
     Raises ReconstructionError when none does: DV_K would be 0 whatever the light field.
     """
     views_v, views_u, rows, columns = shape[:4]
-    found = [
+    fitting = [
         index
         for index in multi_indices(order)
         if all(n < size for n, size in zip(index, (columns, rows, views_u, views_v), strict=True))
     ]
-    if not found:
+    if not fitting:
         raise ReconstructionError(
             f"no derivative of order {order} fits {views_v}x{views_u} views of {rows}x{columns} "
             "samples: lower the order"
         )
-    return found
+    return fitting
 
 
 def stencils(order: int, shape: tuple[int, ...], dtype: np.dtype) -> kernels.Stencils:
@@ -74,7 +74,10 @@ def stencils(order: int, shape: tuple[int, ...], dtype: np.dtype) -> kernels.Ste
 
 
 def _difference_norm_squared(order: int, samples: int | None) -> float:
-    """Return |D|^2 of the order-th difference of `samples` values; None, or many: its limit."""
+    """Return |D|^2 of the order-th difference of `samples` values; None, or many: its limit 4^K.
+
+    D D^T is banded: (-1)^k C(2 K, K + k) on its k-th diagonals; |D|^2 is its largest eigenvalue.
+    """
     if samples is None or samples >= EDGE_FREE_AT or order == 0:
         return 4.0**order
     if samples <= order:

@@ -1,6 +1,6 @@
 """Errors of the reconstruction: each message states the fault and its remedy in one line."""
 
-from emmc_rig.model.advice import AdvisedError
+from emmc_rig.model.errors import AdvisedError
 
 
 class ReconstructionError(AdvisedError):

@@ -1,8 +1,9 @@
 """Fused loops of primal-dual DV_K, total variation included, on the axes (v, u, y, colour, x).
 
-The primal step is the exact proximal point of the misfit and of a quadratic pull to a target. The
-dual variable has axes (v, u, y, index, colour, x), one index for each derivative of `Stencils`, of
-the colours after multiplication by a 3 x 3 metric.
+The mathematics is that of `tv`, in its names. `_descend` computes q, `pull_row` z, `fit_rows` L'
+and the relaxed L, `_dual_rows` the relaxed p. The dual variable p has axes (v, u, y, index, colour,
+x), one index for each derivative of `Stencils`, of the colours after multiplication by a 3 x 3
+metric.
 
 One sweep reads and writes the light field and the dual variable once. Rows of the dual variable
 need the rows of pixels up to K further down: they follow the primal step at that distance, so that
@@ -26,10 +27,11 @@ NO_PULL = np.zeros((0, 0, 0, 0, 0), dtype=np.float32)
 
 
 class FrameFit(NamedTuple):
-    """What the frames say: Psi's weights and colour map, its inverted blocks, the frames, k.
+    """Psi, the frames, and the target of the quadratic pull.
 
-    share, pulled: a sample q descended to becomes share q + pulled before the frames correct it;
-    (y, x) and (v, u, y, colour, x), both empty without a target.
+    weights: (shot, v, u, y, stored colour, x). colour: (shot, y, x) uint8. inverse: the blocks
+    (Psi Psi^T + a)^-1. frames: (shot, pixel_y, pixel_x). binning: k. share, pulled: (y, x) and
+    (v, u, y, colour, x), with z = share q + pulled; both empty without a target.
     """
 
     weights: Any
@@ -42,9 +44,10 @@ class FrameFit(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """The steps, of the arrays' type: gamma, tau, mu, the relaxation, and the colours' metric.
+    """Steps and weights, of the arrays' type.
 
-    metric: (3, 3), turns colours into the coordinates in which differences are measured.
+    primal: gamma. dual: tau. bound: mu. relax: the relaxation. metric: (3, 3), turns colours into
+    the coordinates in which differences are measured.
     """
 
     primal: Any
@@ -67,7 +70,7 @@ def mix(metric, lines):
 
 @njit(forceinline=True, fastmath=True)
 def pull_row(data, v, u, y, lines):
-    """Draw lines (colour, x), row y of view (v, u), towards the target, if there is one."""
+    """Set lines (colour, x), row y of view (v, u), from q to z = share q + pulled."""
     if data.pulled.size > 0:
         share = data.share[y]
         for c in range(3):
@@ -78,11 +81,16 @@ def pull_row(data, v, u, y, lines):
 
 @njit(forceinline=True, fastmath=True)
 def fit_rows(data, steps, light_field, row, ahead, first, moved):
-    """Finish the primal step of a row of pixels, descended to in `ahead` from its row `first` on.
+    """Finish the primal step of a row of pixels, whose z is in `ahead` from its row `first` on.
 
-    Corrects by the frames, moves light_field, and sets ahead to metric (2 new - old).
+        seen  = (Psi Psi^T + a)^-1 (Psi z - I)      of the row's pixels
+        L'    = z - Psi^T seen
+        ahead = metric (2 L' - L)
+        L     = L + relax (L' - L)
+    moved[row]: |L' - L|^2 and |L|^2.
     """
-    weights, colour, inverse, frames, binning = data[:5]
+    weights, colour, inverse = data.weights, data.colour, data.inverse
+    frames, binning = data.frames, data.binning
     shots, views_v, views_u, _, _, width = weights.shape
     base = row * binning
     seen = np.zeros((shots, width), frames.dtype)
@@ -170,7 +178,7 @@ def _differentiate(light_field, stencils, index, v, u, y, out):
 
 @njit(forceinline=True, fastmath=True)
 def _descend(light_field, dual, stencils, step, back, v, u, y, out):
-    """Set out (3, x) to a row of the light field less step times the adjoint on the dual variable.
+    """Set out (3, x) to a row of q = L - step D^T p.
 
     dual: (v, u, y, index, 3 x), 0 where a stencil does not fit, so that no colour spills over.
     """
@@ -196,8 +204,12 @@ def _descend(light_field, dual, stencils, step, back, v, u, y, out):
 
 @njit(forceinline=True, fastmath=True)
 def _dual_rows(steps, stencils, ahead, dual, begin, end):
-    """Do the dual step of rows begin to end: ahead (v, u, y, 3 x), dual (v, u, y, index, 3 x)."""
-    _, step, bound, relax, _ = steps
+    """Do the dual step of rows begin to end: ahead (v, u, y, 3 x), dual (v, u, y, index, 3 x).
+
+    raised = p + tau D ahead
+    p      = (1 - relax) p + relax raised min(1, mu / |raised|),  |.| over indices and colours
+    """
+    step, bound, relax = steps.dual, steps.bound, steps.relax
     views_v, views_u, _, count, values = dual.shape
     width = values // 3
     raised = np.empty((count, 3, width), dual.dtype)

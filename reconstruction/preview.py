@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.choices import choose_mu
 from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.problem import choose_mu
 from emmc_rig.reconstruction.tv import Sweeps
 
 Array = NDArray[np.floating]
@@ -53,7 +53,7 @@ def coarser(psi: ImagingMatrix, factor: int) -> ImagingMatrix:
 
 
 def _grouped(frames: NDArray, part: int, high: int, wide: int) -> NDArray:
-    """Return frames (shot, y, x) as the coarse matrix' (shot part part, high, wide)."""
+    """Return frames (shot, y, x) as those of the coarse Psi, (shot part part, high, wide)."""
     cut = frames[:, : high * part, : wide * part].reshape(-1, high, part, wide, part)
     return np.ascontiguousarray(cut.transpose(0, 2, 4, 1, 3).reshape(-1, high, wide))
 
@@ -91,7 +91,7 @@ class Preview:
             max(frames.noise_sigma, share * mean) for share in (PICTURE_NOISE, COARSE_NOISE)
         )
         self._picture = _Following(self._shared, even_frames(readings, picture_noise, good))
-        self._seen_by = coarse
+        self._coarse_psi = coarse
         cut = even_frames(self._cut(readings), coarse_noise, self._cut(good))
         self._coarse = _Following(coarse, cut)
 
@@ -104,6 +104,7 @@ class Preview:
         Returns the relative change of the light field in the last step.
         """
         self._picture.follow(frames, steps)
+        # What the shared picture varies by within blocks, (1, 1, y, colour, x).
         texture = self._picture.sweeps.planar.copy()
         high, wide = (count * self._factor for count in self.size)
         blocks = texture[0, 0, :high, :, :wide].reshape(
@@ -116,6 +117,6 @@ class Preview:
     @property
     def light_field(self) -> NDArray[np.float32]:
         """The estimate so far, (v, u, y, x, c) in [0, 1], a copy."""
-        found = self._coarse.sweeps.light_field
-        self._seen_by.even_unseen_colours(found)
-        return found
+        light_field = self._coarse.sweeps.light_field
+        self._coarse_psi.even_unseen_colours(light_field)
+        return light_field

@@ -13,8 +13,8 @@ per atom, `ista`, `fista` and `sl0` 4 n m per step; putting the patch together 2
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -32,7 +32,6 @@ from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.patches import (
-    PatchGrid,
     PatchSensing,
     overlap_add,
     pixel_of_sample,
@@ -45,8 +44,9 @@ from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
 FLAT = 1e-3
+"""Spread of each colour in an atom, over its largest value, below which the atom is flat."""
 BATCH_BYTES = 48 * 2**20
-"""Of sensed dictionaries that a thread holds at a time."""
+"""Size of the sensed dictionaries that a thread holds at a time."""
 
 
 class SparseSettings(Settings):
@@ -80,7 +80,7 @@ class PatchEstimates:
     """Patches put together.
 
     light_field: (v, u, y, x, c), 0 where no patch says anything. weight: (y, x), how many patches
-    do. atoms: of each patch. converged: share of the patches. empty: patches without
+    do. atoms: number used by each patch. converged: share of the patches. empty: patches without
     a usable pixel. classes: distinct sensed dictionaries. passes: the solver's mean.
     """
 
@@ -93,48 +93,42 @@ class PatchEstimates:
     passes: float
 
 
-@dataclass(frozen=True)
-class _Work:
-    """Some patches that meet the same colours: those of each class share Psi and usable pixels."""
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Patches whose pixels see the same colours, in classes of equal Psi and usable pixels.
 
-    members: list[NDArray[np.int64]]
+    atoms: the different sets of atoms as shots see them, (atom, part, padded sample) each.
+    set_of_shot: index of each shot's set. classes: indices of the patches of each class. sensing:
+    of all patches, class by class.
+    """
+
+    atoms: list[NDArray[np.float32]]
+    set_of_shot: list[int]
+    classes: list[NDArray[np.int64]]
     sensing: PatchSensing
 
+    @property
+    def patches(self) -> NDArray[np.int64]:
+        """Indices of all patches in the grid, class by class."""
+        return np.concatenate(self.classes)
 
-def _same_colours(
-    psi: ImagingMatrix, grid: PatchGrid
-) -> Iterator[tuple[list[NDArray[np.uint8]] | None, NDArray[np.int64]]]:
-    """Yield the colours (shot, sample) that groups of patches meet, and the patches' indices."""
-    everything = np.arange(len(grid))
-    if psi.colour is None:
-        yield None, everything
-        return
-    rows, columns = grid.shape
+
+@dataclass(frozen=True, eq=False)
+class _CodedBatch:
+    """patches: indices in the grid. estimates: (patch, v u y x c). measured: usable pixels."""
+
+    patches: NDArray[np.int64]
+    estimates: NDArray[np.float32]
+    measured: NDArray[np.int64]
+    codes: list[bpdn.Code]
+
+
+def _grouped(keys: Iterable[bytes]) -> dict[bytes, list[int]]:
+    """Return the places of equal keys, by key, in order of the first."""
     groups: dict[bytes, list[int]] = {}
-    for i, (y, x) in enumerate(grid.corners):
-        seen = psi.colour[:, y : y + rows, x : x + columns]
-        groups.setdefault(seen.tobytes(), []).append(i)
-    for key, members in groups.items():
-        seen = np.frombuffer(key, dtype=np.uint8).reshape(psi.shots, -1)
-        yield list(seen), np.array(members)
-
-
-def _classes(
-    psi: ImagingMatrix, usable: NDArray[np.bool_], grid: PatchGrid, indices: NDArray[np.int64]
-) -> list[NDArray[np.int64]]:
-    """Return the patches of equal Psi and usable pixels, as groups of indices."""
-    k = psi.binning
-    rows, columns = grid.shape
-    groups: dict[bytes, list[int]] = {}
-    for i in indices:
-        y, x = grid.corners[i]
-        digest = hashlib.blake2b(digest_size=16)
-        cut = psi.weights[:, :, :, y : y + rows, :, x : x + columns]
-        digest.update(np.ascontiguousarray(cut).data)
-        seen = usable[:, y // k : (y + rows) // k, x // k : (x + columns) // k]
-        digest.update(np.ascontiguousarray(seen).data)
-        groups.setdefault(digest.digest(), []).append(int(i))
-    return [np.array(members) for members in groups.values()]
+    for place, key in enumerate(keys):
+        groups.setdefault(key, []).append(place)
+    return groups
 
 
 class _Coder:
@@ -150,7 +144,6 @@ class _Coder:
         rows, columns = dictionary.patch_shape[2:4]
         dictionary.check_views(psi.light_field_shape[:2])
         self.psi, self.frames, self.settings = psi, frames, settings
-        self.noise_sigma = frames.noise_sigma
         self.atoms = favoured(dictionary.atoms, settings.flat_favour)
         self.matrix = self.atoms.reshape(dictionary.size, -1)
         self.grid = regular_grid(psi.size, (rows, columns), settings.stride, psi.binning)
@@ -158,58 +151,88 @@ class _Coder:
         self.pixels = rows * columns // psi.binning**2
         self.classes = 0
 
-    def batches(self) -> Iterator[tuple[list[NDArray[np.float32]], list[int], _Work]]:
-        """Yield the atoms as the shots meet them, which of them each shot takes, and patches."""
-        atoms = self.atoms
-        for colours, indices in _same_colours(self.psi, self.grid):
-            if colours is None:
-                distinct, which = [selected_atoms(atoms, None)], [0] * self.psi.shots
-            else:
-                keys = [seen.tobytes() for seen in colours]
-                firsts = sorted({keys.index(key) for key in keys})
-                distinct = [selected_atoms(atoms, colours[first]) for first in firsts]
-                which = [firsts.index(keys.index(key)) for key in keys]
-            classes = _classes(self.psi, self.frames.usable, self.grid, indices)
-            self.classes += len(classes)
-            length = self.psi.shots * self.pixels
-            at_once = max(1, int(BATCH_BYTES // (4 * len(atoms) * (length + 8))))
-            at_once = min(at_once, max(1, len(classes) // (4 * get_num_threads())))
-            for start in range(0, len(classes), at_once):
-                members = classes[start : start + at_once]
-                flat = np.concatenate(members)
-                sensing = sense_patches(
-                    self.psi, self.frames, self.grid.corners[flat], self.grid.shape
-                )
-                yield distinct, which, _Work(members, sensing)
+    def _cut(self, array: NDArray, corner: NDArray[np.int64], step: int = 1) -> NDArray:
+        """Return a patch of an array (..., y, x), of pixels of `step` x `step` samples."""
+        (y, x), (rows, columns) = corner, self.grid.shape
+        return array[..., y // step : (y + rows) // step, x // step : (x + columns) // step]
 
-    def code(
-        self, batch: tuple[list[NDArray[np.float32]], list[int], _Work]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64], list[bpdn.Code]]:
-        """Return the batch's patch indices, the patches, their usable pixels, their codes."""
-        distinct, which, work = batch
-        sensing = work.sensing
-        firsts = np.cumsum([0, *(len(group) for group in work.members)])
-        size, length = len(self.atoms), sensing.data.shape[1]
-        sensed = np.zeros((len(work.members), size, length), dtype=np.float32)
-        for shot, selection in enumerate(which):
-            weights = np.ascontiguousarray(sensing.weights[firsts[:-1], shot])
-            sense_atoms(distinct[selection], weights, self.pixel, self.pixels, shot, sensed)
-        patches = np.zeros((firsts[-1], self.matrix.shape[1]), dtype=np.float32)
+    def _colour_groups(self) -> Iterator[tuple[NDArray[np.uint8] | None, NDArray[np.int64]]]:
+        """Yield the colours (shot, sample) that patches see (None: all), and these patches."""
+        colour = self.psi.colour
+        if colour is None:
+            yield None, np.arange(len(self.grid))
+            return
+        seen = (self._cut(colour, corner).tobytes() for corner in self.grid.corners)
+        for key, members in _grouped(seen).items():
+            colours = np.frombuffer(key, dtype=np.uint8).reshape(self.psi.shots, -1)
+            yield colours, np.array(members)
+
+    def _classes(self, patches: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+        """Return the patches in groups of equal Psi and usable pixels: one sensed dictionary."""
+
+        def key(corner: NDArray[np.int64]) -> bytes:
+            (y, x), (rows, columns) = corner, self.grid.shape
+            weights = self.psi.weights[:, :, :, y : y + rows, :, x : x + columns]
+            digest = hashlib.blake2b(np.ascontiguousarray(weights).data, digest_size=16)
+            usable = self._cut(self.frames.usable, corner, self.psi.binning)
+            digest.update(np.ascontiguousarray(usable).data)
+            return digest.digest()
+
+        groups = _grouped(key(corner) for corner in self.grid.corners[patches])
+        return [patches[places] for places in groups.values()]
+
+    def batches(self) -> Iterator[_Batch]:
+        """Yield all patches; a batch's sensed dictionaries fit into BATCH_BYTES."""
+        measurements = self.psi.shots * self.pixels
+        fitting = max(1, int(BATCH_BYTES // (4 * len(self.atoms) * (measurements + 8))))
+        for colours, patches in self._colour_groups():
+            if colours is None:
+                sets, set_of_shot = [selected_atoms(self.atoms, None)], [0] * self.psi.shots
+            else:
+                shots = list(_grouped(of_shot.tobytes() for of_shot in colours).values())
+                sets = [selected_atoms(self.atoms, colours[alike[0]]) for alike in shots]
+                set_of_shot = [
+                    next(i for i, alike in enumerate(shots) if shot in alike)
+                    for shot in range(self.psi.shots)
+                ]
+            classes = self._classes(patches)
+            self.classes += len(classes)
+            at_once = min(fitting, max(1, len(classes) // (4 * get_num_threads())))
+            for start in range(0, len(classes), at_once):
+                part = classes[start : start + at_once]
+                corners = self.grid.corners[np.concatenate(part)]
+                sensing = sense_patches(self.psi, self.frames, corners, self.grid.shape)
+                yield _Batch(sets, set_of_shot, part, sensing)
+
+    def code(self, batch: _Batch) -> _CodedBatch:
+        """Return the batch with a code and an estimate of each patch.
+
+        Psi D is built shot by shot, once for each class; then every patch of a class is coded in
+        it, and its estimate is D beta.
+        """
+        sensing = batch.sensing
+        ends = np.cumsum([len(members) for members in batch.classes])
+        firsts = ends - [len(members) for members in batch.classes]
+        shape = len(batch.classes), len(self.atoms), sensing.data.shape[1]
+        sensed = np.zeros(shape, dtype=np.float32)
+        for shot, chosen in enumerate(batch.set_of_shot):
+            weights = np.ascontiguousarray(sensing.weights[firsts, shot])
+            sense_atoms(batch.atoms[chosen], weights, self.pixel, self.pixels, shot, sensed)
+        estimates = np.zeros((ends[-1], self.matrix.shape[1]), dtype=np.float32)
         codes = []
-        for group, atoms in enumerate(sensed):
-            members = range(firsts[group], firsts[group + 1])
-            if not sensing.measured[firsts[group]]:
-                codes += [bpdn.EMPTY] * len(members)
+        for atoms, first, end in zip(sensed, firsts, ends, strict=True):
+            if not sensing.measured[first]:
+                codes += [bpdn.EMPTY] * (end - first)
                 continue
-            solver = bpdn.prepared(
-                atoms, sensing.data[members], self.noise_sigma, self.settings.solver
+            dictionary = bpdn.SensedDictionary(
+                atoms, sensing.data[first:end], self.frames.noise_sigma, self.settings.solver
             )
-            for i in members:
-                code = solver(sensing.data[i], int(sensing.measured[i]))
+            for i in range(first, end):
+                code = dictionary.code(sensing.data[i], int(sensing.measured[i]))
                 codes.append(code)
                 used = np.flatnonzero(code.weights)
-                patches[i] = code.weights[used] @ self.matrix[used]
-        return np.concatenate(work.members), patches, sensing.measured, codes
+                estimates[i] = code.weights[used] @ self.matrix[used]
+        return _CodedBatch(batch.patches, estimates, sensing.measured, codes)
 
 
 def estimate_patches(
@@ -223,37 +246,41 @@ def estimate_patches(
     coder = _Coder(psi, frames, dictionary, settings)
     total = np.zeros(psi.light_field_shape, dtype=np.float32)
     weight = np.zeros(psi.size, dtype=np.float32)
-    used = np.zeros(len(coder.grid), dtype=np.int64)
+    count = len(coder.grid)
+    used = np.zeros(count, dtype=np.int64)
     converged = empty = done = 0
     passes = 0.0
     threads = get_num_threads()
     with ThreadPoolExecutor(threads) as pool:
-        for found in _in_order(pool, coder.code, coder.batches(), 2 * threads):
-            indices, patches, measured, codes = found
-            shape = (len(indices), *dictionary.patch_shape)
-            share = (measured > 0).astype(np.float32)
-            overlap_add(coder.grid.corners[indices], patches.reshape(shape), share, total, weight)
-            used[indices] = [np.count_nonzero(code.weights) for code in codes]
-            converged += sum(code.converged for code in codes)
-            passes += sum(code.steps for code in codes)
-            empty += int((measured == 0).sum())
-            done += len(indices)
+        for batch in _in_order(pool, coder.code, coder.batches(), 2 * threads):
+            corners = coder.grid.corners[batch.patches]
+            share = (batch.measured > 0).astype(np.float32)
+            patches = batch.estimates.reshape(len(corners), *dictionary.patch_shape)
+            overlap_add(corners, patches, share, total, weight)
+            used[batch.patches] = [np.count_nonzero(code.weights) for code in batch.codes]
+            converged += sum(code.converged for code in batch.codes)
+            passes += sum(code.steps for code in batch.codes)
+            empty += int((batch.measured == 0).sum())
+            done += len(corners)
             if on_step is not None:
-                on_step(Progress(done, None, None, len(coder.grid)))
-    covered = weight > 0
-    total /= np.where(covered, weight, 1)[:, :, None]
-    count = len(coder.grid)
+                on_step(Progress(done, None, None, count))
+    total /= np.where(weight > 0, weight, 1)[:, :, None]
     return PatchEstimates(
         total, weight, used, converged / count, empty, coder.classes, passes / count
     )
 
 
-def _in_order(pool: ThreadPoolExecutor, call: Callable, items: Iterator, ahead: int) -> Iterator:
-    """Yield call(item) in order, with at most `ahead` items in memory."""
-    waiting = []
+def _in_order(
+    pool: ThreadPoolExecutor,
+    call: Callable[[_Batch], _CodedBatch],
+    batches: Iterator[_Batch],
+    ahead: int,
+) -> Iterator[_CodedBatch]:
+    """Yield call(batch) in order, with at most `ahead` batches in memory."""
+    waiting: list[Future[_CodedBatch]] = []
     try:
-        for item in items:
-            waiting.append(pool.submit(call, item))
+        for batch in batches:
+            waiting.append(pool.submit(call, batch))
             if len(waiting) >= ahead:
                 yield waiting.pop(0).result()
         while waiting:
@@ -269,46 +296,46 @@ def reconstruct_sparse(
     dictionary: Dictionary,
     settings: SparseSettings | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    found: PatchEstimates | None = None,
+    estimates: PatchEstimates | None = None,
 ) -> Reconstruction:
     """Return the light field whose patches are sparse in the dictionary.
 
     The typical deviation of the frames sets the penalty when the settings do not; saturated and
-    dead pixels are left out exactly, and where a whole patch is unusable it says nothing. found:
-    the estimates of the same inputs, where they are known already. Raises ReconstructionError for
+    dead pixels are left out exactly, and where a whole patch is unusable it says nothing.
+    estimates: of the same inputs, where they are known already. Raises ReconstructionError for
     inputs that do not fit each other, and a light field smaller than a patch.
     """
     settings = settings or SparseSettings()
     started = running_s()
     frames = checked_inputs(psi, frames)
-    if found is None:
-        found = estimate_patches(psi, frames, dictionary, settings, on_step)
-    uncovered = int((found.weight == 0).sum())
-    if found.empty == len(found.atoms):
+    if estimates is None:
+        estimates = estimate_patches(psi, frames, dictionary, settings, on_step)
+    patches = len(estimates.atoms)
+    if estimates.empty == patches:
         raise ReconstructionError("no patch holds a usable pixel: nothing can be reconstructed")
     advice = []
-    if found.converged < 1:
+    if estimates.converged < 1:
+        share = 1 - estimates.converged
+        advice.append(f"{share:.1%} of the patches reached the step limit: raise max_steps")
+    if estimates.empty:
+        uncovered = int((estimates.weight == 0).sum())
         advice.append(
-            f"{1 - found.converged:.1%} of the patches reached the step limit: raise max_steps"
-        )
-    if found.empty:
-        advice.append(
-            f"{found.empty} patches hold no usable pixel, {uncovered} samples were left at 0: "
+            f"{estimates.empty} patches hold no usable pixel, {uncovered} samples were left at 0: "
             "expose shorter or add a shot"
         )
     return Reconstruction(
         method=f"dict-{settings.solver.method}",
-        light_field=np.clip(found.light_field, 0, 1),
-        status=Status.CONVERGED if found.converged == 1 and not found.empty else Status.INCOMPLETE,
+        light_field=np.clip(estimates.light_field, 0, 1),
+        status=Status.INCOMPLETE if advice else Status.CONVERGED,
         advice="; ".join(advice),
-        steps=round(found.passes),
+        steps=round(estimates.passes),
         objective=(),
         seconds=running_s() - started,
         parameters={
             "noise_sigma": frames.noise_sigma,
-            "patches": len(found.atoms),
-            "classes": found.classes,
-            "atoms_per_patch": float(found.atoms.mean()),
+            "patches": patches,
+            "classes": estimates.classes,
+            "atoms_per_patch": float(estimates.atoms.mean()),
             "stride": settings.stride,
             "dictionary_atoms": dictionary.size,
         },

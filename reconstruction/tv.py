@@ -8,9 +8,17 @@ those of the chrominances count `chroma_weight` times. Colours vary less than br
 resolves what mask and CFA leave ambiguous; a weight of 1 is the paper's DV_K exactly.
 
 The algorithm is over-relaxed primal-dual splitting (Condat 2013, algorithm 3.1) with the proximal
-step of frames and patches together: with a = 1/gamma + rho W and q what the dual variable descends
-to, z = (q / gamma + rho W M) / a, then z - Psi^T (Psi Psi^T + a)^-1 (Psi z - I), one small block
-per pixel. The paper's eq. 10-13 take gradients instead.
+step of frames and patches together. D are the derivatives of the weighted opponent colours, p the
+dual variable (a vector for each sample), gamma and tau the primal and dual steps, and
+a = 1/gamma + rho W:
+
+    q  = L - gamma D^T p
+    z  = (q / gamma + rho W M) / a
+    L' = z - Psi^T (Psi Psi^T + a)^-1 (Psi z - I)       one small block for each pixel
+    p' = p + tau D (2 L' - L),  each vector shortened to mu
+    L  = L + relaxation (L' - L),  p = p + relaxation (p' - p)
+
+The paper's eq. 10-13 take gradients of the misfit instead.
 
 Bytes of one step, float32, for N = v u y x c values, one stored colour of three and s shots:
 light field read and written 2 x 4N, and once more written, 4N; dual variable read and written
@@ -22,6 +30,7 @@ per value.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,18 +40,18 @@ from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
 from emmc_rig.model.settings import Settings
-from emmc_rig.reconstruction import kernels
-from emmc_rig.reconstruction.choices import (
+from emmc_rig.reconstruction import differences, kernels
+from emmc_rig.reconstruction.inputs import checked_inputs
+from emmc_rig.reconstruction.problem import (
+    PatchTerm,
+    Problem,
     choose_mu,
     choose_primal_step,
+    colour_metric,
     contrast,
     first_light_field,
     smooth_guess,
 )
-from emmc_rig.reconstruction.differences import norm_squared as norm_squared_of
-from emmc_rig.reconstruction.differences import stencils
-from emmc_rig.reconstruction.inputs import checked_inputs
-from emmc_rig.reconstruction.problem import PatchTerm, Problem, colour_metric
 from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
@@ -88,25 +97,26 @@ class Sweeps:
         self, problem: Problem, gamma: np.floating, relaxation: np.floating, begin: Array
     ) -> None:
         psi, dtype = problem.psi, problem.psi.weights.dtype
-        spread = float(np.linalg.norm(problem.metric, 2)) ** 2
-        norm_squared = spread * norm_squared_of(problem.order, (*psi.views, None, None))
-        pull = problem.pixel_weight()
-        total = 1 / gamma + pull
-        inverse = psi.inverted_blocks(np.where(problem.usable, total, np.inf))
+        a = 1 / gamma + problem.pixel_weight()
+        inverse = psi.inverted_blocks(np.where(problem.usable, a, np.inf))
         fit = kernels.FrameFit(psi.weights, psi.colour_map, inverse, problem.frames, psi.binning)
         if problem.patch_term is not None:
-            share = np.kron(1 / (gamma * total), np.ones((psi.binning, psi.binning))).astype(dtype)
+            # z = share q + pulled
+            share = np.kron(1 / (gamma * a), np.ones((psi.binning, psi.binning))).astype(dtype)
             pulled = rows_of_colours(problem.patch_term.target) * (1 - share)[:, None, :]
             fit = fit._replace(share=share, pulled=np.ascontiguousarray(pulled, dtype=dtype))
-        dual_step = dtype.type(1 / (norm_squared * gamma))
-        steps = kernels.Steps(gamma, dual_step, dtype.type(problem.mu), relaxation, problem.metric)
+        # The splitting converges where tau gamma |D|^2 is at most 1.
+        of_colours = float(np.linalg.norm(problem.metric, 2)) ** 2
+        norm2 = of_colours * differences.norm_squared(problem.order, (*psi.views, None, None))
+        tau = dtype.type(1 / (norm2 * gamma))
+        steps = kernels.Steps(gamma, tau, dtype.type(problem.mu), relaxation, problem.metric)
         self.planar = np.empty((*begin.shape[:3], 3, begin.shape[3]), dtype)
         self.planar[:] = rows_of_colours(begin)
-        taps = stencils(problem.order, begin.shape, dtype)
+        taps = differences.stencils(problem.order, begin.shape, dtype)
         dual = np.zeros((*begin.shape[:3], len(taps.reach), 3, begin.shape[3]), dtype)
         self._moved = np.zeros((psi.frames_shape[1], 2))
-        ahead = np.empty_like(self.planar)
-        self._state = fit, steps, taps, self.planar, dual, ahead, self._moved
+        room = np.empty_like(self.planar)
+        self._sweep = partial(kernels.sweep, fit, steps, taps, self.planar, dual, room, self._moved)
 
     @classmethod
     def usual(
@@ -128,14 +138,15 @@ class Sweeps:
     def advance(self, steps: int = 1) -> float:
         """Do some steps; return the relative change of the light field in the last one."""
         for _ in range(steps):
-            kernels.sweep(*self._state)
-        return float(np.sqrt(self._moved[:, 0].sum() / max(self._moved[:, 1].sum(), 1e-300)))
+            self._sweep()
+        squared_change, squared_size = self._moved.sum(axis=0)
+        return float(np.sqrt(squared_change / max(squared_size, 1e-300)))
 
     @property
     def light_field(self) -> NDArray[np.float32]:
         """The estimate so far, (v, u, y, x, c) in [0, 1], a copy."""
-        found = np.ascontiguousarray(np.moveaxis(self.planar, -2, -1), dtype=np.float32)
-        return np.clip(found, 0, 1, out=found)
+        values = np.ascontiguousarray(np.moveaxis(self.planar, -2, -1), dtype=np.float32)
+        return np.clip(values, 0, 1, out=values)
 
 
 def few_steps(
@@ -168,9 +179,8 @@ def reconstruct_tv(
     if settings.rho == 0:
         patch_term = None
     frames = checked_inputs(psi, frames)
-    data, usable, noise_sigma = frames.readings, frames.usable, frames.noise_sigma
-    dtype = psi.weights.dtype.type
-    mu = settings.mu or choose_mu(psi, data[usable], noise_sigma, settings.order)
+    data, usable, dtype = frames.readings, frames.usable, psi.weights.dtype.type
+    mu = settings.mu or choose_mu(psi, data[usable], frames.noise_sigma, settings.order)
     guess = smooth_guess(psi, data, usable)
     usual = choose_primal_step(contrast(guess), mu, settings.chroma_weight, settings.order)
     gamma = settings.primal_step or usual
@@ -204,7 +214,7 @@ def reconstruct_tv(
             "mu": float(mu),
             "chroma_weight": settings.chroma_weight,
             "primal_step": float(gamma),
-            "noise_sigma": noise_sigma,
+            "noise_sigma": frames.noise_sigma,
             "order": settings.order,
             "rho": settings.rho,
         },

@@ -2,16 +2,15 @@
 
 Simplified: a new move starts from where the axis is, at rest; homing is one move onto the switch
 at the lower end and one up by the offset, where the counter is zero; parameters are not kept over
-a power cycle; soft limits are stored and stop nothing. A controller takes the bits "A" for
-downwards, as KDC101 do. A message that is not modelled is passed over, as real controllers do, and
-logged.
+a power cycle. A controller takes the bits "A" for downwards, as KDC101 do. A message that is not
+modelled (jogs, PID, soft limits, ...) is passed over, as real controllers do, and logged.
 Source of the messages: Thorlabs, "APT Controllers Host-Controller Communications Protocol".
 """
 
 import logging
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 from emmc_rig.drivers import apt_codec as codec
@@ -32,21 +31,12 @@ Z825 = AxisSpec(
 )
 HOME_OFFSET_UM = 300.0
 HOME_SPEED_UM_S = 1_000.0
+HOME_VELOCITY = round(codec.velocity_units(HOME_SPEED_UM_S, COUNTS_PER_UM))
 UPDATE_EVERY_S = 0.1
 UPDATES_WITHOUT_ACKNOWLEDGEMENT = 50
 MODEL = b"KDC101\0\0"
 SERIAL_NUMBER = 27_000_001
 FIRMWARE = (3, 0, 2, 0)
-JOG = struct.Struct("<HHiiiiH")
-CONTINUOUS, SINGLE_STEP = 1, 2
-"""Modes of a jog."""
-UPWARDS = 2
-"""Direction of a jog and of a move at a velocity, which KDC101 count the other way round."""
-LIMIT_SWITCHES = struct.Struct("<HHHIIH")
-MAKES_ON_CONTACT = 2
-PID = (435, 195, 993, 195, 15)
-"""Gains, limit of the integral, and which of them are used."""
-LIGHTS = 11
 OUT_OF_RANGE = 8
 """Code of a complaint about a target; the document leaves the numbers to the server's help."""
 
@@ -60,15 +50,11 @@ class _Bay:
     motor: Motor
     maximum: int
     acceleration: int
-    home_velocity: int
-    home_offset: int = round(HOME_OFFSET_UM * COUNTS_PER_UM)
     backlash: int = 0
     enabled: bool = True
     homed: bool = False
     homing: str = ""
     motion_error: bool = False
-    jog: tuple[int, ...] = ()
-    limit_switches: tuple[int, ...] = (MAKES_ON_CONTACT, MAKES_ON_CONTACT, 0, 0, 1)
 
 
 class AptController(SimulatedController):
@@ -86,11 +72,8 @@ class AptController(SimulatedController):
     ) -> None:
         super().__init__(clock, ("motor_unplugged",))
         self.swapped = swapped
-        self._specs = dict(bays or {codec.USB_UNIT: Z825})
-        self._unread = bytearray()
-        self._updates_s: float | None = None
-        self._updates_left = 0
-        self._start()
+        specs = bays or {codec.USB_UNIT: Z825}
+        self._start({address: Motor(spec, clock) for address, spec in specs.items()})
 
     def position_um(self, address: int = codec.USB_UNIT) -> float:
         """Return where the axis really is: um above its home position."""
@@ -101,26 +84,24 @@ class AptController(SimulatedController):
     def power_cycle(self) -> None:
         """Switch off and on: the axes stay in place and lose their reference."""
         with self._lock:
-            for address, bay in self._bays.items():
-                bay.motor.advance()
-                self._specs[address] = replace(self._specs[address], start_um=bay.motor.true_um)
-            self._unread.clear()
-            self._updates_s = None
-            self._start()
+            self._start({address: bay.motor.restarted() for address, bay in self._bays.items()})
 
-    def _start(self) -> None:
+    def _start(self, motors: Mapping[int, Motor]) -> None:
+        """Come up with the parameters of the factory."""
         self._bays = {
             address: _Bay(
-                Motor(spec, self._clock),
-                maximum=round(codec.velocity_units(spec.max_speed_um_s, COUNTS_PER_UM)),
+                motor,
+                maximum=round(codec.velocity_units(motor.spec.max_speed_um_s, COUNTS_PER_UM)),
                 acceleration=round(
-                    codec.acceleration_units(spec.acceleration_um_s2, COUNTS_PER_UM)
+                    codec.acceleration_units(motor.spec.acceleration_um_s2, COUNTS_PER_UM)
                 ),
-                home_velocity=round(codec.velocity_units(HOME_SPEED_UM_S, COUNTS_PER_UM)),
             )
-            for address, spec in self._specs.items()
+            for address, motor in motors.items()
         }
         self._motor_unplugged = False
+        self._unread = bytearray()
+        self._updates_s: float | None = None
+        self._updates_left = 0
 
     def _receive(self, data: bytes) -> None:
         self._unread += data
@@ -172,8 +153,8 @@ class AptController(SimulatedController):
             bay.motion_error, bay.enabled, bay.homing = True, False, ""
         elif bay.homing == "seeking" and end is End.ARRIVED:
             bay.homing = "leaving"
-            bay.motor.count_from_here(-bay.home_offset / COUNTS_PER_UM)
-            bay.motor.go(0.0, self._home_speed_um_s(bay), self._acceleration_um_s2(bay))
+            bay.motor.count_from_here(-HOME_OFFSET_UM)
+            bay.motor.go(0.0, HOME_SPEED_UM_S, self._acceleration_um_s2(bay))
         elif bay.homing == "leaving":
             bay.homing, bay.homed = "", True
             self._say(address, Id.MOT_MOVE_HOMED, 1)
@@ -220,12 +201,6 @@ class AptController(SimulatedController):
     def _counts(self, bay: _Bay) -> int:
         return round(bay.motor.counted_um * COUNTS_PER_UM)
 
-    def _speed_um_s(self, bay: _Bay) -> float:
-        return bay.maximum / codec.velocity_units(1.0, COUNTS_PER_UM)
-
-    def _home_speed_um_s(self, bay: _Bay) -> float:
-        return bay.home_velocity / codec.velocity_units(1.0, COUNTS_PER_UM)
-
     def _acceleration_um_s2(self, bay: _Bay) -> float:
         return bay.acceleration / codec.acceleration_units(1.0, COUNTS_PER_UM)
 
@@ -250,7 +225,7 @@ class AptController(SimulatedController):
         bay.homing = ""
         bay.motor.go(
             target / COUNTS_PER_UM,
-            self._speed_um_s(bay),
+            bay.maximum / codec.velocity_units(1.0, COUNTS_PER_UM),
             self._acceleration_um_s2(bay),
             self._stalls(bay.motor),
             self._start_s(),
@@ -271,70 +246,31 @@ class AptController(SimulatedController):
         if bay.enabled:
             bay.motion_error = False
 
-    def _is_enabled(self, address: int, bay: _Bay, message: Message) -> None:
-        state = codec.ENABLE if bay.enabled else codec.DISABLE
-        self._say(address, Id.MOD_GET_CHANENABLESTATE, message.param1, state)
-
     def _set_velocity(self, address: int, bay: _Bay, message: Message) -> None:
         parameters = codec.decode_velocity(message)
         bay.maximum = max(1, parameters.maximum)
         bay.acceleration = max(1, parameters.acceleration)
 
-    def _jog_parameters(self, bay: _Bay) -> tuple[int, ...]:
-        """Return mode, step, least speed, acceleration, speed and way to stop."""
-        return bay.jog or (
-            *(SINGLE_STEP, round(100 * COUNTS_PER_UM), 0, bay.acceleration, bay.maximum),
-            codec.STOP_PROFILED,
-        )
-
-    def _set_jog(self, address: int, bay: _Bay, message: Message) -> None:
-        if message.data is not None and len(message.data) == JOG.size:
-            bay.jog = JOG.unpack(message.data)[1:]
-
-    def _jog(self, address: int, bay: _Bay, message: Message) -> None:
-        mode, step, _, acceleration, speed, _ = self._jog_parameters(bay)
-        if mode == CONTINUOUS:
-            step = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
-        here = self._counts(bay)
-        usual = bay.maximum, bay.acceleration
-        bay.maximum, bay.acceleration = max(1, speed), max(1, acceleration)
-        target = here + step if message.param2 == UPWARDS else here - step
-        self._go(address, bay, target, message.id)
-        bay.maximum, bay.acceleration = usual
-
-    def _set_limit_switches(self, address: int, bay: _Bay, message: Message) -> None:
-        if message.data is not None and len(message.data) == LIMIT_SWITCHES.size:
-            bay.limit_switches = LIMIT_SWITCHES.unpack(message.data)[1:]
-
     def _pass_over(self, address: int, bay: _Bay, message: Message) -> None:
-        """Take a message that changes nothing here: a lamp, flash memory, the end of the link."""
+        """Take a message that changes nothing here."""
 
     def _set_backlash(self, address: int, bay: _Bay, message: Message) -> None:
         (_, bay.backlash) = struct.unpack("<Hi", message.data or b"\0" * 6)
-
-    def _set_home(self, address: int, bay: _Bay, message: Message) -> None:
-        velocity, bay.home_offset = codec.decode_home(message)
-        bay.home_velocity = max(1, velocity)
 
     def _home(self, address: int, bay: _Bay, message: Message) -> None:
         if not bay.enabled or self._motor_unplugged:
             self._complain(address, message.id, "channel disabled or motor not connected")
             return
         bay.homed, bay.homing = False, "seeking"
-        speed_um_s, acceleration_um_s2 = self._home_speed_um_s(bay), self._acceleration_um_s2(bay)
+        pace = HOME_SPEED_UM_S, self._acceleration_um_s2(bay)
         if self.faults.strikes("stall", self._command):
-            bay.motor.go(bay.motor.counted_um / 2, speed_um_s, acceleration_um_s2, stalls=True)
+            bay.motor.go(bay.motor.counted_um / 2, *pace, stalls=True)
         else:
-            bay.motor.seek(0.0, speed_um_s, acceleration_um_s2)
+            bay.motor.seek(0.0, *pace)
 
     def _move(self, address: int, bay: _Bay, message: Message) -> None:
-        start = self._counts(bay) if message.id == Id.MOT_MOVE_RELATIVE else 0
         if message.data is not None and len(message.data) == 6:
-            self._go(address, bay, start + struct.unpack("<Hi", message.data)[1], message.id)
-
-    def _move_for_ever(self, address: int, bay: _Bay, message: Message) -> None:
-        far = round(2 * bay.motor.spec.travel_um * COUNTS_PER_UM)
-        self._go(address, bay, far if message.param2 == UPWARDS else -far, message.id)
+            self._go(address, bay, struct.unpack("<Hi", message.data)[1], message.id)
 
     def _stop(self, address: int, bay: _Bay, message: Message) -> None:
         if bay.motor.ends_s is None:
@@ -350,23 +286,14 @@ class AptController(SimulatedController):
         Id.HW_REQ_INFO: lambda self, bay: struct.pack(
             "<I8sH4B60sHHH", SERIAL_NUMBER, MODEL, 16, *FIRMWARE, b"", 1, 0, len(self._bays)
         ),
-        Id.MOT_REQ_POSCOUNTER: lambda self, bay: codec.encode_position(1, self._counts(bay)),
         Id.MOT_REQ_VELPARAMS: lambda self, bay: codec.encode_velocity(
             codec.VelocityParameters(1, 0, bay.acceleration, bay.maximum)
         ),
-        Id.MOT_REQ_JOGPARAMS: lambda self, bay: JOG.pack(1, *self._jog_parameters(bay)),
-        Id.MOT_REQ_LIMSWITCHPARAMS: lambda self, bay: LIMIT_SWITCHES.pack(1, *bay.limit_switches),
         Id.MOT_REQ_GENMOVEPARAMS: lambda self, bay: codec.encode_position(1, bay.backlash),
         Id.MOT_REQ_HOMEPARAMS: lambda self, bay: struct.pack(
-            "<HHHii", 1, 2, 1, bay.home_velocity, bay.home_offset
-        ),
-        Id.MOT_REQ_STATUSUPDATE: lambda self, bay: struct.pack(
-            "<HiiI", 1, self._counts(bay), self._counts(bay), self._status(bay).bits
+            "<HHHii", 1, 2, 1, HOME_VELOCITY, round(HOME_OFFSET_UM * COUNTS_PER_UM)
         ),
         Id.MOT_REQ_DCSTATUSUPDATE: lambda self, bay: codec.encode_status(self._status(bay)),
-        Id.MOT_REQ_STATUSBITS: lambda self, bay: struct.pack("<HI", 1, self._status(bay).bits),
-        Id.MOT_REQ_DCPIDPARAMS: lambda self, bay: struct.pack("<HIIIIH", 1, *PID),
-        Id.MOT_REQ_AVMODES: lambda self, bay: struct.pack("<HH", 1, LIGHTS),
     }
     """Data of the answer to a request; the answer's id is the next number after the request's."""
 
@@ -375,19 +302,10 @@ class AptController(SimulatedController):
         Id.HW_STOP_UPDATEMSGS: _stop_updates,
         Id.MOT_ACK_DCSTATUSUPDATE: _acknowledge,
         Id.MOD_SET_CHANENABLESTATE: _enable,
-        Id.MOD_REQ_CHANENABLESTATE: _is_enabled,
         Id.MOT_SET_VELPARAMS: _set_velocity,
-        Id.MOT_SET_JOGPARAMS: _set_jog,
-        Id.MOT_MOVE_JOG: _jog,
-        Id.MOT_SET_LIMSWITCHPARAMS: _set_limit_switches,
-        Id.HW_DISCONNECT: _pass_over,
         Id.HW_NO_FLASH_PROGRAMMING: _pass_over,
-        Id.MOD_IDENTIFY: _pass_over,
         Id.MOT_SET_GENMOVEPARAMS: _set_backlash,
-        Id.MOT_SET_HOMEPARAMS: _set_home,
         Id.MOT_MOVE_HOME: _home,
         Id.MOT_MOVE_ABSOLUTE: _move,
-        Id.MOT_MOVE_RELATIVE: _move,
-        Id.MOT_MOVE_VELOCITY: _move_for_ever,
         Id.MOT_MOVE_STOP: _stop,
     }

@@ -45,7 +45,7 @@ class SimulatedController(ABC):
     """
 
     def __init__(self, clock: Clock, faults: Iterable[str] = ()) -> None:
-        self.faults = Faults((*WIRE_FAULTS, *MOTION_FAULTS, *faults), clock)
+        self.faults = Faults((*WIRE_FAULTS, *MOTION_FAULTS, *faults))
         self.late_by_s = 0.7
         self.drift_um = 40.0
         self.slow_by_s = 0.2

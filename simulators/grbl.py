@@ -1,10 +1,9 @@
 """Firmware of a Grbl 1.1 controller: G-code lines and real-time bytes in, `ok` and reports out.
 
 Simplified: every move of the queue starts and ends at rest; homing takes all its axes to their
-switches together, pulls off, touches the switch again slowly and pulls off. What is not modelled
-(arcs, probing, spindle speeds, ...) is refused as an unsupported command, and logged. The axes have
-no encoders: a stall loses steps unnoticed. Bytes that come while the receive buffer is full are
-lost, as on the real controller.
+switches together, pulls off, touches the switch again slowly and pulls off; the receive buffer is
+never full. What is not modelled (arcs, probing, work offsets, spindle, check mode, ...) is refused
+as an unsupported command, and logged. The axes have no encoders: a stall loses steps unnoticed.
 Source of the messages: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Realtime
 commands"; the order of a report's fields and its counters from report.c.
 """
@@ -13,8 +12,9 @@ import logging
 import math
 import re
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Self
 
 from emmc_rig.drivers import grbl_codec as codec
 from emmc_rig.drivers.clock import Clock
@@ -35,21 +35,8 @@ OVERRIDES_EVERY = {True: 20, False: 10}
 """Reports between two with WCO and Ov, while moving and while not (config.h)."""
 PULL_OFF_MM = 1.0
 LOCATE_MM_MIN = 25.0
-SILENT_WORDS = {"G": (4, 17, 40, 49, 54, 61, 80, 94), "M": (0, 2, 30)}
+SILENT_WORDS = {"G": (4, 17, 40, 49, 54, 61, 80, 94), "M": (0, 2, 5, 9, 30)}
 """Words that are accepted and change nothing here."""
-OUTPUTS = {
-    "M3": {"spindle": 1},
-    "M4": {"spindle": 1},
-    "M5": {"spindle": 0},
-    "M7": {"mist": 1},
-    "M8": {"coolant": 1},
-    "M9": {"coolant": 0, "mist": 0},
-}
-"""Pins that a word switches, once the moves before it have ended (coolant_control.c)."""
-ACCESSORIES = {"spindle": "S", "coolant": "F", "mist": "M"}
-OFFSETS = (10, 92, 92.1)
-"""G words that shift the work coordinates."""
-
 _log = logging.getLogger(__name__)
 _WORD = re.compile(r"([A-Z])(-?\d+\.?\d*|-?\.\d+)")
 _SETTING_LINE = re.compile(r"\$(\d{1,3})=(-?\d+\.?\d*)")
@@ -85,9 +72,9 @@ class _Modes:
 class GrblController(SimulatedController):
     """One controller, its axes by letter; machine position 0 is at the upper end of the travel.
 
-    options: `AS_SHIPPED` or other letters of `$I`.
+    options: `AS_SHIPPED` or other letters of `$I`. work_offset_mm: where G54 begins, which a user
+    may set.
     Faults as `SimulatedController`'s, and `door`: the safety door opens at the next line.
-    `lost_bytes` counts what came while the receive buffer was full.
     """
 
     def __init__(
@@ -102,7 +89,6 @@ class GrblController(SimulatedController):
         self.options = options
         self.settings = _default_settings(axes) | dict(settings or {})
         self.work_offset_mm = dict.fromkeys(axes, 0.0)
-        self.lost_bytes = 0
         self._motors = {letter: Motor(spec, clock) for letter, spec in axes.items()}
         self._boot()
 
@@ -115,12 +101,7 @@ class GrblController(SimulatedController):
     def power_cycle(self) -> None:
         """Switch off and on: the axes stay in place and lose their reference."""
         with self._lock:
-            for motor in self._motors.values():
-                motor.advance()
-            self._motors = {
-                letter: Motor(replace(motor.spec, start_um=motor.true_um), self._clock)
-                for letter, motor in self._motors.items()
-            }
+            self._motors = {letter: motor.restarted() for letter, motor in self._motors.items()}
             self._boot()
 
     def _boot(self) -> None:
@@ -133,8 +114,7 @@ class GrblController(SimulatedController):
         for motor in self._motors.values():
             motor.halt()
         self._line = bytearray()
-        self._lines: deque[tuple[str, int]] = deque()
-        self._shift_mm = dict.fromkeys(self.axes, 0.0)
+        self._lines: deque[str] = deque()
         self._blocks: deque[_Block] = deque()
         self._block: _Block | None = None
         self._ends: dict[str, End] = {}
@@ -142,7 +122,6 @@ class GrblController(SimulatedController):
         self._homing_letters: tuple[str, ...] = ()
         self._held = False
         self._modes = _Modes()
-        self.outputs = dict.fromkeys(ACCESSORIES, 0)
         self._reports_to_offset = 0
         self._reports_to_overrides = 1
         self._status_asked = False
@@ -153,22 +132,10 @@ class GrblController(SimulatedController):
     def _receive(self, data: bytes) -> None:
         for value in data:
             byte = bytes([value])
-            if byte == codec.SOFT_RESET:
-                self._soft_reset()
-            elif byte == codec.STATUS_QUERY:
-                self._status_asked = True
-                self._command = byte
-                self._report_if_asked()
-            elif byte == codec.FEED_HOLD:
-                self._feed_hold()
-            elif byte == codec.CYCLE_START:
-                self._cycle_start()
-            elif byte == codec.JOG_CANCEL:
-                self._cancel_jog()
-            elif value >= 0x80:
-                continue
-            elif self._stuck() and self._buffered() >= RX_BUFFER:
-                self.lost_bytes += 1
+            if act := self._realtime.get(byte):
+                act(self)
+            elif value >= 0x80 or byte == b"~":
+                continue  # overrides, and the end of a hold
             elif byte in b"\r\n":
                 self._end_line()
                 self._execute_lines()
@@ -176,22 +143,10 @@ class GrblController(SimulatedController):
                 self._line.append(value)
         self._execute_lines()
 
-    def _stuck(self) -> bool:
-        """Return whether bytes stay in the receive buffer, since no line can be taken up."""
-        return bool(self._lines or self._homing_letters)
-
-    def _buffered(self) -> int:
-        return len(self._line) + sum(size for _, size in self._lines)
-
-    def _cycle_start(self) -> None:
-        """Take a held program up again; Grbl hears it only once the axes stand."""
-        if self._state != "Hold":
-            return
-        self._held = False
-        self._state = "Idle"
-        if self._blocks:
-            self._start_block(None)
-        self._advance()
+    def _ask_status(self) -> None:
+        self._status_asked = True
+        self._command = codec.STATUS_QUERY
+        self._report_if_asked()
 
     def _end_line(self) -> None:
         line, self._line = bytes(self._line), bytearray()
@@ -200,7 +155,7 @@ class GrblController(SimulatedController):
         text = re.sub(r"\(.*?\)|;.*", "", line.decode("ascii", "replace"))
         if len(line) >= codec.LINE_LENGTH:
             text = "overflow"
-        self._lines.append(("".join(text.split()).upper(), len(line) + 1))
+        self._lines.append("".join(text.split()).upper())
 
     def _advance(self) -> None:
         """Advance motors, queue and homing to the time of the clock, move by move."""
@@ -307,10 +262,8 @@ class GrblController(SimulatedController):
         if homing or moving:
             self._state = "Alarm"
             self._say("ALARM:6" if homing else "ALARM:3")
-        elif self._state in ("Hold", "Door", "Check"):
+        elif self._state in ("Hold", "Door"):
             self._state = "Idle"
-        elif self._state == "Sleep":
-            self._state = "Alarm"
         self._waits_for_reset = False
         self._restart()
 
@@ -333,9 +286,7 @@ class GrblController(SimulatedController):
             and not self._homing_letters
             and len(self._blocks) < PLANNER_BLOCKS
         ):
-            if self._switching(self._lines[0][0]) and (self._block or self._blocks):
-                return
-            line, _ = self._lines.popleft()
+            line = self._lines.popleft()
             if self.faults.strikes("door", line):
                 self._state = "Door"
             try:
@@ -351,7 +302,7 @@ class GrblController(SimulatedController):
             return
         if line.startswith("$"):
             self._execute_system(line)
-        elif self._state in ("Alarm", "Jog", "Door", "Sleep"):
+        elif self._state in ("Alarm", "Jog", "Door"):
             raise _RefusedError(9)
         else:
             self._execute_gcode(line)
@@ -363,66 +314,44 @@ class GrblController(SimulatedController):
     def _execute_system(self, line: str) -> None:
         if line.startswith("$J"):
             self._execute_jog(line)
-        elif line == "$":
-            self._say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
-        elif line == "$G":
-            modes = self._modes
-            units, distance = ("G20", "G21")[not modes.inches], ("G91", "G90")[modes.absolute]
-            self._say(
-                f"[GC:{modes.motion} G54 G17 {units} {distance} G94 {self._accessories()} T0 "
-                f"F{modes.feed_mm_min:g} S0]"
-            )
-        elif line == "$X":
-            if self._state == "Alarm":
-                self._say("[MSG:Caution: Unlocked]")
-                self._state = "Idle"
-        elif line == "$C":
-            self._toggle_check()
-        elif line == "$$":
-            if self._state in ("Run", "Hold"):
-                raise _RefusedError(8)
-            for number, value in sorted(self.settings.items()):
-                self._say(f"${number}={value:.3f}" if number >= 100 else f"${number}={value:g}")
-        elif self._state not in ("Idle", "Alarm"):
+            return
+        in_motion = line in ("$G", "$X") or (line == "$$" and self._state not in ("Run", "Hold"))
+        if not in_motion and self._state not in ("Idle", "Alarm"):
             raise _RefusedError(8)
-        elif line == "$I":
-            self._say(f"[VER:{VERSION}.{BUILD}:]")
-            self._say(f"[OPT:{self.options},{PLANNER_BLOCKS},{RX_BUFFER}]")
-        elif line == "$#":
-            offsets = ",".join(f"{self.work_offset_mm[letter]:.3f}" for letter in self.axes)
-            nothing = ",".join("0.000" for _ in self.axes)
-            self._say(f"[G54:{offsets}]")
-            for name in ("G55", "G56", "G57", "G58", "G59", "G28", "G30"):
-                self._say(f"[{name}:{nothing}]")
-            shifts = ",".join(f"{self._shift_mm[letter]:.3f}" for letter in self.axes)
-            self._say(f"[G92:{shifts}]")
-            self._say("[TLO:0.000]")
-            self._say(f"[PRB:{nothing}:0]")
-        elif line == "$N":
-            self._say("$N0=")
-            self._say("$N1=")
-        elif line == "$SLP":
-            self._say("[MSG:Sleeping]")
-            self._state = "Sleep"
+        if handle := self._commands.get(line):
+            handle(self)
         elif line.startswith("$H"):
             self._execute_home(line[2:])
         else:
             self._execute_setting(line)
 
-    def _accessories(self) -> str:
-        coolant = [word for pin, word in (("mist", "M7"), ("coolant", "M8")) if self.outputs[pin]]
-        return " ".join((("M5", "M3")[self.outputs["spindle"]], *(coolant or ["M9"])))
+    def _list_modes(self) -> None:
+        modes = self._modes
+        units, distance = ("G20", "G21")[not modes.inches], ("G91", "G90")[modes.absolute]
+        self._say(
+            f"[GC:{modes.motion} G54 G17 {units} {distance} G94 M5 M9 T0 F{modes.feed_mm_min:g} S0]"
+        )
 
-    def _toggle_check(self) -> None:
-        """Switch the mode that parses programs and moves nothing; leaving it resets."""
-        if self._state == "Check":
-            self._say("[MSG:Disabled]")
-            self._soft_reset()
-        elif self._state == "Idle":
-            self._state = "Check"
-            self._say("[MSG:Enabled]")
-        else:
-            raise _RefusedError(8)
+    def _unlock(self) -> None:
+        if self._state == "Alarm":
+            self._say("[MSG:Caution: Unlocked]")
+            self._state = "Idle"
+
+    def _list_settings(self) -> None:
+        for number, value in sorted(self.settings.items()):
+            self._say(f"${number}={value:.3f}" if number >= 100 else f"${number}={value:g}")
+
+    def _list_build(self) -> None:
+        self._say(f"[VER:{VERSION}.{BUILD}:]")
+        self._say(f"[OPT:{self.options},{PLANNER_BLOCKS},{RX_BUFFER}]")
+
+    def _list_offsets(self) -> None:
+        zero_mm = dict.fromkeys(self.axes, 0.0)
+        for name in ("G54", "G55", "G56", "G57", "G58", "G59", "G28", "G30", "G92"):
+            offset_mm = self.work_offset_mm if name == "G54" else zero_mm
+            self._say(f"[{name}:{self._coordinates(offset_mm, 1.0)}]")
+        self._say("[TLO:0.000]")
+        self._say(f"[PRB:{self._coordinates(zero_mm, 1.0)}:0]")
 
     def _execute_setting(self, line: str) -> None:
         match = _SETTING_LINE.fullmatch(line)
@@ -514,10 +443,6 @@ class GrblController(SimulatedController):
     def _execute_gcode(self, line: str) -> None:
         words = _words(line)
         modes, machine, motion = self._modes, False, None
-        if any(letter == "G" and value in OFFSETS for letter, value in words):
-            self._set_offsets(words)
-            return
-        switched = self._switching(line)
         for letter, value in words:
             word = f"{letter}{value:g}"
             if word in ("G0", "G1"):
@@ -528,9 +453,6 @@ class GrblController(SimulatedController):
                 modes.absolute = word == "G90"
             elif word == "G53":
                 machine = True
-            elif word in OUTPUTS:
-                if word == "M7" and "M" not in self.options:
-                    raise _RefusedError(20)
             elif letter in SILENT_WORDS:
                 if value not in SILENT_WORDS[letter]:
                     raise _not_modelled(line)
@@ -541,9 +463,6 @@ class GrblController(SimulatedController):
             if letter == "F":
                 modes.feed_mm_min = value * unit
         targets_mm = self._targets_mm(words, unit, modes.absolute, machine)
-        if self._state == "Check":
-            return
-        self.outputs |= switched
         if not targets_mm:
             return
         rapid = (motion or modes.motion) == "G0"
@@ -554,40 +473,6 @@ class GrblController(SimulatedController):
             return
         fastest = max(self._setting(codec.MAX_RATE, letter) for letter in self.axes) * 10
         self._queue(_Block(targets_mm, fastest if rapid else modes.feed_mm_min, jog=False))
-
-    def _switching(self, line: str) -> dict[str, int]:
-        """Return the pins that a line switches, with their new levels."""
-        if line.startswith("$"):
-            return {}
-        words = [f"{letter}{float(value):g}" for letter, value in _WORD.findall(line)]
-        return {pin: level for word in words for pin, level in OUTPUTS.get(word, {}).items()}
-
-    def _set_offsets(self, words: list[tuple[str, float]]) -> None:
-        """Shift the work coordinates: G92 until a reset, G10 L2 and L20 as G54 (P0 or P1)."""
-        given = dict(words)
-        given["G"] = next(value for letter, value in words if letter == "G" and value in OFFSETS)
-        unit = codec.MM_PER_INCH if self._modes.inches else 1.0
-        axes_mm = {letter: value * unit for letter, value in words if letter in self.axes}
-        if given["G"] == 92.1:
-            self._shift_mm = dict.fromkeys(self.axes, 0.0)
-            return
-        if not axes_mm:
-            raise _RefusedError(26)
-        planned_mm = self._planned_mm()
-        if given["G"] == 92:
-            for letter, value_mm in axes_mm.items():
-                self._shift_mm[letter] = planned_mm[letter] - self.work_offset_mm[letter] - value_mm
-        elif given.get("L") not in (2, 20) or given.get("P", 0) not in (0, 1):
-            raise _not_modelled("".join(f"{letter}{value:g}" for letter, value in words))
-        else:
-            for letter, value_mm in axes_mm.items():
-                here_mm = planned_mm[letter] - self._shift_mm[letter] - value_mm
-                self.work_offset_mm[letter] = value_mm if given["L"] == 2 else here_mm
-        self._reports_to_offset = 0
-
-    def _offset_mm(self, letter: str) -> float:
-        """Return where the work coordinates begin: WCO of a report."""
-        return self.work_offset_mm[letter] + self._shift_mm[letter]
 
     def _targets_mm(
         self, words: list[tuple[str, float]], unit: float, absolute: bool, machine: bool
@@ -600,7 +485,7 @@ class GrblController(SimulatedController):
                 if not absolute:
                     targets_mm[letter] = planned_mm[letter] + value * unit
                 else:
-                    offset_mm = 0.0 if machine else self._offset_mm(letter)
+                    offset_mm = 0.0 if machine else self.work_offset_mm[letter]
                     targets_mm[letter] = value * unit + offset_mm
         return targets_mm
 
@@ -655,7 +540,7 @@ class GrblController(SimulatedController):
         if int(self.settings[codec.REPORT_MASK]) & codec.REPORTS_MACHINE_POSITION:
             fields = [state, f"MPos:{self._coordinates(machine_mm, unit)}"]
         else:
-            work_mm = {axis: mm - self._offset_mm(axis) for axis, mm in machine_mm.items()}
+            work_mm = {axis: mm - self.work_offset_mm[axis] for axis, mm in machine_mm.items()}
             fields = [state, f"WPos:{self._coordinates(work_mm, unit)}"]
         velocities = [motor.velocity_um_s() for motor in self._motors.values()]
         decimals = 0 if unit == 1 else 1
@@ -665,16 +550,12 @@ class GrblController(SimulatedController):
             self._reports_to_offset -= 1
         else:
             self._reports_to_offset = OFFSET_EVERY[moving] - 1
-            offsets_mm = {letter: self._offset_mm(letter) for letter in self.axes}
-            fields.append(f"WCO:{self._coordinates(offsets_mm, unit)}")
+            fields.append(f"WCO:{self._coordinates(self.work_offset_mm, unit)}")
         if self._reports_to_overrides:
             self._reports_to_overrides -= 1
         else:
             self._reports_to_overrides = OVERRIDES_EVERY[moving] - 1
             fields.append("Ov:100,100,100")
-            on = "".join(letter for pin, letter in ACCESSORIES.items() if self.outputs[pin])
-            if on:
-                fields.append(f"A:{on}")
         self._say(f"<{'|'.join(fields)}>")
 
     def _coordinates(self, position_mm: Mapping[str, float], unit: float) -> str:
@@ -683,6 +564,21 @@ class GrblController(SimulatedController):
 
     def _say(self, text: str) -> None:
         self._send(text.encode("ascii") + b"\r\n")
+
+    _realtime: Mapping[bytes, Callable[[Self], None]] = {
+        codec.SOFT_RESET: _soft_reset,
+        codec.STATUS_QUERY: _ask_status,
+        codec.FEED_HOLD: _feed_hold,
+        codec.JOG_CANCEL: _cancel_jog,
+    }
+    """What is carried out at once, whatever line it comes in."""
+    _commands: Mapping[str, Callable[[Self], None]] = {
+        "$G": _list_modes,
+        "$X": _unlock,
+        "$$": _list_settings,
+        "$I": _list_build,
+        "$#": _list_offsets,
+    }
 
 
 def _not_modelled(line: str) -> _RefusedError:

@@ -1,7 +1,7 @@
 """A motor on a lead screw: true position, motion, and counted position."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from functools import cached_property
 
@@ -72,36 +72,6 @@ class Motion:
         return elapsed_s, self.duration_s - elapsed_s, self.peak_um_s / self.acceleration_um_s2
 
 
-@dataclass(frozen=True)
-class Braking:
-    """Coming to rest with constant deceleration."""
-
-    start_um: float
-    initial_um_s: float
-    start_s: float
-    acceleration_um_s2: float
-
-    @property
-    def duration_s(self) -> float:
-        """Time until rest."""
-        return abs(self.initial_um_s) / self.acceleration_um_s2
-
-    def position_um(self, now_s: float) -> float:
-        """Return where the motor is."""
-        elapsed_s = min(max(now_s - self.start_s, 0.0), self.duration_s)
-        mean_um_s = (self.initial_um_s + self.velocity_um_s(now_s)) / 2
-        return self.start_um + mean_um_s * elapsed_s
-
-    def velocity_um_s(self, now_s: float) -> float:
-        """Return how fast the motor goes, negative downwards."""
-        elapsed_s = min(max(now_s - self.start_s, 0.0), self.duration_s)
-        speed_um_s = abs(self.initial_um_s) - self.acceleration_um_s2 * elapsed_s
-        return math.copysign(speed_um_s, self.initial_um_s)
-
-
-Course = Motion | Braking
-
-
 class End(Enum):
     """How a motion ended."""
 
@@ -127,7 +97,7 @@ class Motor:
         self.true_um = spec.start_um
         self.nut_um = spec.start_um
         self._counted_from_um = spec.start_um
-        self._course: Course | None = None
+        self._course: Motion | None = None
         self._end = End.ARRIVED
 
     @property
@@ -181,13 +151,16 @@ class Motor:
         self._end = End.ARRIVED
 
     def brake(self, acceleration_um_s2: float) -> None:
-        """Come to rest."""
+        """Come to rest as the second half of a move does whose top speed is the speed now."""
         if self._course is None:
             return
         now_s = self._clock.now_s()
-        self._course = Braking(
-            self.true_um, self._course.velocity_um_s(now_s), now_s, acceleration_um_s2
-        )
+        velocity_um_s = self._course.velocity_um_s(now_s)
+        ramp_s = abs(velocity_um_s) / acceleration_um_s2
+        half_um = velocity_um_s * ramp_s / 2
+        start_um, end_um = self.true_um - half_um, self.true_um + half_um
+        speed_um_s = abs(velocity_um_s)
+        self._course = Motion(start_um, end_um, now_s - ramp_s, speed_um_s, acceleration_um_s2)
         self._end = End.BRAKED
 
     def halt(self) -> None:
@@ -203,6 +176,11 @@ class Motor:
         self.true_um += distance_um
         self.nut_um += distance_um
         self._counted_from_um += distance_um
+
+    def restarted(self) -> "Motor":
+        """Return the motor as it comes up after power was lost where it is now."""
+        self.advance()
+        return Motor(replace(self.spec, start_um=self.true_um), self._clock)
 
     def advance(self) -> End | None:
         """Advance to the time of the clock; return how its motion ended, if it did just now."""

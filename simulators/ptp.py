@@ -133,11 +133,11 @@ class PtpCameraSimulator:
         exposures: tuple[int, ...] = THIRD_STOPS,
         span: tuple[int, int, int] | None = None,
         quality: str = "raw",
-        lacks: tuple[Operation, ...] = (Operation.GET_THUMB,),
+        lacks: tuple[Operation, ...] = (),
         capacity_bytes: int = 1 << 36,
         serial: str = "S1",
     ) -> None:
-        self.faults = Faults(FAULTS, clock)
+        self.faults = Faults(FAULTS)
         self.quality = quality
         self.serial = serial
         self.session = 0
@@ -288,11 +288,6 @@ class PtpCameraSimulator:
         ]
         return Answer(data=encode_handles(tuple(found)))
 
-    def _get_num_objects(self, arguments: tuple[int, ...], *request: object) -> Answer:
-        found = self._get_object_handles(arguments)
-        count = len(found.data or b"") // 4 - 1
-        return Answer(found.code, (count,)) if found.code == Code.OK else found
-
     def _get_object_info(self, arguments: tuple[int, ...], *request: object) -> Answer:
         if arguments[0] not in self.objects:
             return Answer(Code.INVALID_HANDLE)
@@ -302,9 +297,6 @@ class PtpCameraSimulator:
         if arguments[0] not in self.objects:
             return Answer(Code.INVALID_HANDLE)
         return Answer(data=memoryview(self.objects[arguments[0]][1]))
-
-    def _get_thumb(self, *request: object) -> Answer:
-        return Answer(Code.NO_THUMBNAIL)
 
     def _delete_object(self, arguments: tuple[int, ...], *request: object) -> Answer:
         if self.objects.pop(arguments[0], None) is None:

@@ -59,6 +59,10 @@ VENDOR, PRODUCT = 0x1209, 0x0E3C
 COMMAND_OUT, ANSWER_IN, STREAM_IN = 0x01, 0x81, 0x82
 PACKET = 1024
 FRAME_RATE_HZ = 30.0
+SERIAL = "U1"
+EXPOSURE_TICKS = (20, 20_000_000)
+GAIN_STEPS = (0, 240)
+"""Limits of the raw registers: 10 us to 10 s in `xml.EXPOSURE_TICK_US`, 0 to 24 dB."""
 
 ABRM, SBRM, SIRM, MANIFEST, FILE = 0x0, 0x10000, 0x20000, 0x30000, 0x40000
 RESPONSE_MS = 200
@@ -119,12 +123,9 @@ class U3vCameraSimulator(UsbFunction):
         zipped: bool = True,
         alignment_bits: int = 10,
         packet: int = PACKET,
-        serial: str = "U1",
-        exposure_us: tuple[float, float] = (10.0, 10_000_000.0),
-        gain_db: tuple[float, float] = (0.0, 24.0),
     ) -> None:
-        self.faults = Faults(FAULTS, clock)
-        self.spec = _spec(serial, packet)
+        self.faults = Faults(FAULTS)
+        self.spec = _spec(packet)
         self._render = render
         self._clock = clock
         self.exposed_from_s = 0.0
@@ -133,11 +134,8 @@ class U3vCameraSimulator(UsbFunction):
         self._black_level_dn = black_level_dn
         self._alignment_bits = alignment_bits
         formats = tuple(COLOURS[cfa] + depth for depth in depths)
-        ticks = tuple(round(us / xml.EXPOSURE_TICK_US) for us in exposure_us)
-        steps = tuple(round(db / xml.GAIN_STEP_DB) for db in gain_db)
-        self._ticks, self._steps = (ticks[0], ticks[1]), (steps[0], steps[1])
         self._codes = tuple(BY_NAME[name].code for name in formats)
-        self.description = xml.describe(self.spec.model, formats, self._ticks, self._steps)
+        self.description = xml.describe(self.spec.model, formats, EXPOSURE_TICKS, GAIN_STEPS)
         self._file = _zip(self.description) if zipped else self.description
         self._zipped = zipped
         self._packed: tuple[Array, tuple, bytes] | None = None
@@ -349,9 +347,9 @@ class U3vCameraSimulator(UsbFunction):
             (offset == xml.PIXEL_FORMAT and value not in self._codes)
             or (offset == xml.WIDTH and not 2 <= value <= columns)
             or (offset == xml.HEIGHT and not 2 <= value <= rows)
-            or (offset == xml.EXPOSURE and not self._ticks[0] <= value <= self._ticks[1])
+            or (offset == xml.EXPOSURE and not EXPOSURE_TICKS[0] <= value <= EXPOSURE_TICKS[1])
             or (offset == xml.EXPOSURE and auto >> xml.AUTO_EXPOSURE_BIT & 1)
-            or (offset == xml.GAIN and not self._steps[0] <= signed <= self._steps[1])
+            or (offset == xml.GAIN and not GAIN_STEPS[0] <= signed <= GAIN_STEPS[1])
         )
         if refused:
             return INVALID
@@ -538,7 +536,7 @@ def _answer(status: int, command: int, request_id: int, data: bytes) -> bytes:
     return head + data
 
 
-def _spec(serial: str, packet: int) -> DeviceSpec:
+def _spec(packet: int) -> DeviceSpec:
     control = (EndpointSpec(COMMAND_OUT, packet_size=packet), EndpointSpec(ANSWER_IN, 2, packet))
     stream = (EndpointSpec(STREAM_IN, 2, packet),)
     return DeviceSpec(
@@ -546,7 +544,7 @@ def _spec(serial: str, packet: int) -> DeviceSpec:
         PRODUCT,
         "EMMC",
         "U3V simulator",
-        serial,
+        SERIAL,
         (
             InterfaceSpec((0xEF, 0x05, 0x00), control, 0),
             InterfaceSpec((0xEF, 0x05, 0x02), stream, 1),

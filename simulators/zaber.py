@@ -2,22 +2,22 @@
 
 Simplified: a new move starts from where the axis is, at rest; homing is one move onto the switch
 at 0 and sets the counter there; settings are not kept over a power cycle; commands longer than
-the packet size are accepted. A command or setting of real firmware that is not modelled is
-refused as an unknown one, and logged. Source of the messages: Zaber ASCII Protocol Manual.
+the packet size are accepted. A command or setting of real firmware that is not modelled (`move
+vel`, `estop`, ...) is refused as an unknown one, and logged.
+Source of the messages: Zaber ASCII Protocol Manual.
 """
 
 import logging
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
 
 from emmc_rig.drivers.clock import Clock
 from emmc_rig.drivers.zaber_codec import DEFAULT_RESOLUTION, FLAG_MEANINGS, SPEED_SCALE, lrc
 from emmc_rig.simulators.firmware import SimulatedController, earliest_s
-from emmc_rig.simulators.motion import AxisSpec, End, Motion, Motor
+from emmc_rig.simulators.motion import AxisSpec, End, Motor
 
-__all__ = ["BENCH_AXES", "AxisSpec", "Motion", "ZaberChain"]
+__all__ = ["BENCH_AXES", "AxisSpec", "ZaberChain"]
 
 ACCELERATION_SCALE = SPEED_SCALE / 1e4
 PACKET_SIZE = 80
@@ -28,10 +28,8 @@ FIRST_SERIAL_NUMBER = 73_001
 DRIVER_OFF = "FH"
 
 TOP_SPEED_PER_RESOLUTION = 16_384
-"""`maxspeed` and `move vel` end at this many times the resolution."""
+"""`maxspeed` ends at this many times the resolution."""
 FINEST_RESOLUTION = 256
-MOVE_NUMBERS = {"abs": (1, 2), "rel": (1, 2), "vel": (1, 1), "min": (0, 1), "max": (0, 1)}
-"""How many numbers each kind of `move` takes; the last one is a speed."""
 TEMPERATURE_C = "31.4"
 OLD_NAMES = {"deviceid": "device.id", "peripheralid": "peripheral.id"}
 """What firmware 6 called them; firmware 7 answers to both."""
@@ -49,8 +47,9 @@ class _RefusedError(Exception):
 class _Axis:
     """A motor with its settings and warning flags."""
 
-    def __init__(self, spec: AxisSpec, clock: Clock, peripheral_id: int | None) -> None:
-        self.spec = spec
+    def __init__(self, motor: Motor, peripheral_id: int | None) -> None:
+        self.motor = motor
+        self.spec = spec = motor.spec
         self.peripheral_id = peripheral_id
         self.flags = {"WR", "WH"}
         self.driver_enabled = True
@@ -64,8 +63,6 @@ class _Axis:
             "limit.max": math.floor(spec.travel_um / spec.microstep_um),
             "resolution": DEFAULT_RESOLUTION,
         }
-        self._clock = clock
-        self.motor = Motor(spec, clock)
         self._homing = False
 
     def advance(self) -> bool:
@@ -109,17 +106,12 @@ class _Axis:
         self.settings = {name: round(value * ratio) for name, value in self.settings.items()}
         self.settings["resolution"] = resolution
 
-    def move_abs(self, target: int, stalls: bool, start_s: float, speed: int | None = None) -> None:
-        """Go to a position, at `maxspeed` or at the speed given."""
+    def move_abs(self, target: int, stalls: bool, start_s: float) -> None:
+        """Go to a position at `maxspeed`."""
         if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
             raise _RefusedError("BADDATA")
-        if speed is not None and not 0 < abs(speed) <= self.top_speed:
-            raise _RefusedError("BADDATA")
         self._begin(False)
-        speed_um_s, acceleration_um_s2 = self._pace()
-        if speed is not None:
-            speed_um_s = abs(speed) * self.microstep_um / SPEED_SCALE
-        self.motor.go(target * self.microstep_um, speed_um_s, acceleration_um_s2, stalls, start_s)
+        self.motor.go(target * self.microstep_um, *self._pace(), stalls, start_s)
 
     def home(self, stalls: bool) -> None:
         self._begin(True)
@@ -135,12 +127,6 @@ class _Axis:
         if self.motor.moving:
             self.motor.brake(self._pace()[1])
             self.flags.add("NI")
-
-    def halt(self) -> None:
-        """What `estop` does: stop without braking; the position may have slipped."""
-        if self.motor.moving:
-            self.motor.halt()
-            self.flags |= {"NI", "WR"}
 
     def cut_power(self) -> None:
         """What the emergency stop does: the motor stands and its driver is off."""
@@ -158,9 +144,7 @@ class _Axis:
 
     def restarted(self) -> "_Axis":
         """Return the axis as it comes up after power was lost where it is now."""
-        self.advance()
-        spec = replace(self.spec, start_um=self.motor.true_um)
-        return _Axis(spec, self._clock, self.peripheral_id)
+        return _Axis(self.motor.restarted(), self.peripheral_id)
 
     def _pace(self) -> tuple[float, float]:
         """Return speed and acceleration in um/s and um/s^2."""
@@ -220,7 +204,7 @@ class ZaberChain(SimulatedController):
             address: _Device(
                 address,
                 [
-                    _Axis(axes[key], clock, peripherals.get(key))
+                    _Axis(Motor(axes[key], clock), peripherals.get(key))
                     for key in sorted(axes)
                     if key[0] == address
                 ],
@@ -301,11 +285,7 @@ class ZaberChain(SimulatedController):
             if axis_number:
                 axes = [device.axes[axis_number - 1]]
             name = words[0] if words else ""
-            if act := self._simple.get(name):
-                for axis in axes:
-                    act(axis)
-                data = None
-            elif name in self._commands:
+            if name in self._commands:
                 data = self._commands[name](self, device, axes, axis_number, words[1:])
             else:
                 raise _not_modelled(words)
@@ -317,43 +297,24 @@ class ZaberChain(SimulatedController):
         text = f"{address:02d} {axis_number} {label}{outcome} {status} {_flag(axes)} {data or '0'}"
         return _encode("@", text, device)
 
+    def _poll(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
+        """Answer with the status alone."""
+
+    def _stop(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
+        for axis in axes:
+            axis.stop()
+
     def _home(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         for axis in axes:
             axis.home(self._stalls(axis.motor))
 
     def _move(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
-        """`move abs|rel DISTANCE [SPEED]`, `move vel SPEED`, `move min|max [SPEED]`."""
-        kind, *numbers = words or [""]
-        if kind not in MOVE_NUMBERS:
+        if words[:1] != ["abs"]:
             raise _not_modelled(["move", *words])
-        fewest, most = MOVE_NUMBERS[kind]
-        if not fewest <= len(numbers) <= most:
+        if len(words) != 2:
             raise _RefusedError("BADCOMMAND")
-        values = [_integer(number) for number in numbers]
         for axis in axes:
-            low, high = axis.settings["limit.min"], axis.settings["limit.max"]
-            target, *speeds = {
-                "abs": values,
-                "rel": [axis.counter + value for value in values[:1]] + values[1:],
-                "vel": [high if values and values[0] > 0 else low, *values],
-                "min": [low, *values],
-                "max": [high, *values],
-            }[kind]
-            if kind == "vel" and not values[0]:
-                axis.stop()
-            else:
-                speed = speeds[0] if speeds else None
-                axis.move_abs(target, self._stalls(axis.motor), self._start_s(), speed)
-
-    def _system(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
-        if words != ["reset"]:
-            raise _not_modelled(["system", *words])
-        if number:
-            raise _RefusedError("DEVICEONLY")
-        for axis in device.axes:
-            axis.advance()
-            axis.motor.halt()
-        device.axes = [axis.restarted() for axis in device.axes]
+            axis.move_abs(_integer(words[1]), self._stalls(axis.motor), self._start_s())
 
     def _driver(self, device: _Device, axes: list[_Axis], number: int, words: list[str]) -> None:
         if words != ["enable"]:
@@ -413,16 +374,11 @@ class ZaberChain(SimulatedController):
         else:
             device.settings[setting] = value
 
-    _simple: Mapping[str, Callable[[_Axis], None]] = {
-        "": lambda axis: None,
-        "stop": _Axis.stop,
-        "estop": _Axis.halt,
-    }
-    """Commands that ask the same of every axis, whatever follows them."""
     _commands: Mapping[str, Callable[..., str | None]] = {
+        "": _poll,
+        "stop": _stop,
         "home": _home,
         "move": _move,
-        "system": _system,
         "driver": _driver,
         "warnings": _warnings,
         "get": _get,

@@ -8,7 +8,7 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
-# As many processes as cores: threads of BLAS in each would wait on each other.
+# There are as many processes as cores: BLAS threads in each process would compete for them.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Threads of numba's loops sleep until they have work: spinning takes the other process's core.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -33,9 +33,6 @@ def pytest_addoption(parser):
         "--stage", help="a real stage for tests marked hardware: zaber:/dev/ttyUSB0, or a YAML file"
     )
     parser.addoption("--camera", help="a real camera for tests marked hardware: ptp:SERIAL")
-    parser.addoption(
-        "--fuzz-cases", type=int, default=500, help="random cases for each codec and driver"
-    )
     parser.addoption("--all", action="store_true", help="the slow tests, too, as CI does")
     parser.addoption("--list-run", type=Path, help="file to write: the tests that were run")
     parser.addoption("--but", type=Path, help="leave out what such a file lists")
@@ -157,23 +154,6 @@ def run(monkeypatch, capsys, tmp_path):
         return code, shown.out, shown.err
 
     return call
-
-
-@pytest.fixture
-def fuzz(request):
-    """Run a check on as many random cases as were asked for."""
-    from hypothesis import HealthCheck, given, settings
-
-    cases = request.config.getoption("--fuzz-cases")
-
-    def run(check, *strategies):
-        slow = [HealthCheck.too_slow, HealthCheck.data_too_large]
-        chosen = settings(
-            max_examples=cases, deadline=None, suppress_health_check=slow, database=None
-        )
-        chosen(given(*strategies)(check))()
-
-    return run
 
 
 @pytest.fixture(scope="module")

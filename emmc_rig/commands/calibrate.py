@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import SIZE_VARIABLE
+from emmc_rig.commands.options import SIZE_VARIABLE, out_option
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 from emmc_rig.errors import AppError
 
 DEFAULT_CAMERA = "rgbw-bayer-1shot"
+DEFAULT_OUT = "in the session; with --plan emmc-calibration, with --drift emmc-drift"
 
 
 def calibrate(
@@ -73,42 +74,46 @@ def calibrate(
             "--sensor", help="characterise the sensor too (EMVA 1288): writes sensor.json"
         ),
     ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            help="folder to write (default: in the session; with --plan emmc-calibration, with "
-            "--drift emmc-drift)",
-        ),
-    ] = None,
+    out: Annotated[Path | None, out_option(DEFAULT_OUT)] = None,
 ) -> None:
     """Measure Psi from a session's whiteboards.
 
     Or plan these by --plan, or correct Psi for drift by --drift.
     """
-    from emmc_rig.captures.board_plan import PlanSettings, write_plan
-    from emmc_rig.formats.cameras import find_camera
-    from emmc_rig.store.folders import result_folder
     from emmc_rig.store.results import parse_size
 
     if drift is not None:
         if known is None:
             raise typer.BadParameter("--drift needs --known, a folder that `calibrate` wrote")
-        _judge_drift(known, drift, out or Path("emmc-drift"))
-        return
-    if session is not None:
+        _check_drift(known, drift, out or Path("emmc-drift"))
+    elif session is not None:
         _calibrate_session(session, method, out, sensor)
-        return
-    if not plan:
+    elif plan:
+        if not 0 < target < 1:
+            raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
+        shape = parse_size(size)
+        assert shape is not None
+        skipped = frozenset(skip.split(",") if skip else ())
+        _plan_whiteboards(camera, shape, target, frames, skipped, few, out)
+    else:
         raise typer.BadParameter("name a session, or plan its whiteboards by --plan")
-    if not 0 < target < 1:
-        raise AppError(f"--target {target:g}: a relative error lies between 0 and 1")
-    shape = parse_size(size)
-    assert shape is not None
-    settings = PlanSettings(
-        camera, find_camera(camera), shape, target, frames,
-        frozenset(skip.split(",") if skip else ()), few,
-    )  # fmt: skip
+
+
+def _plan_whiteboards(
+    camera: str,
+    size: tuple[int, int],
+    target: float,
+    most_frames: int | None,
+    skipped: frozenset[str],
+    few: bool,
+    out: Path | None,
+) -> None:
+    """Write a plan of whiteboards that measure Psi to the relative error `target`."""
+    from emmc_rig.captures.board_plan import PlanSettings, write_plan
+    from emmc_rig.formats.cameras import find_camera
+    from emmc_rig.store.folders import result_folder
+
+    settings = PlanSettings(camera, find_camera(camera), size, target, most_frames, skipped, few)
     out = out or Path("emmc-calibration")
     with result_folder(out, "calibrate --plan") as folder, shown_progress("plan"):
         metrics = write_plan(settings, folder)
@@ -120,15 +125,6 @@ def calibrate(
         tell(f"planned one whiteboard of every view: with --few it would be {wanted} frames")
     tell(f"next: emmc-rig capture {out / 'plan.yaml'} --rig RIG.yaml")
     give_result(out)
-
-
-def _tell_findings(metrics: dict) -> None:
-    for line in metrics["findings"]:
-        tell(f"finding: {line}")
-    for line in metrics["unwatched"]:
-        tell(line)
-    for line in metrics["advice"]:
-        tell(f"advice: {line}")
 
 
 def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) -> None:
@@ -155,7 +151,9 @@ def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) 
         f"{metrics['why']}, {metrics['frames'][chosen]} frames; validation whiteboard predicted "
         f"to {judged['relative_error']:.2%}"
     )
-    _tell_findings(metrics)
+    for label, key in (("finding: ", "findings"), ("", "unwatched"), ("advice: ", "advice")):
+        for line in metrics[key]:
+            tell(label + line)
     for name, value, deviation, unit in () if sheet is None else sheet.rows():
         spread = "" if deviation is None else f" +- {deviation:.2g}"
         tell(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
@@ -163,7 +161,7 @@ def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) 
     give_result(out)
 
 
-def _judge_drift(known: Path, frames: Path, out: Path) -> None:
+def _check_drift(known: Path, frames: Path, out: Path) -> None:
     from emmc_rig.process.session_drift import run_drift
     from emmc_rig.store.folders import result_folder
 

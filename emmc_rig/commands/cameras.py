@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.options import out_option
 from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 
 
@@ -19,9 +20,7 @@ def cameras(
     name: Annotated[
         str | None, typer.Argument(help="a shipped camera or a YAML file (default: list all)")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="folder for the drawing (default: camera-NAME)")
-    ] = None,
+    out: Annotated[Path | None, out_option("camera-NAME")] = None,
 ) -> None:
     """List the shipped cameras, or draw the masks of one."""
     import emmc_rig as emmc

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,12 +16,12 @@ from rich.console import Console
 
 from emmc_rig.commands.modes import SIMULATED_ONLY, given_names, refuse
 from emmc_rig.commands.options import (
-    SIMULATED as SIMULATED_PANEL,
-)
-from emmc_rig.commands.options import (
+    SIMULATED_PANEL,
+    HostOption,
     RigOption,
     RigSceneOption,
     RigSizeOption,
+    out_option,
 )
 from emmc_rig.commands.output import emit, give_result, json_wanted, say, show_reason, tell
 from emmc_rig.errors import ERRORS, AppError
@@ -28,14 +29,16 @@ from emmc_rig.progress import Event, Watcher
 
 if TYPE_CHECKING:
     from emmc_rig.captures.control import Control
-
-OptionalPath = Path | None
+    from emmc_rig.captures.events import RunEnd
+    from emmc_rig.captures.schedule import Estimate
+    from emmc_rig.commands.capture_display import CaptureDisplay
+    from emmc_rig.session.session import Session
 
 
 def capture(
     context: typer.Context,
     plan: Annotated[
-        OptionalPath, typer.Argument(help="a plan (YAML), or a session to go on with")
+        Path | None, typer.Argument(help="a plan (YAML), or a session to go on with")
     ] = None,
     new: Annotated[
         str | None, typer.Option("--new", help="write a commented plan for this camera, and exit")
@@ -93,12 +96,8 @@ def capture(
             "--other-devices", help="go on with a camera or stage of another serial number"
         ),
     ] = False,
-    host: Annotated[
-        str, typer.Option("--host", help="address to serve the page at, for instance for a phone")
-    ] = "127.0.0.1",
-    out: Annotated[
-        OptionalPath, typer.Option("--out", help="session folder (default: PLAN-session)")
-    ] = None,
+    host: HostOption = "127.0.0.1",
+    out: Annotated[Path | None, out_option("PLAN-session")] = None,
 ) -> None:
     """Capture a plan's frames on a rig.
 
@@ -150,54 +149,18 @@ def _run(
     host: str,
     other_devices: bool,
 ) -> None:
-    from emmc_rig.captures.control import Control, pressed_keys
+    from emmc_rig.captures.control import Control
     from emmc_rig.captures.events import Listener
     from emmc_rig.captures.run import FrontEnd, asked_folder, capture_session
-    from emmc_rig.captures.schedule import Estimate
     from emmc_rig.commands.capture_display import CaptureDisplay
-    from emmc_rig.session.brightness import exposure_reasons, shot_exposures
-    from emmc_rig.session.journal import ended
-    from emmc_rig.session.session import REPORT
-    from emmc_rig.store.results import shown_bytes, shown_seconds
 
     control = Control(stays=page == "steers")
     display = CaptureDisplay(Console(stderr=True, quiet=json_wanted.get()), control)
     watcher: Watcher = Listener(_print_line) if json_wanted.get() else display
 
-    def ask(what: str) -> None:
-        terminal = sys.stdin.isatty()
-        if not terminal and page != "steers":
-            raise AppError(
-                f"somebody has to {what}: answer on a page (--steer), "
-                "run this on a terminal, or automate the lamp and masks"
-            )
-        began_s, objects = time.perf_counter(), {"asked": what}
-        watcher.event(Event("pause", {"reason": f"please {what}"}, objects))
-        wish = f"please {what}, then press Enter"
-        with display.aside():
-            if page != "steers":
-                input(f"{wish} ")
-            else:
-                tell(f"{wish}, or on the page" if terminal else f"please {what}")
-                with pressed_keys() as pressed:
-                    control.until_answered(pressed)
-        seconds = round(time.perf_counter() - began_s, 3)
-        watcher.event(Event("resume", {"seconds": seconds}, objects))
-
     def agreed(expected: Estimate) -> bool:
         if expected.frames:
-            most = "" if until_db is None else "at most "
-            count = expected.by_hand
-            hands = f", {count} change{'s' * (count > 1)} by hand" if count else ""
-            yet = (
-                f"; time excludes {expected.guessed} exposures that are metered first"
-                if expected.guessed
-                else ""
-            )
-            watcher.tell(
-                f"{most}{expected.frames} frames to take, about "
-                f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}{yet}"
-            )
+            watcher.tell(_estimate_words(expected, "" if until_db is None else "at most "))
         return not dry_run
 
     with ExitStack() as open_things:
@@ -208,11 +171,66 @@ def _run(
         open_things.enter_context(display.shown())
         if json_wanted.get():
             emit("stage", stage="open the rig", steps=None)
+        ask = partial(_ask, watcher=watcher, display=display, control=control, page=page)
         front = FrontEnd(watcher, ask, agreed, control)
         captured = capture_session(plan, rig, out, until_db, front, other_devices)
-    if captured is None:
-        return
-    session, outcome = captured
+    if captured is not None:
+        _say_complete(*captured)
+
+
+def _ask(
+    what: str,
+    watcher: Watcher,
+    display: CaptureDisplay,
+    control: Control,
+    page: Literal["shows", "steers"] | None,
+) -> None:
+    """Wait until a person has done something by hand: Enter, or a click on a page that steers.
+
+    Raises AppError where there is neither a terminal nor such a page.
+    """
+    from emmc_rig.captures.control import pressed_keys
+
+    terminal = sys.stdin.isatty()
+    if not terminal and page != "steers":
+        raise AppError(
+            f"somebody has to {what}: answer on a page (--steer), "
+            "run this on a terminal, or automate the lamp and masks"
+        )
+    began_s, objects = time.perf_counter(), {"asked": what}
+    watcher.event(Event("pause", {"reason": f"please {what}"}, objects))
+    wish = f"please {what}, then press Enter"
+    with display.aside():
+        if page != "steers":
+            input(f"{wish} ")
+        else:
+            tell(f"{wish}, or on the page" if terminal else f"please {what}")
+            with pressed_keys() as pressed:
+                control.until_answered(pressed)
+    seconds = round(time.perf_counter() - began_s, 3)
+    watcher.event(Event("resume", {"seconds": seconds}, objects))
+
+
+def _estimate_words(expected: Estimate, most: str) -> str:
+    """Return what a capture takes, in words; most: "at most " where it may end earlier, else ""."""
+    from emmc_rig.store.results import shown_bytes, shown_seconds
+
+    count, guessed = expected.by_hand, expected.guessed
+    hands = f", {count} change{'s' * (count > 1)} by hand" if count else ""
+    excluded = f"; time excludes {guessed} exposures that are metered first" if guessed else ""
+    return (
+        f"{most}{expected.frames} frames to take, about "
+        f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}{excluded}"
+    )
+
+
+def _say_complete(session: Session, outcome: RunEnd) -> None:
+    """Print the counts of frames, reasons against the exposures, and the path of the page."""
+    from emmc_rig.session.brightness import exposure_reasons, shot_exposures
+    from emmc_rig.session.journal import ended
+    from emmc_rig.session.session import REPORT
+    from emmc_rig.store.results import shown_seconds
+
     retried = f", {outcome.retries} retries" if outcome.retries else ""
     tell(
         f"complete: {len(session.needed)} frames verified, {outcome.taken} taken in "

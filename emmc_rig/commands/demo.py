@@ -12,6 +12,7 @@ from emmc_rig.commands.options import (
     DEFAULT_CAMERA,
     CameraOption,
     DictionaryOption,
+    MethodOption,
     OutOption,
     SceneOption,
     SeedOption,
@@ -31,20 +32,17 @@ def demo(
     shots: ShotsOption = None,
     seed: SeedOption = 0,
     size: SizeOption = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            "--method",
-            help="see `reconstruct --list` (default: adaptive, here without TV + dictionary)",
-        ),
-    ] = None,
+    method: MethodOption = None,
     exact_psi: Annotated[
         bool, typer.Option("--exact-psi", help="reconstruct with the exact Psi too, for comparison")
     ] = False,
     dictionary: DictionaryOption = None,
     out: OutOption = Path("emmc-demo"),
 ) -> None:
-    """Try it on a simulated rig: calibrate, capture, reconstruct."""
+    """Try it on a simulated rig: calibrate, capture, reconstruct.
+
+    The method adaptive runs here without TV + dictionary.
+    """
     import emmc_rig as emmc
     from emmc_rig.commands.first_run import helped_to_compile
     from emmc_rig.demo import DemoSettings, run_demo

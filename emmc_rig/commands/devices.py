@@ -7,7 +7,7 @@ Ctrl-C, SIGTERM, a closed terminal or an error during a move stops the stage and
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,11 +16,13 @@ import typer
 from emmc_rig.captures.control import signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
+from emmc_rig.commands.options import StageOption
 from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 from emmc_rig.drivers.cameras import CAMERAS
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
+    from emmc_rig.captures.bench_check import Ability
     from emmc_rig.drivers.stage import Stage
 
 app = typer.Typer(
@@ -29,13 +31,6 @@ app = typer.Typer(
     help="List, test and move stages and cameras.",
 )
 
-StageOption = Annotated[
-    str | None,
-    typer.Option(
-        "--stage",
-        help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file",
-    ),
-]
 RigOption = Annotated[
     str | None,
     typer.Option("--rig", help="simulated, simulated:grbl or simulated:apt, instead of --stage"),
@@ -160,7 +155,7 @@ def check(
     """List which cameras and calibrations a rig can do."""
     from emmc_rig.bench.hands import NoAttendant
     from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
-    from emmc_rig.captures.bench_check import ability, shown_error
+    from emmc_rig.captures.bench_check import ability
     from emmc_rig.formats.cameras import find_camera
     from emmc_rig.model.camera import shipped_camera_files
 
@@ -189,44 +184,9 @@ def check(
             found.append(ability(name, find_camera(name), axes, hands))
             progress.step(name)
     if camera:
-        first = found[0]
-        tell(
-            f"{camera}: {first.shots} of {first.of_shots} shots, {first.by_hand} mask moves by hand"
-        )
-        show_table(
-            ("calibration", "axes", "by hand", "calibration error"),
-            [
-                (
-                    way.name,
-                    ", ".join(way.axes) or "none",
-                    f"{first.hands(way)} moves" if way.name in first.possible else "not possible",
-                    shown_error(way.error),
-                )
-                for way in first.calibrations
-            ],
-        )
+        _show_camera(found[0])
     else:
-        show_table(
-            (
-                "camera",
-                "shots",
-                "calibration",
-                "by hand",
-                "calibration error",
-                "with one more axis",
-            ),
-            [
-                (
-                    fit.camera,
-                    f"{fit.shots} of {fit.of_shots}",
-                    fit.best.name,
-                    f"{fit.hands(fit.best) + fit.by_hand} moves",
-                    shown_error(fit.best.error),
-                    fit.more(axes),
-                )
-                for fit in found
-            ],
-        )
+        _show_cameras(found, axes)
     give_result(
         rig=rig,
         axes=list(axes),
@@ -240,6 +200,45 @@ def check(
             for fit in found
         },
     )
+
+
+def _show_camera(found: Ability) -> None:
+    """Print every calibration of a camera on a rig."""
+    from emmc_rig.captures.bench_check import shown_error
+
+    tell(
+        f"{found.camera}: {found.shots} of {found.of_shots} shots, {found.by_hand} mask moves by "
+        "hand"
+    )
+    rows = [
+        (
+            way.name,
+            ", ".join(way.axes) or "none",
+            f"{found.hands(way)} moves" if way.name in found.possible else "not possible",
+            shown_error(way.error),
+        )
+        for way in found.calibrations
+    ]
+    show_table(("calibration", "axes", "by hand", "calibration error"), rows)
+
+
+def _show_cameras(found: Sequence[Ability], axes: Sequence[str]) -> None:
+    """Print the best calibration of each camera on a rig with these axes."""
+    from emmc_rig.captures.bench_check import shown_error
+
+    heads = ("camera", "shots", "calibration", "by hand", "calibration error", "with one more axis")
+    rows = [
+        (
+            fit.camera,
+            f"{fit.shots} of {fit.of_shots}",
+            fit.best.name,
+            f"{fit.hands(fit.best) + fit.by_hand} moves",
+            shown_error(fit.best.error),
+            fit.more(axes),
+        )
+        for fit in found
+    ]
+    show_table(heads, rows)
 
 
 @app.command()

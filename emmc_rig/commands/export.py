@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from emmc_rig.commands.options import ExportSizeOption
+from emmc_rig.commands.options import ExportSizeOption, TruthOption, out_option
 from emmc_rig.commands.output import give_result, shown_progress, tell
+
+if TYPE_CHECKING:
+    from emmc_rig.formats.format import Film, Format
 
 
 def export(
@@ -36,22 +39,16 @@ def export(
     list_formats: Annotated[
         bool, typer.Option("--list", help="list the formats: what each is, and keeps")
     ] = False,
-    truth: Annotated[
-        str | None,
-        typer.Option("--truth", help="the scene that was captured, to compare with in the viewer"),
-    ] = None,
+    truth: TruthOption = None,
     size: ExportSizeOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="folder to write (default: emmc-FORMAT)")
-    ] = None,
+    out: Annotated[Path | None, out_option("emmc-FORMAT")] = None,
 ) -> None:
     """Export a light field or Psi to other programs, or as a viewer."""
-    from emmc_rig.formats.exports import film_of, open_export
+    from emmc_rig.formats.exports import film_of
     from emmc_rig.formats.registry import ALIASES, FORMATS
     from emmc_rig.report.viewer import VIEWER
-    from emmc_rig.store.folders import result_folder
     from emmc_rig.store.result_files import holds_light_field
-    from emmc_rig.store.results import parse_size, shown_bytes, write_metrics
+    from emmc_rig.store.results import parse_size
 
     if of is not None and result != "psi":
         raise typer.BadParameter(f"'{of}': export one light field at a time")
@@ -75,28 +72,37 @@ def export(
     film = film_of(result)
     if film is not None and truth is not None:
         raise typer.BadParameter(f"--truth: export a single frame, such as {film.first.source}")
+    _write_as(known[form], result, truth, parse_size(size), film, named, out)
+
+
+def _write_as(
+    kind: Format,
+    source: str,
+    truth: str | None,
+    size: tuple[int, int] | None,
+    film: Film | None,
+    named: str,
+    out: Path,
+) -> None:
+    """Write a light field, or a film, in a format; named: the format as typed."""
+    from emmc_rig.formats.exports import open_export
+    from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import shown_bytes, write_metrics
+
     with result_folder(out, f"export --format {named}") as folder, shown_progress("read") as bars:
         if film is None:
-            opened = open_export(result, truth, parse_size(size))
+            opened = open_export(source, truth, size)
             facts: dict[str, object] = {"shape": list(opened.light_field.shape)}
             bars.begin("write")
-            known[form].write_whole(folder, opened)
+            kind.write_whole(folder, opened)
         else:
             facts = {"shape": list(film.shape), "missing_frames": film.missing}
             bars.begin("write", len(film.frames))
-            known[form].write_whole_film(folder, replace(film, watcher=bars))
+            kind.write_whole_film(folder, replace(film, watcher=bars))
         files = [path for path in folder.rglob("*") if path.is_file()]
         written = sum(path.stat().st_size for path in files)
-        write_metrics(
-            folder,
-            {
-                "source": result,
-                "format": form,
-                "keeps": known[form].keeps,
-                **facts,
-                "bytes": written,
-            },
-        )
+        about = {"source": source, "format": kind.name, "keeps": kind.keeps}
+        write_metrics(folder, {**about, **facts, "bytes": written})
         shown = files[0].relative_to(folder) if len(files) == 1 else None
     tell(f"wrote {out / shown if shown else out}, {shown_bytes(written)} in {len(files)} file(s)")
     give_result(out)

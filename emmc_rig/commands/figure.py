@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import ExportSizeOption, OutOption
+from emmc_rig.commands.options import ExportSizeOption, OutOption, TruthOption
 from emmc_rig.commands.output import give_result, shown_progress, tell
 
 
@@ -15,9 +15,7 @@ def figure(
     results: Annotated[
         list[str], typer.Argument(help="folders of `reconstruct` or `demo`, or sessions")
     ],
-    truth: Annotated[
-        str | None, typer.Option("--truth", help="the scene that was captured: adds errors, PSNR")
-    ] = None,
+    truth: TruthOption = None,
     view: Annotated[
         str | None,
         typer.Option(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from emmc_rig.commands.options import CameraOption, OutOption
 from emmc_rig.commands.output import give_result, say, shown_progress, tell
 
 
@@ -17,10 +18,8 @@ def import_(
             help="CSV with a row for each file: file, kind, exposure_s and more, see docs"
         ),
     ] = None,
-    camera: Annotated[str, typer.Option("--camera", help="a shipped camera, or a YAML file")] = "",
-    out: Annotated[Path, typer.Option("--out", help="folder of the session to write")] = Path(
-        "emmc-session"
-    ),
+    camera: CameraOption = "",
+    out: OutOption = Path("emmc-session"),
     shots: Annotated[
         list[str] | None,
         typer.Option(

@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from emmc_rig.commands.modes import given_names, refuse
-from emmc_rig.commands.options import SIMULATED, RigOption, RigSceneOption, RigSizeOption
+from emmc_rig.commands.options import (
+    SIMULATED_PANEL,
+    HostOption,
+    MethodOption,
+    RigOption,
+    RigSceneOption,
+    RigSizeOption,
+    StageOption,
+)
 from emmc_rig.commands.output import say, shown_progress, tell
 from emmc_rig.drivers.cameras import CAMERA_HELP
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
     from emmc_rig.calibration.scale import Scale
+    from emmc_rig.drivers.camera import Camera as DeviceCamera
+    from emmc_rig.drivers.stage import Stage
     from emmc_rig.live.light_field import LiveLightField
     from emmc_rig.live.watch import Watch
     from emmc_rig.model.camera import Camera
@@ -31,15 +41,13 @@ def live(
     camera: Annotated[
         str | None, typer.Option("--camera", help=f"{CAMERA_HELP} or simulated")
     ] = None,
-    stage: Annotated[
-        str | None, typer.Option("--stage", help="zaber:PORT, grbl:PORT, apt:PORT or a YAML file")
-    ] = None,
+    stage: StageOption = None,
     design: Annotated[
         str,
         typer.Option(
             "--design",
             help="the camera whose masks are in it, see `emmc-rig cameras`",
-            rich_help_panel=SIMULATED,
+            rich_help_panel=SIMULATED_PANEL,
         ),
     ] = "rgbw-bayer-1shot",
     scene: RigSceneOption = "deep-occlusions",
@@ -52,17 +60,14 @@ def live(
             "`design`",
         ),
     ] = None,
-    method: Annotated[
-        str | None,
-        typer.Option("--method", help="reconstructs the light field beside the preview"),
-    ] = None,
+    method: MethodOption = None,
     plan: Annotated[
         Path | None,
         typer.Option(
             "--plan", help="a plan into which the page may write; into the file of --rig, too"
         ),
     ] = None,
-    host: Annotated[str, typer.Option("--host", help="address to serve the page at")] = "127.0.0.1",
+    host: HostOption = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
     read_only: Annotated[
         bool, typer.Option("--read-only", help="the page moves and sets nothing")
@@ -131,9 +136,8 @@ def _watch(
     plan: Path | None,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
-    from emmc_rig.bench.hardware import SIMULATED, SimulatedRig, open_camera, open_stage
+    from emmc_rig.bench.hardware import SIMULATED
     from emmc_rig.captures.plan import load_plan
-    from emmc_rig.drivers.errors import UsbNotFoundError
     from emmc_rig.formats.cameras import find_camera
     from emmc_rig.live.save import Files
     from emmc_rig.live.watch import Watch
@@ -145,39 +149,67 @@ def _watch(
     if plan is not None:
         load_plan(plan)
     with ExitStack() as stack:
-        if rig is not None:
-            from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
-            from emmc_rig.store.results import parse_size
-
-            imaged = ImagedRig(scene=scene, size=parse_size(size), real_time=True)
-            opened = stack.enter_context(
-                opened_rig(rig_description(rig, imaged), described, _nobody)
-            )
-            look, targets = None, ()
-            if isinstance(opened, SimulatedRig):
-                opened.attendant.set_lamp("white")
-                open_um = {"aperture_x": opened.window_um, "aperture_y": 0.0}
-                by_hand = {a: um for a, um in open_um.items() if a not in opened.stage.axes}
-                opened.attendant.move(by_hand)
-                look, targets = opened.attendant.place, ("scene", "whiteboard")
-            centre_um = dict(opened.zero_um)
-            if "aperture_x" in centre_um:
-                centre_um["aperture_x"] += opened.window_um
-            field = _light_field(psi, scale, method, described, opened.camera.shape)
-            moved = opened.stage if opened.stage.axes else None
-            watch = Watch(
-                opened.camera, moved, look, targets, centre_um, described, field, files, following
-            )
+        if rig is None:
+            devices = _named_devices(stack, camera, stage)
         else:
-            try:
-                device = stack.enter_context(closing(open_camera(camera or "ptp:")))
-            except UsbNotFoundError as fault:
-                raise AppError(f"{fault}; to look around without one: --rig simulated") from fault
-            driven = stack.enter_context(open_stage(stage)) if stage is not None else None
-            field = _light_field(psi, scale, method, described, device.shape)
-            watch = Watch(device, driven, design=described, light_field=field, saved=files)
+            devices = _devices_of_rig(stack, rig, described, scene, size)
+        field = _light_field(psi, scale, method, described, devices.camera.shape)
+        watch = Watch(
+            devices.camera, devices.stage, devices.place, devices.targets, devices.centre_um,
+            described, field, files, following,
+        )  # fmt: skip
         stack.callback(watch.close)
         yield watch
+
+
+class _Devices(NamedTuple):
+    """What a page shows and moves.
+
+    place: puts a target before the camera; None where a person does. centre_um: position of each
+    axis at which the masks and the aperture are centred.
+    """
+
+    camera: DeviceCamera
+    stage: Stage | None
+    place: Callable[..., None] | None = None
+    targets: tuple[str, ...] = ()
+    centre_um: Mapping[str, float] | None = None
+
+
+def _devices_of_rig(
+    stack: ExitStack, rig: str, design: Camera, scene: str, size: str | None
+) -> _Devices:
+    """Open the devices of a rig until the stack closes; a simulated one with its aperture open."""
+    from emmc_rig.bench.hardware import SimulatedRig
+    from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
+    from emmc_rig.store.results import parse_size
+
+    imaged = ImagedRig(scene=scene, size=parse_size(size), real_time=True)
+    opened = stack.enter_context(opened_rig(rig_description(rig, imaged), design, _nobody))
+    place, targets = None, ()
+    if isinstance(opened, SimulatedRig):
+        opened.attendant.set_lamp("white")
+        open_um = {"aperture_x": opened.window_um, "aperture_y": 0.0}
+        by_hand = {axis: um for axis, um in open_um.items() if axis not in opened.stage.axes}
+        opened.attendant.move(by_hand)
+        place, targets = opened.attendant.place, ("scene", "whiteboard")
+    centre_um = dict(opened.zero_um)
+    if "aperture_x" in centre_um:
+        centre_um["aperture_x"] += opened.window_um
+    moved = opened.stage if opened.stage.axes else None
+    return _Devices(opened.camera, moved, place, targets, centre_um)
+
+
+def _named_devices(stack: ExitStack, camera: str | None, stage: str | None) -> _Devices:
+    """Open a camera, by default a USB camera, and a stage if one is named."""
+    from emmc_rig.bench.hardware import open_camera, open_stage
+    from emmc_rig.drivers.errors import UsbNotFoundError
+
+    try:
+        device = stack.enter_context(closing(open_camera(camera or "ptp:")))
+    except UsbNotFoundError as fault:
+        raise AppError(f"{fault}; to look around without one: --rig simulated") from fault
+    return _Devices(device, None if stage is None else stack.enter_context(open_stage(stage)))
 
 
 def _scale(psi: str | None) -> Scale | None:

@@ -13,8 +13,7 @@ import typer
 from typer.core import TyperCommand
 from typer.main import get_command
 
-from emmc_rig.commands.advice import in_shell
-from emmc_rig.commands.output import emit, json_wanted
+from emmc_rig.commands.output import emit, in_shell, json_wanted
 from emmc_rig.errors import ERRORS
 
 MODES: dict[str, dict[str, set[str]]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -11,7 +11,7 @@ DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
 SIZE_VARIABLE = "EMMC_SIZE"
 """Environment variable: the --size where none is given, so that everything can be tried small."""
-SIMULATED, PARALLEL = "Simulated rig", "Large light fields"
+SIMULATED_PANEL, PARALLEL_PANEL = "Simulated rig", "Large light fields"
 """Panels of the help for options that few commands' users need."""
 
 SceneOption = Annotated[
@@ -41,12 +41,41 @@ ExportSizeOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="of the random scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
+
+
+def out_option(default: str) -> Any:
+    """Return the option --out of a command whose default folder depends on its arguments."""
+    return typer.Option("--out", help=f"folder to write (default: {default})")
+
+
+TruthOption = Annotated[
+    str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
+]
+MethodOption = Annotated[
+    str | None, typer.Option("--method", help="see `reconstruct --list` (default: adaptive)")
+]
+FastOption = Annotated[
+    bool,
+    typer.Option("--fast", help="small crops, few points: minutes instead of hours or days"),
+]
+ZarrOption = Annotated[
+    bool,
+    typer.Option(
+        "--zarr", help="write Zarr, for large light fields", rich_help_panel=PARALLEL_PANEL
+    ),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", min=1, help="processes that share the work", rich_help_panel=PARALLEL_PANEL
+    ),
+]
 ClusterOption = Annotated[
     str | None,
     typer.Option(
         "--cluster",
         help="tcp://HOST:PORT of a Dask scheduler, instead of --workers",
-        rich_help_panel=PARALLEL,
+        rich_help_panel=PARALLEL_PANEL,
     ),
 ]
 DictionaryOption = Annotated[
@@ -62,13 +91,22 @@ ScenesOption = Annotated[
 MethodsOption = Annotated[
     list[str] | None, typer.Option("--method", help="only this method; may repeat")
 ]
+HostOption = Annotated[
+    str, typer.Option("--host", help="address to serve the page at, for instance for a phone")
+]
+StageOption = Annotated[
+    str | None,
+    typer.Option(
+        "--stage", help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file"
+    ),
+]
 RigOption = Annotated[
     str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")
 ]
 RigSceneOption = Annotated[
     str,
     typer.Option(
-        "--scene", help="what its camera looks at, as in `demo`", rich_help_panel=SIMULATED
+        "--scene", help="what its camera looks at, as in `demo`", rich_help_panel=SIMULATED_PANEL
     ),
 ]
 RigSizeOption = Annotated[
@@ -77,7 +115,7 @@ RigSizeOption = Annotated[
         "--size",
         envvar=SIZE_VARIABLE,
         help="ROWSxCOLUMNS of the light field",
-        rich_help_panel=SIMULATED,
+        rich_help_panel=SIMULATED_PANEL,
     ),
 ]
 

@@ -17,12 +17,13 @@ object a line, and nothing else:
 from __future__ import annotations
 
 import json
+import shlex
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.box import SIMPLE
@@ -40,11 +41,33 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from emmc_rig.drivers.errors import AxisFaultError, NotHomedError, PositionMismatchError
+from emmc_rig.model.errors import AdvisedError
 from emmc_rig.progress import Watcher
+
+if TYPE_CHECKING:
+    from emmc_rig.study.points import Study
 
 console = Console(stderr=True)
 json_wanted: ContextVar[bool] = ContextVar("json_wanted", default=False)
 """Whether the running command was given --json."""
+WORDS = {
+    "name-frame": "such as --frame 0",
+    "reconstruct": "run `emmc-rig reconstruct {about}`",
+    "capture": "go on with: emmc-rig capture {about}",
+    "capture-edited": "an edited copy of the plan: emmc-rig capture COPY.yaml --out {about}",
+    "name-rig": "such as --rig simulated",
+    "other-devices": "say so by --other-devices",
+    "new-plan": "`emmc-rig capture --new CAMERA` writes one",
+    "plan-whiteboards": "`emmc-rig calibrate --plan` writes a plan that has them",
+    "plan-open-whiteboards": "`emmc-rig calibrate --plan --skip aperture` writes such a plan",
+    "list-cameras": "`emmc-rig cameras` lists the shipped ones",
+    "list-sessions": "`emmc-rig session list` shows the sessions there are",
+    "list-formats": "`emmc-rig export --list` marks them",
+}
+"""What helps against an error, by its `Advice`, in words of the command line."""
+HOME = "home by `emmc-rig devices home {about} --stage STAGE`"
+TO_HOME = (NotHomedError, AxisFaultError, PositionMismatchError)
 VERDICT_COLOURS = {"trust": "green", "cannot tell": "cyan", "doubt": "yellow", "do not use": "red"}
 
 
@@ -98,6 +121,19 @@ def show_table(heads: Sequence[Any], rows: Iterable[Sequence[Any]], title: str =
     show(table)
 
 
+def show_study(study: Study, out: Path) -> None:
+    """Show the tables of a study, reasons why points are excluded, and its page; out: as typed."""
+    for item in study.shown():
+        if isinstance(item, str):
+            tell(item)
+        else:
+            show_table(item.heads, item.rows, item.title)
+    for line in study.excluded():
+        say("excluded", line)
+    tell(f"{study.seconds:.0f} s; open {out / study.page}")
+    give_result(out)
+
+
 def give_result(out: Path | None = None, **facts: Any) -> None:
     """Give the command's result to a script; out: a folder with metrics.json, or a file."""
     if not json_wanted.get():
@@ -114,6 +150,20 @@ def give_result(out: Path | None = None, **facts: Any) -> None:
 def emit(event: str, **facts: Any) -> None:
     """Print an event as one line of JSON."""
     print(json.dumps({"event": event, **facts}, allow_nan=False), flush=True)
+
+
+def in_shell(fault: BaseException) -> str:
+    """Return an error's line and notes, with the commands or flags that help against its cause."""
+    return "; ".join([str(fault), *getattr(fault, "__notes__", ()), *dict.fromkeys(_typed(fault))])
+
+
+def _typed(fault: BaseException | None) -> Iterator[str]:
+    while fault is not None:
+        if isinstance(fault, AdvisedError) and fault.advice is not None:
+            yield WORDS[fault.advice].format(about=shlex.quote(str(fault.about)))
+        if isinstance(fault, TO_HOME):
+            yield HOME.format(about=fault.axis)
+        fault = fault.__cause__
 
 
 class Shown(Watcher):

@@ -8,11 +8,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from emmc_rig.commands.options import PARALLEL, ClusterOption, DictionaryOption, check_workers
+from emmc_rig.commands.options import (
+    PARALLEL_PANEL,
+    ClusterOption,
+    DictionaryOption,
+    MethodOption,
+    TruthOption,
+    WorkersOption,
+    ZarrOption,
+    check_workers,
+    out_option,
+)
 from emmc_rig.commands.output import give_result, say, show_verdict, shown_progress, tell
 
 if TYPE_CHECKING:
     from emmc_rig.process.captures import Capture
+    from emmc_rig.process.reconstructing import Place
 
 DEFAULT = Path("emmc-reconstruction")
 """The folder that is written, unless it is in a session."""
@@ -23,9 +34,7 @@ def reconstruct(
         list[Path] | None,
         typer.Argument(help="sessions, or folders that `demo` or `simulate` wrote"),
     ] = None,
-    method: Annotated[
-        str | None, typer.Option("--method", help="see --list (default: adaptive)")
-    ] = None,
+    method: MethodOption = None,
     list_methods: Annotated[
         bool,
         typer.Option("--list", help="list the methods: what each assumes and how long it takes"),
@@ -41,9 +50,7 @@ def reconstruct(
             "--settings", help="YAML of settings of methods: tv, sparse, adaptive, film, blocks"
         ),
     ] = None,
-    truth: Annotated[
-        str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
-    ] = None,
+    truth: TruthOption = None,
     without_shots: Annotated[
         list[int] | None,
         typer.Option("--without-shots", help="exclude a shot, counted from 1; may repeat"),
@@ -52,30 +59,15 @@ def reconstruct(
         int | None,
         typer.Option("--frame", min=0, help="one frame of a film alone, counted from 0"),
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            "--workers",
-            min=1,
-            help="processes that share blocks, captures, and segments of a film",
-            rich_help_panel=PARALLEL,
-        ),
-    ] = None,
+    workers: WorkersOption = None,
     cluster: ClusterOption = None,
-    as_zarr: Annotated[
-        bool,
-        typer.Option(
-            "--zarr",
-            help="write result.zarr instead of one HDF5 file",
-            rich_help_panel=PARALLEL,
-        ),
-    ] = False,
+    as_zarr: ZarrOption = False,
     memory: Annotated[
         str | None,
         typer.Option(
             "--memory",
             help="most memory of all processes together, as 2GiB",
-            rich_help_panel=PARALLEL,
+            rich_help_panel=PARALLEL_PANEL,
         ),
     ] = None,
     budget: Annotated[
@@ -85,17 +77,11 @@ def reconstruct(
     strict: Annotated[
         bool, typer.Option("--strict", help="exit code 1 where the verdict is: do not use")
     ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            help="folder to write (default: in a session, else emmc-reconstruction)",
-        ),
-    ] = None,
+    out: Annotated[Path | None, out_option("in a session, else emmc-reconstruction")] = None,
 ) -> None:
     """Reconstruct light fields from frames, or a film of them, with a verdict."""
     from emmc_rig.process.captures import opened_capture
-    from emmc_rig.process.memory import parse_memory
+    from emmc_rig.process.cost import method_within, parse_memory
     from emmc_rig.process.reconstructing import load_settings, reconstruct_captures
     from emmc_rig.reconstruction.methods import DEFAULT_METHOD, find_method
 
@@ -109,56 +95,62 @@ def reconstruct(
     check_workers(workers, cluster)
     if memory is not None and cluster is not None:
         raise typer.BadParameter("--memory is for this machine only: leave it out with --cluster")
-    chosen, why = load_settings(settings), None
+    chosen, limit = load_settings(settings), None if memory is None else parse_memory(memory)
     captures = [opened_capture(folder) for folder in frames]
     films = [capture for capture in captures if capture.planned_frames]
     if films and frame is None:
-        others = {
+        ignored = {
             "--truth": truth, "--without-shots": without_shots, "--zarr": as_zarr,
             "--budget": budget, "--dictionary": dictionary,
         }  # fmt: skip
         if len(frames) > 1:
             raise typer.BadParameter("a film is reconstructed alone: name one session")
-        for name, given in others.items():
+        for name, given in ignored.items():
             if given:
                 raise typer.BadParameter(f"{name}: not of a film; leave it out, or add --frame")
         ((_, written),) = _places(captures, out)
         _film(
             films[0], written, strict, method=method or DEFAULT_METHOD, psi_path=psi,
-            settings=chosen, memory=None if memory is None else parse_memory(memory),
-            workers=workers, cluster=cluster,
+            settings=chosen, memory=limit, workers=workers, cluster=cluster,
         )  # fmt: skip
         return
     if frame is not None and not (films and len(frames) == 1):
         raise typer.BadParameter("--frame: is of a film; name one session that holds a film")
+    why = None
     if budget is not None:
         if method is not None or settings is not None:
             raise typer.BadParameter(
                 "--budget chooses method and settings: leave --method and --settings out"
             )
-        from emmc_rig.process.budget import method_within
-
         method, why = method_within(*captures[0].loaded(psi, frame), budget)
         say("chosen", why, "cyan")
     method = method or DEFAULT_METHOD
     if dictionary is not None and not find_method(method).needs_dictionary:
         raise typer.BadParameter(f"--dictionary: no effect on --method {method}; leave it out")
     places = _places(captures, out if frame is None else out or DEFAULT)
-    limit = None if memory is None else parse_memory(memory)
-    failed, refused = False, False
     with shown_progress() as bars:
         bars.begin(method if len(places) == 1 else f"{method}, {len(places)} captures", None)
-        done = []
-        for place, outcome in reconstruct_captures(
-            places, workers, cluster, limit, bars,
-            method=method, psi_path=psi, dictionary_spec=dictionary, settings=chosen, truth=truth,
-            chosen=why, as_zarr=as_zarr, without_shots=without_shots or (), frame=frame,
-        ):  # fmt: skip
-            if isinstance(outcome, Exception) and len(places) == 1:
-                raise outcome
-            done.append((place, outcome))
-    for (capture, written), outcome in done:
-        if len(places) > 1:
+        outcomes = list(
+            reconstruct_captures(
+                places, workers, cluster, limit, bars,
+                method=method, psi_path=psi, dictionary_spec=dictionary, settings=chosen,
+                truth=truth, chosen=why, as_zarr=as_zarr, without_shots=without_shots or (),
+                frame=frame,
+            )
+        )  # fmt: skip
+        if len(outcomes) == 1 and isinstance(outcomes[0][1], Exception):
+            raise outcomes[0][1]
+    _show_outcomes(outcomes, strict)
+
+
+def _show_outcomes(outcomes: Sequence[tuple[Place, dict | Exception]], strict: bool) -> None:
+    """Print each capture's result or error; raises Exit for an error.
+
+    strict: also for a light field with the verdict "do not use".
+    """
+    failed = False
+    for (capture, written), outcome in outcomes:
+        if len(outcomes) > 1:
             tell(f"{capture.folder}:")
         if isinstance(outcome, Exception):
             tell(f"failed: {outcome}", "red")
@@ -167,8 +159,8 @@ def reconstruct(
         _say_result(outcome, written)
         show_verdict(outcome["verdict"])
         give_result(written)
-        refused = refused or outcome["verdict"]["level"] == "do not use"
-    if failed or (strict and refused):
+        failed |= strict and outcome["verdict"]["level"] == "do not use"
+    if failed:
         raise typer.Exit(1)
 
 

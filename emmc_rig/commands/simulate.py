@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from emmc_rig.commands.options import (
     DEFAULT_CAMERA,
@@ -16,6 +14,7 @@ from emmc_rig.commands.options import (
     SeedOption,
     ShotsOption,
     SizeOption,
+    ZarrOption,
 )
 from emmc_rig.commands.output import give_result, shown_progress, tell
 
@@ -30,9 +29,7 @@ def simulate(
     seed: SeedOption = 0,
     size: SizeOption = None,
     out: OutOption = Path("emmc-frames"),
-    as_zarr: Annotated[
-        bool, typer.Option("--zarr", help="write frames and Psi as Zarr, for large ones")
-    ] = False,
+    as_zarr: ZarrOption = False,
 ) -> None:
     """Simulate the frames that a camera takes of a light field."""
     import emmc_rig as emmc

@@ -8,26 +8,24 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import (
-    PARALLEL,
+    DEFAULT_CAMERA,
+    CameraOption,
     ClusterOption,
     DictionaryOption,
+    FastOption,
     OutOption,
     ScenesOption,
     SeedOption,
     SizeOption,
+    WorkersOption,
     check_workers,
 )
-from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
+from emmc_rig.commands.output import give_result, show_study, show_table, shown_progress
 
 
 def stability(
     scene: ScenesOption = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            "--camera", help="a shipped camera or a YAML file (default: rgbw-bayer-3shots)"
-        ),
-    ] = None,
+    camera: CameraOption = DEFAULT_CAMERA,
     fault: Annotated[
         list[str] | None, typer.Option("--fault", help="only this fault; may repeat")
     ] = None,
@@ -35,22 +33,12 @@ def stability(
         list[str] | None,
         typer.Option("--method", help="only this method, or `all`; may repeat"),
     ] = None,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="one small crop, few points: minutes instead of hours")
-    ] = False,
+    fast: FastOption = False,
     faults: Annotated[bool, typer.Option("--list", help="list the faults, and exit")] = False,
     dictionary: DictionaryOption = None,
     size: SizeOption = None,
     seed: SeedOption = 0,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            "--workers",
-            min=1,
-            help="processes that share the trials",
-            rich_help_panel=PARALLEL,
-        ),
-    ] = None,
+    workers: WorkersOption = None,
     cluster: ClusterOption = None,
     out: OutOption = Path("emmc-stability"),
 ) -> None:
@@ -59,28 +47,20 @@ def stability(
     The same command goes on where it stopped.
     """
     from emmc_rig.store.results import parse_size
-    from emmc_rig.study.stability.curves import breaking_rows
-    from emmc_rig.study.stability.stability_run import run_stability
-    from emmc_rig.study.stability.stability_study import CAMERA, stability_settings
+    from emmc_rig.study.stability.stability_study import StabilityStudy, stability_settings
 
     if faults:
         _list_faults()
         return
     check_workers(workers, cluster)
     settings = stability_settings(
-        fast, scene or [], parse_size(size), camera=camera or CAMERA, faults=tuple(fault or []),
+        fast, scene or [], parse_size(size), camera=camera, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
     )  # fmt: skip
+    study = StabilityStudy(settings, out)
     with shown_progress() as bars:
-        outcome = run_stability(settings, out, bars, workers=workers, cluster=cluster)
-    rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
-    title = f"{outcome.curves[0].scene}: falls 3 dB below its best / below the baseline at"
-    shown = [(f"{fault.title}, {fault.unit}", *cells) for fault, cells in rows]
-    show_table(("fault", *methods), shown, title)
-    for line in outcome.left_out:
-        say("excluded", line)
-    tell(f"open {outcome.page}")
-    give_result(out)
+        study.carry_out(bars, workers, cluster)
+    show_study(study, out)
 
 
 def _list_faults() -> None:

@@ -29,7 +29,7 @@ from emmc_rig.calibration.scale import Scale, exposure_of
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.formats.format import Export
-from emmc_rig.live.server import Picture, Pictured, Query
+from emmc_rig.live.served_page import Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -377,7 +377,7 @@ def export_of(
 def field_pictures(
     newest: Callable[[], Pictures | None],
 ) -> dict[str, Pictured]:
-    """Return what a `emmc_rig.live.server.Page` serves of a light field."""
+    """Return what a `served_page.Page` serves of a light field."""
 
     def light_field(query: Query) -> Picture | None:
         shown = newest()

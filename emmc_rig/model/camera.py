@@ -470,58 +470,81 @@ def pixel_light(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32]:
     return colours * k**2
 
 
+def _cells_seen(
+    camera: Camera, plates: dict[str, Plate], shot: int, axis: int, along: _Axis
+) -> dict[str, list[CellWeights]]:
+    """Return the matrix (sample, cell) of each view along an axis, by mask in the beam of a shot.
+
+    axis: 0: y, 1: x. along: that axis, or a part of every sample and view on it. Raises CameraError
+    for a mask smaller than the beam.
+    """
+    seen = {}
+    for name in camera.shot_masks(shot):
+        plate = plates[name]
+        offset_um = camera.shots[shot].offset_um.get(name, (0.0, 0.0))[1 - axis]
+        try:
+            seen[name] = [
+                along.weights(view, plate, plate.cells.shape[1 + axis], offset_um)
+                for view in range(camera.views[axis])
+            ]
+        except CameraError as fault:
+            raise CameraError(f"mask '{name}', shot {shot}: {fault}") from fault
+    return seen
+
+
 def _transmittances(
     camera: Camera, size: tuple[int, int], plates: dict[str, Plate], shot: int
 ) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
     """Yield (v, u, transmittance (y, x, colour)) of all masks together, averaged over footprints.
 
-    One mask whose footprint covers several cells is averaged exactly. The average of the product
-    of two such masks is not the product of their averages: pixels and aperture cells are then
-    split in `footprint_splits` along each axis, and the products of the parts averaged.
+    A footprint is the product of one along y and one along x, so that of each mask m, exactly,
+
+        t_m[y, x] = sum_ij  D_m[y, i]  cells_m[i, j]  R_m[x, j]
+
+    with D (down) for the view's row v and R (right) for its column u, see `_cells_seen`.
+
+    The average of a product of masks is not the product of their averages where the footprints on
+    two masks cover several cells. Samples and views are then split into k = `footprint_splits`
+    parts along each axis, and
+
+        t = k^-4  sum over the parts along y and along x of  prod_m t_m(parts).
     """
     axes = _axes(camera, size)
-    names = camera.shot_masks(shot)
-
-    def factors(
-        axis: int, splits: int, sample_part: int, view_part: int
-    ) -> dict[tuple[str, int], CellWeights]:
-        part = axes[axis].split(splits, sample_part, view_part)
-        found = {}
-        for name in names:
-            views = _weights_of_views(camera, axis, name, plates[name], shot, part)
-            found |= {(name, view): weights for view, weights in enumerate(views)}
-        return found
-
-    whole = [factors(axis, 1, 0, 0) for axis in (0, 1)]
-    partly = {
-        name for weights in whole for (name, _), matrix in weights.items() if matrix.splits_cells
+    whole = [_cells_seen(camera, plates, shot, axis, along) for axis, along in enumerate(axes)]
+    split_masks = {
+        name
+        for seen in whole
+        for name, of_views in seen.items()
+        if any(matrix.splits_cells for matrix in of_views)
     }
-    splits = camera.footprint_splits if len(partly) > 1 else 1
-    parts = [(i, j) for i in range(splits) for j in range(splits)]
-    by_part = [
-        {part: whole[axis] if splits == 1 else factors(axis, splits, *part) for part in parts}
-        for axis in (0, 1)
-    ]
-    rows, columns = size
+    splits = camera.footprint_splits if len(split_masks) > 1 else 1
+    down, right = [whole[0]], [whole[1]]
+    if splits > 1:
+        down, right = (
+            [
+                _cells_seen(camera, plates, shot, axis, along.split(splits, sample_part, view_part))
+                for sample_part, view_part in np.ndindex(splits, splits)
+            ]
+            for axis, along in enumerate(axes)
+        )
+    cells = {
+        name: plates[name].cells[shot % len(plates[name].cells)] for name in camera.shot_masks(shot)
+    }
     for v in range(camera.views[0]):
-        upper = {
-            (name, part, colour): by_part[0][part][name, v]
-            @ plates[name].cells[shot % len(plates[name].cells), :, :, colour]
-            for name in names
-            for part in parts
-            for colour in range(3)
-        }
+        rows_seen = [
+            {name: [seen[name][v] @ cells[name][:, :, c] for c in range(3)] for name in cells}
+            for seen in down
+        ]
         for u in range(camera.views[1]):
-            total = np.zeros((rows, columns, 3), dtype=np.float32)
-            for part_y in parts:
-                for part_x in parts:
-                    product = np.ones((rows, columns, 3), dtype=np.float32)
-                    for name in names:
-                        right = by_part[1][part_x][name, u]
-                        for colour in range(3):
-                            product[:, :, colour] *= (right @ upper[name, part_y, colour].T).T
+            total = np.zeros((*size, 3), dtype=np.float32)
+            for of_rows in rows_seen:
+                for seen in right:
+                    product = np.ones((*size, 3), dtype=np.float32)
+                    for name, of_colours in of_rows.items():
+                        for colour, row_of_cells in enumerate(of_colours):
+                            product[:, :, colour] *= (seen[name][u] @ row_of_cells.T).T
                     total += product
-            total /= len(parts) ** 2
+            total /= splits**4
             yield v, u, total
 
 
@@ -570,35 +593,23 @@ def _passed_to_all(
 ) -> NDArray[np.float64]:
     """Return the sum over the views of what `_transmittances` yields, (y, x, colour).
 
-    Rows and columns of one mask are separable, so that their sums over the views are summed apart.
+    Of a single mask it is separable: sum_vu t = (sum_v D_v) cells (sum_u R_u)^T.
     """
     names = camera.shot_masks(shot)
     if len(names) != 1:
         every = (passed for _, _, passed in _transmittances(camera, size, plates, shot))
         return np.asarray(sum(every), dtype=np.float64)
     (name,) = names
-    upper, right = (
-        CellWeights.summed([*_weights_of_views(camera, axis, name, plates[name], shot, along)])
+    down, right = (
+        CellWeights.summed(_cells_seen(camera, plates, shot, axis, along)[name])
         for axis, along in enumerate(_axes(camera, size))
     )
     cells = plates[name].cells[shot % len(plates[name].cells)]
-    return np.stack([upper @ (right @ cells[:, :, c].T).T for c in range(3)], axis=-1)
-
-
-def _weights_of_views(
-    camera: Camera, axis: int, name: str, plate: Plate, shot: int, along: _Axis
-) -> Iterator[CellWeights]:
-    """Yield (sample, cell) of each view along an axis, 0: y, 1: x. Raises CameraError."""
-    offset = camera.shots[shot].offset_um.get(name, (0.0, 0.0))[1 - axis]
-    for view in range(camera.views[axis]):
-        try:
-            yield along.weights(view, plate, plate.cells.shape[1 + axis], offset)
-        except CameraError as fault:
-            raise CameraError(f"mask '{name}', shot {shot}: {fault}") from fault
+    return np.stack([down @ (right @ cells[:, :, c].T).T for c in range(3)], axis=-1)
 
 
 def _shares(camera: Camera, size: tuple[int, int]) -> list[NDArray[np.float32]]:
-    """Return the share of each colour in an open camera's Psi, (y, x, colour) of each shot."""
+    """Return an open camera's Psi, r / (sum_c r  V U k^2), (y, x, colour) of each shot."""
     response = sensor_response(camera, size)
     scale = camera.views[0] * camera.views[1] * camera.sensor.binning**2
     return [
@@ -612,10 +623,14 @@ def build_imaging_matrix(
 ) -> ImagingMatrix:
     """Return Psi of a camera for a light field of `size` (rows, columns) samples (paper, eq. 6, 7).
 
-    plates: the masks as they came out, by name; None: as drawn, see `draw_plates`.
+        Psi[s, v, u, y, c, x] = t[s, v, u, y, x, c]  r[s, y, x, c] / (sum_c r  V U k^2)
 
-    Normalised so that the fully open camera reads 1 from a constant white light field, behind its
-    colour filters. Raises CameraError for a mask smaller than the beam, for pixels that do not
+    with the transmittance t of the masks (`_transmittances`), the response r of the colour filters,
+    0 or 1 (`sensor_response`), V x U views, and pixels of k x k samples: the fully open camera
+    reads 1 from a constant white light field. plates: the masks as they came out, by name; None:
+    as drawn, see `draw_plates`.
+
+    Raises CameraError for a mask smaller than the beam, for pixels that do not
     divide the light field, and for a shot that no light reaches.
     """
     plates = draw_plates(camera, size) if plates is None else plates

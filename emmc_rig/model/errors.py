@@ -2,8 +2,14 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Literal
 
-from emmc_rig.model.advice import AdvisedError
+Advice = Literal[
+    "capture", "capture-edited", "list-cameras", "list-formats", "list-sessions", "name-frame",
+    "name-rig", "new-plan", "other-devices", "plan-open-whiteboards", "plan-whiteboards",
+    "reconstruct",
+]  # fmt: skip
+"""What helps against an error, as data: each front end words it for its reader."""
 
 
 def nearest_of(name: str, known: Iterable[str]) -> str:
@@ -16,6 +22,18 @@ def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.5) -> str:
     """Return "did you mean", with the known name that is nearest; "" where no name is near."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=likeness)
     return f"did you mean '{near[0]}'? " if near else ""
+
+
+class AdvisedError(Exception):
+    """An error with a line for the user, and advice for front ends.
+
+    about: the folder to reconstruct, or of the session to capture.
+    """
+
+    def __init__(self, text: str = "", advice: Advice | None = None, about: object = "") -> None:
+        super().__init__(text)
+        self.advice = advice
+        self.about = about
 
 
 class ModelError(AdvisedError):

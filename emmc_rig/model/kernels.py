@@ -17,7 +17,10 @@ from emmc_rig.model.compiling import njit
 
 @njit(forceinline=True, fastmath=True)
 def gather_row(weights, colour, block, part, shot, y, total):
-    """Add to total (x,) what one shot sees of row y; block[:, :, part] is that row."""
+    """Add a row of Psi L before binning: total[x] += sum_vuc W[shot, v, u, y, c, x] L[v, u, c, x].
+
+    block[:, :, part] is row y of L, (v, u, colour, x).
+    """
     views_v, views_u, stored, width = weights.shape[1], weights.shape[2], *weights.shape[4:]
     for v in range(views_v):
         for u in range(views_u):
@@ -37,7 +40,7 @@ def gather_row(weights, colour, block, part, shot, y, total):
 
 @njit(forceinline=True, fastmath=True)
 def spread_row(weights, colour, frame_row, shot, y, v, u, lines):
-    """Add to lines (colour, x), row y of view (v, u), the transpose of a shot on frame_row (x,)."""
+    """Add a row of Psi^T f for view (v, u): lines[c, x] += W[shot, v, u, y, c, x] frame_row[x]."""
     stored, width = weights.shape[4:]
     if stored == 1:
         weight = weights[shot, v, u, y, 0]
@@ -54,7 +57,13 @@ def spread_row(weights, colour, frame_row, shot, y, v, u, lines):
 
 @njit(forceinline=True, fastmath=True)
 def correct_row(inverse, frames, binning, row, seen):
-    """Turn seen (shot, x), sums over views per sample, into -(Psi Psi^T + Lambda)^-1 residual."""
+    """Turn sums over views per sample, seen (shot, x), into the correction of a row of pixels.
+
+    With the sums s of a pixel's samples, f its frames, and inverse = (Psi Psi^T + Lambda)^-1:
+
+        residual[shot] = s[shot] - f[shot]
+        seen[shot] = -sum_other inverse[shot, other] residual[other]    at each of its samples
+    """
     shots, width = seen.shape
     pixels = width // binning
     residual = np.zeros((shots, pixels), frames.dtype)
@@ -75,7 +84,11 @@ def correct_row(inverse, frames, binning, row, seen):
 
 @row_kernel("frames", 1, fastmath=True)
 def project(begin, end, weights, colour, light_field, binning, frames):
-    """Set frames = Psi light_field, a light field in its natural order (v, u, y, x, colour)."""
+    """Set frames f = Psi L of a light field L in its natural order (v, u, y, x, colour).
+
+    f[s, i, j] = sum of W[s, v, u, y, c, x] L[v, u, y, x, c], over v, u, c and the samples (y, x)
+                 of the pixel (i, j)
+    """
     shots, views_v, views_u, _, stored, width = weights.shape
     for row in range(begin, end):
         total = np.empty(width, frames.dtype)
@@ -106,7 +119,9 @@ def project(begin, end, weights, colour, light_field, binning, frames):
 
 @row_kernel("frames", 1, fastmath=True)
 def back_project(begin, end, weights, colour, frames, binning, light_field):
-    """Set light_field = Psi^T frames, a contiguous one in natural order (v, u, y, x, colour).
+    """Set a contiguous light field L = Psi^T f, in its natural order (v, u, y, x, colour).
+
+        L[v, u, y, x, c] = sum_s W[s, v, u, y, c, x] f[s, y // k, x // k]
 
     The first shot sets the samples and the others add to them: every row is written once.
     """
@@ -148,7 +163,10 @@ def back_project(begin, end, weights, colour, frames, binning, light_field):
 
 @row_kernel("blocks", 2)
 def gram(begin, end, weights, colour, binning, blocks):
-    """Set blocks (shot, shot, pixel_y, pixel_x), float64, to those of Psi Psi^T."""
+    """Set blocks (shot, shot, pixel_y, pixel_x), float64, to those of Psi Psi^T.
+
+    blocks[a, b, i, j] = sum of W_a W_b, over v, u, c and the samples of the pixel (i, j)
+    """
     shots, views_v, views_u, _, stored, width = weights.shape
     total = np.empty(width)
     for row in range(begin, end):
@@ -174,6 +192,10 @@ def gram(begin, end, weights, colour, binning, blocks):
 @row_kernel("blocks", 2)
 def invert_blocks(begin, end, blocks, ridge, inverse, failed):
     """Set inverse to (blocks + diag(ridge))^-1 per pixel, by Cholesky in float64.
+
+        blocks + diag(ridge) = lower lower^T
+        lower solved = 1
+        inverse = solved^T solved
 
     ridge: (shot, pixel_y, pixel_x), may be infinite (a measurement not to use).
     failed: (pixel_y,) counts the pixels of each row whose block is not positive definite.

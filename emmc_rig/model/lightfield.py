@@ -343,7 +343,7 @@ def sum_of_squares(values: np.ndarray) -> float:
 
 
 def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
-    """Peak signal-to-noise ratio for peak 1 over all samples; infinite when they are equal.
+    """Peak signal-to-noise ratio, -10 log10(mean squared error), dB; infinite for equal samples.
 
     Args:
         estimate: any shape.
@@ -364,8 +364,10 @@ def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
 def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Structural similarity, the mean over views, colours and every window inside a view.
 
-    Wang et al. 2004, eq. 13: Gaussian window of 11x11 pixels with sigma 1.5, K1 = 0.01,
-    K2 = 0.03, dynamic range 1.
+        SSIM = (2 m_a m_b + C1) (2 s_ab + C2) / ((m_a^2 + m_b^2 + C1) (s_a^2 + s_b^2 + C2))
+
+    with means m, variances s^2 and the covariance s_ab of a window: Gaussian, 11x11 pixels, sigma
+    1.5; C1 = 0.01^2 and C2 = 0.03^2 for values up to 1. Source: Wang et al. 2004, eq. 13.
 
     Args:
         estimate: (v, u, y, x, c).

@@ -1,8 +1,13 @@
 """The imaging matrix Psi as an operator: forward, adjoint, exact per-pixel solve, norms, export.
 
-Light fields have shape (v, u, y, x, c), frames (shot, pixel_y, pixel_x). The columns of Psi follow
-the light field's memory order, its rows the frames'. Every sample of the light field reaches one
-pixel only, so Psi Psi^T is block diagonal: one (shot x shot) block per pixel.
+Frames f (shot, pixel_y, pixel_x) of a light field L (v, u, y, x, c) are, with the weights W and
+pixels of k x k samples,
+
+    f[s, i, j] = sum of W[s, v, u, y, c, x] L[v, u, y, x, c], over v, u, c, y // k = i, x // k = j
+
+The columns of Psi follow the light field's memory order, its rows the frames'. Every sample of the
+light field reaches one pixel only, so Psi Psi^T is block diagonal: one (shot x shot) block per
+pixel.
 """
 
 from __future__ import annotations
@@ -70,6 +75,12 @@ def checksum_of(
 def rows_of_colours(light_field: Array) -> Array:
     """Return a view of a light field (v, u, y, x, c) as the solvers' (v, u, y, c, x)."""
     return np.moveaxis(light_field, -1, -2)
+
+
+def _check_binning(binning: object) -> None:
+    """Raise ArgumentError for what is no number of samples."""
+    if not isinstance(binning, int) or binning < 1:
+        raise refusal(binning, "binning", "the number of samples along a pixel's side")
 
 
 class PsiLayout:
@@ -272,7 +283,10 @@ class ImagingMatrix(PsiLayout):
 
     @cached_property
     def gram(self) -> NDArray[np.float64]:
-        """The blocks of Psi Psi^T: (shot, shot, pixel_y, pixel_x), float64."""
+        """The blocks of Psi Psi^T: (shot, shot, pixel_y, pixel_x), float64.
+
+        G[s, t, i, j] = sum over v, u, c, and the samples (y, x) of the pixel, of W_s W_t.
+        """
         blocks = np.empty((self.shots, *self.frames_shape), dtype=np.float64)
         kernels.gram(self.weights, self.colour_map, self.binning, blocks)
         return blocks
@@ -387,8 +401,7 @@ class ImagingMatrix(PsiLayout):
             raise refusal(matrix, "matrix", "a sparse matrix of SciPy")
         views = pair_of(views, "views", "rows and columns of views, such as (5, 5)")
         size = pair_of(size, "size", "rows and columns of samples, such as (192, 256)")
-        if not isinstance(binning, int) or binning < 1:
-            raise refusal(binning, "binning", "the number of samples along a pixel's side")
+        _check_binning(binning)
         summed = sparse.csr_array(matrix, dtype=np.float32, copy=True)
         summed.sum_duplicates()
         entries = sparse.coo_array(summed)
@@ -458,8 +471,7 @@ class ImagingMatrix(PsiLayout):
         given = numbers_of(weights, "weights", takes)
         if given.ndim not in (5, 6) or not given.size or given.shape[5:] not in ((), (3,)):
             raise refusal(weights, "weights", takes)
-        if not isinstance(binning, int) or binning < 1:
-            raise refusal(binning, "binning", "the number of samples along a pixel's side")
+        _check_binning(binning)
         given = given.astype(np.float32, copy=False)
         if not given.any():
             raise SensingError("weights that are all 0: no pixel sees any light")

@@ -23,16 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
-from emmc_rig.process.memory import peak_memory_mib, task_bytes
+from emmc_rig.process.cost import peak_memory_mib, task_bytes
 from emmc_rig.progress import Watcher
-from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.dictionary import Dictionary, open_dictionary
 from emmc_rig.reconstruction.methods import MethodSettings, find_method
 from emmc_rig.reconstruction.result import Reconstruction, Status, stated_figures
 from emmc_rig.reconstruction.tiles import (
@@ -55,8 +54,9 @@ from emmc_rig.reconstruction.tiles import (
 )
 from emmc_rig.reconstruction.verdict.evidence import Evidence
 from emmc_rig.reconstruction.verdict.rules import Verdict, verdict_from
-from emmc_rig.store.jobs import Store, digest_of, run_job, settled
+from emmc_rig.store.jobs import Store, run_job, settled
 from emmc_rig.store.pool import Pool
+from emmc_rig.store.products import digest_of
 from emmc_rig.store.psi import StoredPsi
 from emmc_rig.store.shards import create_array, created_group, opened_array
 from emmc_rig.version import __version__
@@ -169,7 +169,6 @@ def block_task(task: BlockTask) -> Generator[tuple[str, None], None, None]:
 
     Raises AppError naming the block where it fails, and OSError where it cannot be written.
     """
-    started = running_s()
     try:
         solved = _solved(task)
     except ERRORS as fault:
@@ -189,7 +188,6 @@ def block_task(task: BlockTask) -> Generator[tuple[str, None], None, None]:
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
             "variance": _variance(task.block, solved.arrays),
-            "seconds": running_s() - started,
             "peak_mib": peak_memory_mib(),
         },
     )
@@ -241,7 +239,7 @@ class BlockFiles(Store[None, DoneBlock]):
             method=task.job.method,
             light_field=np.empty((0, 0, 0, 0, 3), np.float32),
             objective=(),
-            seconds=kept["seconds"],
+            seconds=0.0,  # those of all blocks together are measured, see `Blocks`
             **figures,
         )
         evidence = kept["evidence"]

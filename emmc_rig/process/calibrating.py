@@ -98,17 +98,18 @@ def calibrate(
     after the scene, besides what `taken_s` shows of drift. What was not watched for that, the
     report says. Lamps of three colours are poses with their `lamp`.
 
-    `calibrate(session, method)` returns a calibration, whose `psi` it is. `calibrate(whiteboards,
-    poses, camera, darks=darks)` returns Psi and that calibration, whose `frames(dn)` are what the
-    same bench reads of a scene. In both `save(folder)` writes psi.h5 with a report.
+    `calibrate(session, method)` returns a calibration; its `psi` is the imaging matrix.
+    `calibrate(whiteboards, poses, camera, darks=darks)` returns that matrix and the calibration,
+    whose `frames(dn)` makes readings of the bench's raw frames. `save(folder)` of a calibration
+    writes psi.h5 with a report.
 
     Args:
         session: itself, or its folder. Or whiteboards, a list of arrays (repeat, y, x) in DN: at
             least a reference, of two repeats, one for validation, and as many as the method needs:
             through the open aperture with the mask in a few places, or through a pinhole of every
             view.
-        method: parametric, mixed or free; `auto` takes every one that there are whiteboards for,
-            and chooses. Or poses, a dict for each whiteboard with the keys of `Pose`.
+        method: parametric, mixed or free; `auto` tries all methods that the whiteboards suffice
+            for, and chooses. Or poses, a dict for each whiteboard with the keys of `Pose`.
         camera: as designed, of arrays; its noise has the white level.
         route: an earlier name of `method`.
         darks: of arrays, (repeat, y, x) in DN, the lamp off, at one exposure, or by exposures.
@@ -133,6 +134,7 @@ def calibrate(
 def _of_arrays(
     whiteboards: Any, poses: Any, camera: Camera, darks: Any
 ) -> tuple[ImagingMatrix, SessionCalibration]:
+    """Return Psi of arrays, and its calibration; see `calibrate`."""
     started = time.perf_counter()
     required(whiteboards, (list, tuple, np.ndarray), "whiteboards", "a list of arrays, DN")
     required(poses, (list, tuple), "poses", POSES_TAKE)
@@ -143,25 +145,49 @@ def _of_arrays(
         raise refusal(darks, "darks", DARKS_TAKE)
     _refuse_millimetres(stood, camera)
     exposed = darks if isinstance(darks, Mapping) else {stood[0].exposure_s: darks}
-    for exposure_s in exposed:
+    dark = _dark_frames(exposed, camera)
+    boards = _sorted_boards(whiteboards, stood, camera, dark)
+    k, (rows, columns) = camera.sensor.binning, dark[0].mean_dn.shape
+    outcome = boards_outcome(camera, (k * rows, k * columns), boards, "poses: they have")
+    metrics = calibration_metrics(outcome, camera.title, "", "auto", started)
+    chosen = outcome.calibration
+    good = outcome.good if chosen.good is None else chosen.good
+    scale = Scale(chosen.psi, chosen.white_dn_per_s, dark, chosen.gain, good)
+    return chosen.psi, SessionCalibration(outcome, chosen, scale, metrics)
+
+
+def _dark_frames(darks: Mapping[float, ArrayLike], camera: Camera) -> tuple[MeanFrame, ...]:
+    """Return the mean dark frame of each exposure; raises AppError for different sizes."""
+    for exposure_s in darks:
         required(exposure_s, Real, "an exposure of darks", "a number, as poses give it")
-    dark = tuple(
+    means = tuple(
         _mean(frames, float(exposure_s), camera, f"darks at {exposure_s:g}", lit=False)
-        for exposure_s, frames in exposed.items()
+        for exposure_s, frames in darks.items()
     )
-    sizes = {item.mean_dn.shape for item in dark}
+    sizes = {mean.mean_dn.shape for mean in means}
     if len(sizes) != 1:
         raise AppError(f"darks: of {len(sizes)} sizes, {', '.join(map(str, sorted(sizes)))} pixels")
+    return means
+
+
+def _sorted_boards(
+    whiteboards: Sequence[ArrayLike],
+    poses: Sequence[Pose],
+    camera: Camera,
+    darks: tuple[MeanFrame, ...],
+) -> SessionBoards:
+    """Return the whiteboards of the fit, of the method free, and of validation.
+
+    Raises AppError for a whiteboard of another size than the darks, and without a reference.
+    """
     references: dict[tuple[int, str], MeanFrame] = {}
     sorted_in: dict[str, list[BoardFrame]] = {"open": [], "pinhole": [], "validation": []}
-    for place, (frames, pose) in enumerate(zip(whiteboards, stood, strict=True)):
-        name = f"whiteboards[{place}]"
+    for place, (frames, pose) in enumerate(zip(whiteboards, poses, strict=True)):
+        name, size = f"whiteboards[{place}]", darks[0].mean_dn.shape
         _refuse_beyond(pose, camera, name)
         mean = _mean(frames, pose.exposure_s, camera, name, taken_s=pose.taken_s)
-        if mean.mean_dn.shape != dark[0].mean_dn.shape:
-            raise AppError(
-                f"{name}: {mean.mean_dn.shape} pixels, the darks have {dark[0].mean_dn.shape}"
-            )
+        if mean.mean_dn.shape != size:
+            raise AppError(f"{name}: {mean.mean_dn.shape} pixels, the darks have {size}")
         if pose.reference:
             references[pose.shot, pose.lamp] = mean
             continue
@@ -175,22 +201,15 @@ def _of_arrays(
         )
     # The white lamp's first: the sensor's gain follows from it.
     white_first = dict(sorted(references.items(), key=lambda item: item[0][1] != "white"))
-    every = BoardSet(dark, white_first, ())
+    every = BoardSet(darks, white_first, ())
     fitted = [*sorted_in["open"], *(sorted_in["pinhole"] if sorted_in["open"] else ())]
-    boards = SessionBoards(
+    return SessionBoards(
         *(
-            every.with_frames(some) if some else None
-            for some in (fitted, sorted_in["pinhole"], sorted_in["validation"])
+            every.with_frames(frames) if frames else None
+            for frames in (fitted, sorted_in["pinhole"], sorted_in["validation"])
         ),
         turned={},
     )
-    k, (rows, columns) = camera.sensor.binning, dark[0].mean_dn.shape
-    outcome = boards_outcome(camera, (k * rows, k * columns), boards, "poses: they have")
-    metrics = calibration_metrics(outcome, camera.title, "", "auto", started)
-    chosen = outcome.calibration
-    good = outcome.good if chosen.good is None else chosen.good
-    scale = Scale(chosen.psi, chosen.white_dn_per_s, dark, chosen.gain, good)
-    return chosen.psi, SessionCalibration(outcome, chosen, scale, metrics)
 
 
 def _mean(

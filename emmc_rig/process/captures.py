@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -17,32 +16,24 @@ if TYPE_CHECKING:
     from emmc_rig.reconstruction.verdict.rules import Reason
 
 
-class Capture(Protocol):
-    """Frames that are reconstructed with their Psi."""
+class Capture:
+    """Frames that are reconstructed with their Psi: here a folder that `simulate` or `demo` wrote.
 
-    @property
-    def folder(self) -> Path:
-        """Where the frames are."""
-        ...
+    folder: holds the frames. own_place: folder of the result in `folder`; None where results go
+    elsewhere. assumed: whether Psi is the camera as described, measured by no whiteboard.
+    planned_frames: how many frames of a film were planned; 0 where it is no film.
+    """
 
-    @property
-    def own_place(self) -> Path | None:
-        """Folder of the result in `folder`; None where results go elsewhere."""
-        ...
+    own_place: Path | None = None
+    assumed = False
+    planned_frames = 0
 
-    @property
-    def assumed(self) -> bool:
-        """Whether Psi is the camera as described, measured by no whiteboard."""
-        ...
-
-    @property
-    def planned_frames(self) -> int:
-        """How many frames of a film were planned; 0 where it is no film."""
-        ...
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     def psi_file(self) -> Path:
         """Return the file of its own Psi; raises AppError where none is stored."""
-        ...
+        return psi_beside(self.folder)
 
     def frames(
         self, psi: Path | None, place: int | None, out: Path, watcher: Watcher
@@ -52,42 +43,14 @@ class Capture(Protocol):
         psi: the file of another Psi. place: of the one frame of a film, from 0. watcher:
         gets the name of Psi as a note. Raises AppError, SensingError or CalibrationError.
         """
-        ...
-
-    def loaded(self, psi: Path | None, place: int | None) -> tuple[ImagingMatrix, Frames]:
-        """Return Psi and readings; see `frames`."""
-        ...
-
-    def exposure_reasons(self) -> Sequence[Reason]:
-        """Return what speaks against the exposures, for the verdict."""
-        ...
-
-
-@dataclass(frozen=True)
-class FolderCapture:
-    """A folder that `simulate` or `demo` wrote: see `Capture`."""
-
-    folder: Path
-    own_place = None
-    assumed = False
-    planned_frames = 0
-
-    def psi_file(self) -> Path:
-        """Return the file of its Psi."""
-        return psi_beside(self.folder)
-
-    def frames(
-        self, psi: Path | None, place: int | None, out: Path, watcher: Watcher
-    ) -> tuple[Frames, Path]:
-        """Return readings, and the file of their Psi."""
         return read_frames(self.folder), psi or self.psi_file()
 
     def loaded(self, psi: Path | None, place: int | None) -> tuple[ImagingMatrix, Frames]:
-        """Return Psi and readings."""
+        """Return Psi and readings; see `frames`."""
         return StoredPsi(psi or self.psi_file()).load(), read_frames(self.folder)
 
     def exposure_reasons(self) -> Sequence[Reason]:
-        """Return nothing: a folder does not state its exposures."""
+        """Return what speaks against the exposures, for the verdict; a folder states none."""
         return ()
 
 
@@ -99,4 +62,4 @@ def opened_capture(folder: Path) -> Capture:
         from emmc_rig.session.session import Session
 
         return SessionCapture(Session(folder))
-    return FolderCapture(folder)
+    return Capture(folder)

@@ -37,7 +37,7 @@ from emmc_rig.model.files import PART, whole_file, whole_folder
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.sensing import ImagingMatrix, SensingError
-from emmc_rig.process.memory import (
+from emmc_rig.process.cost import (
     BASE_BYTES,
     assumed_grid,
     own_bytes,
@@ -73,8 +73,9 @@ from emmc_rig.store.folders import (
     kept_folder,
     result_folder,
 )
-from emmc_rig.store.jobs import Store, digest_of, kept_words, run_job, settled
+from emmc_rig.store.jobs import Store, kept_words, run_job, settled
 from emmc_rig.store.pool import Ceiling, Pool, opened_pool
+from emmc_rig.store.products import digest_of
 from emmc_rig.store.psi import PSI, StoredPsi
 from emmc_rig.store.result_files import read_metrics
 from emmc_rig.store.results import PSI_ASSUMED, write_metrics

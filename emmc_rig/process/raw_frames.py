@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from numbers import Real
 
 import numpy as np
@@ -54,8 +55,8 @@ above which what differs is texture. Noise of a linear sensor that grows by 15 %
 has a read noise above 100 electrons, which none has; of codes of gamma 2.2 it falls by a fifth of
 what light grows."""
 MOST_LAST = 16
-"""Length of a last axis that is shorter than both others, up to which it is one of shots or colours
-rather than columns of a sensor."""
+"""Longest last axis that is taken for shots or colours, if both others are longer: no sensor has so
+few columns."""
 CLIPPED = 4
 """Times as many pixels as at each of as many levels below read the level where they saturate."""
 
@@ -84,9 +85,15 @@ def frames(
 ) -> MeasuredFrames:
     """Return the readings of raw frames, with the deviation of each and which are usable.
 
-    What is not given is estimated from the frames, see `estimates` of what is returned, and what an
-    estimate of the black level may be off by is part of the deviation. Estimated noise is the most
-    that it can be, as the structure of mask and scene is in it.
+    With the black level b, the white board w, the slope g and floor f of the noise's variance, and
+    an exposure n times the shortest,
+
+        reading = (dn - b) / (w - b) / n
+        deviation = sqrt(g (dn - b) + f + var b + reading^2 var (w - b)) / (w - b) / n
+
+    Missing arguments are estimated from the frames; `estimates` of the frames returned lists them.
+    The deviation includes the error of an estimated black level. Estimated noise is an upper bound:
+    the structure of mask and scene adds to it.
 
     Args:
         dn: (shot, y, x), or (y, x) of one shot, raw values of the sensor. What a masked array
@@ -106,8 +113,8 @@ def frames(
     Raises:
         AppError: axes in another order; values that are not finite, of another size, below 0
             without a dark, or above the white level; darks that are brighter than the frames;
-            frames too small to estimate their noise; exposures that are no times, or not one a
-            shot.
+            frames too small to estimate their noise; exposures that are not positive, or more or
+            fewer than shots.
         ArgumentError: an argument of another type.
 
     >>> import emmc_rig as emmc
@@ -120,24 +127,12 @@ def frames(
     >>> emmc.frames(dn, dark=64, white_level=4095).estimates
     ('noise (at most): variance 0.819 DN per DN of signal and 13.4 DN^2',)
     """
-    takes = "raw values, an array (shot, y, x) or (y, x) of real numbers"
-    taken = numbers_of(np.ma.getdata(dn) if np.ma.isMaskedArray(dn) else dn, "dn", takes)
-    if taken.ndim not in (2, 3) or not taken.size:
-        raise refusal(dn, "dn", takes)
-    _refuse_other_axes(taken.shape)
-    masked = np.broadcast_to(np.ma.getmask(dn), taken.shape)
-    if masked.any():
-        if masked.all():
-            raise AppError("dn: all values are masked: none of them is usable")
-        # So that no estimate sees them.
-        taken = np.where(masked, np.median(taken[~masked]).astype(taken.dtype), taken)
+    taken, masked = _raw_values(dn)
     for name, number in (("white_level", white_level), ("gain", gain), ("gamma", gamma)):
         if number is not None and not (isinstance(number, Real) and 0 < number < np.inf):
             raise refusal(number, name, "a number above 0")
     if read_noise is not None and not (isinstance(read_noise, Real) and 0 <= read_noise < np.inf):
         raise refusal(read_noise, "read_noise", "electrons, 0 or more")
-    taken, masked = (values.reshape(-1, *taken.shape[-2:]) for values in (taken, masked))
-    taken = _finite(taken, "dn")
     if dark is None and taken.min() < 0:
         raise AppError(
             f"dn: values down to {taken.min():g} DN: a sensor reads none below 0; where a black "
@@ -155,41 +150,25 @@ def frames(
     usable = (taken < (np.inf if saturates is None else saturates)) & ~masked
     if not usable.any():
         raise AppError(f"dn: every pixel reads the white level, {saturates:g} DN, or more")
-
     if gamma is None:
         gamma = 1.0
         if looks := _looks_coded(taken, usable, np.asarray(dn).dtype == np.uint8):
             estimates.append(f"gamma 1 (assumed, although {looks}: for a picture give gamma=2.2)")
-
-    def linear(values: Array) -> Array:
-        return (
-            values if gamma == 1 else white_level * (np.maximum(values, 0) / white_level) ** gamma
-        )
-
+    linear = partial(_linear, gamma=gamma, white_level=white_level)
     taken, raw = linear(taken), whole and gamma == 1
     black, black_variance, dark_variance = _black(dark, taken, raw, linear, estimates)
     signal = taken - black
     if signal[usable].mean() < 0:
         raise AppError("dn: darker than dark on average: are frames and darks swapped?")
-    if gain is not None and read_noise is not None:
-        floor = (gain * read_noise) ** 2 + raw / 12
-    else:
-        gain, floor = _noise_line(signal, usable, gain, dark_variance)
-        if read_noise is not None:
-            floor = (gain * read_noise) ** 2 + raw / 12
-        elif dark_variance is None:
-            floor = max(floor, (LEAST_ELECTRONS * gain) ** 2, raw / 12)
-        estimates.append(
-            f"noise (at most): variance {gain:.3g} DN per DN of signal and {floor:.3g} DN^2"
-        )
-    variance = gain * np.maximum(signal, 0) + floor + black_variance
+    slope, floor = _noise(signal, usable, gain, read_noise, dark_variance, raw, estimates)
+    variance = slope * np.maximum(signal, 0) + floor + black_variance
     span, span_variance = white_level - float(np.mean(black)), 0.0
     if white is not None:
         board, repeats = _stacked(white, "white", taken.shape[1:])
         if saturates is not None and (board >= saturates).mean() > 0.5:
             raise AppError(f"white: most of it reads the white level, {saturates:g} DN, or more")
         span = linear(board).mean(axis=0) - black
-        span_variance = (gain * np.maximum(span, 0) + floor) / repeats + black_variance
+        span_variance = (slope * np.maximum(span, 0) + floor) / repeats + black_variance
     lit = np.broadcast_to(np.asarray(span) > 0, taken.shape)
     if not lit.mean() > 0.5:
         raise AppError("white, or the white level, is no brighter than the dark: was the lamp on?")
@@ -200,6 +179,60 @@ def frames(
     return MeasuredFrames(
         readings.astype(np.float32), deviation.astype(np.float32), usable & lit, tuple(estimates)
     )
+
+
+def _raw_values(dn: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Return raw values (shot, y, x), DN, and which are masked; masked ones have the median.
+
+    Raises AppError for axes in another order, values that are not finite, or all masked.
+    """
+    takes = "raw values, an array (shot, y, x) or (y, x) of real numbers"
+    taken = numbers_of(np.ma.getdata(dn) if np.ma.isMaskedArray(dn) else dn, "dn", takes)
+    if taken.ndim not in (2, 3) or not taken.size:
+        raise refusal(dn, "dn", takes)
+    _refuse_other_axes(taken.shape)
+    masked = np.broadcast_to(np.ma.getmask(dn), taken.shape)
+    if masked.any():
+        if masked.all():
+            raise AppError("dn: all values are masked: none of them is usable")
+        # Estimates of noise and levels must not see the masked values.
+        taken = np.where(masked, np.median(taken[~masked]).astype(taken.dtype), taken)
+    taken, masked = (values.reshape(-1, *taken.shape[-2:]) for values in (taken, masked))
+    return _finite(taken, "dn"), masked
+
+
+def _linear(values: Array, gamma: float, white_level: float) -> Array:
+    """Return codes as values proportional to light, with the same white level."""
+    if gamma == 1:
+        return values
+    return white_level * (np.maximum(values, 0) / white_level) ** gamma
+
+
+def _noise(
+    signal: Array,
+    usable: NDArray[np.bool_],
+    gain: float | None,
+    read_noise: float | None,
+    dark_variance: float | None,
+    raw: bool,
+    estimates: list[str],
+) -> tuple[float, float]:
+    """Return slope (DN) and floor (DN^2) of the noise's variance, slope * signal + floor.
+
+    gain, read_noise: as given; what is missing is estimated. dark_variance: of a dark frame, where
+    known. raw: the values are whole numbers, whose rounding has the variance 1/12 DN^2.
+    """
+    if gain is not None and read_noise is not None:
+        return gain, (gain * read_noise) ** 2 + raw / 12
+    slope, floor = _noise_line(signal, usable, gain, dark_variance)
+    if read_noise is not None:
+        floor = (slope * read_noise) ** 2 + raw / 12
+    elif dark_variance is None:
+        floor = max(floor, (LEAST_ELECTRONS * slope) ** 2, raw / 12)
+    estimates.append(
+        f"noise (at most): variance {slope:.3g} DN per DN of signal and {floor:.3g} DN^2"
+    )
+    return slope, floor
 
 
 def _refuse_other_axes(shape: tuple[int, ...]) -> None:
@@ -263,7 +296,7 @@ def _black(
     linear: Callable[[Array], Array],
     estimates: list[str],
 ) -> tuple[Array, float, float | None]:
-    """Return the black level, (1, 1) or (y, x), its variance, and that of one dark if known."""
+    """Return the black level, (1, 1) or (y, x), its variance, and that of a dark frame if known."""
     if dark is not None:
         darks, repeats = _stacked(dark, "dark", dn.shape[1:])
         darks = linear(darks)
@@ -279,7 +312,7 @@ def _black(
 
 
 def _white_level(dn: Array, whole: bool) -> tuple[float, float | None, str]:
-    """Return the white level, that at which pixels saturate (None: none does), and it in words."""
+    """Return the white level, the level of saturated pixels (None without any), and a sentence."""
     top = float(dn.max())
     step = 1.0 if whole else (top - float(dn.min())) / FULL_RANGES[1]
     below = np.count_nonzero((dn >= top - CLIPPED * step) & (dn < top)) / CLIPPED
@@ -310,7 +343,7 @@ def _noise_line(
     columns = [item for item, known in ((x, slope), (np.ones_like(x), floor)) if known is None]
     line, expected = (slope or 0.0, floor or 0.0), np.ones_like(level)
     for _ in range(ROUNDS if columns else 0):
-        # Within a group the smoothest are not to be the darkest: against what each has to have.
+        # Over the variance expected of each block, or the smoothest would be the darkest blocks.
         low = [np.quantile(mean_squares[group] / expected[group], SMOOTHEST) for group in groups]
         y = np.array(low) / SMOOTHEST_READS * [expected[group].mean() for group in groups]
         # A variance is sure to a share of itself.

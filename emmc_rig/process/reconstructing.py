@@ -17,7 +17,6 @@ from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import ERRORS, AppError
-from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.arguments import NAMES, numbers_of, path_of, refusal, required
 from emmc_rig.model.camera import camera_of, pixel_light
@@ -28,7 +27,7 @@ from emmc_rig.model.settings import validated
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.process.block_tasks import Blocks, block_job, compute_blocks
 from emmc_rig.process.captures import Capture, opened_capture
-from emmc_rig.process.memory import (
+from emmc_rig.process.cost import (
     BASE_BYTES,
     assumed_grid,
     own_bytes,
@@ -36,7 +35,7 @@ from emmc_rig.process.memory import (
 )
 from emmc_rig.process.result import Result, compared, figures, open_result
 from emmc_rig.progress import Notes, Watcher
-from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.dictionary import Dictionary, open_dictionary
 from emmc_rig.reconstruction.inputs import check_frames
 from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
 from emmc_rig.reconstruction.result import Progress
@@ -276,17 +275,22 @@ def reconstruct_undrawn(
         further |= blocks.metrics()
         if not in_memory:
             return _write_blocks(blocks, frames, capture, out, truth, further), None
-        arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
-        for name, array in arrays.items():
-            blocks.write(name, array)
-        light_field = arrays.pop("light_field")
-        solved = replace(blocks.result(), light_field=light_field, maps=arrays)
-        result = Result(solved, blocks.verdict(), saved.load(), frames, settings=settings)
+        result = _result_of_blocks(blocks, saved.load(), frames)
     result = replace(result, verdict=result.verdict.with_reasons(capture.exposure_reasons()))
     true = None if truth is None else _true(truth, result.psi)
     metrics = {**result.metrics(), **further, **_compared(result.light_field, truth, true)}
     result.write(out, metrics)
     return metrics, partial(result.draw, metrics=metrics, truth=true)
+
+
+def _result_of_blocks(blocks: Blocks, psi: ImagingMatrix, frames: Frames) -> Result:
+    """Return the result of a capture whose blocks are done, its arrays in memory."""
+    arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
+    for name, array in arrays.items():
+        blocks.write(name, array)
+    light_field = arrays.pop("light_field")
+    solved = replace(blocks.result(), light_field=light_field, maps=arrays)
+    return Result(solved, blocks.verdict(), psi, frames, settings=blocks.job.settings)
 
 
 def _write_blocks(

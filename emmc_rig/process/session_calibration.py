@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emmc_rig.calibration.fit import Fit
 from emmc_rig.calibration.placement import SCALARS, labels
 from emmc_rig.calibration.routes import Outcome
 from emmc_rig.calibration.scale import Scale
@@ -265,6 +266,8 @@ def calibration_metrics(
 
 def outcome_figures(outcome: Outcome) -> dict:
     """Return what a calibration says of itself, for metrics.json and the report."""
+    mixed, best = outcome.mixed, outcome.mixed or outcome.parametric
+    defects = None if mixed is None else 0 if mixed.defects is None else mixed.defects.count
     return {
         "chosen": outcome.chosen,
         "why": outcome.why,
@@ -281,35 +284,23 @@ def outcome_figures(outcome: Outcome) -> dict:
         },
         "frames": dict(outcome.frames),
         "bad_pixels": float(1 - outcome.good.mean()),
-        "defects": None if outcome.mixed is None else _defect_count(outcome),
-        "parameters": _parameters(outcome),
-        "fit": _fit_figures(outcome),
+        "defects": defects,
+        "parameters": {} if best is None else _parameters(best.fit),
+        "fit": {} if best is None else _fit_figures(best.fit),
     }
 
 
-def _defect_count(outcome: Outcome) -> int:
-    assert outcome.mixed is not None
-    return 0 if outcome.mixed.defects is None else outcome.mixed.defects.count
-
-
-def _parameters(outcome: Outcome) -> dict[str, dict[str, float]]:
-    best = outcome.mixed or outcome.parametric
-    if best is None:
-        return {}
-    values = best.fit.placement.vector()
-    views = np.array(best.fit.placement.aperture).shape
-    deviations = np.sqrt(np.diag(best.fit.covariance))
+def _parameters(fit: Fit) -> dict[str, dict[str, float]]:
+    """Return the parameters of the mask's placement with their deviations, by name."""
+    values, deviations = fit.placement.vector(), np.sqrt(np.diag(fit.covariance))
+    rows, columns = np.array(fit.placement.aperture).shape
     return {
-        name: {"value": float(values[i]), "deviation": float(deviations[i])}
-        for i, name in enumerate(labels((views[0], views[1])))
+        name: {"value": float(value), "deviation": float(deviation)}
+        for name, value, deviation in zip(labels((rows, columns)), values, deviations, strict=True)
     }
 
 
-def _fit_figures(outcome: Outcome) -> dict[str, object]:
-    best = outcome.mixed or outcome.parametric
-    if best is None:
-        return {}
-    fit = best.fit
+def _fit_figures(fit: Fit) -> dict[str, object]:
     return {
         "correlation": fit.correlation,
         "chi2": fit.chi2,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from emmc_rig.calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.process.captures import Capture
 from emmc_rig.process.session_calibration import calibrated_scale
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.verdict.rules import Reason
@@ -22,31 +23,15 @@ from emmc_rig.store.folders import SESSION_RECONSTRUCTION
 from emmc_rig.store.psi import PSI, StoredPsi
 
 
-@dataclass(frozen=True)
-class SessionCapture:
-    """An open session: see `emmc_rig.process.captures.Capture`."""
+class SessionCapture(Capture):
+    """An open session, whose light field has a folder in it."""
 
-    session: Session
-
-    @property
-    def folder(self) -> Path:
-        """Where the session is."""
-        return self.session.folder
-
-    @property
-    def own_place(self) -> Path:
-        """The folder of its light field."""
-        return self.folder / SESSION_RECONSTRUCTION
-
-    @property
-    def assumed(self) -> bool:
-        """Whether no whiteboard measured its Psi."""
-        return psi_is_assumed(self.session)
-
-    @property
-    def planned_frames(self) -> int:
-        """How many frames of a film its plan has."""
-        return sum(frame.film is not None for frame in self.session.frames)
+    def __init__(self, session: Session) -> None:
+        super().__init__(session.folder)
+        self.session = session
+        self.own_place = session.folder / SESSION_RECONSTRUCTION
+        self.assumed = psi_is_assumed(session)
+        self.planned_frames = sum(frame.film is not None for frame in session.frames)
 
     def psi_file(self) -> Path:
         """Return the file of the Psi that its whiteboards measured."""

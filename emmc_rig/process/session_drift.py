@@ -1,7 +1,7 @@
 """`emmc-rig calibrate --drift`: does Psi still fit these captures, and the Psi that does.
 
-Takes the calibration of any route: where the mask sat is stored by those that fit it, and fitted to
-the Psi of the free one.
+Takes the calibration of any method. Parametric and mixed calibrations store the position of the
+mask; to a free calibration's Psi the position is fitted here.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A calibration on disk: Psi, its camera, and where the mask sat, with its defects.
+    """A calibration on disk: Psi, its camera, and the position of the mask with its defects.
 
-    seen: what every filter sees of the colours, (filter, colour); None where that was not measured.
-    colour: of every sensor pixel, (shot, pixel_y, pixel_x); None where they see all.
+    seen: crosstalk, the share of each colour that every filter sees, (filter, colour); None without
+    a measurement. colour: of every sensor pixel, (shot, pixel_y, pixel_x); None where pixels see
+    all colours.
     """
 
     psi: ImagingMatrix

@@ -159,12 +159,6 @@ def kept_words(out: Path, what: Callable[[], str]) -> Iterator[None]:
         ) from fault
 
 
-def digest_of(inputs: Mapping[str, object]) -> str:
-    """Return a digest of plain data, the same for equal content in any order of keys."""
-    text = json.dumps(inputs, sort_keys=True)
-    return hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
-
-
 def settled(
     folder: Path,
     digest: str,

@@ -36,12 +36,12 @@ CONNECT_S = 10.0
 
 
 class WorkersError(AppError):
-    """Workers that are not there, do not fit this program, or were lost."""
+    """No worker answers, workers run another version of the program, or all were lost."""
 
 
 @dataclass(frozen=True)
 class Ceiling:
-    """Memory of all processes together, in bytes. own: what the program itself needs of it."""
+    """Limit of the memory of all processes together, bytes. own: bytes of the program itself."""
 
     total: int
     own: int
@@ -50,7 +50,7 @@ class Ceiling:
         """Return how many workers fit; raises AppError with the smallest ceiling for one."""
         count = (self.total - self.own) // task_bytes
         if count < 1:
-            # Rounded up, so that the ceiling named is one that works.
+            # Rounded up: the ceiling that the message names suffices.
             least = -(-(self.own + task_bytes) // 2**20)
             raise AppError(
                 f"memory of {self.total / 2**20:.0f} MiB: this program and one worker need "
@@ -86,7 +86,7 @@ class Pool:
     def run(
         self, task: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield each item with its result, in the order they are done.
+        """Yield each item with its result, in the order of completion.
 
         Tasks whose worker was lost are done again. Raises WorkersError, and what a task raises.
         """
@@ -155,7 +155,7 @@ class Processes(Pool):
     def __init__(self, size: int, ceiling: Ceiling | None = None) -> None:
         super().__init__(size)
         self.ceiling = ceiling
-        # Processes read one end, which no one writes to, and end when the other is closed.
+        # Workers read their end of a pipe without any data: they end when this process closes it.
         self._theirs, self._mine = multiprocessing.Pipe(duplex=False)
 
     def _start(self) -> Executor:
@@ -222,7 +222,7 @@ def fingerprint() -> dict[str, str]:
 
 
 def _on_one_thread(task: Callable[[Item], Result], item: Item) -> Result:
-    """Return the result of a task in a thread of a worker, which may have others beside it."""
+    """Return the result of a task, computed by one thread of a worker that may have several."""
     import numba
 
     numba.set_num_threads(1)

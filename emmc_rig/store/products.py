@@ -3,15 +3,17 @@
     product.json   by kind of product: its digest, inputs, versions, and when it was made
 
 The digest is the same for the same kind and inputs while the program computes the same from them.
+Jobs and points of studies are known by their digest, too, see `emmc_rig.store.jobs`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from emmc_rig.model.json_text import parse_json
 from emmc_rig.version import NUMERICS, __version__
 
 PRODUCT = "product.json"
+JOB_HASH = partial(hashlib.blake2b, digest_size=12)
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,22 @@ class Product:
     made: str
 
 
+def digest_of(inputs: Mapping[str, Any], hashed: Callable[[bytes], Any] = JOB_HASH) -> str:
+    """Return a digest of plain data, the same for equal content in any order of keys.
+
+    hashed: the hash function. Jobs and studies of earlier versions are stored under digests of
+    JOB_HASH, products under SHA-256; with another function the program would not find them.
+    """
+    return hashed(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
 def product_digest(kind: str, inputs: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a kind of product, its inputs and `NUMERICS`; keys in any order.
 
     inputs: plain data, settings, dataclasses, paths. Raises ValueError for anything else.
     """
     what = to_jsonable_python({"kind": kind, "inputs": inputs, "numerics": NUMERICS})
-    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+    return digest_of(what, hashlib.sha256)
 
 
 def record_product(folder: Path, kind: str, inputs: Mapping[str, Any]) -> Product:

@@ -20,10 +20,10 @@ from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
 from emmc_rig.reconstruction.adaptive.mixture import stored
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.adaptive.uncertainty import held_out
-from emmc_rig.reconstruction.choices import choose_mu, contrast, smooth_guess
 from emmc_rig.reconstruction.colour import unseen_colour
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.problem import choose_mu, contrast, smooth_guess
 from emmc_rig.reconstruction.tv import few_steps
 
 Array = NDArray[np.floating]

@@ -24,10 +24,9 @@ from emmc_rig.reconstruction.adaptive.film import Film
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import checked_inputs
-from emmc_rig.reconstruction.method import Given, Method
+from emmc_rig.reconstruction.method import Given, Method, ShippedSettings
 from emmc_rig.reconstruction.result import Progress, Reconstruction
 from emmc_rig.reconstruction.screening import screened
-from emmc_rig.reconstruction.settings import ShippedSettings
 from emmc_rig.reconstruction.sparse import PatchEstimates
 
 DEFAULT_METHOD = "adaptive"

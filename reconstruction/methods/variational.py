@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.choices import choose_mu
 from emmc_rig.reconstruction.inputs import checked_inputs
-from emmc_rig.reconstruction.method import Given, Method, Sensitivity, cost_words
-from emmc_rig.reconstruction.problem import PatchTerm
+from emmc_rig.reconstruction.method import Given, Method, Sensitivity, ShippedSettings, cost_words
+from emmc_rig.reconstruction.problem import PatchTerm, choose_mu
 from emmc_rig.reconstruction.result import Reconstruction
-from emmc_rig.reconstruction.settings import ShippedSettings
 from emmc_rig.reconstruction.sparse import SparseSettings, estimate_patches
 from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 

@@ -9,13 +9,13 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from programs import PROGRAM
 
 from emmc_rig.bench.hardware import open_camera, open_stage
 from emmc_rig.drivers.errors import LimitExceededError
 from emmc_rig.errors import AppError
 
 EXAMPLE = Path(__file__).parents[2] / "docs/example_plugin"
-PROGRAM = "from emmc_rig.cli import main; main()"
 BROKEN = """
 from emmc_rig_example.simulator import open_simulated
 
@@ -131,7 +131,7 @@ def test_the_commands_take_a_plug_in_as_any_other_stage(installed, run):
 def conform(installed, *arguments, answer=""):
     paths = os.pathsep.join((str(installed), str(EXAMPLE), os.environ.get("PYTHONPATH", "")))
     return subprocess.run(
-        [sys.executable, "-c", PROGRAM, "devices", "conform", *arguments],
+        [*PROGRAM, "devices", "conform", *arguments],
         env=os.environ | {"PYTHONPATH": paths},
         input=answer,
         capture_output=True,

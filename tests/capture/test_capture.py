@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from capture_rigs import begun, plan_and_camera, request_for, still_rig
+from capture_rigs import begun, frames_in, plan_and_camera, request_for, still_rig
 from simulated_disk import SimulatedDisk
 from watching import Acting
 
@@ -90,10 +90,6 @@ def started(rig, text=SMALL, disk: Any = None, **changes):
     return session, plan.model_copy(update=changes)
 
 
-def contents(session):
-    return {frame.id: session.read(frame.id) for frame in session.frames}
-
-
 @pytest.fixture(scope="module")
 def undisturbed():
     rig, _ = bench_rig()
@@ -166,7 +162,7 @@ def test_stopping_ends_after_the_frame_and_a_resume_takes_only_what_is_missing(u
     outcome = Sequencer(again, plan, rig).run()
     assert outcome.complete
     assert outcome.taken == len(session.frames) - 9
-    assert contents(again) == contents(undisturbed[0])
+    assert frames_in(again) == frames_in(undisturbed[0])
     assert all(again.stored[name] == entry for name, entry in before.items())
 
 
@@ -175,7 +171,7 @@ def test_a_resume_agrees_with_the_last_whiteboard_under_other_noise(undisturbed)
     rig, _ = bench_rig(seed=1)
     again = Session(session.folder, session.disk)
     Sequencer(again, plan, rig).run()
-    assert again.read("shot-0-e0-r0") != contents(undisturbed[0])["shot-0-e0-r0"]
+    assert again.read("shot-0-e0-r0") != frames_in(undisturbed[0])["shot-0-e0-r0"]
     entry = next(iter(of_kind(again.journal.entries, ComparedEntry)))
     assert entry.kind == "registered"
     assert entry.id.startswith("board")
@@ -332,7 +328,7 @@ def test_a_fault_of_camera_or_stage_costs_a_try_and_no_frame(undisturbed, fault)
     device = rig.still if fault in CAMERA_FAULTS else rig.chain
     device.faults.inject(fault, skip=5 if fault in (*CAMERA_FAULTS, "stall") else 30)
     assert Sequencer(session, plan, rig).run().complete
-    assert contents(session) == contents(undisturbed[0])
+    assert frames_in(session) == frames_in(undisturbed[0])
 
 
 def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
@@ -350,7 +346,7 @@ def test_a_stage_pushed_during_the_exposure_costs_the_frame(undisturbed):
     retry = next(iter(of_kind(session.journal.entries, RetryEntry)))
     assert retry.id == pushed[0]
     assert "off its place" in retry.fault or "home" in retry.fault
-    assert contents(session) == contents(undisturbed[0])
+    assert frames_in(session) == frames_in(undisturbed[0])
 
 
 @pytest.mark.parametrize(
@@ -451,7 +447,7 @@ def test_a_camera_that_repeats_itself_once_costs_a_try():
     faults = [e.fault for e in of_kind(session.journal.entries, RetryEntry)]
     assert len(faults) == 1
     assert "is identical to the frame before it" in faults[0]
-    assert len(set(contents(session).values())) == 3
+    assert len(set(frames_in(session).values())) == 3
 
 
 def test_the_stage_moves_on_while_a_frame_is_written():

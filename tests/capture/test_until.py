@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from capture_rigs import begun, still_rig
+from capture_rigs import begun, frames_in, still_rig
 from programs import done, program
 from simulated_disk import SimulatedDisk
 from watching import Acting
@@ -53,10 +53,6 @@ def plan_file(folder, **changes):
     (folder / "camera.yaml").write_text(yaml.safe_dump(CAMERA))
     path.write_text(yaml.safe_dump({**PLAN, **changes}))
     return path
-
-
-def contents(session):
-    return {frame.id: session.read(frame.id) for frame in session.needed}
 
 
 def decided(session):
@@ -171,7 +167,7 @@ def test_a_higher_target_goes_on_with_a_session_that_had_enough(enough, every, t
     out = done(program("capture", copy, "--until", "70"))
     assert "2 taken" in out
     again = Session(copy)
-    assert contents(again) == contents(Session(every))
+    assert frames_in(again) == frames_in(Session(every))
     assert decided(again)[-1] == decided(Session(every))[-1]
     assert any(kind == "until" and "70 dB" in line for kind, line in events(again))
 
@@ -180,7 +176,7 @@ def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(ev
     """What a kill leaves: a journal up to a line, and perhaps a file that no line tells of."""
     whole = (every / JOURNAL).read_bytes().splitlines(keepends=True)
     first = next(n for n, line in enumerate(whole) if b'"shot-0-e0-r0"' in line)
-    expected, frames = decided(Session(every)), contents(Session(every))
+    expected, frames = decided(Session(every)), frames_in(Session(every))
     for count in range(first, len(whole)):
         copy = tmp_path / str(count)
         shutil.copytree(every, copy)
@@ -188,7 +184,7 @@ def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(ev
         done(program("capture", copy))
         session = Session(copy)
         assert decided(session) == expected
-        assert contents(session) == frames
+        assert frames_in(session) == frames
         assert verify(session).is_complete
         shutil.rmtree(copy)
 

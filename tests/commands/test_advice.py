@@ -10,10 +10,10 @@ import pytest
 import typer
 
 from emmc_rig import cli
-from emmc_rig.commands.advice import HOME, WORDS, in_shell
+from emmc_rig.commands.output import HOME, WORDS, in_shell
 from emmc_rig.drivers.errors import LimitExceededError, NotHomedError, StalledError
 from emmc_rig.errors import AppError
-from emmc_rig.model.advice import Advice
+from emmc_rig.model.errors import Advice
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
@@ -30,8 +30,7 @@ SHOWN = {
     "emmc_rig/study/chart/charting.py": "a report's next command",
     "emmc_rig/study/design/designing.py": "a report's next command",
     "emmc_rig/study/design/search.py": "what made a camera is stored in it",
-    "emmc_rig/study/stability/stability_run.py": "a report's next command",
-    "emmc_rig/study/tables/tables_page.py": "a report's next command",
+    "emmc_rig/study/tables/tables_study.py": "a report's next command",
 }
 """Files that name commands and flags, and why."""
 OF_OTHERS = re.compile(r"(udevadm|systemctl|gphoto2)[a-z ]* --[a-z-]+")

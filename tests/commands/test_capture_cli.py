@@ -15,7 +15,8 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from programs import done, one_line, program, refused, wait_until
+from capture_rigs import frames_in
+from programs import PROGRAM, done, one_line, program, refused, wait_until
 
 from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.session.lock import held
@@ -23,7 +24,6 @@ from emmc_rig.session.session import Session
 from emmc_rig.session.verify import sessions_in
 
 RIG = ["--rig", "simulated", "--scene", "near-planar", "--size", "24x32"]
-PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
 PATIENCE_S = 60.0
 PLAN = {
     "title": "two shots, one of them a bracket",
@@ -74,13 +74,8 @@ def test_two_captures_of_one_plan_are_the_same_byte_for_byte(captured):
     assert "62 frames to take, about" in err
     assert "saturated" not in err  # progress is for a terminal
     assert "\x1b" not in err
-    first, other = (contents(captured / name) for name in ("plan-session", "again"))
+    first, other = (frames_in(Session(captured / name)) for name in ("plan-session", "again"))
     assert first == other
-
-
-def contents(folder):
-    session = Session(folder)
-    return {frame.id: session.read(frame.id) for frame in session.frames}
 
 
 def test_running_a_complete_session_again_takes_nothing(captured, run):
@@ -343,7 +338,7 @@ def test_a_recorded_session_is_replayed_as_the_page_says(captured, recorded, run
     (tmp_path / "rig.yaml").write_text(BARE + more)
     done(run("capture", "plan.yaml", "--rig", "rig.yaml"))
     again = Session(tmp_path / "plan-session")
-    assert {f.id: again.read(f.id) for f in again.needed} == contents(captured / "plan-session")
+    assert frames_in(again) == frames_in(Session(captured / "plan-session"))
 
 
 def test_a_file_that_is_missing_is_named_and_the_session_goes_on(captured, recorded, run, tmp_path):
@@ -357,7 +352,7 @@ def test_a_file_that_is_missing_is_named_and_the_session_goes_on(captured, recor
     (recorded / "shot-0-e1-r0.dng").write_bytes(data)
     done(run("capture", "plan.yaml"))
     again = Session(tmp_path / "plan-session")
-    assert {f.id: again.read(f.id) for f in again.needed} == contents(captured / "plan-session")
+    assert frames_in(again) == frames_in(Session(captured / "plan-session"))
 
 
 def test_files_of_any_name_are_taken_in_order_where_all_exposures_agree(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import typer
 import yaml
-from programs import done, refused
+from programs import PROGRAM, done, refused
 from view_files import save_views
 
 from emmc_rig import cli
@@ -65,9 +65,8 @@ def test_version_and_help_are_printed(run):
 
 @pytest.mark.slow
 def test_ctrl_c_stops_with_130_and_leaves_nothing(tmp_path):
-    command = [sys.executable, "-c", "from emmc_rig.cli import main; main()"]
     process = subprocess.Popen(
-        [*command, "demo", "--size", "96x128", "--out", "r"],
+        [*PROGRAM, "demo", "--size", "96x128", "--out", "r"],
         cwd=tmp_path,
         stderr=subprocess.PIPE,
         text=True,

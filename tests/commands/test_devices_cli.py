@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from programs import done, one_line, wait_until
+from programs import PROGRAM, done, one_line, wait_until
 from serial.tools import list_ports
 
 from emmc_rig.bench.device_config import parse_stage
@@ -31,7 +31,6 @@ from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
 Z825_MOTOR = ACTUATORS["z825"]
 PATIENCE_S = 20.0
-PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()", "devices")
 QUICK = AxisSpec(max_speed_um_s=100_000.0, acceleration_um_s2=1e7, start_um=500.0)
 
 
@@ -252,7 +251,7 @@ def test_every_way_to_interrupt_a_move_stops_the_stage_and_leaves_it_stopped(
     device, distance_um, jog = make()
     with PtyServer(device) as server:
         stage = f"{protocol}:{server.port}{SIMULATED_SCALES[protocol]}"
-        command = [*PROGRAM, "jog", "--stage", stage, *jog]
+        command = [*PROGRAM, "devices", "jog", "--stage", stage, *jog]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         with subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

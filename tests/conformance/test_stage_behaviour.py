@@ -12,10 +12,10 @@ from emmc_rig.bench.conformance.stages import *  # noqa: F403
 
 
 @pytest.fixture(params=[*SIMULATED, pytest.param("hardware", marks=pytest.mark.hardware)])
-def rig(request, opened, tmp_path, monkeypatch):  # noqa: F811
+def rig(request, opened, tmp_path):  # noqa: F811
     """Every kind of stage, a real one too."""
     if request.param != "hardware":
-        return simulated_rig(request.param, opened, tmp_path, monkeypatch)
+        return simulated_rig(request.param, opened, tmp_path)
     real = NamedStage(request.config.getoption("--stage"))
     opened.callback(real.close)
     return real

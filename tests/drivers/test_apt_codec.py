@@ -9,7 +9,14 @@ import struct
 import pytest
 
 from emmc_rig.drivers import apt_codec as codec
-from emmc_rig.drivers.apt_codec import Id, Message, MotorStatus, StatusBit, VelocityParameters
+from emmc_rig.drivers.apt_codec import (
+    Complaint,
+    Id,
+    Message,
+    MotorStatus,
+    StatusBit,
+    VelocityParameters,
+)
 from emmc_rig.drivers.errors import GarbledReplyError
 
 
@@ -74,16 +81,18 @@ def test_hardware_information_is_read():
     assert info.channels == 1
 
 
-def test_a_complaint_is_read_with_and_without_words():
-    data = struct.pack("<HH64s", Id.MOT_MOVE_ABSOLUTE, 8, b"out of range\0junk")
-    reported = codec.decode_complaint(Message(Id.HW_RICHRESPONSE, 0, 0, 1, 0x50, data))
-    assert (reported.message_id, reported.code, reported.notes) == (
-        Id.MOT_MOVE_ABSOLUTE,
-        8,
-        "out of range",
-    )
-    bare = codec.decode_complaint(Message(Id.HW_RESPONSE, 7, 0, 1, 0x50))
-    assert bare.code == 7
+@pytest.mark.parametrize(
+    ("message", "complaint"),
+    [
+        (
+            Message(Id.HW_RICHRESPONSE, 0, 0, 1, 0x50, b"\x53\4\x08\0" + b"far\0junk".ljust(64)),
+            Complaint(Id.MOT_MOVE_ABSOLUTE, 8, "far"),
+        ),
+        (Message(Id.HW_RESPONSE, 7, 0, 1, 0x50), Complaint(0, 7, "a fault without a description")),
+    ],
+)
+def test_a_complaint_is_read_with_and_without_words(message, complaint):
+    assert codec.decode_complaint(message) == complaint
 
 
 def test_velocity_and_acceleration_have_the_documented_scale():

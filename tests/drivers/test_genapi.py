@@ -11,6 +11,7 @@ from random import Random
 
 import numpy as np
 import pytest
+from fuzzing import fuzz
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -555,7 +556,7 @@ def damaged_xml(random):
 
 
 @pytest.mark.slow
-def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors(fuzz):
+def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors():
     names = ("Width", "ExposureTime", "Gain", "PixelFormat", "AcquisitionStart", "BlackLevel")
 
     def check(seed):
@@ -582,7 +583,7 @@ PIECES = (
 )
 
 
-def test_no_formula_makes_the_evaluator_fail_or_hang(fuzz):
+def test_no_formula_makes_the_evaluator_fail_or_hang():
     def check(seed):
         random = Random(seed)
         text = " ".join(random.choices(PIECES, k=random.randint(0, 40)))

@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from itertools import count
 
 import pytest
 from stage_rigs import after_first_sleep
@@ -20,7 +21,7 @@ from emmc_rig.drivers.errors import (
     TransportTimeoutError,
 )
 from emmc_rig.drivers.grbl import GrblStage, identify
-from emmc_rig.drivers.stage import DEFAULT_SETTINGS, StageSettings
+from emmc_rig.drivers.stage import DEFAULT_SETTINGS, Reading, StageSettings
 from emmc_rig.simulators.clock import ManualClock
 from emmc_rig.simulators.grbl import BENCH_AXES, WITH_SINGLE_AXIS_HOMING, GrblController
 
@@ -108,6 +109,15 @@ def test_the_travel_ends_short_of_the_switch(bench):
     stage.home()
     with pytest.raises(LimitExceededError):
         stage.move_to_um({"x": 0.0})
+
+
+def test_an_axis_that_never_reads_the_same_twice_is_named(bench, monkeypatch):
+    stage = bench.homed()
+    readings = (Reading(50.0 * n, homed=True, moving=False) for n in count())
+    monkeypatch.setattr(stage, "_read", lambda axis: next(readings))
+    with pytest.raises(GarbledReplyError, match=r"\(x never reads the same twice\)") as caught:
+        stage.position_um("x")
+    assert (caught.value.raw, caught.value.axis, caught.value.command) == (b"", "x", "position")
 
 
 @pytest.mark.parametrize(

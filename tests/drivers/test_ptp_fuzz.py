@@ -1,15 +1,12 @@
-"""Hostile cameras: whatever bytes come, however they are cut, the driver ends in its own errors.
-
-The number of cases is `--fuzz-cases`; nightly:
-`pytest tests/drivers/test_ptp_fuzz.py --fuzz-cases 100000`.
-"""
+"""Hostile cameras: whatever bytes come, however they are cut, the driver ends in its own errors."""
 
 import random
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from fuzzing import errors_of_the_driver_allowed, fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.drivers import ptp_codec as codec
@@ -74,15 +71,6 @@ SAMPLES = (
 )
 
 
-@contextmanager
-def errors_of_the_driver_allowed():
-    try:
-        yield
-    except DriverError as error:
-        if "\n" in str(error):
-            raise AssertionError("an error of more than one line") from error
-
-
 def damage(data, seed):
     """Return the bytes with a few of them changed, lost, doubled or added."""
     generator = random.Random(seed)
@@ -104,7 +92,7 @@ def damage(data, seed):
 
 
 @pytest.mark.slow
-def test_decoders_read_any_bytes_or_refuse_them_in_one_line(fuzz):
+def test_decoders_read_any_bytes_or_refuse_them_in_one_line():
     def check(data, sample, seed):
         for decode in DECODERS:
             for candidate in (data, damage(sample, seed)):
@@ -115,7 +103,7 @@ def test_decoders_read_any_bytes_or_refuse_them_in_one_line(fuzz):
 
 
 @pytest.mark.slow
-def test_values_of_any_type_are_read_or_refused(fuzz):
+def test_values_of_any_type_are_read_or_refused():
     def check(data_type, data):
         with suppress(DriverError):
             codec.decode_value(data_type, data)
@@ -130,7 +118,7 @@ def check_raw(seed):
 
 
 @pytest.mark.slow
-def test_a_damaged_raw_file_is_refused_in_one_line_or_read(fuzz):
+def test_a_damaged_raw_file_is_refused_in_one_line_or_read():
     fuzz(check_raw, st.integers(0, 2**63))
 
 
@@ -206,7 +194,7 @@ class HostileFunction(PtpUsbFunction):
 
 
 @pytest.mark.slow
-def test_a_hostile_camera_gives_frames_or_errors_of_the_driver_in_bounded_time(fuzz):
+def test_a_hostile_camera_gives_frames_or_errors_of_the_driver_in_bounded_time():
     outcomes = {"case": 0, "success": 0}
 
     def check(seed, probability, garbage):
@@ -237,7 +225,7 @@ def test_a_hostile_camera_gives_frames_or_errors_of_the_driver_in_bounded_time(f
 
 
 class SplittingFunction(PtpUsbFunction):
-    """An honest camera that cuts what it sends where it likes, at whole packets."""
+    """A camera that cuts its answers into pieces of whole packets at random places."""
 
     def __init__(self, camera, seed):
         super().__init__(camera, PACKET)
@@ -271,7 +259,7 @@ class SplittingFunction(PtpUsbFunction):
 
 
 @pytest.mark.slow
-def test_however_an_honest_camera_cuts_its_answers_they_arrive(fuzz):
+def test_however_an_honest_camera_cuts_its_answers_they_arrive():
     def check(seed):
         clock = ManualClock()
         simulator = PtpCameraSimulator(lambda exposure_s: MOSAIC, clock)

@@ -5,7 +5,7 @@ import threading
 from contextlib import suppress
 
 import pytest
-from stage_rigs import RIGS, SIMULATED, after_first_sleep, opened, simulated_rig  # noqa: F401
+from stage_rigs import FAULTED, RIGS, after_first_sleep, opened, simulated_rig  # noqa: F401
 
 from emmc_rig.bench.conformance.stages import TOLERANCE_UM, middle_um
 from emmc_rig.drivers.errors import (
@@ -24,10 +24,10 @@ BACKLASH_UM = 3.0
 REPLY_FAULTS = ("drop_reply", "lose_reply_byte", "garble_reply", "late_reply", "duplicate_reply")
 
 
-@pytest.fixture(params=SIMULATED)
-def simulated(request, opened, tmp_path, monkeypatch):  # noqa: F811
-    """Every kind of stage on every wire."""
-    return simulated_rig(request.param, opened, tmp_path, monkeypatch)
+@pytest.fixture(params=FAULTED)
+def simulated(request, opened, tmp_path):  # noqa: F811
+    """Every kind of stage, and every wire."""
+    return simulated_rig(request.param, opened, tmp_path)
 
 
 @pytest.fixture(params=RIGS)

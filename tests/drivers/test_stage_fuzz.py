@@ -1,7 +1,6 @@
 """Codecs and whole drivers against bytes that nobody meant to send.
 
 Never a hang, never an exception outside the drivers' own, never a position that was not read.
-`python -m pytest tests/drivers/test_stage_fuzz.py --fuzz-cases 100000` is the nightly size.
 """
 
 import random
@@ -9,9 +8,8 @@ import re
 import struct
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from fuzzing import DRIVER_CASES, FUZZ, errors_of_the_driver_allowed, fuzz
 from hypothesis import strategies as st
-from test_ptp_fuzz import errors_of_the_driver_allowed
 
 from emmc_rig.drivers import apt_codec, grbl_codec, zaber_codec
 from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage
@@ -29,7 +27,6 @@ CARELESS = StageSettings(poll_s=0.2, settle_s=0.0)
 MOST_WRITES = 3000
 """A driver that writes more often for one call counts as hung."""
 SIMULATED_LIMIT_S = 600.0
-SAME_EVERY_TIME = 2000
 
 ZABER_LINES = (
     b"@01 1 10 OK BUSY -- 0:E6\r\n",
@@ -57,29 +54,8 @@ APT_MESSAGES = (
 )
 
 
-@pytest.fixture(scope="module")
-def cases(request):
-    return request.config.getoption("--fuzz-cases")
-
-
-def run(cases, *strategies):
-    """Return a decorator that runs a function on many examples.
-
-    The suite repeats the same examples; a nightly run draws new examples.
-    """
-    careful = settings(
-        max_examples=cases,
-        deadline=None,
-        derandomize=cases <= SAME_EVERY_TIME,
-        database=None,
-        suppress_health_check=[HealthCheck.too_slow],
-    )
-    return lambda body: careful(given(*strategies)(body))()
-
-
-def part_of(cases):
-    """A whole driver answers in the time of many codec calls."""
-    return max(1, cases // 4)
+PARTS = DRIVER_CASES // 4
+"""A whole driver answers in the time of many codec calls."""
 
 
 def spoilt(messages):
@@ -110,11 +86,10 @@ def edited(message, edits):
 
 
 @pytest.mark.slow
-def test_no_bytes_make_the_zaber_codec_fail_or_believe_a_wrong_checksum(cases):
+def test_no_bytes_make_the_zaber_codec_fail_or_believe_a_wrong_checksum():
     accepted = []
 
-    @run(cases, spoilt(ZABER_LINES), st.booleans())
-    def _(line, required):
+    def check(line, required):
         with errors_of_the_driver_allowed():
             message = zaber_codec.decode_message(line, required)
             accepted.append(message)
@@ -123,15 +98,16 @@ def test_no_bytes_make_the_zaber_codec_fail_or_believe_a_wrong_checksum(cases):
                 assert (sum(body) + int(checksum, 16)) % 256 == 0
             assert message is None or message.data.encode("ascii") in line
 
+    fuzz(check, spoilt(ZABER_LINES), st.booleans())
+
     assert accepted
 
 
 @pytest.mark.slow
-def test_no_bytes_make_the_grbl_codec_fail_or_invent_a_number(cases):
+def test_no_bytes_make_the_grbl_codec_fail_or_invent_a_number():
     accepted = []
 
-    @run(cases, spoilt(GRBL_LINES))
-    def _(line):
+    def check(line):
         with errors_of_the_driver_allowed():
             message = grbl_codec.decode_line(line)
             accepted.append(message)
@@ -140,15 +116,16 @@ def test_no_bytes_make_the_grbl_codec_fail_or_invent_a_number(cases):
                 for position in (message.machine, message.work, message.offset):
                     assert all(number in reported for number in position or ())
 
+    fuzz(check, spoilt(GRBL_LINES))
+
     assert any(isinstance(message, grbl_codec.Status) for message in accepted)
 
 
 @pytest.mark.slow
-def test_no_bytes_make_the_apt_codec_fail_and_what_it_reads_it_writes_again(cases):
+def test_no_bytes_make_the_apt_codec_fail_and_what_it_reads_it_writes_again():
     accepted = []
 
-    @run(cases, spoilt(APT_MESSAGES))
-    def _(raw):
+    def check(raw):
         with errors_of_the_driver_allowed():
             message = apt_codec.decode(raw)
             accepted.append(message)
@@ -158,29 +135,34 @@ def test_no_bytes_make_the_apt_codec_fail_and_what_it_reads_it_writes_again(case
                 with errors_of_the_driver_allowed():
                     getattr(apt_codec, f"decode_{name}")(message)
 
+    fuzz(check, spoilt(APT_MESSAGES))
+
     assert accepted
 
 
-def test_every_command_that_the_codecs_write_the_firmware_reads_back(cases):
-    @run(part_of(cases), st.integers(1, 99), st.integers(0, 9), st.integers(1, 99))
-    def _(device, axis, message_id):
+def test_every_command_that_the_codecs_write_the_firmware_reads_back():
+    def check_zaber(device, axis, message_id):
         number = device * axis - message_id
         raw = zaber_codec.encode_command(device, axis, message_id, f"move rel {number}")
         body, _, checksum = raw[1:-1].partition(b":")
         assert (sum(body) + int(checksum, 16)) % 256 == 0
 
-    @run(part_of(cases), st.integers(-(2**31), 2**31 - 1), st.integers(1, 6))
-    def _(position, channel):
+    fuzz(check_zaber, st.integers(1, 99), st.integers(0, 9), st.integers(1, 99), cases=PARTS)
+
+    def check_apt(position, channel):
         raw = apt_codec.encode(0x0453, 0x50, data=apt_codec.encode_position(channel, position))
         assert struct.unpack("<Hi", apt_codec.decode(raw).data or b"") == (channel, position)
 
-    @run(part_of(cases), st.floats(-999, 999), st.floats(0.1, 9999))
-    def _(target_mm, feed_mm_min):
+    fuzz(check_apt, st.integers(-(2**31), 2**31 - 1), st.integers(1, 6), cases=PARTS)
+
+    def check_grbl(target_mm, feed_mm_min):
         line = grbl_codec.jog({"X": target_mm, "Y": -target_mm}, feed_mm_min)
         found = re.fullmatch(r"\$J=G53G90G21X(.+)Y(.+)F(.+)", line)
         assert found is not None
         assert float(found[1]) == pytest.approx(target_mm, abs=6e-5)
         assert len(grbl_codec.encode_line(line)) <= grbl_codec.LINE_LENGTH
+
+    fuzz(check_grbl, st.floats(-999, 999), st.floats(0.1, 9999), cases=PARTS)
 
 
 class Liar:
@@ -295,14 +277,11 @@ DRIVERS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", DRIVERS)
-def test_no_answers_make_a_driver_hang_fail_or_tell_a_position_that_it_did_not_read(
-    protocol, cases
-):
+def test_no_answers_make_a_driver_hang_fail_or_tell_a_position_that_it_did_not_read(protocol):
     make, positions_um = DRIVERS[protocol]
     reported = []
 
-    @run(part_of(cases), st.integers(0, 2**32), MOODS, PLANS)
-    def _(seed, moods, plan):
+    def check(seed, moods, plan):
         clock = ManualClock()
         liar, stage = make(clock)
         stage.home()
@@ -327,18 +306,19 @@ def test_no_answers_make_a_driver_hang_fail_or_tell_a_position_that_it_did_not_r
                     read_um = positions_um(liar.heard)
                     assert any(abs(answer - um) < 1e-6 for um in read_um), (answer, read_um)
 
-    assert len(reported) > part_of(cases) / 20
+    fuzz(check, st.integers(0, 2**32), MOODS, PLANS, cases=PARTS)
+
+    assert len(reported) > PARTS * FUZZ / 20
 
 
 @pytest.mark.parametrize("protocol", DRIVERS)
-def test_no_answers_make_connecting_hang_or_fail_otherwise_than_by_an_error_of_the_drivers(
-    protocol, cases
+def test_no_answers_make_connecting_hang_or_fail_outside_the_drivers_errors(
+    protocol,
 ):
     makers = {"zaber": ZaberChain, "grbl": GrblController, "apt": AptController}
     connected = []
 
-    @run(part_of(cases), st.integers(0, 2**32), MOODS)
-    def _(seed, moods):
+    def check(seed, moods):
         clock = ManualClock()
         liar = Liar(makers[protocol](clock), clock)
         liar.lie(seed, moods)
@@ -353,5 +333,7 @@ def test_no_answers_make_connecting_hang_or_fail_otherwise_than_by_an_error_of_t
             connected.append(stage)
             low_um, high_um = stage.limits_um("x")
             assert low_um < high_um
+
+    fuzz(check, st.integers(0, 2**32), MOODS, cases=PARTS)
 
     assert connected

@@ -6,7 +6,7 @@ They come with the extra `peers`, and talk over real pseudo-terminals and TCP in
 import io
 import struct
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -38,27 +38,21 @@ def wait_until(condition):
 
 
 @contextmanager
-def zaber_peer(wire):
+def zaber_peer():
     """Yield a chain, and the devices that zaber-motion finds on it."""
     ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
-    chain = ZaberChain(
-        SYSTEM_CLOCK, {(device, axis): QUICK for device in (1, 2) for axis in (1, 2)}
-    )
-    with ExitStack() as opened:
-        if wire == "pty":
-            server = opened.enter_context(PtyServer(chain))
-            connection = ascii_protocol.Connection.open_serial_port(server.port)
-        else:
-            server = opened.enter_context(TcpServer(chain))
-            connection = ascii_protocol.Connection.open_tcp(*server.address)
-        opened.enter_context(connection)
+    axes = {(device, axis): QUICK for device in (1, 2) for axis in (1, 2)}
+    chain = ZaberChain(SYSTEM_CLOCK, axes)
+    with (
+        PtyServer(chain) as server,
+        ascii_protocol.Connection.open_serial_port(server.port) as connection,
+    ):
         yield chain, connection.detect_devices(identify_devices=False)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wire", ["pty", "tcp"])
-def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
-    with zaber_peer(wire) as (chain, devices):
+def test_zaber_motion_finds_homes_moves_stops_and_is_refused():
+    with zaber_peer() as (chain, devices):
         refusals = pytest.importorskip("zaber_motion.exceptions")
         assert [device.device_address for device in devices] == [1, 2]
         axis = devices[0].get_axis(2)
@@ -67,7 +61,7 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
         assert axis.get_position() == 0.0
         assert axis.warnings.get_flags() == set()
         axis.move_absolute(100_000)
-        axis.move_relative(-25_000)
+        axis.move_absolute(75_000)
         assert axis.get_position() == 75_000.0
         there_um = 75_000 * QUICK.microstep_um
         assert chain.position_um(1, 2) == pytest.approx(there_um, abs=QUICK.backlash_um + 0.1)
@@ -96,19 +90,13 @@ def test_zaber_motion_finds_homes_moves_stops_and_is_refused(wire):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wire", [PtyServer, TcpServer])
-def test_zaber_motion_finds_the_axis_where_its_last_session_left_it(wire):
+def test_zaber_motion_finds_the_axis_where_its_last_session_left_it():
     ascii_protocol = pytest.importorskip("zaber_motion.ascii", reason="needs the extra `peers`")
     chain = ZaberChain(SYSTEM_CLOCK, {(1, 1): QUICK})
-    with wire(chain) as server:
+    with TcpServer(chain) as server:
         before = 0.0
         for target in (100_000, 40_000):
-            opening = (
-                ascii_protocol.Connection.open_serial_port(server.port)
-                if wire is PtyServer
-                else ascii_protocol.Connection.open_tcp(*server.address)
-            )
-            with opening as connection:
+            with ascii_protocol.Connection.open_tcp(*server.address) as connection:
                 (device,) = connection.detect_devices(identify_devices=False)
                 axis = device.get_axis(1)
                 if not before:
@@ -128,13 +116,9 @@ def apt_controller():
 
 @pytest.mark.slow
 @EARLY_READER
-@pytest.mark.parametrize("model", ["kdc101.KDC101", "tdc001.TDC001"])
-def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
-    module, _, name = model.partition(".")
-    devices = pytest.importorskip(
-        f"thorlabs_apt_device.devices.{module}", reason="needs the extra `peers`"
-    )
-    client = getattr(devices, name)
+def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller):
+    tdc001 = "thorlabs_apt_device.devices.tdc001"
+    client = pytest.importorskip(tdc001, reason="needs the extra `peers`").TDC001
     with PtyServer(apt_controller) as server:
         peer = client(serial_port=server.port, home=False)
         try:
@@ -149,7 +133,7 @@ def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
             peer.move_absolute(200_000)
             wait_until(lambda: peer.status["position"] == 200_000 and peer.status["settled"])
             assert apt_controller.position_um() == pytest.approx(200_000 / COUNTS_PER_UM, abs=0.1)
-            peer.move_relative(-50_000)
+            peer.move_absolute(150_000)
             wait_until(lambda: peer.status["position"] == 150_000 and peer.status["settled"])
             peer.set_velocity_params(2_620, 767_367)
             wait_until(lambda: peer.velparams["max_velocity"] == 767_367)
@@ -168,70 +152,43 @@ def test_thorlabs_apt_device_homes_moves_and_stops(apt_controller, model):
 def test_thorlabs_apt_device_finds_the_axis_where_its_last_session_left_it(apt_controller):
     devices = pytest.importorskip("thorlabs_apt_device", reason="needs the extra `peers`")
     with PtyServer(apt_controller) as server:
-        for session, target in enumerate((200_000, 50_000)):
+        for session, target in enumerate((50_000, 200_000)):
             peer = devices.KDC101(serial_port=server.port, home=False)
             try:
-                wait_until(lambda peer=peer: peer.status["msg"] and peer.jogparams["msg"])
+                wait_until(lambda peer=peer: peer.status["msg"] and peer.velparams["msg"])
                 if not session:
                     peer.home()
                 wait_until(lambda peer=peer: peer.status["homed"])
-                peer.set_jog_params(10_000, 1_000, 767_367)
                 peer.move_absolute(target)
                 wait_until(lambda peer=peer, at=target: peer.status["position"] == at)
                 wait_until(lambda peer=peer: peer.status["settled"])
-                peer.move_jog(direction="forward")
-                wait_until(lambda peer=peer, at=target: peer.status["position"] == at + 10_000)
             finally:
                 peer.close()
                 peer._thread.join()
-    assert apt_controller.position_um() == pytest.approx(60_000 / COUNTS_PER_UM, abs=0.1)
+    assert apt_controller.position_um() == pytest.approx(200_000 / COUNTS_PER_UM, abs=0.1)
 
 
 def test_the_apt_codec_writes_the_bytes_that_an_independent_one_writes():
     apt = pytest.importorskip("thorlabs_apt_device.protocol", reason="needs the extra `peers`")
-    here = {"source": 1, "dest": 0x50}
     position = apt_codec.encode_position(1, -123_456)
     velocity = apt_codec.encode_velocity(apt_codec.VelocityParameters(1, 0, 261, 767_367))
-    for theirs, ours in (
-        (apt.hw_req_info(**here), apt_codec.encode(Id.HW_REQ_INFO, 0x50)),
-        (apt.hw_no_flash_programming(**here), apt_codec.encode(Id.HW_NO_FLASH_PROGRAMMING, 0x50)),
-        (apt.hw_stop_updatemsgs(**here), apt_codec.encode(Id.HW_STOP_UPDATEMSGS, 0x50)),
-        (
-            apt.mod_set_chanenablestate(**here, chan_ident=1, enable_state=1),
-            apt_codec.encode(Id.MOD_SET_CHANENABLESTATE, 0x50, 1, apt_codec.ENABLE),
-        ),
-        (
-            apt.mot_move_home(**here, chan_ident=1),
-            apt_codec.encode(Id.MOT_MOVE_HOME, 0x50, 1),
-        ),
-        (
-            apt.mot_move_absolute(**here, chan_ident=1, position=-123_456),
-            apt_codec.encode(Id.MOT_MOVE_ABSOLUTE, 0x50, data=position),
-        ),
-        (
-            apt.mot_move_stop(**here, chan_ident=1, stop_mode=2),
-            apt_codec.encode(Id.MOT_MOVE_STOP, 0x50, 1, apt_codec.STOP_PROFILED),
-        ),
-        (
-            apt.mot_set_velparams(
-                **here, chan_ident=1, min_velocity=0, acceleration=261, max_velocity=767_367
-            ),
-            apt_codec.encode(Id.MOT_SET_VELPARAMS, 0x50, data=velocity),
-        ),
-        (
-            apt.mot_req_homeparams(**here, chan_ident=1),
-            apt_codec.encode(Id.MOT_REQ_HOMEPARAMS, 0x50, 1),
-        ),
-        (
-            apt.mot_set_genmoveparams(**here, chan_ident=1, backlash_distance=-123_456),
-            apt_codec.encode(Id.MOT_SET_GENMOVEPARAMS, 0x50, data=position),
-        ),
-        (
-            apt.mot_req_dcstatusupdate(**here, chan_ident=1),
-            apt_codec.encode(Id.MOT_REQ_DCSTATUSUPDATE, 0x50, 1),
-        ),
+    pace = {"min_velocity": 0, "acceleration": 261, "max_velocity": 767_367}
+    of = {"chan_ident": 1}
+    for name, theirs, parameters, data in (
+        ("hw_req_info", {}, (), None),
+        ("hw_no_flash_programming", {}, (), None),
+        ("hw_stop_updatemsgs", {}, (), None),
+        ("mod_set_chanenablestate", {**of, "enable_state": 1}, (1, apt_codec.ENABLE), None),
+        ("mot_move_home", of, (1,), None),
+        ("mot_move_absolute", {**of, "position": -123_456}, (), position),
+        ("mot_move_stop", {**of, "stop_mode": 2}, (1, apt_codec.STOP_PROFILED), None),
+        ("mot_set_velparams", {**of, **pace}, (), velocity),
+        ("mot_req_homeparams", of, (1,), None),
+        ("mot_set_genmoveparams", {**of, "backlash_distance": -123_456}, (), position),
+        ("mot_req_dcstatusupdate", of, (1,), None),
     ):
-        assert ours == theirs
+        ours = apt_codec.encode(Id[name.upper()], 0x50, *parameters, data=data)
+        assert ours == getattr(apt, name)(source=1, dest=0x50, **theirs), name
 
 
 def test_an_independent_apt_codec_reads_what_the_firmware_and_ours_write():

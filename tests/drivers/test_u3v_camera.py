@@ -5,12 +5,13 @@ import errno
 import itertools
 import math
 import struct
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from random import Random
 
 import numpy as np
 import pytest
 import usb.core
+from fuzzing import fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.bench.hardware import open_camera
@@ -289,9 +290,10 @@ def test_recorded_bytes_of_another_format_or_size_are_refused(bench):
     struct.pack_into("<Q", original, len(original) - 12, 100)
     with pytest.raises(RawFrameError, match="100 bytes are not the 2880 of 40x48"):
         decode_frame(bytes(original))
-    struct.pack_into("<II", original, 28, 0x010C0059, 60_000)
-    with pytest.raises(RawFrameError, match="bytes are not the"):
-        decode_frame(bytes(original))
+    for width, needed in ((60_000, 3_600_000), (0, 0)):
+        struct.pack_into("<II", original, 28, 0x010C0059, width)
+        with pytest.raises(RawFrameError, match=f"100 bytes are not the {needed} of"):
+            decode_frame(bytes(original))
 
 
 SIZES = [(2, 2), (38, 46), (40, 48), (200, 514)]
@@ -310,8 +312,8 @@ def test_payloads_of_any_size_pass_whatever_alignment_and_packets(shape, alignme
 
 
 def test_a_frame_of_many_transfers_comes_whole():
-    mosaic = np.random.default_rng(1).integers(0, 4096, (2000, 3000), dtype=np.uint16)
-    bench = Bench(mosaic)
+    mosaic = np.random.default_rng(1).integers(0, 4096, (1500, 3000), dtype=np.uint16)
+    bench = Bench(mosaic, depths=("12",))
     camera = bench.open()
     np.testing.assert_array_equal(camera.snap().mosaic, mosaic)
     sirm = [bench.simulator._read_u32(simulation.SIRM, offset) for offset in (0x1C, 0x20, 0x24)]
@@ -369,6 +371,23 @@ def test_a_write_that_goes_wrong_is_not_repeated(bench, faults, fault, error):
         camera._control.write(0x100040, bytes(4))
     assert len(written) <= 1
     np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_a_write_that_was_done_in_part_is_an_error_but_an_old_camera_states_no_count(
+    bench, monkeypatch, count
+):
+    camera, execute = bench.open(), bench.simulator._execute
+
+    def answer(command, request_id, body):
+        if command != codec.WRITEMEM:
+            return execute(command, request_id, body)
+        return simulation._answer(0, codec.WRITEMEM_ACK, request_id, struct.pack("<HH", 0, count))
+
+    monkeypatch.setattr(bench.simulator, "_execute", answer)
+    in_part = pytest.raises(CameraFormatError, match="not all 4 bytes were written")
+    with in_part if count else nullcontext():
+        camera._control.write(0x100040, bytes(4))
 
 
 def test_a_camera_that_stays_silent_is_given_up_in_bounded_time(bench, faults):
@@ -676,7 +695,7 @@ class Noise(U3vCameraSimulator):
 
 
 @pytest.mark.slow
-def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(fuzz, caplog):
+def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(caplog):
     caplog.set_level("CRITICAL")
     mosaic = MOSAIC[:4, :6].copy()
     clock = ManualClock()
@@ -729,7 +748,7 @@ def test_no_damage_on_the_wire_makes_the_driver_hang_or_fail_outside_its_errors(
 
 
 @pytest.mark.slow
-def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors(fuzz):
+def test_no_stream_bytes_make_the_decoder_fail_outside_the_drivers_errors():
     original = Bench(MOSAIC[:4, :6].copy()).open().snap().original
 
     def check(seed):

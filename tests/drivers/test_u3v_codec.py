@@ -4,6 +4,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
+from fuzzing import fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.drivers.errors import CameraFormatError, DriverError
@@ -45,11 +46,8 @@ MANIFEST = bytes.fromhex(
 )
 
 
-def test_a_read_command_is_written_as_in_the_standard():
+def test_commands_are_written_as_in_the_standard():
     assert encode_read(1, 0x1D8, 8) == READ_SBRM
-
-
-def test_a_write_command_is_written_as_in_the_standard():
     assert encode_write(0xFFFE, 0x20004, (1).to_bytes(4, "little")) == WRITE_ENABLE
 
 
@@ -177,7 +175,7 @@ def damaged(random):
     return bytes(raw)
 
 
-def test_no_bytes_make_a_decoder_fail_outside_the_drivers_errors(fuzz):
+def test_no_bytes_make_a_decoder_fail_outside_the_drivers_errors():
     def check(seed):
         raw = damaged(Random(seed))
         for decode in DECODERS:

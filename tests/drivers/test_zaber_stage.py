@@ -1,7 +1,6 @@
-"""The Zaber stage against simulated firmware: the same behaviours in memory and over a pty."""
+"""The Zaber stage against simulated firmware; `tests/conformance` has it on every wire."""
 
 import errno
-from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
@@ -26,7 +25,7 @@ from emmc_rig.drivers.stage import (
     move_time_limit_s,
     needs_approach,
 )
-from emmc_rig.drivers.transport import SerialTransport, Transport
+from emmc_rig.drivers.transport import SerialTransport
 from emmc_rig.drivers.zaber import ZaberStage, find_devices
 from emmc_rig.simulators.clock import ManualClock
 from emmc_rig.simulators.wire import MemoryTransport, PtyServer
@@ -41,13 +40,13 @@ TIMEOUT_S = 0.15
 class Bench:
     """A simulated chain, the wire to it, and what the wire carried."""
 
-    def __init__(self, chain: ZaberChain, clock: ManualClock, transport: Transport):
-        self.chain = chain
-        self.clock = clock
-        self.transport = transport
+    def __init__(self, axes=BENCH_AXES):
+        self.clock = ManualClock()
+        self.chain = ZaberChain(self.clock, axes)
+        self.transport = self.chain.transport(TIMEOUT_S)
         self.sent = []
-        self._feed = chain.feed
-        chain.feed = self._record
+        self._feed = self.chain.feed
+        self.chain.feed = self._record
 
     def _record(self, data):
         self.sent += data.decode("ascii").splitlines()
@@ -61,28 +60,9 @@ class Bench:
         return [line for line in self.sent if " stop" in line]
 
 
-@pytest.fixture(params=["memory", "pty"])
-def make_bench(request):
-    """Return a function from axes to a bench, on either kind of wire."""
-
-    def make(axes=BENCH_AXES):
-        clock = ManualClock()
-        chain = ZaberChain(clock, axes)
-        if request.param == "memory":
-            transport = chain.transport(TIMEOUT_S)
-        else:
-            server = opened.enter_context(PtyServer(chain))
-            transport = SerialTransport(server.port, timeout_s=TIMEOUT_S)
-        opened.callback(transport.close)
-        return Bench(chain, clock, transport)
-
-    with ExitStack() as opened:
-        yield make
-
-
 @pytest.fixture
-def bench(make_bench):
-    return make_bench()
+def bench():
+    return Bench()
 
 
 @pytest.fixture
@@ -164,9 +144,9 @@ def test_an_axis_the_device_does_not_have_shows_at_construction(bench):
     assert (caught.value.reply, caught.value.axis) == ("BADAXIS", "focus")
 
 
-def test_a_speed_setting_is_microsteps_per_second_times_1_6384(make_bench):
+def test_a_speed_setting_is_microsteps_per_second_times_1_6384():
     slow = replace(SPEC, max_speed_um_s=100.0)
-    bench = make_bench({(1, 1): slow})
+    bench = Bench({(1, 1): slow})
     stage = bench.stage(axes={"mask_x": (1, 1)})
     stage.home()
     start_s = bench.clock.now_s()
@@ -183,22 +163,15 @@ def test_waiting_until_settled_outlasts_a_move_that_something_else_started(stage
 @pytest.mark.parametrize(
     "stale", [b"@01 1 00 OK IDLE -- 77", b"@02 1 99 OK IDLE -- 7", b"#01 0 hi"]
 )
-def test_a_reply_to_another_message_is_not_taken_for_ours(stale):
-    clock = ManualClock()
-    chain = ZaberChain(clock)
-    stage = ZaberStage(chain.transport(), AXES, MICROSTEP_UM, clock)
-    stage.home()
-    feed = chain.feed
-    chain.feed = lambda data: with_checksum(stale) + feed(data)
+def test_a_reply_to_another_message_is_not_taken_for_ours(stage, bench, stale):
+    feed = bench.chain.feed
+    bench.chain.feed = lambda data: with_checksum(stale) + feed(data)
     assert stage.position_um("mask_x") == 0.0
 
 
-def test_a_reply_without_the_promised_checksum_is_not_believed():
-    clock = ManualClock()
-    chain = ZaberChain(clock)
-    stage = ZaberStage(chain.transport(), AXES, MICROSTEP_UM, clock)
-    feed = chain.feed
-    chain.feed = lambda data: feed(data).partition(b":")[0] + b"\r\n"
+def test_a_reply_without_the_promised_checksum_is_not_believed(stage, bench):
+    feed = bench.chain.feed
+    bench.chain.feed = lambda data: feed(data).partition(b":")[0] + b"\r\n"
     with pytest.raises(GarbledReplyError, match="missing"):
         stage.position_um("mask_x")
 
@@ -211,10 +184,9 @@ def test_an_approach_is_needed_unless_the_move_ends_with_enough_upward_travel(st
     assert needs_approach(start_um, 100.0, approach_um=10.0) is needed
 
 
-def test_a_tolerance_finer_than_half_a_microstep_is_refused():
-    clock = ManualClock()
+def test_a_tolerance_finer_than_half_a_microstep_is_refused(bench):
     with pytest.raises(ValueError, match="loosen it"):
-        ZaberStage(ZaberChain(clock).transport(), AXES, 1.0, clock, StageSettings(tolerance_um=0.4))
+        bench.stage(StageSettings(tolerance_um=0.4), microstep_um=1.0)
 
 
 def test_a_port_that_does_not_exist_is_named():
@@ -329,9 +301,8 @@ def test_nothing_distinguishes_two_devices_with_one_address():
         find_devices(first.transport(), clock)
 
 
-@pytest.mark.slow
-def test_homing_is_given_time_for_its_own_slower_speed(make_bench):
-    bench = make_bench({(1, 1): replace(SPEC, start_um=25_000.0)})
+def test_homing_is_given_time_for_its_own_slower_speed():
+    bench = Bench({(1, 1): replace(SPEC, start_um=25_000.0)})
     bench.chain.feed(b"/1 1 set limit.approach.maxspeed 10000\n")
     stage = bench.stage(axes={"mask_x": (1, 1)})
     start_s = bench.clock.now_s()

@@ -3,7 +3,6 @@
 import ast
 import io
 import json
-import os
 import struct
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from fuzzing import FUZZ
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -420,7 +420,7 @@ SPECS = (
         max_size=4,
     ),
 )
-@settings(max_examples=int(os.environ.get("EMMC_FUZZ", "300")), deadline=None)
+@settings(max_examples=300 * FUZZ, deadline=None)
 @example("zaber:/dev/x,microstep_um=", [(26, 0, "[1")])
 @example("zaber:/dev/x,microstep_um=", [(26, 0, "\x00")])
 @example("zaber:/dev/x,microstep_um=", [(26, 0, "&a [*a]")])

@@ -32,7 +32,7 @@ KEPT = {
 """Largest error of what is read back."""
 SCENES = {"eslf": "light_field_5x5_eslf.png", "lftoolbox": "light_field.mat",
           "hci-hdf5": "lf.h5", "ome-zarr": "light_field.ome.zarr"}  # fmt: skip
-"""The file or folder in an export that is the scene, if not all of it."""
+"""Path of the scene within an export; without an entry the export is the scene."""
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import open_scene
 from emmc_rig.process.captures import opened_capture
 from emmc_rig.process.reconstructing import open_frames, reconstruct_undrawn
+from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings
-from emmc_rig.reconstruction.settings import BlockSettings
 from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.store import psi as psis
 from emmc_rig.store import shards

@@ -148,3 +148,8 @@ def begun(folder, disk, rig, text=PLAN_YAML):
     """Return a new session on a disk, and its plan."""
     request = request_for(folder, text=text)
     return new_session(request, planned_frames(request, rig), disk), request.plan
+
+
+def frames_in(session):
+    """Return the bytes of each frame that a session needs, by the frame's name."""
+    return {frame.id: session.read(frame.id) for frame in session.needed}

@@ -46,5 +46,8 @@ def held_bytes(count):
 
 def children(process):
     """Return the processes that a process of this machine started, the latest last."""
-    task = Path(f"/proc/{process}/task/{process}/children")
-    return [int(child) for child in task.read_text().split()] if task.exists() else []
+    try:
+        text = Path(f"/proc/{process}/task/{process}/children").read_text()
+    except OSError:  # it has ended
+        return []
+    return [int(child) for child in text.split()]

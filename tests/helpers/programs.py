@@ -11,6 +11,9 @@ import pytest
 
 from emmc_rig import cli
 
+PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
+"""Begins a command of the program in a process of its own."""
+
 
 def exit_code(*arguments):
     """Run the program and return its exit code."""
@@ -51,6 +54,14 @@ def refused(ended, code=1):
     """Return the one line of a run that ended with an exit code other than 0."""
     assert ended[0] == code, ended
     return one_line(ended[2])
+
+
+def contents(folder):
+    """Return every file and folder below a folder by its path, with the bytes of files."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
 
 
 def wait_until(condition, limit_s=20.0):

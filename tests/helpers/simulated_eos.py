@@ -89,7 +89,7 @@ class EosCameraSimulator(PtpCameraSimulator):
         *arguments: Any,
         **settings: Any,
     ) -> None:
-        lacks = (Operation.INITIATE_CAPTURE, Operation.GET_THUMB)
+        lacks = (Operation.INITIATE_CAPTURE,)
         super().__init__(render, clock, *arguments, lacks=lacks, **settings)
         self.vendor_operations = (*EosOperation, *AS_STANDARD)
         self._codes = {

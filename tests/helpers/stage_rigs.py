@@ -194,11 +194,15 @@ class AptRig(StageRig):
 
 RIGS = {"zaber": ZaberRig, "grbl": GrblRig, "apt": AptRig}
 SIMULATED = [f"{protocol}-{wire}" for protocol in RIGS for wire in WIRES]
+FAULTED = (*(f"{protocol}-memory" for protocol in RIGS), "zaber-pty", "grbl-tcp", "apt-pty")
+"""For tests of faults: every protocol, and every wire, but not each on each."""
 
 
 @pytest.fixture
-def opened():
+def opened(monkeypatch):
     """What the other fixtures open; closed after the test."""
+    # pyserial pauses 0.3 s in the closing of a socket, for the other side's sake
+    monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=lambda pause_s: None))
     with ExitStack() as stack:
         yield stack
 
@@ -217,9 +221,7 @@ def after_first_sleep(monkeypatch, clock, later_s, act):
     monkeypatch.setattr(clock, "sleep", sleep_and_act)
 
 
-def simulated_rig(name, opened, tmp_path, monkeypatch):
+def simulated_rig(name, opened, tmp_path):
     """Return the rig of one of the names in `SIMULATED`."""
     protocol, wire = name.split("-")
-    # pyserial pauses 0.3 s in the closing of a socket, for the other side's sake
-    monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=lambda pause_s: None))
     return RIGS[protocol](wire, opened, tmp_path)

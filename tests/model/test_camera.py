@@ -1,4 +1,4 @@
-"""Camera descriptions: what they say, and that a wrong one is refused in one helpful line."""
+"""Camera descriptions: their Psi, and the one helpful line that refuses a wrong description."""
 
 from copy import deepcopy
 

@@ -1,4 +1,4 @@
-"""Machine code kept on the disk: it is never older than a source that it was made of."""
+"""Machine code kept on the disk is never older than any of its sources."""
 
 import ast
 import fcntl
@@ -235,7 +235,7 @@ def own_kernel(tmp_path, monkeypatch):
 
 @pytest.fixture
 def held(own_kernel):
-    """The lock of that kernel, held as by another process that compiles it."""
+    """The kernel's lock, held as if another process compiled the kernel."""
     line = own_kernel.halves.py_func.__code__.co_firstlineno
     folder = compiling._folder(Path(own_kernel.__file__), "")
     assert folder is not None

@@ -1,4 +1,4 @@
-"""Frames: readings with one deviation for all or one of each, cut and averaged."""
+"""Frames: readings with a common deviation or a deviation each, cut and averaged."""
 
 import numpy as np
 import pytest

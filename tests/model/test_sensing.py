@@ -421,7 +421,7 @@ def traced_transmittance(described, size, rays):
     """Return what dense rays pass, (v, u, y, x, c), of the masks of a camera's first shot.
 
     Rays are straight lines from rays[0] points of a sample's width to rays[1] points of an
-    aperture cell's, along both axes; a mask passes what its cell passes where they meet it.
+    aperture cell's, along both axes; a ray takes the transmittance of the mask cell that it meets.
     """
     plates = draw_plates(described, size)
     pitch = described.sensor.sample_pitch_um

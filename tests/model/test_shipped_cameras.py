@@ -1,4 +1,4 @@
-"""Every camera that comes with the program: what its Psi must be, and what its file refuses."""
+"""Shipped cameras: properties of their Psi, and mistakes in their files."""
 
 from __future__ import annotations
 

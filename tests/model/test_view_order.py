@@ -86,7 +86,7 @@ def test_a_folder_in_another_order_is_told_and_put_right_by_its_option(
 
 
 def test_files_named_column_by_column_are_put_right(tmp_path: Path, truth: np.ndarray) -> None:
-    # Named here, so that no code of the orders has a part in it.
+    # The test names the files itself: code under test must not decide the order.
     for row, column in np.ndindex(5, 5):
         codes = np.round(255 * truth[row, column, ..., ::-1]).astype(np.uint8)
         cv2.imwrite(str(tmp_path / f"view_{column}_{row}.png"), codes)

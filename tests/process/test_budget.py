@@ -10,8 +10,8 @@ import pytest
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.frames import Frames, even_frames
-from emmc_rig.process import budget
-from emmc_rig.process.budget import FACTORS, method_within, timed
+from emmc_rig.process import cost
+from emmc_rig.process.cost import FACTORS, method_within, timed
 from emmc_rig.reconstruction.methods import reconstruct
 from emmc_rig.simulators.scenes import render
 from emmc_rig.store.results import METRICS, parse_seconds
@@ -36,7 +36,7 @@ def test_nonsense_is_one_line(text):
 
 
 def test_a_budget_takes_the_most_accurate_within_it(monkeypatch):
-    monkeypatch.setattr(budget, "timed", lambda psi, frames: 10.0)
+    monkeypatch.setattr(cost, "timed", lambda psi, frames: 10.0)
     for text, method in (("60", "adaptive"), ("35", "adaptive"), ("34", "adaptive-fast"),
                          ("9", "tv"), ("0.5", "tv")):  # fmt: skip
         taken, why = method_within(NOT_READ, NOT_READ, text)
@@ -48,7 +48,7 @@ def test_a_budget_takes_the_most_accurate_within_it(monkeypatch):
 @pytest.fixture(scope="module")
 def capture():
     """Psi and noisy frames of a built-in scene, larger than the window that is timed."""
-    size = (128, 160)
+    size = (64, 96)
     psi = find_camera("scenario-ii-cfa").psi(size)
     truth = render("deep-occlusions", size=size).light_field.astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 0.004, psi.frames_shape)
@@ -58,7 +58,8 @@ def capture():
 
 @pytest.mark.slow
 @pytest.mark.timing("compares two times")
-def test_the_time_of_a_window_predicts_that_of_the_whole(capture):
+def test_the_time_of_a_window_predicts_that_of_the_whole(capture, monkeypatch):
+    monkeypatch.setattr(cost, "WINDOW", 48)
     psi, frames = capture
     timed(psi, frames)  # compiles
     expected = timed(psi, frames)
@@ -77,7 +78,7 @@ def test_the_window_keeps_pixels_whole(random_psi, monkeypatch, binning, size):
         seen.append((part, frames.readings))
         raise ZeroDivisionError
 
-    monkeypatch.setattr(budget, "reconstruct", solve)
+    monkeypatch.setattr(cost, "reconstruct", solve)
     with pytest.raises(ZeroDivisionError):
         timed(psi, Frames(rows, rows, rows >= 0))
     ((part, readings),) = seen

@@ -94,7 +94,7 @@ def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured,
     out = captured / "sensor"
     assert exit_code("calibrate", captured / "session", "--sensor", "--out", out) == 0
     reported = capsys.readouterr().out
-    # The series ends below saturation: what follows from it is no more than a bound.
+    # The series of exposures ends below saturation, which gives a lower bound of the capacity.
     assert "Saturation capacity, at least" in reported
     figures = json.loads((out / "sensor.json").read_text())
     noise = find_camera("rgbw-bayer-1shot").sensor.noise
@@ -176,7 +176,7 @@ def used_psi(folder):
 
 @pytest.fixture
 def own_session(captured, tmp_path):
-    """A copy of the session, without what other tests made of it."""
+    """A copy of the session, without calibrations and reconstructions of other tests."""
     left_out = shutil.ignore_patterns("calibration", "reconstruction")
     return Path(shutil.copytree(captured / "session", tmp_path / "session", ignore=left_out))
 

@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 import tracemalloc
 from contextlib import nullcontext
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pools import Here, Posting, children
-from programs import one_line, program
+from programs import PROGRAM, one_line, program
 from watching import Recorder
 
 import emmc_rig as emmc
@@ -54,7 +53,6 @@ TIMES = {
     "command",
 }
 """What differs from run to run."""
-PROGRAM = (sys.executable, "-c", "from emmc_rig.cli import main; main()")
 
 
 class KilledError(Exception):

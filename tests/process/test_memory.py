@@ -3,7 +3,6 @@
 import json
 import re
 import subprocess
-import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,13 +10,14 @@ from typing import Any
 
 import pytest
 import yaml
-from pools import held_bytes
+from pools import children, held_bytes
+from programs import PROGRAM
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.process.memory import task_bytes
-from emmc_rig.reconstruction.settings import BlockSettings
+from emmc_rig.process.cost import task_bytes
+from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.tiles import Grid
 from emmc_rig.store.pool import Ceiling, Processes, WorkersError
 
@@ -92,14 +92,6 @@ def peaks_mib(process):
     return peaks, err
 
 
-def children(process):
-    try:
-        text = Path(f"/proc/{process}/task/{process}/children").read_text()
-    except OSError:
-        return []
-    return [int(word) for word in text.split()]
-
-
 @pytest.mark.slow
 @LINUX
 def test_the_ceiling_that_a_refusal_names_works_and_is_kept(tmp_path):
@@ -112,8 +104,7 @@ def test_the_ceiling_that_a_refusal_names_works_and_is_kept(tmp_path):
     def started(memory):
         return subprocess.Popen(
             [
-                sys.executable, "-c", "from emmc_rig.cli import main; raise SystemExit(main())",
-                "reconstruct", str(frames), "--method", "tv", "--settings",
+                *PROGRAM, "reconstruct", str(frames), "--method", "tv", "--settings",
                 str(tmp_path / "blocks.yaml"), "--out", str(tmp_path / "out"), "--memory", memory,
             ],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

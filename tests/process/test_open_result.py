@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -16,6 +17,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.formats.exports import open_export, open_film
 from emmc_rig.process.captures import opened_capture
 from emmc_rig.process.reconstructing import reconstruct_undrawn
+from emmc_rig.reconstruction import methods
 from emmc_rig.reconstruction.verdict.rules import Verdict
 from emmc_rig.store.folders import result_folder
 from emmc_rig.store.results import write_metrics
@@ -232,6 +234,20 @@ def test_what_is_no_result_is_refused_in_one_line(frames, saved, tmp_path):
         refused(damaged, words)
     (damaged / "metrics.json").unlink()
     refused(damaged, r"metrics\.json: cannot be read")
+
+
+def test_the_seconds_of_a_result_are_those_of_its_steps(monkeypatch):
+    clock = SimpleNamespace(s=0.0)
+    monkeypatch.setattr(methods, "running_s", lambda: clock.s)
+
+    def step(progress):
+        clock.s += 0.5
+
+    psi = emmc.camera("rgbw-bayer-1shot").psi((24, 32))
+    frames = psi @ emmc.scene("near-planar", size=(24, 32))
+    result = emmc.reconstruct(psi, frames, "tv", on_step=step)
+    assert result.seconds == result.metrics()["seconds"] == clock.s
+    assert clock.s >= 0.5 * result.solved.steps > 0
 
 
 @pytest.mark.slow

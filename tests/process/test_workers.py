@@ -5,8 +5,8 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
+from itertools import count
 from pathlib import Path
 
 import h5py
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from pools import Here, StoppedHereError, children
-from programs import program
+from programs import PROGRAM, program
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError, WrongUsageError
@@ -23,7 +23,7 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.process import block_tasks
 from emmc_rig.process.captures import opened_capture
-from emmc_rig.process.memory import parse_memory
+from emmc_rig.process.cost import parse_memory
 from emmc_rig.process.reconstructing import load_settings, reconstruct_undrawn
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.store.folders import result_folder
@@ -86,6 +86,14 @@ def test_the_truth_and_the_verdict_cover_all_blocks(place):
     assert content(place / "compared") == content(place / "alone")
 
 
+def test_the_seconds_of_blocks_are_those_from_the_first_to_the_last(place, monkeypatch):
+    """A clock that a second passes on whenever it is read: before all blocks, and after them."""
+    monkeypatch.setattr(block_tasks, "running_s", count().__next__)
+    metrics = here(place, "timed", Here())
+    assert metrics["blocks"] == [2, 3]
+    assert metrics["seconds"] == 1
+
+
 @pytest.mark.slow
 def test_blocks_state_the_psnr_that_their_deviations_stand_for(place):
     (place / "wide.yaml").write_text(yaml.safe_dump({"blocks": {"whole": 1000, "side": 64}}))
@@ -133,8 +141,7 @@ def test_a_capture_of_one_block_comes_out_as_without_workers(place):
 def command(place, out, *more):
     return subprocess.Popen(
         [
-            sys.executable, "-c", "from emmc_rig.cli import main; raise SystemExit(main())",
-            "reconstruct", str(place / "frames"), "--method", "tv", "--settings",
+            *PROGRAM, "reconstruct", str(place / "frames"), "--method", "tv", "--settings",
             str(place / "blocks.yaml"), "--out", str(place / out), *map(str, more),
         ],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

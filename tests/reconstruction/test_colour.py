@@ -6,8 +6,8 @@ import pytest
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.lightfield import OPPONENT
-from emmc_rig.reconstruction.choices import smooth_guess
 from emmc_rig.reconstruction.colour import chroma_of, coloured, unseen_colour
+from emmc_rig.reconstruction.problem import smooth_guess
 from emmc_rig.study.trial import Capture, trial_of
 
 SIZE = (48, 64)

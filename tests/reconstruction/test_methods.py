@@ -114,7 +114,7 @@ def test_adaptive_takes_patches_from_two_shots_where_one_fits(
 
 def test_blocks_and_time_budgets_ask_the_method_and_name_none():
     root = Path(__file__).parents[2]
-    for module in ("reconstruction/tiles.py", "emmc_rig/process/budget.py"):
+    for module in ("reconstruction/tiles.py", "emmc_rig/process/cost.py"):
         code = (root / module).read_text()
         # Keys of settings are not names of methods.
         code = re.sub(r"model_copy\(update=\{.*?\}\)", "", code)

@@ -9,7 +9,6 @@ import pytest
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.formats.dictionaries import open_dictionary
 from emmc_rig.model.lightfield import load_hdf5
 from emmc_rig.process.captures import opened_capture
 from emmc_rig.process.reconstructing import (
@@ -20,7 +19,7 @@ from emmc_rig.process.result import Result
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.adaptive.joint import TextureSettings
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
-from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.dictionary import Dictionary, open_dictionary
 from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
 from emmc_rig.store.psi import read_frames
 

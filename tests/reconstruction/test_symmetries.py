@@ -1,4 +1,4 @@
-"""Symmetries of physics: shots in another order, light field and camera mirrored, less light."""
+"""Symmetries of physics: order of shots, mirrors, brightness, units, phases of sensor and mask."""
 
 from functools import cache
 
@@ -100,3 +100,64 @@ def test_half_the_light_through_a_psi_of_half_the_weights_changes_nothing(method
         for p, f, n in ((psi, frames, NOISE), (half, frames / 2, NOISE / 2))
     )
     assert psnr_db(full, less) > 40
+
+
+def by_tv(psi, frames, noise=NOISE):
+    """Return the light field by total variation of readings of one deviation."""
+    return reconstruct("tv", psi, even_frames(frames.astype(np.float32), noise)).light_field
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(light=st.floats(0.3, 1.8), seed=st.integers(0, 3))
+def test_light_and_noise_of_another_brightness_scale_the_light_field(light, seed):
+    psi = three_shots()
+    frames = noisy(psi, scene() / 2, seed)  # of light below 0.9, which is not clipped at 1
+    found, brighter = by_tv(psi, frames), by_tv(psi, light * frames, light * NOISE)
+    assert psnr_db(brighter / light, found) > 60
+    np.testing.assert_array_equal(by_tv(psi, frames / 2, NOISE / 2), found / 2)  # without rounding
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(unit=st.floats(0.01, 100), seed=st.integers(0, 3))
+def test_the_unit_of_raw_frames_and_of_their_black_level_changes_nothing(unit, seed):
+    psi = three_shots()
+    black, white, gain = 64.0, 4000.0, 0.8
+    dn = black + (white - black) * noisy(psi, scene(), seed)
+
+    def found(unit):
+        frames = emmc.frames(
+            unit * dn, unit * black, 1.2 * unit * white, unit * gain, 2.0, white=unit * white
+        )
+        return emmc.reconstruct(psi, frames, "tv").light_field
+
+    assert psnr_db(found(unit), found(1.0)) > 60
+
+
+def psnr_through(camera, seed=0):
+    """Return the PSNR of one scene by total variation, seen through a camera by its own Psi."""
+    psi = camera.psi(SIZE)
+    return psnr_db(by_tv(psi, noisy(psi, scene(), seed)), scene())
+
+
+def test_the_four_phases_of_a_bayer_sensor_resolve_a_scene_alike():
+    camera = emmc.camera("rgbw-bayer-3shots")
+    phases = [
+        camera.model_copy(update={"sensor": camera.sensor.model_copy(update={"cfa": cfa})})
+        for cfa in ("rggb", "grbg", "gbrg", "bggr")
+    ]
+    reached = [psnr_through(phase) for phase in phases]
+    assert min(reached) > 19
+    assert np.ptp(reached) < 0.6
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(cells=st.tuples(*[st.integers(-40, 40)] * 2))
+def test_a_mask_moved_by_whole_cells_with_its_psi_resolves_a_scene_alike(cells):
+    camera = emmc.camera("rgbw-bayer-1shot")
+    (shot,) = camera.shots
+    by_um = tuple(n * camera.masks["mask"].cell_um for n in cells)
+    moved = camera.model_copy(
+        update={"shots": (shot.model_copy(update={"offset_um": {"mask": by_um}}),)}
+    )
+    # Other cells of a random mask lie before the scene.
+    assert psnr_through(moved) == pytest.approx(psnr_through(camera), abs=0.5)

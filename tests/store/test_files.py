@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+from programs import contents
 
 from emmc_rig.model.files import (
     SYSTEM_DISK,
@@ -15,10 +16,6 @@ from emmc_rig.model.files import (
     write_text,
 )
 from emmc_rig.store.journal import Lines
-
-
-def contents(folder):
-    return {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("fault", [ValueError, KeyboardInterrupt, OSError])
@@ -33,7 +30,7 @@ def test_after_an_error_the_earlier_file_stays_and_no_part_of_the_new_one(tmp_pa
 
     with pytest.raises(fault):
         write()
-    assert contents(tmp_path) == {"a.txt": "old"}
+    assert contents(tmp_path) == {"a.txt": b"old"}
 
 
 @pytest.mark.parametrize("fault", [ValueError, KeyboardInterrupt])
@@ -51,9 +48,9 @@ def test_a_folder_takes_its_name_with_all_its_files_or_not_at_all(tmp_path, faul
     write("first")
     with pytest.raises(fault):
         write("half", fault)
-    assert contents(tmp_path) == {"a.txt": "first"}
+    assert contents(tmp_path / "frame") == {"inner": None, "inner/a.txt": b"first"}
     write("second")
-    assert contents(tmp_path) == {"a.txt": "second"}
+    assert contents(tmp_path / "frame") == {"inner": None, "inner/a.txt": b"second"}
     assert [path.name for path in tmp_path.iterdir()] == ["frame"]
 
 

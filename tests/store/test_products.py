@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from emmc_rig.store import products
-from emmc_rig.store.products import PRODUCT, product_digest, read_product, record_product
+from emmc_rig.store.products import (
+    PRODUCT,
+    digest_of,
+    product_digest,
+    read_product,
+    record_product,
+)
 
 INPUTS = {"frames": ["ab", "cd"], "settings": {"method": "parametric", "window": (3, 5)}}
 
@@ -25,6 +31,12 @@ def test_a_digest_is_the_sha_256_of_canonical_json(monkeypatch):
     assert product_digest("psi", {"b": "x", "a": (1, 2.5)}) == (
         hashlib.sha256(text.encode()).hexdigest()
     )
+
+
+def test_jobs_and_studies_of_earlier_versions_are_stored_under_the_same_digest():
+    text = '{"a": [2], "b": {"10": null, "9": 0.5}}'
+    expected = hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
+    assert digest_of({"b": {"9": 0.5, "10": None}, "a": (2,)}) == expected
 
 
 def test_a_digest_depends_on_kind_inputs_and_numerics_alone(monkeypatch):

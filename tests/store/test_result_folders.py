@@ -8,19 +8,12 @@ import sys
 from contextlib import suppress
 
 import pytest
+from programs import contents
 
 from emmc_rig.errors import AppError
 from emmc_rig.store.folders import FILES, PARTIAL, new_file, result_folder
 
 OPERATIONS = ("rename", "replace", "unlink", "rmdir", "mkdir", "link", "fsync")
-
-
-def contents(folder):
-    """Return every file and folder by name, with the bytes of files."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
 
 
 def write(out, files, command="simulate", **more):
@@ -288,7 +281,7 @@ def test_an_edit_after_a_kill_between_two_moves_is_kept_and_reported(out, name):
         assert (out / name).read_text() == "edited"
     (out / name).rename(out.parent / "mine")
     failing_command(out)
-    # What had taken its place is where its owner moved it, everything else is the new result.
+    # The moved file is where its owner put it; all other files are those of the new result.
     moved = {name} & {"light_field.h5"}
     written = {other: (out / other).read_text() for other in NEW if other not in moved}
     assert written == {other: text for other, text in NEW.items() if other not in moved}
@@ -317,7 +310,7 @@ def test_a_result_that_version_0_2_had_not_finished_replacing_is_refused_as_it_i
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[3])
+sys.path[:0] = sys.argv[3:]
 from test_result_folders import NEW, write
 count, at = 0, int(sys.argv[2])
 def audit(event, arguments):
@@ -334,9 +327,9 @@ write(Path(sys.argv[1]), NEW)
 @pytest.mark.skipif(os.name == "nt", reason="SIGKILL")
 @pytest.mark.parametrize("at", [3, 17, 24, 29])
 def test_a_real_kill_leaves_one_whole_result_and_no_hidden_files_after_the_next_command(out, at):
-    here = os.path.dirname(__file__)
-    before = contents(out)
-    done = subprocess.run([sys.executable, "-c", KILLED, str(out), str(at), here], check=False)
+    before, imported = contents(out), (os.path.dirname(__file__), *sys.path)
+    typed = [sys.executable, "-c", KILLED, str(out), str(at), *imported]
+    done = subprocess.run(typed, check=False)
     assert done.returncode == -9
     assert (out / PARTIAL).exists()
     failing_command(out)

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from emmc_rig.model.lightfield import replicate_centre
-from emmc_rig.process.memory import peak_memory_mib
+from emmc_rig.process.cost import peak_memory_mib
 from emmc_rig.reconstruction.methods import installed_methods
 from emmc_rig.simulators.scenes import render
 from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point, charted_points
-from emmc_rig.study.chart.charting import answer
-from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts, pareto_front
+from emmc_rig.study.chart.charting import POOLED, Chart, Mark, answer, charts, pareto_front
 from emmc_rig.study.scores import angular_snr_db, scored, swept_disparity
 from emmc_rig.study.trial import Capture
 
@@ -106,7 +105,7 @@ def test_every_method_is_planned():
 
 def test_the_peak_of_memory_is_not_the_parents():
     held = np.ones(400 * 2**17)
-    code = "from emmc_rig.process.memory import peak_memory_mib; print(peak_memory_mib())"
+    code = "from emmc_rig.process.cost import peak_memory_mib; print(peak_memory_mib())"
     reported = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

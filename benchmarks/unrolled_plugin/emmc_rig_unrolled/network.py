@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.choices import smooth_guess
 from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.problem import smooth_guess
 from emmc_rig_unrolled.weights import Architecture, NetworkWeights
 
 Array = NDArray[np.floating]

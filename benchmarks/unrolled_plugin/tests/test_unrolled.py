@@ -11,9 +11,9 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.choices import smooth_guess
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
+from emmc_rig.reconstruction.problem import smooth_guess
 from emmc_rig.simulators.scenes import render
 
 torch = pytest.importorskip("torch", reason="the network needs PyTorch")

@@ -1,7 +1,5 @@
 """The example's firmware, simulated: it answers on the same wire as the real one."""
 
-from dataclasses import replace
-
 from emmc_rig.drivers.clock import Clock
 from emmc_rig.drivers.errors import GarbledReplyError
 from emmc_rig.drivers.stage import HostStage, StageSettings
@@ -26,7 +24,7 @@ class ExampleController(SimulatedController):
     def __init__(self, clock: Clock) -> None:
         super().__init__(clock)
         self._unread = b""
-        self._power_up(SPEC)
+        self._power_up(Motor(SPEC, clock))
 
     def position_um(self) -> float:
         """Return where the carriage really is."""
@@ -36,11 +34,10 @@ class ExampleController(SimulatedController):
     def power_cycle(self) -> None:
         """Switch off and on."""
         with self._lock:
-            self._motor.advance()
-            self._power_up(replace(SPEC, start_um=self._motor.true_um))
+            self._power_up(self._motor.restarted())
 
-    def _power_up(self, spec: AxisSpec) -> None:
-        self._motor = Motor(spec, self._clock)
+    def _power_up(self, motor: Motor) -> None:
+        self._motor = motor
         self._speed_um_s = TOP_SPEED_UM_S
         self._homed = self._homing = self._stalled = False
 

@@ -1,7 +1,14 @@
-"""What a reconstruction needs of memory, and a ceiling that all its processes keep together.
+"""What a reconstruction costs: seconds, by which a method is chosen, and memory, which is limited.
 
-The number of workers follows from what a block is reckoned to need. What they really hold is
-limited by the system, see `emmc_rig.store.pool`, measured, and stated in metrics.json.
+The seconds of a method are those of the method of factor 1 on a window of the frames, on this
+machine, times the light field's values over the window's, times the factor of the method, see
+`reconstruction.method.Method`. Factors are from the charts docs/results/chart-group-*.csv and
+group-b-chart.csv (64x80 and 128x160 views, one and three shots): there they lie within 0.6 and 1.6
+times these for any scene, camera and size.
+
+The number of workers follows from the memory that a block is estimated to need. What the processes
+really hold is limited by the system, see `emmc_rig.store.pool`, measured, and stated in
+metrics.json.
 """
 
 from __future__ import annotations
@@ -16,10 +23,17 @@ from pathlib import Path
 import numpy as np
 
 from emmc_rig.errors import WrongUsageError
-from emmc_rig.reconstruction.methods import MethodSettings
+from emmc_rig.model.frames import Frames
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
 from emmc_rig.reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
 from emmc_rig.store.psi import StoredPsi
+from emmc_rig.store.results import parse_seconds
 
+FACTORS = {name: method.factor for name, method in METHODS.items() if method.factor is not None}
+TIMED = next(name for name, factor in FACTORS.items() if factor == 1)
+WINDOW = 96
+"""Samples a side of the window that is timed, at most."""
 UNITS = {"K": 10**3, "M": 10**6, "G": 10**9, "KI": 2**10, "MI": 2**20, "GI": 2**30}
 BASE_BYTES = 512 * 2**20
 """Of a process with the program's libraries, its kernels compiled."""
@@ -30,9 +44,39 @@ samples, one shot; less for smaller ones, tv and adaptive."""
 READING_BYTES = 60
 """Of a capture's reading in the program itself: readings, deviation, usable, and copies."""
 WHOLE, COMPARED = 8, 4
-"""Light fields that the program holds of one that is one block, to draw it; and to compare one."""
+"""Copies of a light field that the program holds to draw a light field of one block, and to compare
+any."""
 PARALLAX_PX = 3.0
 """Disparity whose halo is reckoned with before a survey has found the capture's own."""
+
+
+def method_within(psi: ImagingMatrix, frames: Frames, budget: str) -> tuple[str, str]:
+    """Return the method for a budget as typed, such as "30s", and why it is, in words.
+
+    Raises WrongUsageError for what is no time, ReconstructionError for frames that do not fit Psi.
+    """
+    budget_s = parse_seconds(budget, "budget")
+    assert budget_s is not None
+    unit_s = timed(psi, frames)
+    within = [method for method, factor in FACTORS.items() if factor * unit_s <= budget_s]
+    choose = max if within else min
+    method = choose(within or FACTORS, key=FACTORS.__getitem__)
+    why = "the most accurate within" if within else "the quickest: none is done within"
+    takes_s = FACTORS[method] * unit_s
+    return method, f"{method}: {why} {budget_s:g} s; about {takes_s:.2g} s on this machine"
+
+
+def timed(psi: ImagingMatrix, frames: Frames) -> float:
+    """Return the seconds that TIMED takes for all of the frames, from its time for a window."""
+    k, places = psi.binning, []
+    for length in psi.size:
+        side = min(WINDOW // k * k, length)
+        start = (length - side) // 2 // k * k
+        places.append(slice(start, start + side))
+    part = psi.window(*places)
+    pixels = (slice(None), *(slice(at.start // k, at.stop // k) for at in places))
+    solved = reconstruct(TIMED, part, frames.cut(pixels))
+    return solved.seconds * float(np.prod(psi.size)) / float(np.prod(part.size))
 
 
 def parse_memory(text: str) -> int:
