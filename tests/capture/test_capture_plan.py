@@ -154,7 +154,8 @@ def test_an_estimate_counts_exposures_moves_and_bytes():
     assert reported.exposing_s == 8.0
     assert reported.guessed == 0
     # Three moves, the first from an unknown place, settle for 1 s and begin and end in 0.2 s each.
-    # The fourth frame needs none. They go 0 mm, 4 mm up and 2 mm down at 1 mm/s: not upwards, 10 um further down and up again.
+    # They go 0 mm, 4 mm up and 2 mm down at 1 mm/s: not upwards, 10 um further down and up again.
+    # The fourth frame needs no move.
     assert reported.moving_s == pytest.approx(3 * 1.2 + 0.02 + 4 + 2.02)
     # Each a megabyte of pixels, 4 KiB of the file's own and 1500 bytes of the journal's.
     assert reported.bytes == 4 * (1_000_000 + 4096 + 1500)
