@@ -1,7 +1,8 @@
 """Plans: their frames in order, estimates, and a clear line for a bad plan."""
 
 import json
-from itertools import pairwise
+import operator
+from itertools import accumulate, pairwise
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from emmc_rig.captures.plan import (
     new_plan,
     planned_camera,
 )
-from emmc_rig.captures.schedule import Pace, ordered, spread, travel_um
+from emmc_rig.captures.schedule import Pace, ordered, spread
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import shipped_cameras
@@ -95,6 +96,16 @@ def test_shots_with_equal_masks_and_filter_need_no_hand_between_them():
     assert fittings(planned_camera(plan_of())) == [0, 0, 0]
     sequence = Plan.model_validate({"camera": "programmable-aperture", "shots": [{}] * 25})
     assert fittings(planned_camera(sequence)) == list(range(25))
+
+
+def travel_um(frames):
+    """How far the stage goes in all, the longest axis of each move counted."""
+    places = [frame.bench.offsets_um for frame in frames]
+    moves = zip(accumulate(places, operator.or_), places[1:], strict=False)
+    return sum(
+        max((abs(um - at.get(axis, um)) for axis, um in goal.items()), default=0.0)
+        for at, goal in moves
+    )
 
 
 def test_least_travel_goes_less_far_and_takes_the_same_frames():

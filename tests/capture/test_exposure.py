@@ -12,7 +12,7 @@ from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.captures.amend import amendment
 from emmc_rig.captures.control import Control
 from emmc_rig.captures.faults import GaveUpError
-from emmc_rig.captures.metering import BRACKET_STEP, METERABLE_LEVELS, asked_of_scene
+from emmc_rig.captures.metering import BRACKET_STEP, METERABLE_LEVELS, Exposures, asked_of_scene
 from emmc_rig.captures.plan import Metering
 from emmc_rig.captures.run import planned_frames
 from emmc_rig.captures.sequencer import Sequencer
@@ -167,6 +167,15 @@ def test_a_bracket_has_two_stops_for_each_four_times_that_the_range_is_above_eig
         seen = entry.model_copy(update={"figures": Figures(0.0, 20.0, bright_dn, 10.0)})
         asked = asked_of_scene(frames, {"meter-shot-0": seen}, Metering(), (1e-6, 1e6)).asked
         assert max([f.light for f in frames if f.id in asked], default=1) == longest
+
+
+def test_the_first_metering_of_a_scene_counts_where_it_is_taken_again(session):
+    exposures, limits_s = Exposures(plan_and_camera(AUTO)[0], session), (1e-6, 1e3)
+    decided = exposures.decide(limits_s)
+    planned = next(frame for frame in session.frames if frame.kind == "metering")
+    entry = session.stored[planned.id]
+    exposures.learn(planned, entry.model_copy(update={"exposure_s": entry.exposure_s / 9}))
+    assert exposures.decide(limits_s) == decided
 
 
 @pytest.mark.parametrize("last", ["meter-shot-0", "shot-0-e0-r0", "shot-0-e1-r0"])
