@@ -30,40 +30,41 @@ from emmc_rig.model.errors import CameraError
 
 SIZE = 48, 64
 TARGET = 0.005
-"""Of Psi, relative: what whiteboards are planned for, where they reach it."""
+"""Relative error of Psi for which whiteboards are planned, if so many reach it."""
 MOST = 60
 PINHOLE, MASK = ("aperture_x", "aperture_y"), ("mask_x", "mask_y")
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """One way to Psi: the axes that it moves, how often, and the relative error expected.
-
-    error: None where it is not known beforehand.
-    """
+    """One way to Psi."""
 
     name: str
     axes: tuple[str, ...]
+    """Axes that it moves."""
     moves: int
+    """Number of moves."""
     error: float | None
+    """Expected relative error of Psi; None: only the calibration itself shows it."""
 
 
 @dataclass(frozen=True)
 class Ability:
-    """What a bench can do for a camera.
-
-    shots: how many of the camera's it can take, `by_hand` moves of the mask among them.
-    calibrations: every way, the surest first. possible: names of those that stage and hands allow;
-    alone: of those that need no hand.
-    """
+    """What a bench can do for a camera."""
 
     camera: str
     shots: int
+    """Number of the camera's shots that the bench can take."""
     of_shots: int
+    """Number of shots that the camera has."""
     by_hand: int
+    """Moves of the mask by hand among them."""
     calibrations: tuple[Calibration, ...]
+    """Every way to Psi, the surest first."""
     possible: frozenset[str]
+    """Names of the ways that stage and hands allow."""
     alone: frozenset[str]
+    """Names of the ways that need no hand."""
 
     @property
     def best(self) -> Calibration:
@@ -111,8 +112,8 @@ def shown_error(error: float | None) -> str:
 def ability(name: str, camera: Camera, axes: Collection[str], hands: bool) -> Ability:
     """Return what a bench can do for a camera.
 
-    axes: that its stages have. hands: whether somebody moves what they have not. Raises CameraError
-    for a camera that no bench can be.
+    axes: of its stages. hands: whether a person moves the axes that the stages lack. Raises
+    CameraError for a camera that no bench can be.
     """
     places = [mask_offsets_um(camera, shot) for shot in range(len(camera.shots))]
     moved = [axis for axis in MASK if len({place.get(axis) for place in places}) > 1]

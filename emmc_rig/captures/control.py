@@ -11,7 +11,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
@@ -144,7 +144,9 @@ def signals_interrupt() -> Iterator[None]:
 @contextmanager
 def pressed_keys() -> Iterator[Callable[[], str]]:
     """Yield a function that returns the key just pressed, "" for none, or where none can be."""
-    before = _terminal_settings()
+    before = None
+    with suppress(termios.error, OSError, ValueError):  # where keys come from no terminal
+        before = termios.tcgetattr(sys.stdin)
     if before is None:
         yield lambda: ""
         return
@@ -160,11 +162,3 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
         )
     finally:
         termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
-
-
-def _terminal_settings() -> list | None:
-    """Return how the terminal is set that keys come from; None: no terminal."""
-    try:
-        return termios.tcgetattr(sys.stdin)
-    except (termios.error, OSError, ValueError):
-        return None

@@ -62,8 +62,6 @@ LEAST_MOVE = 50.0
 """Of a cell: nobody moves a mask or pinhole by less, but 0.02 to 2 cells in mm look like that."""
 MOST_MOVE = 500.0
 """Cells: half a cell in nm looks like that, and masks are hardly larger."""
-TOO_BRIGHT = 20.0
-"""Times what the camera says of white: a minute has 60 s; only a lamp in the scene has as much."""
 ONE_CLOCK_S = 3e7
 """Between frames of a session: a year. Seconds from a start and dates lie farther apart."""
 WHITE_ABOVE = 4.0
@@ -700,11 +698,10 @@ class _Import:
             raise AppError("no shot is brighter than the camera's sensor.noise.black_level_dn")
         if "electrons_per_s" in noise.model_fields_set:
             bright = electrons_per_s / noise.electrons_per_s
-            unit = "minutes" if bright > TOO_BRIGHT else "ms"
-            if unit == "minutes" or 0.02 < bright * UNIT < 2:
+            if 0.02 < bright * UNIT < 2:
                 raise AppError(
                     f"the shots are {bright:.2g} times as bright as the camera's electrons_per_s "
-                    f"says: {unit} for s in exposure_s? write seconds"
+                    "says: ms for s in exposure_s? write seconds"
                 )
             return
         self._note(

@@ -23,24 +23,15 @@ from emmc_rig.session.session import Session
 
 def matched(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[str, Recorded]:
     """Return the file of each frame, by the frame's id; files: in the order of capture."""
-    found = _by_name(frames, files)
+    # Sessions put a number before the frame's name.
+    named = {re.sub(r"^\d{5}-", "", Path(file.name).stem): file for file in files}
+    found = {frame.id: named[frame.id] for frame in frames if frame.id in named}
     taken = {file.name for file in found.values()}
     left = [file for file in files if file.name not in taken]
     wanted = [frame for frame in frames if frame.id not in found and not frame.is_optional]
-    return found | _in_order(wanted, left)
-
-
-def _by_name(frames: Sequence[PlannedFrame], files: Sequence[Recorded]) -> dict[str, Recorded]:
-    """Return the files that are named as frames, or as sessions name theirs."""
-    named = {re.sub(r"^\d{5}-", "", Path(file.name).stem): file for file in files}
-    return {frame.id: named[frame.id] for frame in frames if frame.id in named}
-
-
-def _in_order(wanted: Sequence[PlannedFrame], left: Sequence[Recorded]) -> dict[str, Recorded]:
-    """Return file after file as frame after frame, where number and all exposures agree."""
-    if len(wanted) != len(left) or not all(map(_agree, wanted, left)):
-        return {}
-    return {frame.id: file for frame, file in zip(wanted, left, strict=True)}
+    if len(wanted) == len(left) and all(map(_agree, wanted, left)):
+        found |= {frame.id: file for frame, file in zip(wanted, left, strict=True)}
+    return found
 
 
 def _agree(frame: PlannedFrame, file: Recorded) -> bool:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import errno
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,11 @@ class CaptureRequest:
     until_db: float | None = None
     other_devices: bool = False
 
+    def frozen(self, frames: tuple[PlannedFrame, ...]) -> Frozen:
+        """Return what a session keeps of the request unchanged."""
+        camera = self.camera.model_dump(mode="json")
+        return Frozen(self.plan_yaml, camera, dict(self.rig), frames)
+
 
 @dataclass(frozen=True)
 class FrontEnd:
@@ -93,48 +98,43 @@ class FrontEnd:
     control: Control = field(default_factory=Control)
 
 
-def session_folder(plan_path: Path) -> Path:
-    """Return the folder of a plan's session unless another is named."""
-    return plan_path.with_name(f"{plan_path.stem}-session")
-
-
 def asked_folder(plan: Path, out: Path | None) -> Path:
     """Return the folder of the session that a plan or session, and --out, name."""
-    return out or (plan if is_session(plan) else session_folder(plan))
+    return out or (plan if is_session(plan) else plan.with_name(f"{plan.stem}-session"))
 
 
-def request_from_plan(
-    plan_path: Path, out: Path, rig: Mapping[str, Any], until_db: float | None = None
+def asked_for(
+    path: Path,
+    folder: Path,
+    rig: Mapping[str, Any] | None,
+    until_db: float | None,
+    other_devices: bool = False,
 ) -> CaptureRequest:
-    """Return what a plan file asks for; raises AppError."""
-    plan = load_plan(plan_path)
-    camera = planned_camera(plan, plan_path.parent)
-    text = plan_path.read_text(encoding="utf-8")
-    return CaptureRequest(plan_path, plan, text, camera, out, rig, until_db)
+    """Return what a plan file asks for, or what a session was begun for; raises AppError.
 
-
-def request_from_session(
-    folder: Path, rig: Mapping[str, Any] | None, until_db: float | None, out: Path
-) -> CaptureRequest:
-    """Return the request that began a session; out: the folder to write. Raises AppError."""
-    session = Session(folder)
-    plan = validated(Plan, session.plan_data(), str(folder), AppError)
-    camera = validated(Camera, session.camera, str(folder), CameraError)
-    rig = rig or session.rig
-    return CaptureRequest(folder, plan, session.plan_yaml, camera, out, rig, until_db)
+    folder: of the session. rig: see `rig_description`; a session keeps its own rig, also under an
+    edited plan.
+    """
+    if is_session(path):
+        session = Session(path)
+        plan = validated(Plan, session.plan_data(), str(path), AppError)
+        camera = validated(Camera, session.camera, str(path), CameraError)
+        text, rig = session.plan_yaml, rig or session.rig
+    else:
+        if rig is None and is_session(folder):
+            rig = Session(folder).rig
+        if rig is None:
+            raise AppError("say which rig: simulated, or a YAML file of devices", "name-rig")
+        plan = load_plan(path)
+        camera = planned_camera(plan, path.parent)
+        text = path.read_text(encoding="utf-8")
+    return CaptureRequest(path, plan, text, camera, folder, rig, until_db, other_devices)
 
 
 def planned_frames(request: CaptureRequest, rig: Rig) -> tuple[PlannedFrame, ...]:
     """Return every frame of a request in the order of the capture."""
     frames = expand(request.plan, request.camera, rig.window_um, rig.window_side_um)
     return ordered(frames, request.plan.order, with_hands(rig, frames).hands)
-
-
-def still_possible(request: CaptureRequest, session: Session) -> tuple[PlannedFrame, ...]:
-    """Return the frames that going on may take; another target asks for spared shots again."""
-    other_target = request.until_db not in (None, session.target_db)
-    frames = session.frames if other_target else session.needed
-    return tuple(frame for frame in frames if frame.id not in session.stored)
 
 
 def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session | None:
@@ -172,12 +172,7 @@ def new_session(
         "versions": versions(),
         **({} if request.until_db is None else {"until_db": request.until_db}),
     }
-    return Session.create(request.out, _frozen(request, frames), about, disk)
-
-
-def _frozen(request: CaptureRequest, frames: tuple[PlannedFrame, ...]) -> Frozen:
-    camera = request.camera.model_dump(mode="json")
-    return Frozen(request.plan_yaml, camera, dict(request.rig), frames)
+    return Session.create(request.out, request.frozen(frames), about, disk)
 
 
 def estimated(
@@ -283,6 +278,7 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
             raise AppError("a film is taken to its end: leave the target PSNR or film out")
         refuse_unless_shots_can_be_spared(plan, request.camera)
     with ExitStack() as open_things:
+        # Everything is read and checked before anything is made or moved.
         session = begun_session(request)
         hook = None
         if plan.between is not None:
@@ -295,13 +291,11 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
             frames = tuple(frame for frame in planned if not frame.is_optional)
         elif edit := amendment(session, plan, request.camera, request.rig, planned):
             watcher.tell(edit.words(len(session.stored)))
-            frames = tuple(
-                frame
-                for frame in edit.frames
-                if frame.id not in session.stored and not frame.is_optional
-            )
+            frames = _not_stored(session, (f for f in edit.frames if not f.is_optional))
         else:
-            frames = still_possible(request, session)
+            # Another target asks for spared shots again.
+            other_target = request.until_db not in (None, session.target_db)
+            frames = _not_stored(session, session.frames if other_target else session.needed)
         recording: Mapping[str, Recorded] | None = None
         if isinstance(rig.camera, FolderCamera):
             folder = rig.camera.folder
@@ -327,40 +321,19 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
             open_things.enter_context(held(session.folder))
         with interruptible(front.control, watcher.tell), disk_faults_named(session):
             if edit is not None:
-                session = session.amend(_frozen(request, edit.frames), edit.changes)
+                session = session.amend(request.frozen(edit.frames), edit.changes)
             with way_on_named(request, session):
                 if request.until_db not in (None, session.target_db):
                     session.note(UntilEntry(target_db=request.until_db))
                 choose = None if recording is None else there(session, recording)
                 if session.target_db is not None:
                     choose = Until(session, watcher)
-                sequencer = Sequencer(
-                    session,
-                    plan,
-                    rig,
-                    watcher,
-                    front.control,
-                    choose,
-                    hook,
-                )
-                return session, sequencer.run()
+                run = Sequencer(session, plan, rig, watcher, front.control, choose, hook)
+                return session, run.run()
 
 
-def asked_for(
-    plan: Path, folder: Path, rig: Mapping[str, Any] | None, until_db: float | None
-) -> CaptureRequest:
-    """Return what a plan file asks for, or what a session was begun for; raises AppError.
-
-    folder: of the session. rig: see `rig_description`; a session keeps its own rig, also under an
-    edited plan.
-    """
-    if is_session(plan):
-        return request_from_session(plan, rig, until_db, folder)
-    if rig is None and is_session(folder):
-        rig = Session(folder).rig
-    if rig is None:
-        raise AppError("say which rig: simulated, or a YAML file of devices", "name-rig")
-    return request_from_plan(plan, folder, rig, until_db)
+def _not_stored(session: Session, frames: Iterable[PlannedFrame]) -> tuple[PlannedFrame, ...]:
+    return tuple(frame for frame in frames if frame.id not in session.stored)
 
 
 def capture_session(
@@ -380,8 +353,7 @@ def capture_session(
         raise AppError(f"{plan}: no such file; write a plan", "new-plan")
     folder = asked_folder(plan, out)
     with held(folder):
-        request = asked_for(plan, folder, rig, until_db)
-        request = replace(request, other_devices=other_devices)
+        request = asked_for(plan, folder, rig, until_db, other_devices)
         try:
             captured = run_capture(request, front)
         except (KeyboardInterrupt, StoppedError) as stop:

@@ -96,17 +96,6 @@ def spread(frames: Sequence[PlannedFrame], checks: Sequence[PlannedFrame]) -> li
     return found
 
 
-def travel_um(frames: Iterable[PlannedFrame]) -> float:
-    """Return how far the stage goes in all, the longest axis of each move counted."""
-    at_um: dict[str, float] = {}
-    total = 0.0
-    for frame in frames:
-        goal = frame.bench.offsets_um
-        total += max((abs(um - at_um.get(axis, um)) for axis, um in goal.items()), default=0.0)
-        at_um |= goal
-    return total
-
-
 def _tour(
     places: list[tuple[tuple[str, float], ...]], start_um: dict[str, float]
 ) -> list[tuple[tuple[str, float], ...]]:

@@ -300,25 +300,20 @@ def a_target_without_a_choice(bench):
     bench.plan(shots=[{"exposure_s": 0.01}, {"exposure_s": 0.01, "mask_um": [270, 162]}])
 
 
-@walk(", so that the Psi of its shots cannot be measured")
-def a_target_without_darks(bench):
-    bench.small_camera(darks=None)
+BEYOND_PSI = {
+    ", so that the Psi of its shots cannot be measured": {"darks": None},
+    "the plan has neither open whiteboards nor the pinhole": {},
+    "no open whiteboard of the plan has `validation: true`": boards(open=[{"repeats": 1}]),
+}
+
+
+def a_target_without_psi(bench, changes):
+    bench.small_camera(**changes)
     yield bench.refused(*CAPTURE, "--until", "30dB")
     calibration_plan(bench)
 
 
-@walk("the plan has neither open whiteboards nor the pinhole")
-def a_target_without_boards(bench):
-    bench.small_camera()
-    yield bench.refused(*CAPTURE, "--until", "30dB")
-    calibration_plan(bench)
-
-
-@walk("no open whiteboard of the plan has `validation: true`")
-def a_target_without_a_judge(bench):
-    bench.small_camera(whiteboards={**PLAN["whiteboards"], "open": [{"repeats": 1}]})
-    yield bench.refused(*CAPTURE, "--until", "30dB")
-    calibration_plan(bench)
+WALKS |= {text: partial(a_target_without_psi, changes=c) for text, c in BEYOND_PSI.items()}
 
 
 def calibration_plan(bench):
@@ -378,9 +373,34 @@ def a_stage_without_an_axis(bench):
     bench.rig = replace(bench.rig, zero_um=zero_um)
 
 
-@walk(": write simulated, or the name of a YAML file of devices")
-def a_rig_that_is_none(bench):
-    yield bench.refused("capture", "plan.yaml", "--rig", "real")
+def command_that_is_mended(bench, wrong, plan=None, then=None):
+    """Run a command that is refused; plan: its changes. then: arguments that are right."""
+    bench.plan(**(plan or {}))
+    yield bench.refused(*wrong)
+    if then is not None:
+        done(bench.run(*then))
+
+
+NEW = ("capture", "--new", PLAN["camera"])
+OTHER = (*NEW, "--out", "other.yaml")
+WALKS |= {
+    text: partial(command_that_is_mended, **walk)
+    for text, walk in {
+        ": write simulated, or the name of a YAML file of devices": {
+            "wrong": ("capture", "plan.yaml", "--rig", "real")
+        },
+        "say which rig: simulated": {"wrong": ("capture", "plan.yaml")},
+        "a film is taken to its end": {
+            "wrong": (*CAPTURE, "--until", "30dB"), "plan": {"film": FILM, "shots": [ONE]},
+        },
+        ": exists already; choose another name, or move it away first": {
+            "wrong": NEW, "then": OTHER
+        },
+        "); choose another place": {
+            "wrong": (*NEW, "--out", "nowhere/plan.yaml"), "then": OTHER
+        },
+    }.items()
+}  # fmt: skip
 
 
 # Frames that cannot be right.
@@ -446,19 +466,17 @@ def a_lamp_left_on(bench):
     bench.light.factor = {}
 
 
-@walk("gave up after ")
-def a_fault_that_stays(bench):
+def loose_cable(bench, **plan):
+    bench.plan(**plan)
     bench.light.faults[AGAIN] = DriverError("a cable is loose", "fix it")
     yield bench.refused()
     bench.light.faults.clear()
 
 
-@walk(" retries of the session are spent")
-def faults_that_go_on(bench):
-    bench.plan(retries={"per_session": 0})
-    bench.light.faults[AGAIN] = DriverError("a cable is loose", "fix it")
-    yield bench.refused()
-    bench.light.faults.clear()
+WALKS |= {
+    "gave up after ": loose_cable,
+    " retries of the session are spent": partial(loose_cable, retries={"per_session": 0}),
+}
 
 
 @walk("the bench has changed: frame ")
@@ -498,11 +516,6 @@ def no_plan(bench):
     assert bench.run("capture", "--new", PLAN["camera"])[0] == 0
     written = yaml.safe_load((bench.folder / "plan.yaml").read_text())
     bench.plan(camera=written["camera"])
-
-
-@walk("say which rig: simulated")
-def no_rig(bench):
-    yield bench.refused("capture", "plan.yaml")
 
 
 @walk("holds something else than a session; name another folder")
@@ -710,12 +723,6 @@ def work_by_hand_without_a_terminal(bench):
     bench.patch.setattr("sys.stdin", terminal)
 
 
-@walk("a film is taken to its end")
-def a_film_with_a_target(bench):
-    bench.plan(film=FILM, shots=[ONE])
-    yield bench.refused(*CAPTURE, "--until", "30dB")
-
-
 @walk(" frames by number and exposures; name them after the frames")
 def a_recording_of_two_files_for_each_frame(bench):
     assert bench.run(*CAPTURE)[0] == 0
@@ -735,18 +742,6 @@ def a_recording_of_two_files_for_each_frame(bench):
     yield bench.refused()
     for path, named in theirs.items():
         path.rename(named)
-
-
-@walk(": exists already; choose another name, or move it away first")
-def a_new_plan_where_one_is(bench):
-    yield bench.refused("capture", "--new", PLAN["camera"])
-    assert bench.run("capture", "--new", PLAN["camera"], "--out", "other.yaml")[0] == 0
-
-
-@walk("); choose another place")
-def a_new_plan_in_no_folder(bench):
-    yield bench.refused("capture", "--new", PLAN["camera"], "--out", "nowhere/plan.yaml")
-    assert bench.run("capture", "--new", PLAN["camera"], "--out", "other.yaml")[0] == 0
 
 
 def test_repeats_that_an_edit_made_different_are_averaged_where_most_are_alike(bench):

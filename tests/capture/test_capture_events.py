@@ -129,9 +129,11 @@ def test_the_estimate_knows_what_was_metered(plan):
 
 
 def test_what_a_frame_costs_beside_its_exposure_is_learnt():
-    pace = Pace({}, 0.0, 1000)
-    for _ in range(100):
-        pace.learn(2.5, exposure_s=2.0, moving_s=0.1)
     frames = begun(Path("/disk"), SimulatedDisk(), still_rig())[0].frames
-    reported = pace.estimate(frames, lambda frame: 0.0)
-    assert reported.downloading_s == pytest.approx(0.4 * len(frames), rel=0.01)
+    # Exposures and moves of most simulated rigs take no time.
+    for waits, cost_s in ((True, 0.4), (False, 2.5)):
+        pace = Pace({}, 0.0, 1000, waits)
+        for _ in range(100):
+            pace.learn(2.5, exposure_s=2.0, moving_s=0.1)
+        reported = pace.estimate(frames, lambda frame: 0.0)
+        assert reported.downloading_s == pytest.approx(cost_s * len(frames), rel=0.01)

@@ -1,7 +1,8 @@
 """Plans: their frames in order, estimates, and a clear line for a bad plan."""
 
 import json
-from itertools import pairwise
+import operator
+from itertools import accumulate, pairwise
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from emmc_rig.captures.plan import (
     new_plan,
     planned_camera,
 )
-from emmc_rig.captures.schedule import Pace, ordered, travel_um
+from emmc_rig.captures.schedule import Pace, ordered, spread
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import shipped_cameras
@@ -97,6 +98,16 @@ def test_shots_with_equal_masks_and_filter_need_no_hand_between_them():
     assert fittings(planned_camera(sequence)) == list(range(25))
 
 
+def travel_um(frames):
+    """How far the stage goes in all, the longest axis of each move counted."""
+    places = [frame.bench.offsets_um for frame in frames]
+    moves = zip(accumulate(places, operator.or_), places[1:], strict=False)
+    return sum(
+        max((abs(um - at.get(axis, um)) for axis, um in goal.items()), default=0.0)
+        for at, goal in moves
+    )
+
+
 def test_least_travel_goes_less_far_and_takes_the_same_frames():
     frames = frames_of(plan_of())
     short = ordered(frames, "least-travel")
@@ -132,6 +143,14 @@ def test_the_bench_is_changed_by_hand_as_rarely_as_can_be():
     assert changes(ordered(frames_of(plan_of()), "least-travel")) == 2
 
 
+def test_checks_are_spread_evenly_and_repeats_of_a_whiteboard_stay_together():
+    bench = Bench("whiteboard", "white", 0, 0, True)
+    frames = [PlannedFrame(f"b{i}", "open", bench, 0.1, repeat=i % 3) for i in range(6)]
+    checks = [PlannedFrame(f"c{i}", "check", bench, 0.1) for i in range(4)]
+    names = [frame.id for frame in spread(frames, checks)]
+    assert names == ["c0", "b0", "b1", "b2", "c1", "b3", "b4", "b5", "c2", "c3"]
+
+
 def test_frames_survive_the_way_through_json():
     for frame in frames_of(plan_of(shots=[{"exposure_s": [0.01, 0.1]}])):
         assert PlannedFrame.from_dict(json.loads(json.dumps(frame.as_dict()))) == frame
@@ -139,16 +158,18 @@ def test_frames_survive_the_way_through_json():
 
 def test_an_estimate_counts_exposures_moves_and_bytes():
     bench = [Bench("scene", "white", 0, 0, True, {"mask_x": um}) for um in (0.0, 4000.0, 2000.0)]
+    bench.append(bench[-1])
     frames = [PlannedFrame(f"f{i}", "shot", stood, 2.0) for i, stood in enumerate(bench)]
     pace = Pace({"mask_x": 1000.0}, settle_s=1.0, frame_bytes=1_000_000)
     reported = pace.estimate(frames, lambda frame: frame.exposure_s)
-    assert reported.exposing_s == 6.0
+    assert reported.exposing_s == 8.0
     assert reported.guessed == 0
     # Three moves, the first from an unknown place, settle for 1 s and begin and end in 0.2 s each.
     # They go 0 mm, 4 mm up and 2 mm down at 1 mm/s: not upwards, 10 um further down and up again.
+    # The fourth frame needs no move.
     assert reported.moving_s == pytest.approx(3 * 1.2 + 0.02 + 4 + 2.02)
     # Each a megabyte of pixels, 4 KiB of the file's own and 1500 bytes of the journal's.
-    assert reported.bytes == 3 * (1_000_000 + 4096 + 1500)
+    assert reported.bytes == 4 * (1_000_000 + 4096 + 1500)
     assert reported.by_hand == 0
 
 
@@ -247,6 +268,12 @@ def test_what_differs_between_two_plans_is_named():
     assert differences(plan, plan) == []
     assert differences(other, plan) == ["settle_s is 0.5, not 0.0"]
     assert differences(plan, plan_of(shots=[{}]))[0] == "shots has 3 entries, not 1"
+    assert differences(plan_of(shots=[{}]), plan) == ["shots has 1 entries, not 3"]
+    # What one plan has as a mapping or list, and the other as a single value.
+    assert differences(plan_of(darks=None), plan)[0].startswith("darks is null, not {")
+    assert differences(plan, plan_of(darks=None))[0].endswith(", not null")
+    every, few = (plan_of(whiteboards={"views": views}) for views in ("all", [[2, 2]]))
+    assert differences(every, few) == ['whiteboards.views is "all", not [[2, 2]]']
 
 
 def test_a_key_of_earlier_versions_is_read_under_its_new_name_and_not_beside_it():

@@ -12,9 +12,9 @@ from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.captures.amend import amendment
 from emmc_rig.captures.control import Control
 from emmc_rig.captures.faults import GaveUpError
-from emmc_rig.captures.metering import BRACKET_STEP, METERABLE_LEVELS, asked_of_scene
+from emmc_rig.captures.metering import BRACKET_STEP, METERABLE_LEVELS, Exposures, asked_of_scene
 from emmc_rig.captures.plan import Metering
-from emmc_rig.captures.run import _frozen, planned_frames
+from emmc_rig.captures.run import planned_frames
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.formats.scenes import fine_scene
@@ -169,6 +169,15 @@ def test_a_bracket_has_two_stops_for_each_four_times_that_the_range_is_above_eig
         assert max([f.light for f in frames if f.id in asked], default=1) == longest
 
 
+def test_the_first_metering_of_a_scene_counts_where_it_is_taken_again(session):
+    exposures, limits_s = Exposures(plan_and_camera(AUTO)[0], session), (1e-6, 1e3)
+    decided = exposures.decide(limits_s)
+    planned = next(frame for frame in session.frames if frame.kind == "metering")
+    entry = session.stored[planned.id]
+    exposures.learn(planned, entry.model_copy(update={"exposure_s": entry.exposure_s / 9}))
+    assert exposures.decide(limits_s) == decided
+
+
 @pytest.mark.parametrize("last", ["meter-shot-0", "shot-0-e0-r0", "shot-0-e1-r0"])
 def test_a_capture_that_goes_on_exposes_as_it_was_decided_before(last):
     disk, control = SimulatedDisk(), Control()
@@ -195,7 +204,7 @@ def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
     planned = planned_frames(request_for(Path("/disk"), text), rig)
     edit = amendment(session, edited, camera, session.rig, planned)
     assert edit is not None
-    session = session.amend(_frozen(request_for(Path("/disk"), text), edit.frames), edit.changes)
+    session = session.amend(request_for(Path("/disk"), text).frozen(edit.frames), edit.changes)
     assert Sequencer(session, edited, rig).run().complete
     taken_s = [session.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)]
     assert taken_s[1] == taken_s[2] == pytest.approx(taken_s[0] / 2, rel=0.02)

@@ -418,7 +418,6 @@ MISTAKES = {
     "a mask in a reference": (
         changed(2, kind="reference", mask_x_um=24), "kind reference, which is without masks"
     ),
-    "minutes for s": (camera_of(all_rows(exposure_s=0.02 / 60), **LIT_BENCH), "minutes for s in"),
     "ms for s": (camera_of(all_rows(exposure_s=20), **LIT_BENCH), "ms for s in exposure_s?"),
     "us for s": (all_rows(exposure_s=20_000), "less than or equal to 3600"),
     "levels swapped": (
