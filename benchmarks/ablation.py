@@ -5,8 +5,6 @@ The last row of each scene is the disparity of the true views in place of the se
 
 from __future__ import annotations
 
-import time
-
 import lab
 from oracle import matched_disparity
 
@@ -35,12 +33,10 @@ def measure(scene: str, camera: str, size: tuple[int, int], seed: int, without: 
     given = trial_of(Capture(scene, camera, size, seed))
     disparity = matched_disparity(given.truth) if without == ORACLE else None
     settings = AdaptiveSettings.model_validate(PARTS.get(without, {}))
-    started = time.process_time()
-    result = reconstruct_adaptive(given.psi, given.frames, settings, disparity=disparity)
-    return {
-        "psnr_db": given.psnr_db(result.light_field),
-        "cpu_s": time.process_time() - started,
-    }
+    result, cpu_s = lab.timed(
+        reconstruct_adaptive, given.psi, given.frames, settings, disparity=disparity
+    )
+    return {"psnr_db": given.psnr_db(result.light_field), "cpu_s": cpu_s}
 
 
 def main() -> None:

@@ -9,8 +9,6 @@ by more than 0.03 dB; `--store` makes the figures of today those that count. One
 from __future__ import annotations
 
 import sys
-import time
-from dataclasses import replace
 
 import lab
 import numpy as np
@@ -30,26 +28,19 @@ def measure(
     """Return PSNR and processor seconds of a method on a crop of a scene."""
     capture = Capture(scene, camera, None, seed=crop, shots=shots)
     whole = capture.scene_seen()
-    seen = whole.light_field
     chance = np.random.default_rng(crop)
-    top, left = (
+    corner = [
         int(chance.integers(0, max(length - side, 0) + 1))
-        for length, side in zip(seen.shape[2:4], size, strict=True)
-    )
-    part = np.ascontiguousarray(seen[:, :, top : top + size[0], left : left + size[1]])
-    given = trial_of(capture, scene=replace(whole, light_field=part, disparity_px=None))
-    started = time.process_time()
-    result = given.solved(method)
-    return {
-        "psnr_db": round(given.psnr_db(result.light_field), 3),
-        "cpu_s": round(time.process_time() - started, 2),
-    }
+        for length, side in zip(whole.size, size, strict=True)
+    ]
+    given = trial_of(capture, scene=lab.part_of(whole, corner, size))
+    result, cpu_s = lab.timed(given.solved, method)
+    return {"psnr_db": round(given.psnr_db(result.light_field), 3), "cpu_s": round(cpu_s, 2)}
 
 
 def main() -> None:
     """Measure the crops, and compare with those stored."""
-    parser = lab.arguments(__doc__, size="128x128")
-    parser.add_argument("--method", action="append", help=f"may repeat; default: {METHODS}")
+    parser = lab.arguments(__doc__, size="128x128", methods=METHODS)
     parser.add_argument("--shots", type=int, help="of the camera (default: its own)")
     parser.add_argument("--crops", type=int, default=CROPS)
     parser.add_argument("--store", action="store_true", help="keep the figures as those to reach")
@@ -57,7 +48,7 @@ def main() -> None:
     shared = {"camera": args.camera, "size": args.size, "shots": args.shots}
     points = [
         {"scene": args.scenes[crop % len(args.scenes)], **shared, "crop": crop, "method": method}
-        for method in (args.method or METHODS)
+        for method in args.methods
         for crop in range(1 if args.smallest else args.crops)
     ]
     rows = lab.measured(points, measure, "crops-now", args)

@@ -7,7 +7,6 @@ scene itself, whatever the motion. The exact light field of every frame is known
 
 from __future__ import annotations
 
-import time
 from functools import lru_cache
 from itertools import pairwise
 
@@ -100,12 +99,9 @@ def measure(
         shot = frame % psi.shots
         part = psi.of_shots([shot], psi.camera_json)
         given = part, shown.of_one_deviation().cut(np.s_[shot : shot + 1,])
-        started = time.process_time()
-        result, _ = reconstruct_judged("adaptive", *given, film=film)
-        carried_s = time.process_time() - started
+        (result, _), carried_s = lab.timed(reconstruct_judged, "adaptive", *given, film=film)
         film = result.film
-        alone, _ = reconstruct_judged("adaptive", *given)
-        alone_s = time.process_time() - started - carried_s
+        (alone, _), alone_s = lab.timed(reconstruct_judged, "adaptive", *given)
         low_db, high_db = result.stated["stated_interval_db"] or (np.nan, np.nan)
         both = psnr_db(result.light_field, truth), psnr_db(alone.light_field, truth)
         errors.append((result.light_field - truth, alone.light_field - truth))

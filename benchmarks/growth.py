@@ -14,8 +14,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 from emmc_rig.reconstruction.methods import MethodSettings
-from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point
-from emmc_rig.study.chart.measure import measured
+from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point, measured
 from emmc_rig.study.trial import Capture
 
 METHODS = {
@@ -43,7 +42,7 @@ def measure(
 
 def main() -> None:
     """Measure every axis by every method."""
-    parser = lab.arguments(__doc__, camera="rgbw-bayer-1shot", size="64x80")
+    parser = lab.arguments(__doc__, camera="rgbw-bayer-1shot", size="64x80", methods=tuple(METHODS))
     parser.add_argument("--largest", default="128x160", help="rows x columns")
     args = lab.parsed(parser)
     largest = 24 if args.smallest else int(args.largest.split("x")[0])
@@ -62,7 +61,7 @@ def main() -> None:
     args.scenes = args.scenes[:1]
     choices = [
         {"method": method, "axis": axis, **base, **change}
-        for method in (["tv"] if args.smallest else METHODS)
+        for method in args.methods
         for axis, changes in varied.items()
         for change in changes
     ]

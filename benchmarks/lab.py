@@ -7,23 +7,29 @@ import csv
 import datetime
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import joblib
 import matplotlib
+import numpy as np
 import pandas as pd
 
 import emmc_rig
+from emmc_rig.formats.scenes import Scene
 
 matplotlib.use("Agg")
+Result = TypeVar("Result")
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
 GROUP_A = ("dragons", "dice", "fish", "buttercup", "occlusions", "begonia", "antinous")
 GROUP_B = (
     "messerschmitt", "bikes", "isochart", "general11", "lytro1@by-parallax", "lytro2@by-parallax",
 )  # fmt: skip
 """Real light fields in the folder EMMC_LIGHTFIELDS: tune on A, report on B."""
-SMALLEST = (32, 40)
+SMALLEST, QUICKEST = (32, 40), ("tv",)
 RUNS = "runs.csv"
 """Of every CSV beside it: when its rows were measured, by which version and command."""
 
@@ -33,8 +39,12 @@ def arguments(
     scenes: Sequence[str] = ("deep-occlusions",),
     camera: str = "scenario-ii-cfa",
     size: str = "64x80",
+    methods: Sequence[str] = (),
 ) -> argparse.ArgumentParser:
-    """Return a parser of what most scripts take; the defaults are a script's own."""
+    """Return a parser of what most scripts take; the defaults are a script's own.
+
+    methods: the methods compared where none is given; without it the script takes no `--method`.
+    """
     parser = argparse.ArgumentParser(description=sentence)
     parser.add_argument("--scene", action="append", help=f"may repeat; default: {scenes}")
     parser.add_argument("--group", choices="AB", help="of the real light fields, instead of scenes")
@@ -44,13 +54,20 @@ def arguments(
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smallest", action="store_true", help="to see that it runs: seconds")
-    parser.set_defaults(scenes=scenes)
+    if methods:
+        parser.add_argument("--method", action="append", help=f"may repeat; default: {methods}")
+    parser.set_defaults(scenes=scenes, methods=methods)
     return parser
 
 
 def parsed(parser: argparse.ArgumentParser, given: Sequence[str] | None = None):
-    """Return the arguments, `size` as rows and columns or None, `scenes` as chosen."""
+    """Return the arguments, `size` as rows and columns or None, `scenes` and `methods` as chosen.
+
+    `--smallest` is one small scene, and a method that takes no time where methods can be chosen.
+    """
     args = parser.parse_args(given)
+    if args.methods:
+        args.methods = tuple(args.method or (QUICKEST if args.smallest else args.methods))
     sides = args.size.lower().split("x")
     args.size = None if sides == ["whole"] else tuple(map(int, sides))
     if args.group:
@@ -95,6 +112,20 @@ def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, ar
     wanted = {tuple(map(_text, point.values())) for point in points}
     chosen = kept[[key in wanted for key in kept[keys].fillna("").itertuples(False, None)]]
     return chosen.reset_index(drop=True).apply(_numbers)
+
+
+def timed(call: Callable[..., Result], *given: Any, **more: Any) -> tuple[Result, float]:
+    """Return what a call returns, and its processor seconds."""
+    started = time.process_time()
+    result = call(*given, **more)
+    return result, time.process_time() - started
+
+
+def part_of(scene: Scene, corner: Sequence[int], size: tuple[int, int]) -> Scene:
+    """Return rows x columns of a scene from a corner (y, x), without its disparity."""
+    rows, columns = (slice(at, at + side) for at, side in zip(corner, size, strict=True))
+    part = np.ascontiguousarray(scene.light_field[:, :, rows, columns])
+    return replace(scene, light_field=part, disparity_px=None)
 
 
 def note_run(folder: Path, name: str) -> None:

@@ -65,11 +65,14 @@ def measure(
 
 def main() -> None:
     """Measure every error on every scene, by every method."""
-    args = lab.parsed(lab.arguments(__doc__, camera="rgbw-bayer-1shot", size="32x40"))
+    methods = installed_methods()
+    args = lab.parsed(
+        lab.arguments(__doc__, camera="rgbw-bayer-1shot", size="32x40", methods=methods)
+    )
     choices = [
         {"method": method, "error": error, "by": by}
         for error, by in (ERRORS[:1] if args.smallest else ERRORS)
-        for method in (["tv"] if args.smallest else installed_methods())
+        for method in args.methods
     ]
     rows = lab.measured(lab.points(args, choices), measure, "mismatch", args)
     scenarios = ["ideal_db", "assumed_db", "oracle_db", "mended_db"]

@@ -6,7 +6,6 @@ At rest the shots are a film, too: its last frame against all shots of one captu
 
 from __future__ import annotations
 
-import time
 from functools import lru_cache
 
 import lab
@@ -47,13 +46,6 @@ def _captured(
     return psi, described.read_out(np.maximum(np.concatenate(clean), 0), seed)
 
 
-def _judged(psi, shown):
-    """Return the reconstruction, the verdict, and the processor time of both."""
-    started = time.process_time()
-    found = reconstruct_judged("adaptive", psi, shown)
-    return *found, time.process_time() - started
-
-
 @lru_cache(maxsize=1)
 def _at_rest(scene: str, camera: str, shots: int, size: tuple[int, int], seed: int) -> dict:
     """Return what is reached without motion, see `measure`."""
@@ -69,7 +61,7 @@ def _at_rest(scene: str, camera: str, shots: int, size: tuple[int, int], seed: i
     for shot in range(1, shots):
         last = solved(shot, last.film)
     together = reconstruct("adaptive", psi, rest, None, WITHOUT_PATCHES)
-    at_rest, _, cpu_s = _judged(psi, rest)
+    (at_rest, _), cpu_s = lab.timed(reconstruct_judged, "adaptive", psi, rest)
     return {
         "rest_db": psnr_db(at_rest.light_field, truth),
         "alone_db": psnr_db(alone, truth),
@@ -90,7 +82,7 @@ def measure(
     of a film of the shots at rest; together_db: of all shots at rest, without patches as in films.
     """
     psi, moved = _captured(scene, camera, shots, size, seed, step_px)
-    result, verdict, cpu_s = _judged(psi, moved)
+    (result, verdict), cpu_s = lab.timed(reconstruct_judged, "adaptive", psi, moved)
     found_db = psnr_db(result.light_field, _seen(scene, size, step_px, 0))
     low_db, high_db = result.stated["stated_interval_db"] or (np.nan, np.nan)
     return {

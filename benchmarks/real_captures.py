@@ -5,7 +5,6 @@ interpolation, and a Psi that is not the camera's is refused.
 from __future__ import annotations
 
 import os
-import time
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from matplotlib import pyplot as plt
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
+METHODS = ("adaptive-fast", "tv")
 MASKS = ("right", SOFTER, "1 rows off", "2 rows off", "3 rows off", "4 rows off", "mirrored")
 
 
@@ -41,9 +41,8 @@ def measure(
     """
     taken = coded_capture(folder, capture, size, mask)
     psi, frames, kept = taken.psi, taken.frames, taken.kept
-    began = time.process_time()
-    result = taken.reconstruct(method)
-    row: dict = {"level": result.verdict.level, "cpu_s": time.process_time() - began}
+    result, cpu_s = lab.timed(taken.reconstruct, method)
+    row: dict = {"level": result.verdict.level, "cpu_s": cpu_s}
     between = interpolated(frames.readings, frames.usable & ~kept)
     kept = kept & np.isfinite(between)
     brightest = float(frames.readings[frames.usable].max())
@@ -61,22 +60,21 @@ def measure(
 
 def main() -> None:
     """Measure, and draw how much better than interpolation."""
-    parser = lab.arguments(__doc__, (), size="x".join(map(str, WINDOW)))
+    parser = lab.arguments(__doc__, (), size="x".join(map(str, WINDOW)), methods=METHODS)
     peers = Path(os.environ.get("EMMC_PEER_FILES", "."))
     parser.add_argument("--captures", type=Path, default=peers / "captures")
-    parser.add_argument("--method", action="append", help="default: adaptive-fast and tv")
     parser.add_argument("--mask", action="append", choices=MASKS, help="default: all")
     args = lab.parsed(parser)
     names, size = available(args.captures), args.size
-    methods, masks = args.method or ["adaptive-fast", "tv"], args.mask or MASKS
+    masks = args.mask or MASKS
     if args.smallest:
-        names, methods, masks = names[:1], ["tv"], MASKS[:1]
+        names, masks = names[:1], MASKS[:1]
     if not names:
         raise SystemExit(f"no captures in {args.captures}: name their folder by --captures")
     points = [
         {"capture": name, "size": size, "method": method, "mask": mask}
         for name in names
-        for method in methods
+        for method in args.methods
         for mask in masks
         if mask == "right" or name.split("/")[0] in BANDS
     ]

@@ -56,6 +56,16 @@ def number(row: Row, key: str) -> float:
     return float(row[key])
 
 
+def where(rows: Iterable[Row], **values: str) -> list[Row]:
+    """Return the rows with these values."""
+    return [row for row in rows if all(row[key] == value for key, value in values.items())]
+
+
+def cost_and_psnr(rows: Sequence[Row]) -> tuple[float, float]:
+    """Return the means of processor seconds and PSNR in dB."""
+    return average(rows, "cpu_seconds"), average(rows, "psnr_db")
+
+
 def average(rows: Iterable[Row], key: str) -> float:
     """Return the mean of a figure."""
     return mean(number(row, key) for row in rows)
@@ -128,13 +138,13 @@ CAMERAS = {"one shot": "rgbw-bayer-1shot", "three shots": "rgbw-bayer-3shots"}
 
 def speed() -> Section:
     """Accuracy and processor time of every method."""
-    rows = [row for row in rows_of("chart-group-b-64x80") if row["level"] == "default"]
+    rows = where(rows_of("chart-group-b-64x80"), level="default")
     scenes = {row["scene"] for row in rows}
     named: dict[str, dict[str, tuple[float, float]]] = {}
     for shots, camera in CAMERAS.items():
         for method in sorted({row["method"] for row in rows}):
-            of = [row for row in rows if (row["camera"], row["method"]) == (camera, method)]
-            named.setdefault(shots, {})[method] = average(of, "cpu_seconds"), average(of, "psnr_db")
+            of = cost_and_psnr(where(rows, camera=camera, method=method))
+            named.setdefault(shots, {})[method] = of
     best = named["one shot"]["adaptive"]
     second = max(
         (db, method)
@@ -170,8 +180,8 @@ def whole_speed() -> Section:
     rows = rows_of("chart-full-frames")
     means: dict[str, dict[str, tuple[float, float]]] = {}
     for method, level in dict.fromkeys((row["method"], row["level"]) for row in rows):
-        of = [row for row in rows if (row["method"], row["level"]) == (method, level)]
-        means.setdefault(method, {})[level] = average(of, "cpu_seconds"), average(of, "psnr_db")
+        of = cost_and_psnr(where(rows, method=method, level=level))
+        means.setdefault(method, {})[level] = of
     scenes = {row["scene"] for row in rows}
     best, fast = means["adaptive"]["default"], means["adaptive-fast"]["default"]
     known: dict[str, list[float]] = defaultdict(list)
@@ -202,15 +212,13 @@ def films() -> Section:
     """Films against their frames alone."""
     rows = rows_of("films")
     words = {
-        "rests": "at rest",
-        "creeps": "0.1 pixels a frame",
-        "pans": "camera pans",
+        "rests": "at rest", "creeps": "0.1 pixels a frame", "pans": "camera pans",
         "passes": "an object passes",
-    }
+    }  # fmt: skip
     scenes = sorted({row["scene"] for row in rows})
     gain = figures(rows, "gain_db", "scene", "motion")
     dots = {text: [gain[scene, motion] for scene in scenes] for motion, text in words.items()}
-    of = {motion: [row for row in rows if row["motion"] == motion] for motion in words}
+    of = {motion: where(rows, motion=motion) for motion in words}
     pans, rests = (average(of[motion], "gain_db") for motion in ("pans", "rests"))
     cost, flicker = average(rows, "cost"), average(of["rests"], "flicker")
     table: list[tuple[str, ...]] = [
@@ -392,9 +400,7 @@ def verdicts() -> Section:
         ("broken", "broken (3 dB lost or more), flagged"),
         ("good", "good (1 dB at most), flagged"),
     ):
-        counts[kind] = [
-            share([row for row in of if row["kind"] == kind], flagged) for of in groups.values()
-        ]
+        counts[kind] = [share(where(of, kind=kind), flagged) for of in groups.values()]
         table.append((words, *counts[kind]))
     return Section(
         "Is a broken result flagged?",
@@ -422,7 +428,7 @@ def verdicts() -> Section:
 
 def wrong_psi() -> Section:
     """What a moved mask costs, and what fitting Psi to the frames wins back."""
-    rows = [row for row in rows_of("mismatch") if row["error"] == "Mask shift 0.5 px"]
+    rows = where(rows_of("mismatch"), error="Mask shift 0.5 px")
     # It has become part of `adaptive`.
     rows = [row for row in rows if row["method"] != "adaptive-dict"]
     rows.sort(key=lambda row: -number(row, "oracle"))
@@ -457,31 +463,27 @@ FAULTS = {
 
 def breaking() -> Section:
     """From which strength a fault costs 3 dB."""
-    rows = [
-        row
-        for row in rows_of("stability-real-breaking")
-        if row["screened"] == "True" and row["scene"] != "all scenes"
-    ]
+    rows = where(rows_of("stability-real-breaking"), screened="True")
+    rows = [row for row in rows if row["scene"] != "all scenes"]
     table = [("fault", "`adaptive-fast`, median (least, most)", "`tv`, median")]
     for fault, words in FAULTS.items():
-        cells = []
-        for method in ("adaptive-fast", "tv"):
-            of = [
+        fast, tv = (
+            [
                 number(row, "below_best_to")
-                for row in rows
-                if (row["fault"], row["method"]) == (fault, method) and row["below_best_to"]
+                for row in where(rows, fault=fault, method=method)
+                if row["below_best_to"]
             ]
-            cells.append(of)
-        most = f"{median(cells[0]):.2g} ({min(cells[0]):.2g}, {max(cells[0]):.2g})"
-        table.append((words, _plain(most), _plain(f"{median(cells[1]):.2g}")))
-    moved = [r for r in rows if (r["fault"], r["method"]) == ("mask-shift", "adaptive-fast")]
+            for method in ("adaptive-fast", "tv")
+        )
+        most = f"{median(fast):.2g} ({min(fast):.2g}, {max(fast):.2g})"
+        table.append((words, _plain(most), _plain(f"{median(tv):.2g}")))
+    shift = {"fault": "mask-shift", "method": "adaptive-fast", "screened": "True"}
+    moved = where(rows, **shift)
     shifts = figures(moved, "below_best_to", "scene")
     strict, mild = min(shifts, key=shifts.__getitem__), max(shifts, key=shifts.__getitem__)
     points: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for row in rows_of("stability-real"):
-        kind = row["fault"], row["method"], row["screened"]
-        if kind == ("mask-shift", "adaptive-fast", "True"):
-            points[row["scene"]].append((number(row, "strength"), number(row, "psnr_db")))
+    for row in where(rows_of("stability-real"), **shift):
+        points[row["scene"]].append((number(row, "strength"), number(row, "psnr_db")))
     every = [sorted(line) for line in points.values()]
     shared = sorted(set.intersection(*({x for x, _ in line} for line in every)))
     middle = [(x, mean(dict(line)[x] for line in every)) for x in shared]
@@ -589,7 +591,7 @@ def mask_design() -> Section:
 def learning() -> Section:
     """What a trained network gains."""
     rows = [*rows_of("group-b-chart"), *rows_of("group-b-unrolled")]
-    kept = [row for row in rows if row["camera"] == "scenario-ii-cfa" and row["level"] == "default"]
+    kept = where(rows, camera="scenario-ii-cfa", level="default")
     by = figures(kept, "psnr_db", "scene", "method")
     scenes = sorted({row["scene"] for row in kept}, key=lambda scene: -by[scene, "adaptive"])
     dots = {
@@ -617,7 +619,7 @@ def learning() -> Section:
 
 def others() -> Section:
     """Captures of cameras that nobody here built."""
-    rows = [row for row in rows_of("real_captures") if row["mask"] == "right"]
+    rows = where(rows_of("real_captures"), mask="right")
     by = {
         (row["capture"], row["method"]): number(row, "rms") / number(row, "interpolation_rms")
         for row in rows

@@ -40,7 +40,9 @@ def measure(
     anew instead. error_db, deviation_db: the values that `foretold_db` should return.
     """
     capture = Capture(scene, camera, size, seed + cut, noise=noise)
-    given = trial_of(capture, scene=None if capture.is_built_in or not cut else _cut(scene, size))
+    given = trial_of(
+        capture, scene=None if capture.is_built_in or not cut else _quarter(scene, size)
+    )
     result, verdict = reconstruct_judged(method, given.psi, given.frames)
     if "sigma" not in result.maps:
         return {"verdict": verdict.level}
@@ -65,13 +67,14 @@ def measure(
     }
 
 
-def _cut(scene: str, size: tuple[int, int]) -> Scene:
-    whole = open_scene(scene).light_field
-    top, left = (
+def _quarter(scene: str, size: tuple[int, int]) -> Scene:
+    """Return a window about the middle of a scene's first quarter."""
+    whole = open_scene(scene)
+    corner = [
         int(np.clip(length // 4 - side // 2, 0, length - side))
-        for length, side in zip(whole.shape[2:4], size, strict=True)
-    )
-    return open_scene(whole[:, :, top : top + size[0], left : left + size[1]])
+        for length, side in zip(whole.size, size, strict=True)
+    ]
+    return lab.part_of(whole, corner, size)
 
 
 def fitted(rows: pd.DataFrame, column: str) -> pd.Series:

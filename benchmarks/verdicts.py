@@ -25,6 +25,7 @@ NAMED = {
     "vignetting": "outermost rays", "black-level": "black level", "gamma": "to the power of",
     "jpeg": "compressed",
 }  # fmt: skip
+METHODS = ("tv", "adaptive-fast")
 BROKEN_DB, GOOD_DB, POOR_DB, EVEN_DB = 3.0, 1.0, 2.0, 5.0
 
 
@@ -71,9 +72,10 @@ def kinds(rows):
 
 def main() -> None:
     """Measure every fault of capture and Psi on every scene, by every method."""
-    parser = lab.arguments(__doc__, ("near-planar", "deep-occlusions"), "rgbw-bayer-3shots")
+    parser = lab.arguments(
+        __doc__, ("near-planar", "deep-occlusions"), "rgbw-bayer-3shots", methods=METHODS
+    )
     parser.add_argument("--fault", action="append", help="may repeat; default: all")
-    parser.add_argument("--method", action="append", help="default: tv and adaptive-fast")
     args = lab.parsed(parser)
     shots = len(Capture(args.scenes[0], args.camera).described.shots)
     faults = [f for f in FAULTS.values() if f.kind in (SENSOR, MASK, SHOTS) and f.shots <= shots]
@@ -82,7 +84,7 @@ def main() -> None:
         {"method": method, "fault": fault.name, "strength": float(strength)}
         for fault in (faults[:1] if args.smallest else faults)
         for strength in fault.quick
-        for method in (["tv"] if args.smallest else args.method or ["tv", "adaptive-fast"])
+        for method in args.methods
     ]
     rows = kinds(lab.measured(lab.points(args, choices), measure, "verdicts", args))
     summary = rows.groupby("kind").flagged.agg(["sum", "count"])

@@ -90,9 +90,12 @@ def measure(
 
 def main() -> None:
     """Measure every method on every scene."""
-    args = lab.parsed(lab.arguments(__doc__, camera="rgbw-bayer-3shots", size="24x32"))
-    methods, rounds = (["tv"], 1) if args.smallest else (installed_methods(), ROUNDS)
-    points = lab.points(args, ({"method": method, "rounds": rounds} for method in methods))
+    methods = installed_methods()
+    args = lab.parsed(
+        lab.arguments(__doc__, camera="rgbw-bayer-3shots", size="24x32", methods=methods)
+    )
+    rounds = 1 if args.smallest else ROUNDS
+    points = lab.points(args, ({"method": method, "rounds": rounds} for method in args.methods))
     rows = lab.measured(points, measure, "worst", args)
     axes = rows.groupby("method").lost_db.max().plot.barh(xlabel="dB lost to the worst direction")
     lab.finished(rows, axes, "worst", args)

@@ -1,9 +1,17 @@
-"""The mixed route: dust and defects on the mask, found in what the placement leaves unexplained.
+"""Specks: dust and defects on the mask, and dust that moved on the sensor, seen in the residuals.
 
 A defect takes the share delta off whatever passes a grain of the mask (half a cell), for every
 view and wherever the stage moves it: a property of the mask, not of pixels. Residuals are linear
 in the deltas. Grains are taken up only where the whiteboards support it (their own evidence beats
-SUPPORT deviations), then solved for together with the prior N(0, SIZE^2), and looked for again.
+SUPPORT deviations), then solved for together with the prior N(0, SIZE^2), and looked for again:
+
+    residual_p = - sum over grains g of  influence_pg delta_g + noise
+    gradient_g = sum over p of  - influence_pg residual_p,    curvature_g = sum of influence_pg^2
+    evidence_g = gradient_g / sqrt(curvature_g),    residuals and influences in deviations
+
+Dust that came onto the sensor, or left it, between the references and the whiteboards is no such
+defect: a whiteboard over its reference does not show how bright a pixel is. Its pixels are darker,
+or brighter, by the same share in every whiteboard, whatever the mask casts there.
 """
 
 from __future__ import annotations
@@ -15,10 +23,12 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.ndimage import binary_dilation
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from emmc_rig.calibration.boards import Board, Opening
+from emmc_rig.calibration.choice import predicted_by_shadow
 from emmc_rig.calibration.placement import Placement
 from emmc_rig.calibration.robust import deviation_of
 from emmc_rig.calibration.shadow import Shadow, ShadowMask
@@ -37,6 +47,16 @@ CHUNK = 16_384
 """Pixels whose influences are held at once."""
 LARGEST_SHARE = 0.02
 """Of the mask's grains; more are no defects but a wrong placement."""
+FEWEST_BOARDS = 3
+"""That show a pixel, to know a change alike in all."""
+SURE_DUST, LEAST_DUST = 6.0, 0.01
+"""Deviations, and share of the light, from which on a pixel's change is dust."""
+LARGEST_CHI2 = 3.0
+"""Of what a change alike in all whiteboards leaves of a pixel: more, and it is no dust."""
+SKIRT_PX = 2
+"""Around dusty pixels: the fainter rim of a speck's shadow."""
+MOST_OF_SENSOR = 0.25
+"""More pixels than these are not dusty: whatever it is, the model misses it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,3 +239,34 @@ def _with_losses(fine: ShadowMask, placement: Placement, lost: Array) -> ShadowM
     through = leak + (clear - leak) * fine.cells
     passed = through * (1 - lost[None, :, :, None])
     return replace(fine, cells=((passed - leak) / (clear - leak)).astype(np.float32))
+
+
+def moved_dust(shadow: Shadow, boards: Sequence[Board]) -> NDArray[np.bool_]:
+    """Return the pixels, (pixel_y, pixel_x), under dust that moved after the references.
+
+    With reading = (1 + change) shadow + noise, a pixel's change over all whiteboards is
+
+        change = sum w shadow (reading - shadow) / sum w shadow^2,    w = 1 / variance
+
+    Dusty: a change that is sure, large, and leaves residuals like the noise in every whiteboard.
+    """
+    shape = boards[0].reading.shape
+    light, power, squares, count = (np.zeros(shape) for _ in range(4))
+    for board in boards:
+        weight = np.where(board.usable, 1 / board.variance.astype(np.float64), 0.0)
+        predicted = predicted_by_shadow(shadow, board)
+        off = board.reading - predicted
+        light += weight * predicted * off
+        power += weight * predicted**2
+        squares += weight * off**2
+        count += board.usable
+    change = light / np.maximum(power, 1e-300)
+    left = squares - change * light
+    # All share the noise of the references, which the boards' own variances count anew each time.
+    common = deviation_of(change[power > 0])
+    sure = np.abs(change) > SURE_DUST * np.maximum(common, 1 / np.sqrt(np.maximum(power, 1e-300)))
+    alike = left < LARGEST_CHI2 * np.maximum(count - 1, 1)
+    dusty = sure & alike & (np.abs(change) > LEAST_DUST) & (count >= FEWEST_BOARDS)
+    if not 0 < dusty.mean() < MOST_OF_SENSOR:
+        return np.zeros(shape, bool)
+    return np.asarray(binary_dilation(dusty, iterations=SKIRT_PX), bool)

@@ -699,7 +699,7 @@ def _widening_samples(
 ) -> Iterator[list[Sample]]:
     """Yield samples of all whiteboards, from windows that widen to the picture.
 
-    The last two are of the whole picture: with few pixels, then with all that are asked for.
+    The last two are of the whole picture: of `first_pixels`, then of `pixels`.
     """
     rng = np.random.default_rng(settings.seed)
     whole_px, half_px = max(mask.pixel_shape()) / 2, float(FIRST_WINDOW_PX)

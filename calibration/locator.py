@@ -32,7 +32,7 @@ CROP_PX = 160
 LEAST_CORRELATION = 0.3
 """Of frame and shadow, below which the mask is not the design's."""
 CLEAR_CORRELATION = 0.6
-"""From which on no other rotation is tried, and a mirrored mask is named."""
+"""Ends the search over rotations; a mirrored mask is named from this correlation on."""
 ROTATIONS_DEG = (0.5, -0.5, 1.0, -1.0, 1.5, -1.5, 2.0, -2.0)
 """A quarter of a degree moves the rim of CROP_PX by a third of a pixel."""
 ORIENTATIONS = {
@@ -218,7 +218,12 @@ def search(
 ) -> Location:
     """Return the start moved to the best shift, and the correlation coefficient there.
 
-    Of a mask that repeats it is the place nearest to the start that looks so.
+        score(shift) = sum of centred reading x shadow(shift)
+                       / sqrt(sum of reading^2 x sum of shadow(shift)^2)
+
+    Sums over the usable pixels of all colours, each colour about its own mean; every shift at once
+    by FFT, the peak by a parabola. Of a mask that repeats, the place nearest to the start that
+    looks so.
 
     reach_um: shifts tried, along either axis. crop_px: the middle of the picture that is used.
     """
@@ -310,9 +315,15 @@ def _fit_window(
 ) -> Location:
     """Return the placement after Gauss-Newton steps on one window.
 
-    Light and level of every colour are eliminated, the light a quadratic over the picture: shadow
-    and slopes are taken orthogonal to them (variable projection, Golub and Pereyra 1973, with
-    Kaufman's simplification).
+        reading = light(x, y) shadow(placement) + level + noise,   light: a quadratic, by colour
+
+    Light and level are linear in their coefficients and eliminated (variable projection, Golub and
+    Pereyra 1973, with Kaufman's simplification): with Q the projection away from them,
+
+        r = Q reading,    J = Q light d(shadow) / d(fitted),    w: Tukey's weights of r
+        step = (J^T w J + diag(variance / tolerance^2))^-1 J^T w r,    variance: of r
+
+    The tolerances hold what the shadow does not show, as the place along stripes.
     """
     indices = [SCALARS.index(name) for name in fitted]
     tolerances = Tolerances().deviations(mask.views)[indices]
@@ -336,7 +347,6 @@ def _fit_window(
         alike = correlation(sample.reading, sample.reading - residual, sample.channels)
         weight = tukey_weights(residual / (deviation_of(residual) + 1e-12))
         variance = 1e-12 + np.sum(weight * residual**2) / max(np.sum(weight) - len(indices), 1.0)
-        # What the shadow does not show, as the place along stripes, stays where it is.
         matrix = rows.T @ (rows * weight[:, None]) + np.diag(variance / tolerances**2)
         inverse = np.linalg.inv(matrix)
         deviations = MODEL_FACTOR * np.sqrt(np.diag(inverse) * variance)

@@ -65,7 +65,14 @@ def slopes(plane: Array) -> NDArray[np.float64]:
 def measured_misfit(
     squares: Array, variance: Array, plane: Array, usable: NDArray[np.bool_]
 ) -> Misfit:
-    """Return the misfit that squared differences (y, x) show beyond a variance."""
+    """Return the misfit that squared differences (y, x) show beyond a variance.
+
+        squares - variance = level + per_slope slope^2 + chance
+
+    A line through the means of LIKE_SLOPES groups of coefficients alike in slope^2, weighed by
+    their numbers; level and per_slope are not negative. Outliers (specks, bad pixels) are left out.
+    plane: the model's coefficients, whose slopes count.
+    """
     steep = slopes(plane)
     calm = usable & (squares < OUTLIER2 * (variance + np.median(squares[usable])))
     limits = np.quantile(steep[calm], np.linspace(0, 1, LIKE_SLOPES + 1)[1:-1])
@@ -101,8 +108,13 @@ def beyond_chance(misfits: Sequence[Misfit]) -> list[Misfit]:
 
 
 def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> Calibration:
-    """Return what pinhole and model know of Psi, in one.
+    """Return Psi as pinhole and model know it together.
 
+        share = (inherent + misfit) / (inherent + misfit + noise)
+        weight = expected + share (measured - expected),    variance = share noise
+
+    expected, inherent: the model's coefficient and variance; measured, noise: the pinhole's; misfit
+    as measured over the view and around the pixel. An outlier is the pinhole's alone (share 1).
     good: (pixel_y, pixel_x), pixels whose frames count; elsewhere Psi is the model's.
     """
     weights, deviation = np.empty_like(free.psi.weights), np.empty_like(free.psi.weights)
@@ -115,7 +127,7 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
     ]
 
     def estimates_of(place: tuple[int, int, int, slice, int]) -> tuple[Array, ...]:
-        """Return what pinhole and model say, and the variances of both."""
+        """Return the pinhole's and the model's coefficients, and the variances of both."""
         both = free, model
         measured, expected = (known.psi.weights[place].astype(np.float64) for known in both)
         noise, inherent = (np.square(known.deviation[place], dtype=np.float64) for known in both)
@@ -142,7 +154,11 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
 def _local_misfit(
     squares: Array, variance: Array, misfit: Array, usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the misfit's variance (y, x), that of a pixel's surroundings where surely another."""
+    """Return the misfit's variance (y, x): of a pixel's surroundings where that surely differs.
+
+    There it is the mean of squares - variance over AROUND_PX x AROUND_PX usable pixels, which
+    chance makes uncertain by sqrt(2) / AROUND_PX of the variance.
+    """
     over = np.where(usable, squares - variance - misfit, 0.0)
     inside = uniform_filter(usable.astype(np.float64), AROUND_PX)
     more = uniform_filter(over, AROUND_PX) / np.maximum(inside, 1e-9)

@@ -43,7 +43,13 @@ SCALARS = (
     "bow_um",
     "glass_um",
 )
+(
+    OFFSET_X, OFFSET_Y, ROTATION, SCALE, SKEW, DISTANCE, DISTORTION, BLUR,
+    CLEAR, LEAK, VIGNETTING, FALLOFF, TILT_X, TILT_Y, BOW, GLASS,
+) = range(len(SCALARS))  # fmt: skip
+"""Where the scalars lie in the parameter vector."""
 LEAST_BLUR_UM = 0.3
+"""Far below a cell; keeps the shadow differentiable where the mask's edges are sharp."""
 
 
 @dataclass(frozen=True)

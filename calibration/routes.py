@@ -39,8 +39,7 @@ from emmc_rig.calibration.colours import (
     mixing,
     other_colours,
 )
-from emmc_rig.calibration.defects import find_defects, loss_variance
-from emmc_rig.calibration.dust import moved_dust
+from emmc_rig.calibration.defects import find_defects, loss_variance, moved_dust
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.fit import OFFSETS, fit_placement
 from emmc_rig.calibration.frames import MeanFrame
@@ -203,7 +202,7 @@ class _Task:
     """What every step of a calibration needs, and none changes.
 
     captured, steady: the whiteboards as captured, and as under a steady lamp and a straight
-    response. stages: (x, y) of the mask in um, per shot. crosstalk: None where it does not matter.
+    response. stages: (x, y) of the mask in um, per shot. crosstalk: None for negligible crosstalk.
     """
 
     camera: Camera
@@ -229,7 +228,7 @@ class _Task:
 class _Readings:
     """Whiteboards as readings, and the pixels to use.
 
-    good: (pixel_y, pixel_x). judges: held out. seen: those that models are fitted to.
+    good: (pixel_y, pixel_x). judges: held out. seen: for the models' fits.
     """
 
     good: NDArray[np.bool_]
@@ -255,7 +254,7 @@ class _RoutePsi(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Modelled:
-    """The fits of the mask; without any where no route fits it.
+    """The fits of the mask, by the routes that model it.
 
     plain: the mask as designed. models: by route (parametric, mixed). bare: their calibrations
     without the misfit in the deviations. psis: with it.

@@ -26,14 +26,17 @@ Array = NDArray[np.floating]
 Frame = NDArray[np.uint16]
 Flags = NDArray[np.bool_]
 BLOCKS = 12
+"""Of rows: a deviation of so many is known to a fifth."""
 TILES = 8
 """Across: with BLOCKS down, the parts of a frame of which the brightest show saturation."""
 BRIGHTEST_SHARE = 0.95
+"""Of the brightest tile's light, from which on a tile shows saturation."""
 CLIPPED_BLACK = 1e-3
 """Share of the pixels of the shortest dark that read 0, from which on the black level clips."""
-FIT_SHARE = 0.7
-LINEAR_RANGE = (0.05, 0.95)
+FIT_SHARE, LINEAR_RANGE = 0.7, (0.05, 0.95)
+"""Of saturation, where gain and linearity are fitted, as EMVA 1288 has it."""
 CLIPPED_SHARE = 0.01
+"""Of a tile's pixels at the white level, from which on it saturates."""
 FALLEN_SHARE = 0.8
 """Of the greatest variance: beyond what noise makes of the variance of a frame of any size."""
 COLLAPSED_SHARE = 0.1
@@ -46,9 +49,12 @@ QUANTISED_DN2, QUANTISED_DN = 0.24, 0.40
 ROUNDED_DN = 0.2
 """What rounding may add to a mean of pixels that hardly differ: 1/pi at most, 0.2 at 0.16 DN."""
 BRIGHTER_DEVIATIONS = 10.0
+"""Of the dark's noise, by which flats at saturation are brighter at least."""
 EVERY = np.ones((BLOCKS, TILES), dtype=bool)
 HOT_DEVIATIONS = 8.0
+"""Robust ones of all pixels, from which on a dark pixel is hot: of normal noise none is."""
 DEAD_SHARE = 0.5
+"""Of the median of a pixel's colour, below which it is dead."""
 
 
 @dataclass(frozen=True)
@@ -246,22 +252,8 @@ def characterise(darks: Sequence[Pair], flats: Iterable[Pair], white_level_dn: i
     quantised = points.dark_variance_dn2 < QUANTISED_DN2
     deviations = _deviations(dark, flat, bright)
     if quantised:
-        # Without noise to spread them, mean darks are rounded alike.
-        current_dn = ROUNDED_DN / (max(times_s) - min(times_s))
-        for name, more in (
-            ("black_level_dn", ROUNDED_DN),
-            ("dark_current_electrons_per_s", current_dn / figures["gain_dn_per_electron"]),
-        ):
-            deviations[name] = float(np.hypot(deviations[name], more))
-    saturation, step = points.saturation
-    for name, slope in (
-        ("full_well_electrons", figures["full_well_electrons"]),
-        ("saturation_dn", saturation),
-        ("snr_max_db", 10 / np.log(10)),
-        ("dynamic_range_db", 20 / np.log(10)),
-    ):
-        of_step = step / np.sqrt(3) / saturation * slope
-        deviations[name] = float(np.hypot(deviations[name], of_step))
+        _add_rounding(deviations, figures["gain_dn_per_electron"], max(times_s) - min(times_s))
+    _add_saturation_step(deviations, figures, *points.saturation)
     half_dn = points.black_dn + PRNU_SHARE * (brightest_dn - points.black_dn)
     lit = min(unsaturated, key=lambda held: abs(held[0] - half_dn))[2]
     shortest = darks[int(np.argmin(times_s))]
@@ -327,6 +319,36 @@ def _deviations(dark: _Levels, flat: _Levels, bright: Flags) -> dict[str, float]
     return {
         name: float(factor * np.std([figures[name] for figures in without])) for name in without[0]
     }
+
+
+def _add_rounding(deviations: dict[str, float], gain_dn_per_electron: float, span_s: float) -> None:
+    """Add what rounding makes of mean darks, over exposures that differ by span_s.
+
+    Without noise to spread them, all pixels are rounded alike.
+    """
+    current_dn_per_s = ROUNDED_DN / span_s
+    for name, rounded in (
+        ("black_level_dn", ROUNDED_DN),
+        ("dark_current_electrons_per_s", current_dn_per_s / gain_dn_per_electron),
+    ):
+        deviations[name] = float(np.hypot(deviations[name], rounded))
+
+
+def _add_saturation_step(
+    deviations: dict[str, float], figures: dict[str, float], saturation_dn: float, step_dn: float
+) -> None:
+    """Add what a step between exposures leaves open of saturation: uniform, of deviation / sqrt 3.
+
+    Each figure grows by its slope times a relative change of the saturation.
+    """
+    for name, slope in (
+        ("full_well_electrons", figures["full_well_electrons"]),
+        ("saturation_dn", saturation_dn),
+        ("snr_max_db", 10 / np.log(10)),
+        ("dynamic_range_db", 20 / np.log(10)),
+    ):
+        of_step = step_dn / np.sqrt(3) / saturation_dn * slope
+        deviations[name] = float(np.hypot(deviations[name], of_step))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,18 @@
 """The mask's shadow: what every pixel reads through a set of views, and how that depends on the
 placement of the mask.
 
+A pixel p that sees the views of an opening reads, of a white board,
+
+    reading(p) = sum over open views j of  w_j(p) (leak + (clear - leak) T_j(p))
+    T_j(p) = sum over cells (a, b) of  down_a across_b cells[row + a, column + b]
+
+with w_j the view's share of the light and T_j the mask as the footprint of (p, j) averages it: see
+`placement` for w_j, the point xi where the ray meets the mask, and its column and row.
+
 Cost and memory are linear in the pixels asked for: each (pixel, view) looks up the few cells that
 its footprint covers, their shares from tables over where the footprint lies within a cell. The
-tables are exact at TABLE_STEPS places and linear between. A turned footprint is taken as one along
-the cells (an error of rotation x footprint, under 0.2 um at 0.3 degrees).
+tables are exact at TABLE_STEPS places and linear between. A turned footprint is taken along the
+cells (an error of rotation x footprint, under 0.2 um at 0.3 degrees).
 """
 
 from __future__ import annotations
@@ -19,7 +27,24 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.placement import SCALARS, Placement
+from emmc_rig.calibration.placement import (
+    BLUR,
+    BOW,
+    CLEAR,
+    DISTANCE,
+    DISTORTION,
+    FALLOFF,
+    GLASS,
+    LEAK,
+    OFFSET_X,
+    OFFSET_Y,
+    ROTATION,
+    SCALARS,
+    TILT_X,
+    TILT_Y,
+    VIGNETTING,
+    Placement,
+)
 from emmc_rig.calibration.repeats import Repeats, repeats_of
 from emmc_rig.model.camera import Camera, Plate, draw_plates
 from emmc_rig.model.compiling import njit
@@ -27,10 +52,15 @@ from emmc_rig.model.compiling import njit
 Array = NDArray[np.floating]
 Pixels = NDArray[np.int64]
 TABLE_STEPS = 512
+"""Of a cell: linear interpolation errs by (1/512)^2 / 8 = 5e-7 of the shares' second derivative."""
 TAILS = 4.0
+"""Deviations of the blur that a footprint reaches beyond its boxes: 3e-5 of it lies beyond."""
 NARROWEST_CELLS = 1e-3
+"""Of a box: the shares are divided by the widths."""
 GLASS_INDEX = 1.52
+"""Refractive index of crown glass, as of a sensor's cover."""
 ANY_COLOUR = 3
+"""Channel of a pixel that sees all colours."""
 OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
 SPARE_UM = 900.0
@@ -126,14 +156,21 @@ def _larger_if_same(made: Plate, roomy: Plate) -> Plate:
 
 
 def _third_integral(t: Array, sigma: float) -> Array:
-    """Return the thrice integrated Gaussian: its second difference is two boxes' and its share."""
+    """Return the thrice integrated Gaussian: 1/2 ((t^2 + s^2) Phi(t / s) + t s phi(t / s))."""
     z = t / sigma
     density = np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
     return 0.5 * ((t * t + sigma * sigma) * ndtr(z) + t * sigma * density)
 
 
 def _share_below(t: Array, widths: tuple[float, float], sigma: float) -> Array:
-    """Return the share of the footprint (two boxes and a Gaussian, in cells) below t."""
+    """Return the share of a footprint around 0 that lies below t, in cells.
+
+    The footprint is the convolution of boxes of widths a and b and a Gaussian. A convolution with a
+    box is a difference of integrals over the width, so that with G the Gaussian, integrated thrice,
+
+        share(t) = (G(t + o) - G(t + i) - G(t - i) + G(t - o)) / (a b),
+        o = (a + b) / 2,    i = (a - b) / 2
+    """
     a, b = (max(width, NARROWEST_CELLS) for width in widths)
     outer, inner = (a + b) / 2, (a - b) / 2
 
@@ -143,23 +180,13 @@ def _share_below(t: Array, widths: tuple[float, float], sigma: float) -> Array:
     return (third(t + outer) - third(t + inner) - third(t - inner) + third(t - outer)) / (a * b)
 
 
-def _shares(
-    mask: ShadowMask, ratio: float, blur_um: float, reach: float, count: int, places: Array
-) -> Array:
-    """Return the share of `count` cells for footprints at `places` in the first: (place, cell)."""
-    widths = ((1 - ratio) * mask.pixel_um / mask.cell_um, ratio * mask.aperture_um / mask.cell_um)
-    edges = np.arange(1, count)[None, :] - reach - places[:, None]
-    below = _share_below(edges, widths, blur_um / mask.cell_um)
-    ends = np.zeros((len(places), 1)), np.ones((len(places), 1))
-    return np.diff(np.hstack([ends[0], below, ends[1]]), axis=1)
-
-
 def share_tables(
     mask: ShadowMask, placement: Placement, derivatives: bool = True
 ) -> tuple[NDArray[np.float64], float]:
-    """Return (kind, place, cell) and the reach of a footprint in cells.
+    """Return the tables (kind, place, cell), and the reach of a footprint to either side, cells.
 
-    kind: the shares, and their derivatives by position in cells, by rho and by blur_um.
+    kind: the shares, and their derivatives by position in cells, by rho and by blur_um (by
+    differences). place: where the footprint begins within its first cell.
     """
     ratio = mask.distance_um * (1 + placement.distance_share) / mask.lens_um
     blur_um = placement.blur_um
@@ -169,21 +196,26 @@ def share_tables(
     count = int(np.ceil(2 * reach)) + 1
     places = np.linspace(0, 1, TABLE_STEPS + 1)
 
-    def at(places: Array, ratio: float, blur_um: float) -> Array:
-        return _shares(mask, ratio, blur_um, reach, count, places)
+    def shares(places: Array, ratio: float, blur_um: float) -> Array:
+        widths = (
+            (1 - ratio) * mask.pixel_um / mask.cell_um,
+            ratio * mask.aperture_um / mask.cell_um,
+        )
+        edges = np.arange(1, count)[None, :] - reach - places[:, None]
+        below = _share_below(edges, widths, blur_um / mask.cell_um)
+        ends = np.zeros((len(places), 1)), np.ones((len(places), 1))
+        return np.diff(np.hstack([ends[0], below, ends[1]]), axis=1)
 
+    here = shares(places, ratio, blur_um)
     if not derivatives:
-        return at(places, ratio, blur_um)[None].astype(np.float64), reach
-    small, turn, soft = 1e-5, 1e-6, 1e-4 * mask.cell_um
-    tables = np.stack(
-        [
-            at(places, ratio, blur_um),
-            (at(places + small, ratio, blur_um) - at(places - small, ratio, blur_um)) / (2 * small),
-            (at(places, ratio + turn, blur_um) - at(places, ratio - turn, blur_um)) / (2 * turn),
-            (at(places, ratio, blur_um + soft) - at(places, ratio, blur_um - soft)) / (2 * soft),
-        ]
-    )
-    return tables.astype(np.float64), reach
+        return here[None].astype(np.float64), reach
+    # Steps of central differences: in cells, of rho, and of blur_um.
+    move, nearer, softer = 1e-5, 1e-6, 1e-4 * mask.cell_um
+    by_place = shares(places + move, ratio, blur_um) - shares(places - move, ratio, blur_um)
+    by_ratio = shares(places, ratio + nearer, blur_um) - shares(places, ratio - nearer, blur_um)
+    by_blur = shares(places, ratio, blur_um + softer) - shares(places, ratio, blur_um - softer)
+    tables = [here, by_place / (2 * move), by_ratio / (2 * nearer), by_blur / (2 * softer)]
+    return np.stack(tables).astype(np.float64), reach
 
 
 def _turns(placement: Placement) -> NDArray[np.float64]:
@@ -205,27 +237,28 @@ def _turns(placement: Placement) -> NDArray[np.float64]:
 
 
 class _Rays(NamedTuple):
-    """What the rays of a frame follow from: camera, placement and stage, lengths in um.
-
-    rows, columns, binning: of the light field's samples. corner_um, far_um: from the middle to the
-    corner of the picture, and to the outermost view. design_share, distance_share: of the mask,
-    d / D and rho. reach: of a footprint, cells. The others are those of `ShadowMask` and
-    `Placement`, offsets with the stage's place.
-    """
+    """Parameters of a frame's rays: camera, placement and stage. Others as in `Placement`."""
 
     rows: int
     columns: int
     binning: int
     pitch_um: float
     view_um: float
+    """From one view to the next, on the aperture."""
     corner_um: float
+    """From the middle of the picture to its corner."""
     far_um: float
+    """From the middle of the aperture to the outermost view."""
     lens_um: float
     cell_um: float
     reach: float
+    """Of a footprint to either side, cells."""
     design_share: float
+    """d / D as designed."""
     distance_share: float
+    """rho: d / D as the mask stands."""
     offset_x_um: float
+    """With the stage's place."""
     offset_y_um: float
     distortion_um: float
     clear: float
@@ -238,6 +271,55 @@ class _Rays(NamedTuple):
     glass_um: float
 
 
+class _Light(NamedTuple):
+    """A view's light on a pixel: (1 + vignetting lean)(1 + falloff far) = leaning x falling."""
+
+    lean: float
+    """x . u, as shares of the picture's corner and the aperture's."""
+    far: float
+    """|u|^2, as a share of the aperture's corner."""
+    leaning: float
+    falling: float
+
+
+class _Point(NamedTuple):
+    """Where a ray meets the mask's plane, from the mask's middle, and its direction."""
+
+    x_um: float
+    y_um: float
+    to_u: float
+    """Slopes of the ray: (u - x) / D."""
+    to_v: float
+    refracted: float
+    """By so much of glass_um, times the slope, glass moves the ray."""
+
+
+class _Passed(NamedTuple):
+    """What a footprint passes of the light, T, and its derivatives."""
+
+    share: float
+    by_column: float
+    """By cells."""
+    by_row: float
+    by_ratio: float
+    """By rho, of the footprint's size alone."""
+    by_blur: float
+    """By um."""
+
+
+class _Seen(NamedTuple):
+    """Readings of pixels, and their derivatives; arrays that were not asked for have no rows."""
+
+    readings: NDArray[np.float64]
+    """(n,)."""
+    slopes: NDArray[np.float64]
+    """(n, parameter)."""
+    each: NDArray[np.float64]
+    """(n, view): what every open view adds."""
+    by_view: NDArray[np.float64]
+    """(n, view, OF_VIEW): by the mask as this view alone sees it, see `Shadow.slopes_by_view`."""
+
+
 @njit(forceinline=True)
 def _centred_um(index, count, step_um):
     """Return the place of one of `count` samples, or views, that lie around 0."""
@@ -246,10 +328,10 @@ def _centred_um(index, count, step_um):
 
 @njit(forceinline=True)
 def _light_factors(rays, x_um, y_um, u_um, v_um):
-    """Return x.u, |u|^2 (shares of corners) and what vignetting and falloff make of a ray."""
+    """Return the light of the view at (u, v) on the pixel at (x, y)."""
     lean = (x_um * u_um + y_um * v_um) / (rays.corner_um * rays.far_um)
     far = (u_um * u_um + v_um * v_um) / (rays.far_um * rays.far_um)
-    return lean, far, 1 + rays.vignetting * lean, 1 + rays.falloff * far
+    return _Light(lean, far, 1 + rays.vignetting * lean, 1 + rays.falloff * far)
 
 
 @njit(forceinline=True)
@@ -261,16 +343,22 @@ def _light_sums(rays, aperture, x_um, y_um):
         for u in range(views_u):
             u_um = _centred_um(u, views_u, rays.view_um)
             v_um = _centred_um(v, views_v, rays.view_um)
-            lean, far, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
-            total += aperture[v, u] * leaning * falling
-            by_vignetting += aperture[v, u] * lean * falling
-            by_falloff += aperture[v, u] * far * leaning
+            light = _light_factors(rays, x_um, y_um, u_um, v_um)
+            total += aperture[v, u] * light.leaning * light.falling
+            by_vignetting += aperture[v, u] * light.lean * light.falling
+            by_falloff += aperture[v, u] * light.far * light.leaning
     return total, by_vignetting, by_falloff
 
 
 @njit(forceinline=True)
 def _ray_on_mask(rays, x_um, y_um, u_um, v_um):
-    """Return where a ray meets the mask's plane, x and y, its slopes, and the glass's share."""
+    """Return where the ray from the pixel at (x, y) to the lens point (u, v) meets the mask.
+
+    t = (u - x) / D,    square = |x|^2 / corner^2
+    refracted = 1 / sqrt(n^2 (1 + |t|^2) - |t|^2) - 1 / n
+    farther = tilt . x + bow square + glass refracted
+    xi = (1 - rho) x + rho u + distortion x square / corner - offset + farther t
+    """
     to_u, to_v = (u_um - x_um) / rays.lens_um, (v_um - y_um) / rays.lens_um
     steep = to_u * to_u + to_v * to_v
     refracted = 1 / np.sqrt(GLASS_INDEX**2 * (1 + steep) - steep) - 1 / GLASS_INDEX
@@ -281,7 +369,7 @@ def _ray_on_mask(rays, x_um, y_um, u_um, v_um):
     ratio, bend = rays.distance_share, rays.distortion_um * cube
     xi_x = (1 - ratio) * x_um + ratio * u_um + bend * x_um - rays.offset_x_um + more * to_u
     xi_y = (1 - ratio) * y_um + ratio * v_um + bend * y_um - rays.offset_y_um + more * to_v
-    return xi_x, xi_y, to_u, to_v, refracted
+    return _Point(xi_x, xi_y, to_u, to_v, refracted)
 
 
 @njit(forceinline=True)
@@ -301,7 +389,7 @@ def _interpolate_shares(tables, start, shares):
 
 @njit(forceinline=True)
 def _sum_footprint(cells, top, left, channel, down, across, values):
-    """Return what a footprint passes, and that by column, row, rho and blur.
+    """Return what a footprint passes, sum of down x cells x across, and its derivatives.
 
     down, across: (kind, cell), of one kind where no derivatives are needed. values: (4,), scratch.
     """
@@ -318,7 +406,7 @@ def _sum_footprint(cells, top, left, channel, down, across, values):
             by_row += down[1, a] * values[0]
             by_ratio += down[0, a] * values[2] + down[2, a] * values[0]
             by_blur += down[0, a] * values[3] + down[3, a] * values[0]
-    return passed, by_column, by_row, by_ratio, by_blur
+    return _Passed(passed, by_column, by_row, by_ratio, by_blur)
 
 
 @njit(forceinline=True)
@@ -335,14 +423,57 @@ def _sum_softenings(cells, top, left, channel, down, across):
     return blur_x, blur_y, crossed
 
 
+# Into the code of `_read` before it is compiled: the kernel rounds as if it were written there.
+@njit(inline="always")
+def _add_ray_slopes(slope, rays, b, x_um, y_um, square, u_um, v_um, light, point, passed, share):
+    """Add to slope (parameter,) the derivatives of share (leak + (clear - leak) T), one ray's.
+
+    Return its derivatives by a move of the mask's point: (gain, by x, by y), in um.
+
+        column, row = B xi / cell,    gain = share (clear - leak)
+        by_x, by_y = gain (T_column, T_row) B / cell
+        offset: xi falls by 1.     rotation, scale, skew: column and row grow by dB xi / cell
+        rho: xi grows by u - x, and the footprint's boxes change
+        tilt, bow, glass: xi grows by the ray's slope t times x, square, refracted
+
+    share: of the light, w_j; `_read` subtracts what the sum of all views takes from it. b: B and
+    its derivatives by rotation, scale and skew, over the cell, (4, 2, 2).
+    """
+    through = rays.leak + (rays.clear - rays.leak) * passed.share
+    gain = share * (rays.clear - rays.leak)
+    by_x = gain * (passed.by_column * b[0, 0, 0] + passed.by_row * b[0, 1, 0])
+    by_y = gain * (passed.by_column * b[0, 0, 1] + passed.by_row * b[0, 1, 1])
+    slope[OFFSET_X] -= by_x
+    slope[OFFSET_Y] -= by_y
+    for t in range(3):
+        column = b[t + 1, 0, 0] * point.x_um + b[t + 1, 0, 1] * point.y_um
+        row = b[t + 1, 1, 0] * point.x_um + b[t + 1, 1, 1] * point.y_um
+        slope[ROTATION + t] += gain * (passed.by_column * column + passed.by_row * row)
+    by_ratio = by_x * (u_um - x_um) + by_y * (v_um - y_um) + gain * passed.by_ratio
+    slope[DISTANCE] += rays.design_share * by_ratio
+    slope[DISTORTION] += square / rays.corner_um * (by_x * x_um + by_y * y_um)
+    slope[BLUR] += gain * passed.by_blur
+    slope[CLEAR] += share * passed.share
+    slope[LEAK] += share * (1 - passed.share)
+    slope[VIGNETTING] += share * light.lean / light.leaning * through
+    slope[FALLOFF] += share * light.far / light.falling * through
+    along = by_x * point.to_u + by_y * point.to_v
+    slope[TILT_X] += along * x_um
+    slope[TILT_Y] += along * y_um
+    slope[BOW] += along * square
+    slope[GLASS] += along * point.refracted
+    return gain, by_x, by_y
+
+
 @njit(cache=True, parallel=True, fastmath=True)
 def _read(pixels, channels, cells, tables, turns, rays, views_open, aperture, out):
-    """Set out (readings (n,), slopes (n, parameter), each (n, view), by_view (n, view, 5)).
+    """Set out (see `_Seen`) to the readings of pixels (n, 2), and what it has rows for.
 
-    slopes, each, by_view: where they have rows; each is what every open view adds, by_view the
-    reading's derivatives by the mask as that view alone sees it: its x and y, its blur along
-    columns and rows, and across both. tables: (kind, place, cell), of one kind where slopes has no
-    rows, see `share_tables`; turns: see `_turns`.
+        reading = mean over the pixel's samples of  sum_j share_j (leak + (clear - leak) T_j)
+        share_j = a_j (1 + vignetting lean_j)(1 + falloff far_j) / total,   total: over all views
+
+    channels: (n,). cells: (row, column, colour). tables: (kind, place, cell), of one kind where
+    slopes has no rows, see `share_tables`. turns: see `_turns`. views_open, aperture: (v, u).
     """
     readings, slopes, each, by_view = out
     height, width = cells.shape[0], cells.shape[1]
@@ -371,45 +502,24 @@ def _read(pixels, channels, cells, tables, turns, rays, views_open, aperture, ou
                         continue
                     v_um = _centred_um(v, views_v, rays.view_um)
                     u_um = _centred_um(u, views_u, rays.view_um)
-                    xi_x, xi_y, to_u, to_v, refracted = _ray_on_mask(rays, x_um, y_um, u_um, v_um)
-                    column = b[0, 0, 0] * xi_x + b[0, 0, 1] * xi_y + width / 2
-                    row = b[0, 1, 0] * xi_x + b[0, 1, 1] * xi_y + height / 2
+                    point = _ray_on_mask(rays, x_um, y_um, u_um, v_um)
+                    column = b[0, 0, 0] * point.x_um + b[0, 0, 1] * point.y_um + width / 2
+                    row = b[0, 1, 0] * point.x_um + b[0, 1, 1] * point.y_um + height / 2
                     left = _interpolate_shares(tables, column - rays.reach, across)
                     top = _interpolate_shares(tables, row - rays.reach, down)
-                    passed, by_column, by_row, by_ratio, by_blur = _sum_footprint(
-                        cells, top, left, channel, down, across, values
-                    )
-                    lean, far, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
-                    share = aperture[v, u] * leaning * falling / total
-                    through = rays.leak + (rays.clear - rays.leak) * passed
+                    passed = _sum_footprint(cells, top, left, channel, down, across, values)
+                    light = _light_factors(rays, x_um, y_um, u_um, v_um)
+                    share = aperture[v, u] * light.leaning * light.falling / total
+                    through = rays.leak + (rays.clear - rays.leak) * passed.share
                     view = v * views_u + u
                     here += share * through
                     if each.shape[0] > 0:
                         each[n, view] += share * through / parts
                     if kinds == 1:
                         continue
-                    gain = share * (rays.clear - rays.leak)
-                    by_x = gain * (by_column * b[0, 0, 0] + by_row * b[0, 1, 0])
-                    by_y = gain * (by_column * b[0, 0, 1] + by_row * b[0, 1, 1])
-                    slope[0] -= by_x
-                    slope[1] -= by_y
-                    for t in range(3):
-                        column = b[t + 1, 0, 0] * xi_x + b[t + 1, 0, 1] * xi_y
-                        row = b[t + 1, 1, 0] * xi_x + b[t + 1, 1, 1] * xi_y
-                        slope[2 + t] += gain * (by_column * column + by_row * row)
-                    by_distance = by_x * (u_um - x_um) + by_y * (v_um - y_um) + gain * by_ratio
-                    slope[5] += rays.design_share * by_distance
-                    slope[6] += square / rays.corner_um * (by_x * x_um + by_y * y_um)
-                    slope[7] += gain * by_blur
-                    slope[8] += share * passed
-                    slope[9] += share * (1 - passed)
-                    slope[10] += share * lean / leaning * through
-                    slope[11] += share * far / falling * through
-                    along = by_x * to_u + by_y * to_v
-                    slope[12] += along * x_um
-                    slope[13] += along * y_um
-                    slope[14] += along * square
-                    slope[15] += along * refracted
+                    gain, by_x, by_y = _add_ray_slopes(
+                        slope, rays, b, x_um, y_um, square, u_um, v_um, light, point, passed, share
+                    )
                     slope[scalars + view] += share / aperture[v, u] * through
                     if by_view.shape[0] > 0:
                         blur_x, blur_y, crossed = _sum_softenings(
@@ -422,14 +532,16 @@ def _read(pixels, channels, cells, tables, turns, rays, views_open, aperture, ou
                         by_view[n, view, 4] += gain * crossed / (rays.cell_um * parts)
             readings[n] += here / parts
             if kinds > 1:
-                slope[10] -= here * by_vignetting / total
-                slope[11] -= here * by_falloff / total
+                # The shares are divided by the total, which depends on these parameters as well.
+                slope[VIGNETTING] -= here * by_vignetting / total
+                slope[FALLOFF] -= here * by_falloff / total
                 for v in range(views_v):
                     for u in range(views_u):
                         u_um = _centred_um(u, views_u, rays.view_um)
                         v_um = _centred_um(v, views_v, rays.view_um)
-                        _, _, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
-                        slope[scalars + v * views_u + u] -= here * leaning * falling / total
+                        light = _light_factors(rays, x_um, y_um, u_um, v_um)
+                        by_weight = light.leaning * light.falling / total
+                        slope[scalars + v * views_u + u] -= here * by_weight
                 for p in range(len(gradient)):
                     gradient[p] += slope[p] / parts
         if kinds > 1:
@@ -449,15 +561,16 @@ def _find_footprints(pixels, cells, table, turns, rays, chosen, aperture, out):
             v, u = chosen[k]
             v_um = _centred_um(v, views_v, rays.view_um)
             u_um = _centred_um(u, views_u, rays.view_um)
-            xi_x, xi_y, _, _, _ = _ray_on_mask(rays, x_um, y_um, u_um, v_um)
+            point = _ray_on_mask(rays, x_um, y_um, u_um, v_um)
             for axis in range(2):
                 turn = turns[0, 1 - axis] / rays.cell_um
-                start = turn[0] * xi_x + turn[1] * xi_y + cells.shape[axis] / 2 - rays.reach
+                middle = turn[0] * point.x_um + turn[1] * point.y_um + cells.shape[axis] / 2
+                start = middle - rays.reach
                 corners[n, k, axis] = int(np.floor(start))
                 place = int(np.rint((start - corners[n, k, axis]) * TABLE_STEPS))
                 shares[axis, n, k] = table[place]
-            _, _, leaning, falling = _light_factors(rays, x_um, y_um, u_um, v_um)
-            weights[n, k] = aperture[v, u] * leaning * falling / total
+            light = _light_factors(rays, x_um, y_um, u_um, v_um)
+            weights[n, k] = aperture[v, u] * light.leaning * light.falling / total
 
 
 class Shadow:
@@ -484,7 +597,7 @@ class Shadow:
         frame: int = 0,
     ) -> NDArray[np.float64]:
         """Return what pixels read of a white board, (n,)."""
-        return self._run(pixels, channels, (views_open, stage_um, frame), 0, 0, 0)[0]
+        return self._run(pixels, channels, (views_open, stage_um, frame)).readings
 
     def with_slopes(
         self,
@@ -495,7 +608,8 @@ class Shadow:
         frame: int = 0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the readings (n,) and their derivatives (n, parameter)."""
-        return self._run(pixels, channels, (views_open, stage_um, frame), 1, 0, 0)[:2]
+        seen = self._run(pixels, channels, (views_open, stage_um, frame), slopes=True)
+        return seen.readings, seen.slopes
 
     def slopes_by_view(
         self,
@@ -510,8 +624,9 @@ class Shadow:
         The latter by what each view alone sees of the mask, (n, view x 5): x, y, blur along columns
         and rows, all in um, and across both, in cells times um.
         """
-        out = self._run(pixels, channels, (views_open, stage_um, frame), 1, 0, 1)
-        return out[1], out[3].reshape(len(pixels), -1)
+        opening = views_open, stage_um, frame
+        seen = self._run(pixels, channels, opening, slopes=True, by_view=True)
+        return seen.slopes, seen.by_view.reshape(len(pixels), -1)
 
     def coefficients(
         self,
@@ -522,8 +637,8 @@ class Shadow:
     ) -> NDArray[np.float64]:
         """Return Psi's coefficients of pixels and the colours they see, (n, v, u)."""
         every = np.ones(self.mask.views, dtype=bool)
-        each = self._run(pixels, channels, (every, stage_um, frame), 0, 1, 0)[2]
-        return each.reshape(len(pixels), *self.mask.views)
+        seen = self._run(pixels, channels, (every, stage_um, frame), each=True)
+        return seen.each.reshape(len(pixels), *self.mask.views)
 
     def footprints(
         self, pixels: Pixels, views_open: NDArray[np.bool_], stage_um: tuple[float, float]
@@ -570,16 +685,17 @@ class Shadow:
         pixels: Pixels,
         channels: NDArray[np.uint8],
         opening: tuple[NDArray[np.bool_], tuple[float, float], int],
-        slopes: int,
-        each: int,
-        by_view: int,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return readings, slopes, each, by_view of `_read`, the latter three empty where 0."""
+        *,
+        slopes: bool = False,
+        each: bool = False,
+        by_view: bool = False,
+    ) -> _Seen:
+        """Return the readings and what is asked for; by_view needs slopes."""
         views_open, stage_um, frame = opening
         if slopes and len(self._tables) == 1:
             self._tables = share_tables(self.mask, self.placement)[0]
         count, views = len(pixels), self._aperture.size
-        out = (
+        out = _Seen(
             np.empty(count),
             np.empty((slopes * count, len(SCALARS) + views)),
             np.zeros((each * count, views)),

@@ -15,6 +15,9 @@ from emmc_rig.drivers.raw import RawFrame, decode_raw
 EXPOSURE_AGREEMENT = 0.1
 """Shutter times are nominal: a marked 1/30 s is 1/32 s, 7 per cent off."""
 
+EXPOSURE_UNIT_S = 1e-4
+"""Of PTP, which knows exposures no finer."""
+
 Limits = tuple[float, float]
 
 
@@ -136,7 +139,7 @@ def check_frame(
 
 
 class ShapeFromFrames(ABC):
-    """Base of cameras whose shape and colours only frames show: `snap` keeps both."""
+    """Base of cameras whose shape and colours only their RAW files show: `snap` decodes them."""
 
     _shape: tuple[int, int] | None = None
     _cfa: str | None = None
@@ -144,6 +147,24 @@ class ShapeFromFrames(ABC):
     @abstractmethod
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises a `DriverError`."""
+
+    def _decoded(
+        self, name: str, data: bytes, exposure_s: float | None, gain: float, host_time_s: float
+    ) -> RawFrame:
+        """Return the frame in a RAW file, of the shape and colours of those before.
+
+        exposure_s: what was asked for; the file's own counts where it states one, and may differ
+        by `EXPOSURE_UNIT_S`. Raises `RawFrameError`.
+        """
+        frame = check_frame(decode_raw(data, self._shape), self._cfa, exposure_s, EXPOSURE_UNIT_S)
+        self._shape, self._cfa = frame.mosaic.shape, frame.cfa
+        return replace(
+            frame,
+            exposure_s=frame.exposure_s or exposure_s,
+            gain=gain,
+            host_time_s=host_time_s,
+            metadata={**frame.metadata, "name": name},
+        )
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -91,41 +91,8 @@ def encode_dng(
     """
     black = np.atleast_2d(np.asarray(black_level_dn, np.float64))
     _check(mosaic, cfa, black, exposure_s)
-    tags = [
-        (271, ASCII, 0, identity.maker, True),
-        (272, ASCII, 0, identity.model, True),
-        (274, SHORT, 1, 1, True),
-        (50706, BYTE, 4, (1, 4, 0, 0), True),
-        (50707, BYTE, 4, (1, 1, 0, 0), True),
-        (50708, ASCII, 0, identity.model, True),
-        (50717, LONG, 1, int(white_level_dn), True),
-    ]
-    if exposure_s is not None and facts is None:
-        exposure = Fraction(exposure_s).limit_denominator(1_000_000)
-        tags.append((33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True))
-    if facts is not None:
-        tags += [
-            (269, ASCII, 0, facts.document, True),
-            (305, ASCII, 0, facts.software, True),
-            (50735, ASCII, 0, identity.serial, True),
-        ]
-        tags = [tag for tag in tags if tag[3] != ""]
-        tags.append((STAND_IN_TAG, LONG, 1, 0, True))
-    if private is not None:
-        kept = PRIVATE_DATA_OWNER + private
-        tags.append((PRIVATE_DATA_TAG, UNDEFINED, len(kept), kept, True))
-    tags += _level_tags(black, cfa)
-    if cfa != MONO:
-        pattern = BAYER_PATTERNS.get(cfa, BAYER_PATTERNS[STAND_IN_PHASE])
-        tags += [
-            (33421, SHORT, 2, (2, 2), True),
-            (33422, BYTE, 4, pattern, True),
-            (50710, BYTE, 3, (0, 1, 2), True),
-            (50711, SHORT, 1, 1, True),
-            (50721, SRATIONAL, 9, IDENTITY_MATRIX, True),
-            (50728, RATIONAL, 3, (1, 1) * 3, True),
-            (50778, SHORT, 1, D65, True),
-        ]
+    tags = _file_tags(identity, int(white_level_dn), exposure_s, private, facts)
+    tags += _level_tags(black, cfa) + ([] if cfa == MONO else _colour_tags(cfa))
     named = cfa == MONO or cfa in BAYER_PATTERNS
     file = io.BytesIO()
     tifffile.imwrite(
@@ -151,7 +118,59 @@ def encode_dng(
     return file.getvalue()
 
 
-def _level_tags(black: Array, cfa: str) -> list[tuple[int, int, int, Any, bool]]:
+Tag = tuple[int, int, int, Any, bool]
+"""As tifffile takes it: code, type, count (0: of a text), value, whether it is written once."""
+
+
+def _file_tags(
+    identity: CameraIdentity,
+    white_level_dn: int,
+    exposure_s: float | None,
+    private: bytes | None,
+    facts: Facts | None,
+) -> list[Tag]:
+    """Return the tags of camera, file and exposure; with `facts`, exposure goes into EXIF."""
+    tags: list[Tag] = [
+        (271, ASCII, 0, identity.maker, True),
+        (272, ASCII, 0, identity.model, True),
+        (274, SHORT, 1, 1, True),
+        (50706, BYTE, 4, (1, 4, 0, 0), True),
+        (50707, BYTE, 4, (1, 1, 0, 0), True),
+        (50708, ASCII, 0, identity.model, True),
+        (50717, LONG, 1, white_level_dn, True),
+    ]
+    if exposure_s is not None and facts is None:
+        exposure = Fraction(exposure_s).limit_denominator(1_000_000)
+        tags.append((33434, RATIONAL, 1, (exposure.numerator, exposure.denominator), True))
+    if facts is not None:
+        tags += [
+            (269, ASCII, 0, facts.document, True),
+            (305, ASCII, 0, facts.software, True),
+            (50735, ASCII, 0, identity.serial, True),
+        ]
+        tags = [tag for tag in tags if tag[3] != ""]
+        tags.append((STAND_IN_TAG, LONG, 1, 0, True))
+    if private is not None:
+        kept = PRIVATE_DATA_OWNER + private
+        tags.append((PRIVATE_DATA_TAG, UNDEFINED, len(kept), kept, True))
+    return tags
+
+
+def _colour_tags(cfa: str) -> list[Tag]:
+    """Return the tags of the Bayer phase, or of the one that stands in for another tile."""
+    pattern = BAYER_PATTERNS.get(cfa, BAYER_PATTERNS[STAND_IN_PHASE])
+    return [
+        (33421, SHORT, 2, (2, 2), True),
+        (33422, BYTE, 4, pattern, True),
+        (50710, BYTE, 3, (0, 1, 2), True),
+        (50711, SHORT, 1, 1, True),
+        (50721, SRATIONAL, 9, IDENTITY_MATRIX, True),
+        (50728, RATIONAL, 3, (1, 1) * 3, True),
+        (50778, SHORT, 1, D65, True),
+    ]
+
+
+def _level_tags(black: Array, cfa: str) -> list[Tag]:
     """Return the tags of black levels: a tile, to which rows and columns add where it is large.
 
     Raises `ValueError` for levels that are neither.

@@ -12,20 +12,14 @@ import re
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from emmc_rig.drivers.camera import (
-    CameraIdentity,
-    Limits,
-    ShapeFromFrames,
-    check_frame,
-    check_setting,
-)
+from emmc_rig.drivers.camera import CameraIdentity, Limits, ShapeFromFrames, check_setting
 from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
 from emmc_rig.drivers.errors import CameraClosedError, CameraSettingError, CaptureError, GphotoError
-from emmc_rig.drivers.raw import RawFrame, decode_raw, has_raw_suffix
+from emmc_rig.drivers.raw import RawFrame, has_raw_suffix
 
 PTP_IP = "PTP/IP Camera"
 PAIR_LIMIT_S = 2.0
@@ -181,16 +175,7 @@ class GphotoCamera(ShapeFromFrames):
                     pass
                 first = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
                 name, data = self._raw_file(first)
-            arrived_s = self._clock.now_s()
-            frame = check_frame(decode_raw(data, self._shape), self._cfa, exposure_s, 1e-4)
-            self._shape, self._cfa = frame.mosaic.shape, frame.cfa
-        return replace(
-            frame,
-            exposure_s=frame.exposure_s or exposure_s,
-            gain=gain,
-            host_time_s=arrived_s,
-            metadata={**frame.metadata, "name": name},
-        )
+            return self._decoded(name, data, exposure_s, gain, self._clock.now_s())
 
     def close(self) -> None:
         """Close the camera; closing twice is allowed."""

@@ -5,7 +5,7 @@ Source: Grbl v1.1 documentation, "Interface" (response, push and status messages
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from emmc_rig.drivers.errors import FirmwareError, GarbledReplyError
@@ -61,8 +61,6 @@ ALARMS = {
 
 _STATUS = re.compile(r"<([A-Z][a-z]+)(?::(\d+))?((?:\|[A-Za-z]+:[^|<>]*)+)>")
 _NUMBER = re.compile(r"-?\d{1,9}(\.\d{1,6})?")
-_BANNER = re.compile(r"(?:Grbl|GrblHAL) (\d+\.\d+\S*) \[.*\]")
-_SETTING = re.compile(r"\$(\d{1,4})=(.*)")
 _OLD_STATUS = re.compile(r"<[A-Z][a-z]+,[MW]Pos:.*>")
 
 
@@ -139,6 +137,20 @@ class Status:
 
 Message = Ok | Refusal | Alarm | Banner | Setting | Feedback | Status
 
+_MESSAGES: tuple[tuple[re.Pattern, Callable[[re.Match], Message | None]], ...] = (
+    (re.compile(r"ok"), lambda found: Ok()),
+    (re.compile(r"error:(\d{1,3})"), lambda found: Refusal(int(found[1]))),
+    (re.compile(r"ALARM:(\d{1,3})"), lambda found: Alarm(int(found[1]))),
+    (re.compile(r"(?:Grbl|GrblHAL) (\d+\.\d+\S*) \[.*\]"), lambda found: Banner(found[1])),
+    (re.compile(r"\$(\d{1,4})=(.*)"), lambda found: Setting(int(found[1]), found[2].strip())),
+    (re.compile(r"\[([A-Za-z0-9]+):(.*)\]"), lambda found: Feedback(found[1], found[2])),
+    (re.compile(r"|(?:>|\$N).*"), lambda found: None),
+)
+"""Every message but the status: pattern of its line, and how it is read.
+
+The last is an empty line, or a startup line that Grbl lists or ran at boot.
+"""
+
 
 def encode_line(text: str) -> bytes:
     """Return the line's bytes, line end included.
@@ -175,24 +187,11 @@ def decode_line(line: bytes) -> Message | None:
     text = line.decode("ascii").rstrip("\r\n").lstrip("\r")
     if not text.isprintable():
         raise GarbledReplyError(line, "not printable text")
-    if not text:
-        return None
-    if text == "ok":
-        return Ok()
     if text.startswith("<"):
         return _decode_status(line, text)
-    if match := re.fullmatch(r"error:(\d{1,3})", text):
-        return Refusal(int(match[1]))
-    if match := re.fullmatch(r"ALARM:(\d{1,3})", text):
-        return Alarm(int(match[1]))
-    if match := _BANNER.fullmatch(text):
-        return Banner(match[1])
-    if match := _SETTING.fullmatch(text):
-        return Setting(int(match[1]), match[2].strip())
-    if match := re.fullmatch(r"\[([A-Za-z0-9]+):(.*)\]", text):
-        return Feedback(match[1], match[2])
-    if text.startswith((">", "$N")):
-        return None
+    for pattern, message in _MESSAGES:
+        if found := pattern.fullmatch(text):
+            return message(found)
     raise GarbledReplyError(line, "not a Grbl message")
 
 

@@ -18,10 +18,10 @@ from typing import Any
 
 from emmc_rig.drivers import ptp_codec as codec
 from emmc_rig.drivers.camera import (
+    EXPOSURE_UNIT_S,
     CameraIdentity,
     Limits,
     ShapeFromFrames,
-    check_frame,
     check_setting,
 )
 from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
@@ -49,7 +49,7 @@ from emmc_rig.drivers.ptp_codec import (
     Property,
 )
 from emmc_rig.drivers.ptp_usb import PTP_INTERFACE, PtpUsb
-from emmc_rig.drivers.raw import RawFrame, decode_raw, has_raw_suffix
+from emmc_rig.drivers.raw import RawFrame, has_raw_suffix
 from emmc_rig.drivers.transport import repeated
 from emmc_rig.drivers.usb import open_device
 
@@ -64,7 +64,6 @@ NO_WAIT_S = 0.001
 MOST_NEW_OBJECTS = 64
 LONGEST_EXPOSURE_S = 3600.0
 """Upper bound on the wait for an exposure, whatever the camera states."""
-EXPOSURE_UNIT_S = 1e-4
 EXPOSURE_SPECIALS = frozenset((0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD))
 """Bulb and time, by which no exposure can be asked for."""
 ISO_SPECIALS = frozenset((0xFFFF,))
@@ -567,20 +566,11 @@ class PtpCamera(ShapeFromFrames):
             taken = session.capture(exposure_s or 0.0, is_raw, all_of_it=self._from_card)
             data = session.download(taken.handle, taken.info, self.on_progress)
             arrived_s = session.clock.now_s()
-            frame = decode_raw(data, self._shape)
-            check_frame(frame, self._cfa, exposure_s, EXPOSURE_UNIT_S)
-            self._shape, self._cfa = frame.mosaic.shape, frame.cfa
+            frame = self._decoded(taken.info.name, data, exposure_s, self.gain, arrived_s)
             if self._from_card:
                 for handle in (taken.handle, *(other for other, _ in taken.others)):
                     session.request(Operation.DELETE_OBJECT, handle, 0)
-        return replace(
-            frame,
-            exposure_s=frame.exposure_s or exposure_s,
-            gain=self.gain,
-            camera_time_s=_camera_time_s(taken.info.captured),
-            host_time_s=arrived_s,
-            metadata={**frame.metadata, "name": taken.info.name},
-        )
+        return replace(frame, camera_time_s=_camera_time_s(taken.info.captured))
 
     def stop_exposure(self) -> bool:
         """Break off the exposure under way, within half a second; any thread may call.

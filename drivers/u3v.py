@@ -426,9 +426,9 @@ def read_description(control: U3vControl) -> bytes:
     count = control.integer(table, 8)
     if not 0 < count <= MANIFEST_LIMIT:
         raise CameraDescriptionError(f"its manifest table has {count} entries")
+    size = codec.MANIFEST_ENTRY_SIZE
     entries = [
-        codec.decode_manifest_entry(control.read(table + 8 + i * size, size))
-        for i, size in enumerate([codec.MANIFEST_ENTRY_SIZE] * count)
+        codec.decode_manifest_entry(control.read(table + 8 + i * size, size)) for i in range(count)
     ]
     usable = [
         entry

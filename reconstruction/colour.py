@@ -46,19 +46,27 @@ def chroma_of(
 ) -> Chroma:
     """Return the chrominance that frames (shot, pixel_y, pixel_x) show.
 
-    picture: a smooth one (y, x, c) that explains their local means; its colours are ignored.
+    With e the reading of the grey picture and q_i that of chrominance i over e, the readings vary
+    over the nearest pixels by
+
+        reading / e - mean  =  t (q - mean q) . k + noise,
+
+    and k is estimated window by window, each on what the windows before leave.
+    picture: a smooth one (y, x, c) that explains the local means; its colours are ignored.
     """
     grey = np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1)
     level = psi.forward_picture(grey)
     good = usable & (level > DIMMEST * float(level.mean()))
     safe = np.where(good, level, 1)
-    signals = [frames, *(psi.forward_picture(grey * np.sqrt(3) * axis) for axis in OPPONENT[1:])]
     near = np.maximum(_blurred(good.sum(axis=0), NEAREST_PX), 1e-6)
-    varied = []
-    for signal in signals:
+
+    def variation(signal: Array) -> Array:
         share = np.where(good, signal / safe, 0)
-        varied.append(np.where(good, share - _blurred(share.sum(axis=0), NEAREST_PX) / near, 0))
-    left, signs = varied[0], np.stack(varied[1:], axis=-1)
+        return np.where(good, share - _blurred(share.sum(axis=0), NEAREST_PX) / near, 0)
+
+    left = variation(frames)
+    axes = [psi.forward_picture(grey * np.sqrt(3) * axis) for axis in OPPONENT[1:]]
+    signs = np.stack([variation(axis) for axis in axes], axis=-1)
     value, posterior = np.zeros((*level.shape[1:], 2)), np.zeros((*level.shape[1:], 2, 2))
     for window, presumed in WINDOWS:
         change, posterior = _regressed(left, signs, good, window, presumed)
@@ -73,8 +81,13 @@ def _regressed(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the chrominance within windows, (pixel_y, pixel_x, 2), and its covariance.
 
+    Least squares with a prior of deviation `presumed`; s the signs, n the mean square left:
+
+        covariance  = (sum(s s^T) w + 1 / presumed^2)^-1,  w = 1 / n of independent pixels
+        chrominance = covariance w sum(s left)
+
     left: variation of the readings not yet explained, (shot, pixel_y, pixel_x). signs: variation by
-    a chrominance of 1, (..., 2).
+    a chrominance of 1, (..., 2). window: its deviation in pixels; None: the whole picture.
     """
     size = left.shape[1:]
     square = np.einsum("syxi,syxj->yxij", signs, signs).reshape(*size, 4)

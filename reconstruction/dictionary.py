@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -24,11 +25,16 @@ from emmc_rig.reconstruction.errors import DictionaryError
 KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
 FORMAT = "emmc-rig dictionary 1"
 REMEDY = "benchmarks/train_dictionary.py makes a dictionary"
-_NORM_TOLERANCE = 1e-3
-_CHUNK_BYTES = 1 << 20
-
-_BLUR_PX, _CHROMA_BLUR_PX = 0.7, 1.0
-_SAME = 0.995
+NORM_TOLERANCE = 1e-3
+"""Of an atom's norm, which is 1; far above float32's rounding of any patch."""
+CHUNK_BYTES = 1 << 20
+"""Of a file, read and checked at a time."""
+BLUR_PX, CHROMA_BLUR_PX = 0.7, 1.0
+"""Deviation of edges, lines and spots: as sharp as a pixel allows, and softer in colour."""
+SAME = 0.995
+"""|cosine| of two atoms from which on they are one."""
+FAINT = 1e-2
+"""Root mean square of a texture less its mean, of values about 1, below which it is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +51,7 @@ class Dictionary:
 
     def __post_init__(self) -> None:
         norms = _norms(self.atoms, self.kind)
-        wrong = np.flatnonzero(np.abs(norms - 1) > _NORM_TOLERANCE)
+        wrong = np.flatnonzero(np.abs(norms - 1) > NORM_TOLERANCE)
         if wrong.size:
             raise DictionaryError(
                 f"atom {wrong[0]} has norm {norms[wrong[0]]:.4g}, needs 1: "
@@ -98,8 +104,7 @@ class Dictionary:
         Raises DictionaryError when it cannot be written.
         """
         path = Path(path)
-        atom_bytes = self.atoms[0].nbytes
-        rows = min(self.size, max(1, _CHUNK_BYTES // atom_bytes))
+        rows = min(self.size, max(1, CHUNK_BYTES // self.atoms[0].nbytes))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with whole_file(path) as partial, h5py.File(partial, "w") as file:
@@ -217,16 +222,14 @@ def lambertian_dictionary(
             f"disparities {tuple(disparities)}: needs one or more, finite, within "
             f"+-{largest:.4g} pixels per view step for these views and patches"
         )
-    edge, line = _edge(_BLUR_PX), _line(_BLUR_PX)
+    samples = [_plane_samples(views, patch, disparity) for disparity in planes]
     textures = [
-        *(_ridges(views, patch, d, 8, 1.5, (edge, line)) for d in planes),
-        *(_spots(views, patch, d, 1.5, 1.0) for d in planes),
+        *(_ridges(plane, 8, 1.5, (_edge(BLUR_PX), _line(BLUR_PX))) for plane in samples),
+        *(_spots(plane, patch, 1.5, 1.0) for plane in samples),
     ]
-    nearest = int(np.abs(planes).argmin())
-    soft = [
-        _ridges(views, patch, d, 6, 2.0, (_edge(_CHROMA_BLUR_PX),))
-        for d in planes[nearest % 2 :: 2]
-    ]
+    # Every other plane, the one nearest to the focus among them.
+    coarse = samples[int(np.abs(planes).argmin()) % 2 :: 2]
+    soft = [_ridges(plane, 6, 2.0, (_edge(CHROMA_BLUR_PX),)) for plane in coarse]
     flat = np.ones((1, *views, *patch), np.float32)
     atoms = _coloured(_distinct([flat, *textures]), _distinct([flat, *soft]))
     return Dictionary.normalised(atoms, "lambertian")
@@ -270,6 +273,7 @@ def _coloured(luminance: Textures, chrominance: Textures) -> NDArray[np.float32]
 
 
 def _cosines(sizes: Sequence[int], counts: Sequence[int]) -> Textures:
+    """Return the products of cosines of so many frequencies along v, u, y and x."""
     if len(counts) != 4 or min(counts) < 1:
         raise DictionaryError(f"frequencies {tuple(counts)}: needs 4 numbers (v, u, y, x), 1 or up")
     axes = []
@@ -279,10 +283,17 @@ def _cosines(sizes: Sequence[int], counts: Sequence[int]) -> Textures:
     return np.einsum("av,bu,cy,dx->abcdvuyx", *axes).reshape(-1, *sizes)
 
 
-def _grid(
+class _PlaneSamples(NamedTuple):
+    """Where in a plane's texture the samples (v, u, y, x) of a patch look, from its middle."""
+
+    y: NDArray[np.float64]
+    x: NDArray[np.float64]
+    disparity: float
+
+
+def _plane_samples(
     views: tuple[int, int], patch: tuple[int, int], disparity: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where in the texture every sample (v, u, y, x) looks, from the patch's middle."""
+) -> _PlaneSamples:
     v, u, y, x = np.meshgrid(
         np.arange(views[0]) - views[0] // 2,
         np.arange(views[1]) - views[1] // 2,
@@ -290,51 +301,51 @@ def _grid(
         np.arange(patch[1]) - (patch[1] - 1) / 2,
         indexing="ij",
     )
-    return y - disparity * v, x - disparity * u
+    return _PlaneSamples(y - disparity * v, x - disparity * u, disparity)
 
 
 def _edge(blur_px: float) -> Callable[[NDArray], NDArray]:
+    """Return the profile of an edge, the integral of `_line`."""
     return lambda t: erf(t / (np.sqrt(2) * blur_px))
 
 
 def _line(blur_px: float) -> Callable[[NDArray], NDArray]:
+    """Return the profile exp(-t^2 / 2 blur^2) of a line."""
     return lambda t: np.exp(-0.5 * np.square(t / blur_px))
 
 
 def _offsets(reach_px: float, step_px: float) -> NDArray[np.float64]:
+    """Return the multiples of a step within +-reach."""
     last = int(reach_px / step_px)
     return np.arange(-last, last + 1, dtype=np.float64) * step_px
 
 
 def _ridges(
-    views: tuple[int, int],
-    patch: tuple[int, int],
-    disparity: float,
+    plane: _PlaneSamples,
     directions: int,
     step_px: float,
     profiles: Sequence[Callable[[NDArray], NDArray]],
 ) -> Textures:
-    """Return textures that vary along one direction only, with their middle wherever it shows."""
-    y, x = _grid(views, patch, disparity)
-    found = []
+    """Return profile(t - offset), t = x cos(angle) + y sin(angle), for offsets across the patch."""
+    textures = []
     for angle in np.pi * np.arange(directions) / directions:
-        along = np.cos(angle) * x + np.sin(angle) * y
-        offsets = _offsets(0.9 * float(np.abs(along).max()), step_px)
-        found += [profile(along - o) for profile in profiles for o in offsets]
-    return np.array(found, dtype=np.float32)
+        t = np.cos(angle) * plane.x + np.sin(angle) * plane.y
+        offsets = _offsets(0.9 * float(np.abs(t).max()), step_px)
+        textures += [profile(t - offset) for profile in profiles for offset in offsets]
+    return np.array(textures, dtype=np.float32)
 
 
 def _spots(
-    views: tuple[int, int], patch: tuple[int, int], disparity: float, step_px: float, blur_px: float
+    plane: _PlaneSamples, patch: tuple[int, int], step_px: float, blur_px: float
 ) -> Textures:
-    y, x = _grid(views, patch, disparity)
-    down = _line(blur_px)(
-        y - _offsets(patch[0] / 2 + abs(disparity), step_px)[:, None, None, None, None]
-    )
-    right = _line(blur_px)(
-        x - _offsets(patch[1] / 2 + abs(disparity), step_px)[:, None, None, None, None]
-    )
-    return (down[:, None] * right).reshape(-1, *y.shape).astype(np.float32)
+    """Return round spots, products of a line down and a line across, all over the patch."""
+
+    def lines(along: NDArray[np.float64], length: int) -> NDArray[np.float64]:
+        offsets = _offsets(length / 2 + abs(plane.disparity), step_px)
+        return _line(blur_px)(along - offsets[:, None, None, None, None])
+
+    down, across = lines(plane.y, patch[0]), lines(plane.x, patch[1])
+    return (down[:, None] * across).reshape(-1, *plane.y.shape).astype(np.float32)
 
 
 def _distinct(sets: Sequence[Textures]) -> Textures:
@@ -347,9 +358,9 @@ def _distinct(sets: Sequence[Textures]) -> Textures:
     first = len(sets[0])
     kept[first:] -= kept[first:].mean(axis=1, keepdims=True)
     norms = np.linalg.norm(kept, axis=1)
-    kept = kept[norms > 1e-2 * np.sqrt(kept.shape[1])]
+    kept = kept[norms > FAINT * np.sqrt(kept.shape[1])]
     kept /= np.linalg.norm(kept, axis=1, keepdims=True)
-    near = np.abs(kept @ kept.T) > _SAME
+    near = np.abs(kept @ kept.T) > SAME
     stays = np.ones(len(kept), bool)
     for i in range(len(kept)):
         if stays[i]:

@@ -140,9 +140,12 @@ def selected_atoms(
 def sense_atoms(selected, weights, pixel, pixels, shot, out):
     """Add one shot's rows to out (patch, atom, padded measurement), the sensed dictionaries.
 
+        row[i]                          = sum over parts of atom[part, i] weights[part, i]
+        out[p, j, pixels shot + pixel[i]] = sum of row over the samples i of that pixel
     selected: (atom, part, padded sample). weights: (patch, part, padded sample).
     pixel: (sample,), see `pixel_of_sample`; `pixels` of them a shot.
-    Operations: 2 patches atoms parts samples. Each atom is read once for all patches.
+    Operations: 2 patches atoms parts samples. Each atom is read once for all patches. Five parts at
+    a time: fewer passes over the row.
     """
     count, parts, width = selected.shape
     first = shot * pixels

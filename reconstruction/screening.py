@@ -8,6 +8,7 @@ Dark shots, repeated shots, flicker and bad pixels are not.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,11 +92,11 @@ def screened(psi: ImagingMatrix, given: Frames) -> Screened:
     given: finite where usable.
     """
     notes: list[str] = []
-    frames, usable = given.readings, given.usable
+    frames, usable = given.readings, given.usable.copy()
     dark = dark_shots(psi, frames, usable)
-    usable = _without(usable, dark)
+    usable[list(dark)] = False
     double = double_shots(psi, frames, usable)
-    usable = _without(usable, double)
+    usable[list(double)] = False
     if dark:
         notes.append(f"excluded {_shots(dark)}: dark, while the others are not")
     if double:
@@ -132,14 +133,12 @@ def screened(psi: ImagingMatrix, given: Frames) -> Screened:
 
 def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that no light of the scene reached, while it reached others."""
-    expected = psi.picture_weights.sum(axis=-1).mean(axis=(1, 2)) * psi.binning**2
-    seen = np.array(
-        [
-            float(frame[kept].mean()) if kept.any() else np.nan
-            for frame, kept in zip(frames, usable, strict=True)
-        ]
-    )
-    brightness = seen / np.maximum(expected, 1e-12)
+    of_white = psi.picture_weights.sum(axis=-1).mean(axis=(1, 2)) * psi.binning**2
+    read = [
+        float(frame[kept].mean()) if kept.any() else np.nan
+        for frame, kept in zip(frames, usable, strict=True)
+    ]
+    brightness = np.array(read) / np.maximum(of_white, 1e-12)
     if not np.isfinite(brightness).any() or not np.nanmax(brightness) > 0:
         return ()
     dark = brightness < DARK_SHARE * np.nanmax(brightness)
@@ -149,23 +148,25 @@ def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
 def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that repeat another although they differ in Psi.
 
-    Of two equal shots the one with the larger residual is returned.
+    With p the difference of two shots that Psi predicts and r that of their readings, they are the
+    same if |r|^2 < ALIKE |p|^2 and r . p < SHOWN |p|^2. Of two equal shots the one with the larger
+    residual is returned.
     """
     kept = [shot for shot in range(len(frames)) if usable[shot].any()]
     predicted = _predicted(psi, frames, usable)
-    found: list[int] = []
-    for place, shot in enumerate(kept):
-        for other in kept[:place]:
-            both = usable[shot] & usable[other]
-            if other in found or shot in found or not both.any():
-                continue
-            expected = (predicted[shot] - predicted[other])[both].astype(np.float64)
-            seen = (frames[shot] - frames[other])[both].astype(np.float64)
-            square = float(expected @ expected)
-            if float(seen @ seen) < ALIKE * square and float(seen @ expected) < SHOWN * square:
-                misfits = [_square(frames[i] - predicted[i], both) for i in (other, shot)]
-                found.append((other, shot)[int(np.argmax(misfits))])
-    return tuple(sorted(found))
+    doubles: list[int] = []
+    for other, shot in sorted(combinations(kept, 2), key=lambda pair: pair[::-1]):
+        both = usable[shot] & usable[other]
+        if other in doubles or shot in doubles or not both.any():
+            continue
+        p = (predicted[shot] - predicted[other])[both].astype(np.float64)
+        r = (frames[shot] - frames[other])[both].astype(np.float64)
+        square = float(p @ p)
+        if float(r @ r) < ALIKE * square and float(r @ p) < SHOWN * square:
+            residuals = [(frames[i] - predicted[i])[both] for i in (other, shot)]
+            misfits = [np.mean(np.square(left, dtype=np.float64)) for left in residuals]
+            doubles.append((other, shot)[int(np.argmax(misfits))])
+    return tuple(sorted(doubles))
 
 
 def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
@@ -174,7 +175,11 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     The light of most shots counts as 1 (the median), of two their mean.
 
     What a pixel reads over what a smooth picture predicts is, but for the light, much the same in
-    every shot: the scene's texture is in all of them. The median over the pixels is the light.
+    every shot: the scene's texture is in all of them. The median over the pixels is the light. In
+    turn, for shots s and well-lit pixels i,
+        ratio_si = reading_si / (gain_s predicted_si), over its mean over the shots
+        gain_s   = gain_s median_i(ratio_si), over the mean gain
+    where the prediction explains the evened readings.
     """
     even = np.ones(len(frames))
     kept = np.flatnonzero(usable.any(axis=(1, 2)))
@@ -347,7 +352,7 @@ def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
             usual = max(float(np.median(width[known])), 1e-12)
             score += np.maximum(beyond, 0) / np.maximum(width, usual)
             count += known
-        # Judged anew each time: what a bad neighbour made look bad is good again.
+        # All pixels anew in each round: beside a bad neighbour a good one may have looked bad.
         bad = (score > widths * count) & ~_bright_details(frames, predicted, usable)
         widths = BAD_WIDTHS - EASIER * np.log10(max(float(bad.mean()), FEW_BAD) / FEW_BAD)
         widths = max(widths, LEAST_WIDTHS)
@@ -360,7 +365,10 @@ def _bright_details(
     """Return where pixels read more than predicted by one factor in all shots, (pixel_y, pixel_x).
 
     So a glint does, behind masks that differ from shot to shot; a hot pixel reads more by the same
-    amount. Of one shot, or where masks pass as much in all, nothing is said.
+    amount. With excess x_s = reading_s - predicted_s and light l_s = predicted_s of a pixel:
+        as light:  sum_s (x_s - f l_s)^2,  f = sum_s(x_s l_s) / sum_s(l_s^2)
+        as offset: sum_s (x_s - mean x)^2
+    Of one shot, or where masks pass as much in all, nothing is said.
     """
     count = usable.sum(axis=0)
     excess = np.where(usable, frames - predicted, 0)
@@ -375,18 +383,6 @@ def _bright_details(
 def _predicted(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return what a smooth picture, the same in all views, reads."""
     return psi.forward_picture(smooth_guess(psi, frames, usable))
-
-
-def _square(difference: Array, where: NDArray[np.bool_]) -> float:
-    return float(np.mean(np.square(difference[where], dtype=np.float64)))
-
-
-def _without(usable: NDArray[np.bool_], shots: tuple[int, ...]) -> NDArray[np.bool_]:
-    if not shots:
-        return usable
-    kept = usable.copy()
-    kept[list(shots)] = False
-    return kept
 
 
 def _shots(shots: tuple[int, ...]) -> str:

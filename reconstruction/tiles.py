@@ -269,13 +269,55 @@ def multiple_of(binning: int, dictionary: Dictionary | None, settings: MethodSet
     return lcm(2 * binning, settings.sparse.stride if dictionary is not None else 1)
 
 
-def _largest_disparity(
-    scout: str, psi: ImagingMatrix, frames: Frames, settings: MethodSettings
-) -> float:
-    """Return the largest disparity, in size, that a method is sure of in a window."""
-    maps = reconstruct(scout, psi, frames, None, settings).maps
-    sure = maps["disparity"][maps["disparity_sigma"] < SURE_PX]
-    return float(np.percentile(np.abs(sure), COVERED)) if sure.size else 0.0
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Sample windows of a capture, beside each other as one.
+
+    psi, frames: of all windows, along x. windows: Psi of each.
+    """
+
+    psi: ImagingMatrix
+    frames: Frames
+    windows: list[ImagingMatrix]
+
+    @classmethod
+    def of(cls, psi: PsiLayout, frames: Frames, multiple: int) -> _Sample:
+        """Return the sample windows, whose edges are multiples of so many samples."""
+        places = samples(psi.size, multiple)
+        windows = [psi.window(*place) for place in places]
+        colours = [window.colour for window in windows if window.colour is not None]
+        mosaic = replace(
+            windows[0],
+            weights=np.concatenate([window.weights for window in windows], axis=5),
+            colour=np.concatenate(colours, axis=2) if colours else None,
+        )
+        seen = [pixels_of(place, psi.binning) for place in places]
+        usable = np.concatenate([frames.usable[place] for place in seen], axis=2)
+        readings = np.concatenate([frames.readings[place] for place in seen], axis=2)
+        readings = np.where(usable, readings.astype(np.float32), 0)
+        return cls(mosaic, even_frames(readings, frames.noise_sigma, usable), windows)
+
+    def largest_disparity(self, scout: str, settings: MethodSettings) -> float:
+        """Return the largest |disparity| that a method is sure of in a window, 0 for none."""
+        largest, first = 0.0, 0
+        for window in self.windows:
+            frames = self.frames.cut(np.s_[:, :, first : first + window.frames_shape[2]])
+            first += window.frames_shape[2]
+            if frames.usable.any():
+                maps = reconstruct(scout, window, frames, None, settings).maps
+                sure = maps["disparity"][maps["disparity_sigma"] < SURE_PX]
+                if sure.size:
+                    largest = max(largest, float(np.percentile(np.abs(sure), COVERED)))
+        return largest
+
+    def contrast(self, settings: MethodSettings) -> float:
+        """Return the contrast that `adaptive` presumes of the scene's texture."""
+        if settings.adaptive.contrast:
+            return settings.adaptive.contrast
+        readings, usable = self.frames.readings, self.frames.usable
+        picture = smooth_guess(self.psi, readings, usable).astype(np.float32)
+        noise = np.full(readings.shape, self.frames.noise_sigma**2)
+        return contrast_of(self.psi, readings, picture, noise, usable)
 
 
 def surveyed(
@@ -286,61 +328,31 @@ def surveyed(
     settings: MethodSettings | None = None,
 ) -> CaptureSurvey:
     """Return what is settled from sample windows of a capture, read one at a time."""
-    settings, method, k = settings or MethodSettings(), find_method(name), psi.binning
-    places = samples(psi.size, multiple_of(k, dictionary, settings))
-    windows = [psi.window(*place) for place in places]
-    mosaic = replace(
-        windows[0],
-        weights=np.concatenate([window.weights for window in windows], axis=5),
-        colour=None
-        if windows[0].colour is None
-        else np.concatenate(
-            [window.colour for window in windows if window.colour is not None], axis=2
-        ),
-    )
-    seen = [pixels_of(place, k) for place in places]
-    use = np.concatenate([frames.usable[place] for place in seen], axis=2)
-    readings = np.concatenate([frames.readings[place] for place in seen], axis=2).astype(np.float32)
-    read = even_frames(np.where(use, readings, 0), frames.noise_sigma, use)
+    settings, method = settings or MethodSettings(), find_method(name)
+    sample = _Sample.of(psi, frames, multiple_of(psi.binning, dictionary, settings))
     left_out, gains, words = (), (1.0,) * psi.shots, ()
-    if settings.screening and use.any():
-        found = screened(mosaic, read)
-        left_out = tuple(sorted((*found.dark, *found.double)))
-        gains = tuple(float(gain) for gain in found.gains)
+    if settings.screening and sample.frames.usable.any():
+        seen = screened(sample.psi, sample.frames)
+        left_out = tuple(sorted((*seen.dark, *seen.double)))
+        gains = tuple(float(gain) for gain in seen.gains)
         # Bad pixels and lines are left to the blocks.
-        words = found.notes[: len(found.notes) - bool(found.bad.any()) - bool(found.lines.any())]
-        read = found.frames
-    halo, largest, scout = REACH, 0.0, method.scout
-    sparse = method.patches(mosaic, settings)
-    if scout is not None:
-        firsts = np.cumsum([0, *(window.frames_shape[2] for window in windows)])
-        parts = [
-            (window, np.s_[:, :, first : first + window.frames_shape[2]])
-            for window, first in zip(windows, firsts, strict=False)
-        ]
-        largest = max(
-            (
-                _largest_disparity(scout, window, read.cut(part), settings)
-                for window, part in parts
-                if read.usable[part].any()
-            ),
-            default=0.0,
-        )
+        words = seen.notes[: len(seen.notes) - bool(seen.bad.any()) - bool(seen.lines.any())]
+        sample = replace(sample, frames=seen.frames)
+    halo, largest_px = REACH, 0.0
+    sparse = method.patches(sample.psi, settings)
+    if method.scout is not None:
+        largest_px = sample.largest_disparity(method.scout, settings)
         reach = TEXTURE_REACH if sparse is None else PATCHED_REACH
-        halo = reach * k + ceil(largest * (max(mosaic.light_field_shape[:2]) // 2))
-        picture = smooth_guess(mosaic, read.readings, read.usable).astype(np.float32)
-        noise = np.full(read.shape, read.noise_sigma**2)
-        own = settings.adaptive.contrast or contrast_of(
-            mosaic, read.readings, picture, noise, read.usable
-        )
+        halo = reach * psi.binning + ceil(largest_px * (max(psi.views) // 2))
         # What a block would decide by its own size is decided for all.
         count = None if sparse is None else settings.adaptive.patches
-        adaptive = settings.adaptive.model_copy(update={"contrast": own, "patches": count})
+        update = {"contrast": sample.contrast(settings), "patches": count}
+        adaptive = settings.adaptive.model_copy(update=update)
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
-    settled = _settled(mosaic, read, settings, sparse)
-    return CaptureSurvey(settled, halo, left_out, gains, words, largest)
+    settled = _settled(sample.psi, sample.frames, settings, sparse)
+    return CaptureSurvey(settled, halo, left_out, gains, words, largest_px)
 
 
 def _settled(

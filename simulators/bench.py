@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -81,6 +81,30 @@ class MountingErrors:
 NO_ERRORS = MountingErrors((0.0, 0.0), 0.0, 1.0)
 
 
+class MaskRow(NamedTuple):
+    """A mask as `trace` reads it: a row of its `plates`.
+
+    Cells of the mask, from its middle: column = column_per_x x + column_per_y y, and rows alike,
+    for x and y in um on the mask. The rays of sensor point s are displaced by bend_per_um2 s^2 s.
+    The mask lies at distance_um + slope . (x, y) + sag (x^2 + y^2).
+    """
+
+    distance_um: float
+    x_um: float
+    y_um: float
+    column_per_x: float
+    column_per_y: float
+    row_per_x: float
+    row_per_y: float
+    bend_per_um2: float
+    edge_um: float
+    slope_x: float
+    slope_y: float
+    sag_per_um: float
+    glass_um: float
+    index: float
+
+
 def ray_points(views: tuple[int, int], count: int, axes: int = 4) -> NDArray[np.float64]:
     """Return where the rays of every view start in a pixel and an aperture cell, in [0, 1).
 
@@ -140,6 +164,50 @@ def _place(column, row, start, height, width):
     return 0 if beside else start + i * width + j
 
 
+@njit(forceinline=True, fastmath=True)
+def _find_cells(
+    place, plate, start, shape, first_x, ray_y, ray_u, ray_v, blur_x, blur_y, lens_um, pitch_um
+):
+    """Set place (x) to the cell that the ray of every pixel of a row meets on a mask.
+
+    plate: a `MaskRow`. first_x, ray_y: sensor point of the first pixel's ray, in um; ray_u, ray_v:
+    the lens point of all. blur_x, blur_y: shift of the mask's edges, in standard deviations. A
+    thin, flat, undistorted mask is met at distance d in x + d / lens (u - x), linear in x.
+    """
+    distance_um, x_um, y_um = plate[:3]
+    column_x, column_y, row_x, row_y = plate[3:7]
+    bend, edge_um, slope_x, slope_y, sag, glass_um, index = plate[7:]
+    ratio = distance_um / lens_um
+    at_x = (1 - ratio) * first_x + ratio * ray_u - x_um + edge_um * blur_x
+    at_y = (1 - ratio) * ray_y + ratio * ray_v - y_um + edge_um * blur_y
+    height, width = shape
+    column = column_x * at_x + column_y * at_y + width / 2
+    row = row_x * at_x + row_y * at_y + height / 2
+    along = (1 - ratio) * pitch_um * column_x
+    across = (1 - ratio) * pitch_um * row_x
+    flat = slope_x == 0 and slope_y == 0 and sag == 0 and glass_um == 0
+    if flat and bend == 0:
+        for x in range(place.size):
+            place[x] = _place(column + along * x, row + across * x, start, height, width)
+        return
+    for x in range(place.size):
+        to_column, to_row = column + along * x, row + across * x
+        ray_x = first_x + x * pitch_um
+        if not flat:
+            met_x, met_y = _met(
+                ray_x, ray_y, ray_u, ray_v,
+                lens_um, distance_um, slope_x, slope_y, sag, glass_um, index,
+            )  # fmt: skip
+            more_x = met_x - ((1 - ratio) * ray_x + ratio * ray_u)
+            more_y = met_y - ((1 - ratio) * ray_y + ratio * ray_v)
+            to_column += column_x * more_x + column_y * more_y
+            to_row += row_x * more_x + row_y * more_y
+        cubed = bend * (ray_x * ray_x + ray_y * ray_y)
+        to_column += cubed * (column_x * ray_x + column_y * ray_y)
+        to_row += cubed * (row_x * ray_x + row_y * ray_y)
+        place[x] = _place(to_column, to_row, start, height, width)
+
+
 @row_kernel("readings", 0, fastmath=True)
 def trace(
     begin,
@@ -165,10 +233,8 @@ def trace(
     points: (v, u, ray, 4). at_lens_um: (v, u, ray, 2), where the rays meet the lens, x and y.
     passes: (v, u, ray), whether the aperture plate lets them through. lengths_um: lens distance,
     sample pitch, sample width. cells: (1 + all cells, colour), the first opaque; starts, shapes:
-    where each mask lies in it, (rows, columns). plates: per mask distance_um, x_um, y_um, what
-    turns um on the mask into cells (column from x and y, row from x and y), the displacement of
-    its rays per cubed um off the axis, the width of its edges in um, and the slopes, sag, glass and
-    index that `_met` takes. falloff: (v, u, y, x), or all 1.
+    where each mask lies in it, (rows, columns). plates: a `MaskRow` for each mask. falloff:
+    (v, u, y, x), or all 1.
     points: (v, u, ray, 4 or 6), 6 where edges are blurred: the last two are normal.
     """
     rows, columns = readings.shape
@@ -197,58 +263,17 @@ def trace(
                         continue
                     in_x, in_y, in_u, in_v = points[v, u, ray, :4]
                     ray_u, ray_v = at_lens_um[v, u, ray]
+                    blur_x = points[v, u, ray, 4] if points.shape[3] == 6 else 0.0
+                    blur_y = points[v, u, ray, 5] if points.shape[3] == 6 else 0.0
                     first_x = -(columns - 1) / 2 * pitch_um + (in_x - 0.5) * width_um
                     ray_y = (y - (rows - 1) / 2) * pitch_um + (in_y - 0.5) * width_um
                     for c in range(3):
                         passed[c, :] = lamp[c]
                     for mask in range(plates.shape[0]):
-                        ratio = plates[mask, 0] / lens_um
-                        at_x = (1 - ratio) * first_x + ratio * ray_u - plates[mask, 1]
-                        at_y = (1 - ratio) * ray_y + ratio * ray_v - plates[mask, 2]
-                        if points.shape[3] == 6:
-                            at_x += plates[mask, 8] * points[v, u, ray, 4]
-                            at_y += plates[mask, 8] * points[v, u, ray, 5]
-                        height, width = shapes[mask, 0], shapes[mask, 1]
-                        column_x, column_y, row_x, row_y = plates[mask, 3:7]
-                        bend = plates[mask, 7]
-                        column = column_x * at_x + column_y * at_y + width / 2
-                        row = row_x * at_x + row_y * at_y + height / 2
-                        along = (1 - ratio) * pitch_um * column_x
-                        across = (1 - ratio) * pitch_um * row_x
-                        start = starts[mask]
-                        slope_x, slope_y, sag, glass_um, index = plates[mask, 9:]
-                        flat = slope_x == 0 and slope_y == 0 and sag == 0 and glass_um == 0
-                        if flat and bend == 0:
-                            for x in range(columns):
-                                place[x] = _place(
-                                    column + along * x, row + across * x, start, height, width
-                                )
-                        else:
-                            for x in range(columns):
-                                to_column, to_row = column + along * x, row + across * x
-                                ray_x = first_x + x * pitch_um
-                                if not flat:
-                                    met_x, met_y = _met(
-                                        ray_x,
-                                        ray_y,
-                                        ray_u,
-                                        ray_v,
-                                        lens_um,
-                                        plates[mask, 0],
-                                        slope_x,
-                                        slope_y,
-                                        sag,
-                                        glass_um,
-                                        index,
-                                    )
-                                    more_x = met_x - ((1 - ratio) * ray_x + ratio * ray_u)
-                                    more_y = met_y - ((1 - ratio) * ray_y + ratio * ray_v)
-                                    to_column += column_x * more_x + column_y * more_y
-                                    to_row += row_x * more_x + row_y * more_y
-                                cubed = bend * (ray_x * ray_x + ray_y * ray_y)
-                                to_column += cubed * (column_x * ray_x + column_y * ray_y)
-                                to_row += cubed * (row_x * ray_x + row_y * ray_y)
-                                place[x] = _place(to_column, to_row, start, height, width)
+                        _find_cells(
+                            place, plates[mask], starts[mask], shapes[mask],
+                            first_x, ray_y, ray_u, ray_v, blur_x, blur_y, lens_um, pitch_um,
+                        )  # fmt: skip
                         for c in range(3):
                             for x in range(columns):
                                 passed[c, x] *= cells[place[x], c]
@@ -454,7 +479,7 @@ class Bench:
                 (at_um["mask_x"], at_um["mask_y"]) if name in camera.moving_masks else (0.0, 0.0)
             )
             errors = NO_ERRORS if at_lens else self._errors
-            plates.append(self._standing(errors, plate.distance_mm, grain_um, moved))
+            plates.append(self._mask_row(errors, plate.distance_mm, grain_um, moved))
         board = self.target == "whiteboard" or cell is not None
         scene = (
             np.ones((1, 1, 1, 1, 3), np.float32)
@@ -487,7 +512,7 @@ class Bench:
             np.concatenate(cells),
             np.array(starts, dtype=np.int64),
             np.array(shapes, dtype=np.int64).reshape(-1, 2),
-            np.array(plates, dtype=np.float64).reshape(-1, 14),
+            np.array(plates, dtype=np.float64).reshape(-1, len(MaskRow._fields)),
             falloff,
             samples,
         )
@@ -501,34 +526,33 @@ class Bench:
         y_um, x_um = centred_grid(rows, cell_um)[cell[0]], centred_grid(columns, cell_um)[cell[1]]
         return np.array([(float(x_um), float(y_um), cell_um / 2)])
 
-    def _standing(
+    def _mask_row(
         self,
         errors: MountingErrors,
         distance_mm: float,
         cell_um: float,
         moved_um: tuple[float, float],
-    ) -> tuple[float, ...]:
-        """Return a mask's row of `trace`'s plates."""
+    ) -> MaskRow:
         turn = np.deg2rad(errors.rotation_deg)
         cosine, sine = np.cos(turn), np.sin(turn)
         per_um = 1 / (cell_um * errors.stretch)
         pitch_um = self.camera.sensor.sample_pitch_um
         corner_um = np.hypot(*self._size) / 2 * pitch_um
-        return (
-            distance_mm * 1e3 * (1 + errors.distance_share),
-            errors.offset_um[0] + moved_um[0],
-            errors.offset_um[1] + moved_um[1],
-            (cosine - errors.skew * sine) * per_um,
-            (sine + errors.skew * cosine) * per_um,
-            -sine * per_um,
-            cosine * per_um,
-            errors.distortion_um / corner_um**3,
-            errors.edge_blur_um,
-            np.tan(np.deg2rad(errors.tilt_deg[0])),
-            np.tan(np.deg2rad(errors.tilt_deg[1])),
-            errors.bow_um / corner_um**2,
-            errors.substrate_um,
-            errors.refractive_index,
+        return MaskRow(
+            distance_um=distance_mm * 1e3 * (1 + errors.distance_share),
+            x_um=errors.offset_um[0] + moved_um[0],
+            y_um=errors.offset_um[1] + moved_um[1],
+            column_per_x=(cosine - errors.skew * sine) * per_um,
+            column_per_y=(sine + errors.skew * cosine) * per_um,
+            row_per_x=-sine * per_um,
+            row_per_y=cosine * per_um,
+            bend_per_um2=errors.distortion_um / corner_um**3,
+            edge_um=errors.edge_blur_um,
+            slope_x=np.tan(np.deg2rad(errors.tilt_deg[0])),
+            slope_y=np.tan(np.deg2rad(errors.tilt_deg[1])),
+            sag_per_um=errors.bow_um / corner_um**2,
+            glass_um=errors.substrate_um,
+            index=errors.refractive_index,
         )
 
     def _openings(self, x_um: float, y_um: float) -> Array:

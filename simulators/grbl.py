@@ -12,8 +12,9 @@ import logging
 import math
 import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Self
 
 from emmc_rig.drivers import grbl_codec as codec
 from emmc_rig.drivers.clock import Clock
@@ -131,16 +132,8 @@ class GrblController(SimulatedController):
     def _receive(self, data: bytes) -> None:
         for value in data:
             byte = bytes([value])
-            if byte == codec.SOFT_RESET:
-                self._soft_reset()
-            elif byte == codec.STATUS_QUERY:
-                self._status_asked = True
-                self._command = byte
-                self._report_if_asked()
-            elif byte == codec.FEED_HOLD:
-                self._feed_hold()
-            elif byte == codec.JOG_CANCEL:
-                self._cancel_jog()
+            if act := self._realtime.get(byte):
+                act(self)
             elif value >= 0x80 or byte == b"~":
                 continue  # overrides, and the end of a hold
             elif byte in b"\r\n":
@@ -149,6 +142,11 @@ class GrblController(SimulatedController):
             else:
                 self._line.append(value)
         self._execute_lines()
+
+    def _ask_status(self) -> None:
+        self._status_asked = True
+        self._command = codec.STATUS_QUERY
+        self._report_if_asked()
 
     def _end_line(self) -> None:
         line, self._line = bytes(self._line), bytearray()
@@ -316,38 +314,44 @@ class GrblController(SimulatedController):
     def _execute_system(self, line: str) -> None:
         if line.startswith("$J"):
             self._execute_jog(line)
-        elif line == "$G":
-            modes = self._modes
-            units, distance = ("G20", "G21")[not modes.inches], ("G91", "G90")[modes.absolute]
-            self._say(
-                f"[GC:{modes.motion} G54 G17 {units} {distance} G94 M5 M9 T0 "
-                f"F{modes.feed_mm_min:g} S0]"
-            )
-        elif line == "$X":
-            if self._state == "Alarm":
-                self._say("[MSG:Caution: Unlocked]")
-                self._state = "Idle"
-        elif line == "$$":
-            if self._state in ("Run", "Hold"):
-                raise _RefusedError(8)
-            for number, value in sorted(self.settings.items()):
-                self._say(f"${number}={value:.3f}" if number >= 100 else f"${number}={value:g}")
-        elif self._state not in ("Idle", "Alarm"):
+            return
+        in_motion = line in ("$G", "$X") or (line == "$$" and self._state not in ("Run", "Hold"))
+        if not in_motion and self._state not in ("Idle", "Alarm"):
             raise _RefusedError(8)
-        elif line == "$I":
-            self._say(f"[VER:{VERSION}.{BUILD}:]")
-            self._say(f"[OPT:{self.options},{PLANNER_BLOCKS},{RX_BUFFER}]")
-        elif line == "$#":
-            zero_mm = dict.fromkeys(self.axes, 0.0)
-            for name in ("G54", "G55", "G56", "G57", "G58", "G59", "G28", "G30", "G92"):
-                offset_mm = self.work_offset_mm if name == "G54" else zero_mm
-                self._say(f"[{name}:{self._coordinates(offset_mm, 1.0)}]")
-            self._say("[TLO:0.000]")
-            self._say(f"[PRB:{self._coordinates(zero_mm, 1.0)}:0]")
+        if handle := self._commands.get(line):
+            handle(self)
         elif line.startswith("$H"):
             self._execute_home(line[2:])
         else:
             self._execute_setting(line)
+
+    def _list_modes(self) -> None:
+        modes = self._modes
+        units, distance = ("G20", "G21")[not modes.inches], ("G91", "G90")[modes.absolute]
+        self._say(
+            f"[GC:{modes.motion} G54 G17 {units} {distance} G94 M5 M9 T0 F{modes.feed_mm_min:g} S0]"
+        )
+
+    def _unlock(self) -> None:
+        if self._state == "Alarm":
+            self._say("[MSG:Caution: Unlocked]")
+            self._state = "Idle"
+
+    def _list_settings(self) -> None:
+        for number, value in sorted(self.settings.items()):
+            self._say(f"${number}={value:.3f}" if number >= 100 else f"${number}={value:g}")
+
+    def _list_build(self) -> None:
+        self._say(f"[VER:{VERSION}.{BUILD}:]")
+        self._say(f"[OPT:{self.options},{PLANNER_BLOCKS},{RX_BUFFER}]")
+
+    def _list_offsets(self) -> None:
+        zero_mm = dict.fromkeys(self.axes, 0.0)
+        for name in ("G54", "G55", "G56", "G57", "G58", "G59", "G28", "G30", "G92"):
+            offset_mm = self.work_offset_mm if name == "G54" else zero_mm
+            self._say(f"[{name}:{self._coordinates(offset_mm, 1.0)}]")
+        self._say("[TLO:0.000]")
+        self._say(f"[PRB:{self._coordinates(zero_mm, 1.0)}:0]")
 
     def _execute_setting(self, line: str) -> None:
         match = _SETTING_LINE.fullmatch(line)
@@ -560,6 +564,21 @@ class GrblController(SimulatedController):
 
     def _say(self, text: str) -> None:
         self._send(text.encode("ascii") + b"\r\n")
+
+    _realtime: Mapping[bytes, Callable[[Self], None]] = {
+        codec.SOFT_RESET: _soft_reset,
+        codec.STATUS_QUERY: _ask_status,
+        codec.FEED_HOLD: _feed_hold,
+        codec.JOG_CANCEL: _cancel_jog,
+    }
+    """What is carried out at once, whatever line it comes in."""
+    _commands: Mapping[str, Callable[[Self], None]] = {
+        "$G": _list_modes,
+        "$X": _unlock,
+        "$$": _list_settings,
+        "$I": _list_build,
+        "$#": _list_offsets,
+    }
 
 
 def _not_modelled(line: str) -> _RefusedError:

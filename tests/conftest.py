@@ -8,7 +8,7 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
-# As many processes as cores: threads of BLAS in each would wait on each other.
+# There are as many processes as cores: BLAS threads in each process would compete for them.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Threads of numba's loops sleep until they have work: spinning takes the other process's core.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -16,7 +16,7 @@ from emmc_rig.commands.options import (
     SeedOption,
     SizeOption,
 )
-from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
+from emmc_rig.commands.output import show_study, shown_progress
 
 
 def chart(
@@ -41,20 +41,13 @@ def chart(
     """
     from emmc_rig.store.results import parse_size
     from emmc_rig.study.chart.chart_points import chart_settings
-    from emmc_rig.study.chart.charting import run_chart
+    from emmc_rig.study.chart.charting import ChartStudy
 
     settings = chart_settings(
         fast, scene or [], camera or [], parse_size(size), repeats,
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
     )  # fmt: skip
+    study = ChartStudy(settings, out)
     with shown_progress() as bars:
-        outcome = run_chart(settings, out, bars)
-    for panel in outcome.shown():
-        rows = [
-            (m.configuration.label, f"{m.seconds:.3g}", f"{m.psnr_db:.2f}") for m in panel.front()
-        ]
-        show_table(("method", "s", "dB"), rows, panel.title)
-    for line in outcome.left_out:
-        say("excluded", line)
-    tell(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
-    give_result(out)
+        study.carry_out(bars)
+    show_study(study, out)

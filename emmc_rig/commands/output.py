@@ -23,7 +23,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.box import SIMPLE
@@ -44,6 +44,9 @@ from rich.text import Text
 from emmc_rig.drivers.errors import AxisFaultError, NotHomedError, PositionMismatchError
 from emmc_rig.model.errors import AdvisedError
 from emmc_rig.progress import Watcher
+
+if TYPE_CHECKING:
+    from emmc_rig.study.points import Study
 
 console = Console(stderr=True)
 json_wanted: ContextVar[bool] = ContextVar("json_wanted", default=False)
@@ -116,6 +119,19 @@ def show_table(heads: Sequence[Any], rows: Iterable[Sequence[Any]], title: str =
     for row in rows:
         table.add_row(*row)
     show(table)
+
+
+def show_study(study: Study, out: Path) -> None:
+    """Show the tables of a study, reasons why points are excluded, and its page; out: as typed."""
+    for item in study.shown():
+        if isinstance(item, str):
+            tell(item)
+        else:
+            show_table(item.heads, item.rows, item.title)
+    for line in study.excluded():
+        say("excluded", line)
+    tell(f"{study.seconds:.0f} s; open {out / study.page}")
+    give_result(out)
 
 
 def give_result(out: Path | None = None, **facts: Any) -> None:

@@ -20,7 +20,7 @@ from emmc_rig.commands.options import (
     WorkersOption,
     check_workers,
 )
-from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
+from emmc_rig.commands.output import give_result, show_study, show_table, shown_progress
 
 
 def stability(
@@ -47,9 +47,7 @@ def stability(
     The same command goes on where it stopped.
     """
     from emmc_rig.store.results import parse_size
-    from emmc_rig.study.stability.curves import breaking_rows
-    from emmc_rig.study.stability.stability_run import run_stability
-    from emmc_rig.study.stability.stability_study import stability_settings
+    from emmc_rig.study.stability.stability_study import StabilityStudy, stability_settings
 
     if faults:
         _list_faults()
@@ -59,16 +57,10 @@ def stability(
         fast, scene or [], parse_size(size), camera=camera, faults=tuple(fault or []),
         methods=tuple(method or []), dictionary=dictionary, seed=seed,
     )  # fmt: skip
+    study = StabilityStudy(settings, out)
     with shown_progress() as bars:
-        outcome = run_stability(settings, out, bars, workers=workers, cluster=cluster)
-    rows, methods = breaking_rows(outcome.curves, outcome.curves[0].scene)
-    title = f"{outcome.curves[0].scene}: falls 3 dB below its best / below the baseline at"
-    shown = [(f"{fault.title}, {fault.unit}", *cells) for fault, cells in rows]
-    show_table(("fault", *methods), shown, title)
-    for line in outcome.left_out:
-        say("excluded", line)
-    tell(f"open {outcome.page}")
-    give_result(out)
+        study.carry_out(bars, workers, cluster)
+    show_study(study, out)
 
 
 def _list_faults() -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import DictionaryOption, FastOption, OutOption, SeedOption
-from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
+from emmc_rig.commands.output import show_study, shown_progress
 
 
 def tables(
@@ -28,18 +28,13 @@ def tables(
 
     The same command goes on where it stopped.
     """
-    from emmc_rig.study.tables.tables_page import run_tables
-    from emmc_rig.study.tables.tables_study import FAST, TablesSettings
+    from emmc_rig.study.tables.cells import chosen_parts
+    from emmc_rig.study.tables.tables_study import FAST, TablesSettings, TablesStudy, scene_specs
 
     settings = (FAST if fast else TablesSettings()).model_copy(
         update={"seed": seed, "dictionary": dictionary}
     )
+    study = TablesStudy(settings, out, chosen_parts(only), scene_specs(scenes))
     with shown_progress() as bars:
-        outcome = run_tables(scenes, out, only, settings, bars)
-    for grid in outcome.grids:
-        # Ours above the paper's: side by side the widest table does not fit a terminal.
-        rows = [[cell.replace(" | ", "\n") for cell in row] for row in grid.rows]
-        show_table(grid.heads, rows, grid.title)
-    tell("PSNR in dB, the paper's below; compare figures within one run only")
-    tell(f"{outcome.seconds:.0f} s; open {out / outcome.page.name}")
-    give_result(out)
+        study.carry_out(bars)
+    show_study(study, out)

@@ -1,29 +1,34 @@
-"""The engine of every study: points are measured one by one, stored, and resumed after a stop.
+"""The engine of every study: points are measured one by one, kept, and drawn on a page.
 
-A point is identified by a digest of everything that it depends on, so that changed settings never
-reuse old results. The journal has one JSON line for each point; a line torn by a crash is ignored.
+A study is a subclass of `Study`, with points, their measurement, columns of CSV files and sections
+of a page. A point is identified by a digest of everything that it depends on, so
+that changed settings never reuse old results. The journal has one JSON line for each point; a line
+torn by a crash is ignored, and a stopped study resumes.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.files import write_text
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.progress import Watcher
-from emmc_rig.report.page import number
-from emmc_rig.store.folders import Listing, refuse_edited, refuse_inside_session
+from emmc_rig.report.page import Head, Section, framed, number, provenance_section
+from emmc_rig.store.folders import Listing, refuse_edited, refuse_inside_session, result_folder
 from emmc_rig.store.jobs import Store, kept_words, run_job
 from emmc_rig.store.journal import Lines
-from emmc_rig.store.pool import Pool
+from emmc_rig.store.pool import Pool, opened_pool
 from emmc_rig.store.products import digest_of
-from emmc_rig.study.rows import described, plain
+from emmc_rig.store.results import write_metrics
+from emmc_rig.study.rows import csv_text, plain, provenance
 from emmc_rig.version import __version__
 
 P = TypeVar("P", bound=Hashable)
@@ -98,31 +103,70 @@ class Journal(Store[dict, dict]):
         return result
 
 
+class Table(NamedTuple):
+    """A table of a terminal and a page. heads: of the columns. rows: cells in words."""
+
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Content of a study's files.
+
+    about: sentences under the title of the page. rows: of each CSV file, by the file's name.
+    metrics: of metrics.json. sources: where figures came from, beside settings and versions.
+    """
+
+    head: Head
+    about: Sequence[str]
+    sections: Sequence[Section]
+    rows: Mapping[str, Sequence[Mapping[str, object]]]
+    metrics: Mapping[str, object]
+    sources: Mapping[str, str]
+
+
 @dataclass
 class Study(Generic[P]):
-    """Points measured into a folder. A study is a subclass that says what a point is.
+    """Points measured into a folder, and their page. A study is a subclass.
 
     results: by point, plain data; one with `failed` says why there are no figures, and is measured
-    again the next time if its `keep` is False. left_out: points that cannot be, and why.
+    again the next time if its `keep` is False. left_out: points that cannot be measured, and why.
+    started: time of the study's making, perf_counter. seconds: from then until the page is written.
     """
 
     settings: Any
     folder: Path
     results: dict[P, dict] = field(default_factory=dict, init=False)
     left_out: dict[P, str] = field(default_factory=dict, init=False)
+    started: float = field(default_factory=time.perf_counter, init=False)
+    seconds: float = field(default=0.0, init=False)
 
+    command: ClassVar[str] = "study"
+    """As typed."""
+    title: ClassVar[str] = ""
+    page: ClassVar[str] = "study.html"
+    style_sheets: ClassVar[Sequence[str]] = ()
+    caveats: ClassVar[Sequence[str]] = ()
+    columns: ClassVar[Mapping[str, Sequence[str]]] = {}
+    """Of each CSV file, by its name; empty fields are infinite, unknown or not applicable."""
     journal: ClassVar[str] = "points.jsonl"
     noun: ClassVar[str] = "points"
     stage: ClassVar[str] = "measure the points"
     revision: ClassVar[int] = 0
     """Of what a point's figures are: raised with them, so that older points are measured again."""
 
+    def planned(self) -> Sequence[P]:
+        """Return the points. Raises AppError for wrong input, before the folder is made."""
+        raise NotImplementedError
+
     def inputs(self, point: P) -> dict[str, object]:
-        """Return everything that a point's figures depend on, as plain data: by default its own.
+        """Return everything that a point's figures depend on, as plain data.
 
         Raises NotApplicableError for a point that cannot be measured.
         """
-        return described(point)
+        raise NotImplementedError
 
     def measured(self, points: Sequence[P]) -> Results:
         """Yield the result of each point of a group, in order.
@@ -130,6 +174,17 @@ class Study(Generic[P]):
         Raises NotApplicableError where the rest of the group cannot be measured.
         """
         raise NotImplementedError
+
+    def report(self, new: Path) -> Report:
+        """Return the content of the files, with drawings written into a folder.
+
+        Raises AppError where no point has figures.
+        """
+        raise NotImplementedError
+
+    def shown(self) -> Iterable[Table | str]:
+        """Return tables and sentences for a terminal, in their order."""
+        return ()
 
     def group(self, point: P) -> Hashable:
         """Return what points that are measured together have in common."""
@@ -157,6 +212,14 @@ class Study(Generic[P]):
         """Return the digest that identifies a point."""
         return digest_of(self.all_inputs(point))
 
+    def excluded(self) -> list[str]:
+        """Return a line for what could not be measured, and for each point that failed."""
+        return [*self.unmeasured(), *self.failures()]
+
+    def unmeasured(self) -> list[str]:
+        """Return a line for each reason why points were not measured."""
+        return list(dict.fromkeys(self.left_out.values()))
+
     def failures(self) -> list[str]:
         """Return a line for each point that has no figures."""
         return [
@@ -164,6 +227,41 @@ class Study(Generic[P]):
             for point, result in self.results.items()
             if "failed" in result
         ]
+
+    def carry_out(
+        self, watcher: Watcher, workers: int | None = None, cluster: str | None = None
+    ) -> None:
+        """Measure into a folder that outlives interruptions, and write everything.
+
+        workers: processes that share the points; None: this process. cluster: address of a Dask
+        scheduler whose workers share them, on a disk shared with them.
+
+        Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
+        and the errors of the layers below; measured points are kept in each case.
+        """
+        points = self.planned()
+        with study_folder(self.folder, self.journal, self.command) as self.folder:
+            shared = workers is not None or cluster is not None
+            with opened_pool(workers or 1, cluster) if shared else nullcontext() as pool:
+                self.run(points, watcher, pool)
+            watcher.begin("draw", None)
+            self.seconds = time.perf_counter() - self.started
+            with result_folder(self.folder, self.command, adds=True) as new:
+                self.write(new)
+
+    def write(self, new: Path) -> None:
+        """Write CSV files, page and metrics.json into a folder."""
+        report, excluded = self.report(new), self.excluded()
+        for name, rows in report.rows.items():
+            write_text(new / name, csv_text(rows, self.columns[name]))
+        sources = provenance(self.settings, self.seconds, **report.sources)
+        sections = [*report.sections, provenance_section(sources)]
+        about = [*report.about, *([f"Excluded: {'; '.join(excluded)}."] if excluded else [])]
+        text = framed(
+            self.title, about, self.caveats, sections, self.style_sheets, head=report.head
+        )
+        write_text(new / self.page, text)
+        write_metrics(new, report.metrics)
 
     def run(self, points: Iterable[P], watcher: Watcher, pool: Pool | None = None) -> dict[P, dict]:
         """Measure the points that the folder does not hold; return the results in their order.

@@ -8,11 +8,7 @@ import os
 import platform
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
-from typing import Any
-
-from pydantic_core import to_jsonable_python
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import parse_json
@@ -23,14 +19,6 @@ from emmc_rig.store.results import command_line, metrics_text, versions
 def plain(result: Mapping[str, object]) -> dict:
     """Return a result as read back from JSON: None for what is not finite, lists for tuples."""
     return parse_json(metrics_text(result), "a result", AppError)
-
-
-def described(point: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as plain data; a capture as its identity."""
-    values = {each.name: getattr(point, each.name) for each in fields(point)}
-    if "capture" in values:
-        values["capture"] = values["capture"].identity()
-    return to_jsonable_python(values)
 
 
 def csv_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:

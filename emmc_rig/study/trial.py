@@ -91,7 +91,7 @@ class Capture:
     def scene_seen(
         self, views: tuple[int, int] | None = None, change: Callable[[World], World] | None = None
     ) -> Scene:
-        """Return the scene in the camera's views, or in others; changed, if it is a built-in one.
+        """Return the scene in the camera's views, or in other views; change: of a built-in scene.
 
         Raises what `zoomed_scene` does.
         """
@@ -139,7 +139,7 @@ def method_inputs(name: str, dictionary: str | None) -> dict[str, object]:
 
 
 def with_shots(camera: Camera, count: int) -> Camera:
-    """Return a camera of so many shots; raises NotApplicableError where it has no rule for them."""
+    """Return a camera of `count` shots; raises NotApplicableError where it has no rule for more."""
     try:
         return camera.with_shots(count)
     except CameraError as why:
@@ -166,8 +166,8 @@ class Trial:
     """What a method gets, and the truth.
 
     psi, readings, noise_sigma, usable: the method's inputs; `psi` is the assumed one. true_psi: the
-    one that made the readings. truth: (v, u, y, x, c); disparity_px: (y, x), None where it is not
-    known. peak: of the PSNR; below 1 where the scene has less contrast to show.
+    one that made the readings. truth: (v, u, y, x, c); disparity_px: (y, x), None where it is
+    unknown. peak: of the PSNR; below 1 where the scene has less contrast.
     """
 
     psi: ImagingMatrix

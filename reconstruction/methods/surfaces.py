@@ -65,6 +65,7 @@ def _solve(
     present = given.of_first_shot() if given.moving else given
 
     def patches(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Return the light field of `tv-dict`, less exact, from some of the readings."""
         atoms = _dictionary(psi.light_field_shape[:2], psi.binning)
         frames = dataclasses.replace(present.frames, usable=usable)
         fitted = dataclasses.replace(present, frames=frames, dictionary=atoms, on_step=None)
@@ -73,16 +74,22 @@ def _solve(
         quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
         return solve_tv_dict(fitted, quick).light_field
 
-    result, taken = given.film, patches if patches_fit(present.psi, adaptive) else None
+    film, solved = given.film, None
+    fitting = patches if patches_fit(present.psi, adaptive) else None
     if given.moving:
-        result = reconstruct_moving(psi, given.frames, adaptive, given.on_step, taken)
-    elif result is not None and result.known is not None:
-        result = reconstruct_next(psi, given.frames, result, adaptive, given.on_step)
-    if not isinstance(result, Reconstruction):
-        result = reconstruct_adaptive(
-            psi, given.frames, adaptive, given.on_step, patches=taken, film=result
+        solved = reconstruct_moving(psi, given.frames, adaptive, given.on_step, fitting)
+    elif film is not None and film.known is not None:
+        solved = reconstruct_next(psi, given.frames, film, adaptive, given.on_step)
+    if not isinstance(solved, Reconstruction):  # the first frame, or a cut of the film
+        solved = reconstruct_adaptive(
+            psi,
+            given.frames,
+            adaptive,
+            given.on_step,
+            patches=fitting,
+            film=film if solved is None else solved,
         )
-    return dataclasses.replace(result, method=name)
+    return dataclasses.replace(solved, method=name)
 
 
 METHODS = (

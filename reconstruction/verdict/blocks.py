@@ -29,6 +29,15 @@ class JudgedBlock:
     column: int
     pixels: int
 
+    @property
+    def evidence(self) -> Evidence:
+        """The figures of its verdict."""
+        return self.verdict.evidence
+
+    def in_whole(self, place: Sequence[float]) -> tuple[int, int]:
+        """Return a place of the block, row and column, counted from the first pixel of all."""
+        return int(self.row + place[0]), int(self.column + place[1])
+
 
 def _mean(values: Sequence[float], weights: Sequence[float]) -> float:
     return float(np.average(values, weights=weights))
@@ -53,73 +62,65 @@ COMBINED: dict[str, Combine] = {
     "misfit": _root_mean_square,
     "hole_px": _largest,
 }
-"""How figures of blocks become one; others by their mean."""
+"""How figures of blocks are combined; those not named here by their mean."""
 
 
-def _combined(key: str, values: Sequence[Any], weights: Sequence[float]) -> Any:
-    """Return the combined value of a figure, or collection of figures, over the blocks with
-    values."""
-    having = [(value, weight) for value, weight in zip(values, weights, strict=True)
-              if value is not None]  # fmt: skip
+def _over_blocks(key: str, values: Sequence[Any], weights: Sequence[float]) -> Any:
+    """Return a figure, or each of a tuple or dict of figures, over the blocks that have it."""
+    having = [(v, w) for v, w in zip(values, weights, strict=True) if v is not None]
     if not having:
         return None
-    first = having[0][0]
-    some, heavy = [figure for figure, _ in having], [weight for _, weight in having]
-    if isinstance(first, dict):
-        keys = dict.fromkeys(name for figure in some for name in figure)
+    known, of_known = zip(*having, strict=True)
+    if isinstance(known[0], dict):
+        names = dict.fromkeys(name for figures in known for name in figures)
         return {
-            name: _combined(name, [figure.get(name) for figure in some], heavy) for name in keys
+            name: _over_blocks(name, [figures.get(name) for figures in known], of_known)
+            for name in names
         }
-    if isinstance(first, tuple):
-        return tuple(_combined(key, each, heavy) for each in zip(*some, strict=True))
-    return COMBINED.get(key, _mean)(some, heavy)
+    if isinstance(known[0], tuple):
+        return tuple(_over_blocks(key, each, of_known) for each in zip(*known, strict=True))
+    return COMBINED.get(key, _mean)(known, of_known)
 
 
-def _places(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
-    """Return figures of the worst block of each kind: hole and motion."""
-    found: dict[str, Any] = {}
-    e = [(block, block.verdict.evidence) for block in blocks]
-    block, figures = max(e, key=lambda each: each[1].hole_px)
-    found["hole_at"] = _at(block, figures.hole_at)
-    moved = [(figures.motion, block, figures) for block, figures in e if figures.motion is not None]
-    if moved:
-        ratio, block, figures = max(moved, key=lambda each: each[0])
-        found |= {
-            "motion": ratio,
-            "motion_effect": figures.motion_effect,
-            "moved_px": figures.moved_px,
-        }
-        if figures.moved_at is not None:
-            found["moved_at"] = (figures.moved_at[0], *_at(block, figures.moved_at[1:]))
-    return found
-
-
-def _at(block: JudgedBlock, place: Sequence[float]) -> tuple[int, int]:
-    return int(block.row + place[0]), int(block.column + place[1])
+def _worst_motion(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
+    """Return the figures of motion of the block where its ratio is largest."""
+    moving = [block for block in blocks if block.evidence.motion is not None]
+    if not moving:
+        return {"moved_at": None, "moved_px": None}
+    worst = max(moving, key=lambda block: block.evidence.motion or 0.0)
+    e = worst.evidence
+    at = None if e.moved_at is None else (e.moved_at[0], *worst.in_whole(e.moved_at[1:]))
+    return {
+        "motion": e.motion, "motion_effect": e.motion_effect, "moved_px": e.moved_px,
+        "moved_at": at,
+    }  # fmt: skip
 
 
 def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
     """Return the evidence of all blocks together: means by pixels, and the worst places."""
+    evidence = [block.evidence for block in blocks]
     weights = [float(block.pixels) for block in blocks]
-    evidence = [block.verdict.evidence for block in blocks]
-    first = evidence[0]
-    same = {key: getattr(first, key) for key in ("method", "status", "view_axes")}
-    left_out = tuple(sorted({shot for figures in evidence for shot in figures.left_out}))
-    figures = {
-        key: _combined(key, [getattr(of_block, key) for of_block in evidence], weights)
-        for key in Evidence.__dataclass_fields__
-        if key not in (*same, "left_out", "kept", "hole_at", "moved_at", "moved_px")
+    worst_hole = max(blocks, key=lambda block: block.evidence.hole_px)
+    of_whole = {
+        **{key: getattr(evidence[0], key) for key in ("method", "status", "view_axes")},
+        "left_out": tuple(sorted({shot for e in evidence for shot in e.left_out})),
+        "kept": sum(e.kept for e in evidence),
+        "hole_at": worst_hole.in_whole(worst_hole.evidence.hole_at),
+        **_worst_motion(blocks),
     }
-    kept = sum(of_block.kept for of_block in evidence)
-    parameters = {**(figures["parameters"] or {})}
-    worst = max(blocks, key=lambda block: block.verdict.evidence.parameters.get("misfit", 0.0))
+    figures = {
+        key: _over_blocks(key, [getattr(e, key) for e in evidence], weights)
+        for key in Evidence.__dataclass_fields__
+        if key not in of_whole
+    }
+    parameters = dict(figures["parameters"] or {})
     if "misfit" in parameters:
-        of_worst = worst.verdict.evidence.parameters
-        row, column = _at(worst, (of_worst["misfit_row"], of_worst["misfit_column"]))
+        worst = max(blocks, key=lambda block: block.evidence.parameters.get("misfit", 0.0))
+        of_worst = worst.evidence.parameters
+        row, column = worst.in_whole((of_worst["misfit_row"], of_worst["misfit_column"]))
         parameters |= {"misfit_row": float(row), "misfit_column": float(column)}
-    whole = {"hole_at": (0, 0), "moved_at": None, "moved_px": None, **_places(blocks)}
     figures |= {"parameters": parameters, "changes": figures["changes"] or {}}
-    return Evidence(**{**same, "left_out": left_out, "kept": kept, **figures, **whole})
+    return Evidence(**figures, **of_whole)
 
 
 def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:

@@ -28,7 +28,7 @@ from emmc_rig.reconstruction.verdict.shadow import (
     Relief,
     averaged,
     channels,
-    relief_of,
+    predicted_relief,
     tile_edges,
 )
 
@@ -71,15 +71,14 @@ class Change:
 class Displaced:
     """By how much the masks' shadow lies off Psi's, in pixels, and what else may be wrong.
 
-    shift: (y, x), the weighted mean over tiles. size_px: their root mean square beyond what the
-    deviations make, and beyond what derivatives elsewhere make of the same readings (a placebo:
-    what a wrong picture adds to both). Both are None if no design determines shifts.
+    size_px: root mean square over tiles, beyond what the deviations make, and beyond what
+    derivatives elsewhere make of the same readings (a placebo: what a wrong picture adds to both).
+    None if no design determines shifts.
     changes: of `distance`, relative; `blur`, variance in px^2; `vignetting`, what the outermost
     rays lose; `offset`, added to the readings, over their mean; `gamma`, power of the light less 1;
     `contrast`, what the masks' modulation loses everywhere, relative.
     """
 
-    shift: tuple[float, float] | None
     size_px: float | None
     changes: dict[str, Change]
 
@@ -94,7 +93,7 @@ class _Design:
 
 def _moved(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camera:
     """Return the camera with the masks near its sensor moved, and further by a factor."""
-    near = [n for n, m in camera.masks.items() if m.distance_mm < 0.5 * camera.lens.distance_mm]
+    near = _near_masks(camera)
     shots = []
     for shot in camera.shots:
         offsets = dict(shot.offset_um)
@@ -117,41 +116,46 @@ def _camera(psi: ImagingMatrix) -> Camera | None:
         camera = camera_of(psi)
     except SensingError:
         return None
-    near = [m for m in camera.masks.values() if m.distance_mm < 0.5 * camera.lens.distance_mm]
     fits = len(camera.shots) == psi.shots and camera.views == psi.light_field_shape[:2]
-    return camera if near and fits else None
+    return camera if _near_masks(camera) and fits else None
 
 
-def displaced(psi: ImagingMatrix, found: Relief) -> Displaced:
+def _near_masks(camera: Camera) -> list[str]:
+    """Return the names of the masks nearer to the sensor than to the lens."""
+    half_mm = 0.5 * camera.lens.distance_mm
+    return [name for name, mask in camera.masks.items() if mask.distance_mm < half_mm]
+
+
+def displaced(psi: ImagingMatrix, relief: Relief) -> Displaced:
     """Return by how much the masks lie off, and every cause alone."""
-    design = _design(psi, found)
+    design = _design(psi, relief)
     shifts = () if design is None else design.shifts
-    others = _blurs(psi, found) if design is None else design.changes.items()
+    others = _blurs(psi, relief) if design is None else design.changes.items()
     changes: dict[str, Change] = {}
     # One cause at a time: together, correlated as they are, no cause could be estimated.
-    for name, cause in (*_of_readings(psi, found), *others):
-        fit = _regressed([cause, *shifts], found.seen - found.masks, found.weight)
+    for name, cause in (*_of_readings(psi, relief), *others):
+        fit = _regressed([cause, *shifts], relief.seen - relief.masks, relief.weight)
         if fit is not None and not (name in changes and changes[name].gain > fit.gain):
             (value, *_), (deviation, *_) = fit.values[0], fit.deviations[0]
             changes[name] = Change(float(value), float(deviation), fit.gain)
-    if design is None or (tiled := _tiled(found, *design.shifts)) is None:
-        return Displaced(None, None, changes)
-    decoys = (_tiled(found, *moved) for moved in _decoys(*design.shifts, found.good))
+    if design is None or (tiled := _tiled(relief, *design.shifts)) is None:
+        return Displaced(None, changes)
+    decoys = (_tiled(relief, *moved) for moved in _decoys(*design.shifts, relief.good))
     placebo = [decoy.excess for decoy in decoys if decoy is not None]
     excess = tiled.excess - (float(np.mean(placebo)) if placebo else 0.0)
-    return Displaced(tiled.mean_shift, float(np.sqrt(max(excess, 0))), changes)
+    return Displaced(float(np.sqrt(max(excess, 0))), changes)
 
 
-def _tiled(found: Relief, shift_y: Array, shift_x: Array) -> _Regression | None:
+def _tiled(relief: Relief, shift_y: Array, shift_x: Array) -> _Regression | None:
     """Return the shifts that each tile's readings ask for, None where no tile determines any."""
-    return _regressed([found.masks, shift_y, shift_x], found.seen, found.weight, tiles=True)
+    return _regressed([relief.masks, shift_y, shift_x], relief.seen, relief.weight, tiles=True)
 
 
-def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
+def _design(psi: ImagingMatrix, relief: Relief) -> _Design | None:
     """Return the changes of the masks' shadow by the camera's design; None for a Psi of another
     design."""
     camera = _camera(psi)
-    good = found.good
+    good = relief.good
     if camera is None or not good.any():
         return None
     pixel_um = camera.sensor.sample_pitch_um * psi.binning
@@ -159,7 +163,7 @@ def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
     def drawn(dy_px: float, dx_px: float, distance: float = 1.0) -> Array:
         moved = _moved(camera, dy_px * pixel_um, dx_px * pixel_um, distance)
         plates = draw_plates(moved, psi.size) if distance != 1 else roomy
-        return relief_of(psi, seen_of_white(moved, psi.size, plates), found.picture)[1]
+        return predicted_relief(psi, seen_of_white(moved, psi.size, plates), relief.picture)[1]
 
     try:
         # Masks with room for all moves are drawn once.
@@ -171,42 +175,43 @@ def _design(psi: ImagingMatrix, found: Relief) -> _Design | None:
         further = drawn(0, 0, 1 + DISTANCE_STEP)
     except ModelError:
         return None
-    both = own[good], found.masks[good]
-    norms = [float(np.sqrt(np.mean(np.square(relief)))) for relief in both]
-    if min(norms) < LEAST_RELIEF or float(np.mean(both[0] * both[1])) < ALIKE * norms[0] * norms[1]:
+    designed, measured = own[good], relief.masks[good]
+    norms = [float(np.sqrt(np.mean(np.square(shadow)))) for shadow in (designed, measured)]
+    alike = float(np.mean(designed * measured)) >= ALIKE * norms[0] * norms[1]
+    if min(norms) < LEAST_RELIEF or not alike:
         return None
-    darker = relief_of(psi, _vignetted(psi, VIGNETTING_STEP), found.picture)[1]
+    darker = predicted_relief(psi, _vignetted(psi, VIGNETTING_STEP), relief.picture)[1]
     return _Design(
         ((up - down) / (2 * STEP_PX), (right - left) / (2 * STEP_PX)),
         {
             "distance": (further - own) / DISTANCE_STEP,
             # A blur of variance s adds s/2 times the second derivatives.
             "blur": (up + down + right + left - 4 * own) / (2 * STEP_PX**2),
-            "vignetting": (darker - found.masks) / VIGNETTING_STEP,
+            "vignetting": (darker - relief.masks) / VIGNETTING_STEP,
         },
     )
 
 
-def _of_readings(psi: ImagingMatrix, found: Relief) -> Iterator[tuple[str, Array]]:
+def _of_readings(psi: ImagingMatrix, relief: Relief) -> Iterator[tuple[str, Array]]:
     """Yield what a wrong black level or a tone curve makes of the masks' modulation, by name."""
-    if float(np.mean(np.square(found.masks))) < LEAST_RELIEF**2:
+    if float(np.mean(np.square(relief.masks))) < LEAST_RELIEF**2:
         return
-    passed = 1 + found.masks
-    mean = float(np.mean((found.level * passed)[found.good]))
-    yield "offset", -found.masks * mean / np.maximum(found.level, DIMMEST * mean)
+    passed = 1 + relief.masks
+    mean = float(np.mean((relief.level * passed)[relief.good]))
+    yield "offset", -relief.masks * mean / np.maximum(relief.level, DIMMEST * mean)
     power = passed * np.log(np.maximum(passed, DIMMEST))
-    around = averaged(power, found.good, channels(psi), SMOOTH_PX)
+    around = averaged(power, relief.good, channels(psi), SMOOTH_PX)
     yield "gamma", power - passed * around
-    yield "contrast", -found.masks
+    yield "contrast", -relief.masks
 
 
-def _blurs(psi: ImagingMatrix, found: Relief) -> Iterator[tuple[str, Array]]:
+def _blurs(psi: ImagingMatrix, relief: Relief) -> Iterator[tuple[str, Array]]:
     """Yield what each of BLURS_PX changes of Psi's own shadow, over its variance."""
-    if float(np.mean(np.square(found.masks))) < LEAST_RELIEF**2:
+    if float(np.mean(np.square(relief.masks))) < LEAST_RELIEF**2:
         return
     for blur_px in BLURS_PX:
-        blurred = averaged(found.masks, found.good, channels(psi), blur_px)
-        yield "blur", (blurred - found.masks) / blur_px**2
+        blurred = averaged(relief.masks, relief.good, channels(psi), blur_px)
+        yield "blur", (blurred - relief.masks) / blur_px**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,13 +226,6 @@ class _Regression:
     gain: float
 
     @property
-    def mean_shift(self) -> tuple[float, float]:
-        """Weighted mean over the tiles of the last two terms, the shifts (y, x)."""
-        shifts, weights = self.values[:, -2:], 1 / np.square(self.deviations[:, -2:])
-        y, x = np.average(shifts, axis=0, weights=weights)
-        return float(y), float(x)
-
-    @property
     def excess(self) -> float:
         """Mean square of the shifts, y and x added, less what the deviations make."""
         shifts, errors = self.values[:, -2:], self.deviations[:, -2:]
@@ -240,7 +238,11 @@ def _regressed(
 ) -> _Regression | None:
     """Return the weighted regression of the observed on the base, tile by tile.
 
-    tiles: of about TILE_PX; else the picture is one. None where no tile determines it.
+    With the columns of B the terms, W the weights and y the observed values of a tile:
+        values     = (B^T W B)^-1 B^T W y,  e = y - B values
+        deviations = sqrt(diag((B^T W B)^-1 (sum of (W B e)^T (W B e)) (B^T W B)^-1))
+    the second for errors of unequal size. tiles: of about TILE_PX; else the whole picture is a
+    tile. None where no tile determines it.
     """
     shape = weight.shape[1:]
     rows, columns = (tile_edges(n) if tiles else np.array([0, n]) for n in shape)
@@ -287,9 +289,9 @@ def _decoys(
 
 
 def _correlation(own: Array, other: Array) -> float:
-    """Return that of two arrays around 0, its size alone."""
-    products = np.mean(own * other), np.mean(np.square(own)) * np.mean(np.square(other))
-    return abs(float(products[0])) / max(float(np.sqrt(products[1])), 1e-12)
+    """Return |correlation| of two arrays around 0."""
+    squares = np.mean(np.square(own)) * np.mean(np.square(other))
+    return abs(float(np.mean(own * other))) / max(float(np.sqrt(squares)), 1e-12)
 
 
 def _vignetted(psi: ImagingMatrix, lost: float) -> Array:

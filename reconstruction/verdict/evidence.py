@@ -19,7 +19,7 @@ from emmc_rig.reconstruction.result import SCALE, Reconstruction
 from emmc_rig.reconstruction.verdict.displaced import displaced
 from emmc_rig.reconstruction.verdict.kept import compare_held_out, over_baselines
 from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
-from emmc_rig.reconstruction.verdict.shadow import Relief, relief, shadow
+from emmc_rig.reconstruction.verdict.shadow import Relief, measured_relief, shadow
 from emmc_rig.reconstruction.verdict.shots import Motion, compared
 
 Array = NDArray[np.floating]
@@ -32,59 +32,47 @@ by a flat field the white level differs from pixel to pixel."""
 class Evidence:
     """Figures of a capture and of a light field found from it; None stands for an unknown figure.
 
-    method: its name; status: its status. left_out: shots that screening left out. bad: share of the
-    pixels that screening left out. noise: the readings' deviation over their mean. motion: ratio of
-    `Motion`, above 1 where shots saw different scenes; motion_effect: its effect; moved_at: shot
-    (None: any), row, column; moved_px: its rows and columns; moved: share of the readings left out
-    for it. off: share of readings that are far off all around, where neighbours agree; unusable,
-    saturated: shares of the readings. blind: share of the pixels that lie far from any that a shot
-    sees; hole_px, hole_at: radius and centre (y, x) of the largest hole. kept: readings kept from
-    the fit; explained: share of the smooth picture's squared residual of these, less noise, that
-    the light field removes; noise_share: noise's share of the light field's own. colour_error: root
-    mean square by colours that frames do not show, over the brightness. short: share of the
-    readings that only say that there was at least so much light, and are needed. gains: by which
-    the shots' brightness was evened. over_flat, over_neighbours: see `over_baselines`. parallax:
-    root mean square by which views differ from the middle one, over it. blockiness: see there.
-    steps: noise by quantisation, over the noise stated. stated: standard deviation that held-out
-    readings show, root mean square over the light field, over its mean. view_axes: Psi's.
+    Shares are of all readings, places are (row, column) of pixels, rms is root mean square.
     """
 
     method: str
-    status: str
-    left_out: tuple[int, ...]
-    noise: float
-    relief: float
-    strengths: tuple[float | None, ...]
-    strength_errors: tuple[float | None, ...]
-    other_strengths: tuple[tuple[float | None, ...], ...]
-    displaced_px: float | None
-    changes: dict[str, tuple[float | None, ...]]
-    brightness: tuple[float | None, ...]
-    off: float
-    bad: float
+    status: str  #: of the reconstruction
+    left_out: tuple[int, ...]  #: shots that screening left out, dark or repeating others
+    noise: float  #: deviation of the readings over their mean
+    relief: float  #: root mean square of what the masks add to the readings, over them
+    strengths: tuple[float | None, ...]  #: of the masks' shadow in each shot, 1 where Psi is right
+    strength_errors: tuple[float | None, ...]  #: their standard deviations
+    other_strengths: tuple[tuple[float | None, ...], ...]  #: (read, said), see `ShotAgreement`
+    displaced_px: float | None  #: root mean square displacement of the shadow
+    changes: dict[str, tuple[float | None, ...]]  #: fields of `displaced.Change`, by cause
+    brightness: tuple[float | None, ...]  #: of each shot, over the shots' mean
+    off: float  #: share far off all around, where neighbours agree
+    bad: float  #: share of the pixels that screening left out
     unusable: float
     saturated: float
-    blind: float
-    hole_px: float
-    hole_at: tuple[int, int]
-    kept: int
+    blind: float  #: share of the pixels that lie far from any that a shot sees
+    hole_px: float  #: radius of the largest hole
+    hole_at: tuple[int, int]  #: its centre
+    kept: int  #: readings kept from the fit
+    #: share of the smooth picture's squared residual of these, less noise, that the light field
+    #: removes
     explained: float | None
-    noise_share: float | None
-    parameters: dict[str, float]
-    colour_error: float | None = None
-    motion: float | None = None
+    noise_share: float | None  #: of noise in the light field's squared residual of these
+    parameters: dict[str, float]  #: REPORTED_PARAMETERS of the result
+    colour_error: float | None = None  #: rms by colours that frames do not show, over brightness
+    motion: float | None = None  #: ratio of `Motion`, above 1 where shots saw different scenes
     motion_effect: float | None = None
-    moved_at: tuple[int | None, int, int] | None = None
-    moved_px: tuple[int, int] | None = None
-    moved: float = 0.0
-    short: float = 0.0
-    gains: tuple[float, ...] = ()
-    over_flat: float | None = None
+    moved_at: tuple[int | None, int, int] | None = None  #: shot (None: any), row, column
+    moved_px: tuple[int, int] | None = None  #: rows and columns of that place
+    moved: float = 0.0  #: share left out for motion
+    short: float = 0.0  #: share that only gives a lower bound of the light, and is needed
+    gains: tuple[float, ...] = ()  #: by which the shots' brightness was evened
+    over_flat: float | None = None  #: see `over_baselines`
     over_neighbours: float | None = None
-    parallax: float | None = None
-    blockiness: float | None = None
-    steps: float | None = None
-    stated: float | None = None
+    parallax: float | None = None  #: rms by which views differ from the middle one, over it
+    blockiness: float | None = None  #: see `blockiness`
+    steps: float | None = None  #: noise by quantisation, over the noise stated
+    stated: float | None = None  #: deviation by held-out readings, rms, over the light field's mean
     view_axes: ViewAxes = ANGLES
 
     def as_dict(self) -> dict:
@@ -145,31 +133,32 @@ class FittedFrames:
 
 def gathered(
     psi: ImagingMatrix,
-    read: FittedFrames,
+    fitted: FittedFrames,
     result: Reconstruction,
-    found: Relief | None = None,
+    relief: Relief | None = None,
     moved: Motion | None = None,
 ) -> Evidence:
     """Return the figures of a light field that was fitted without the readings kept.
 
-    found: relief of the usable readings, where it is known. moved: the largest difference between
-    the scenes of several shots.
+    relief: of the usable readings, where it is known. moved: the largest difference between the
+    scenes of several shots.
     """
-    frames, usable, noise_sigma = read.shown, read.frames.usable, read.frames.noise_sigma
-    found = relief(psi, frames, noise_sigma, usable) if found is None else found
-    masks = shadow(found)
+    frames, usable, noise_sigma = fitted.shown, fitted.frames.usable, fitted.frames.noise_sigma
+    if relief is None:
+        relief = measured_relief(psi, frames, noise_sigma, usable)
+    masks = shadow(relief)
     residual = frames - psi.forward(result.light_field)
     with ThreadPoolExecutor(1) as beside:  # the two that take long
-        given = psi, frames, residual, noise_sigma, usable, read.kept
+        given = psi, frames, residual, noise_sigma, usable, fitted.kept
         baselines = beside.submit(over_baselines, *given)
-        off = displaced(psi, found)
-    shots = compared(found)
+        off = displaced(psi, relief)
+    shots = compared(relief)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     step = quantised(frames, usable)
     return Evidence(
         method=result.method,
         status=result.status,
-        left_out=read.left_out,
+        left_out=fitted.left_out,
         noise=noise_sigma / mean,
         relief=masks.relief,
         strengths=_plain(masks.strength),
@@ -179,15 +168,15 @@ def gathered(
         changes={name: _plain(astuple(change)) for name, change in off.changes.items()},
         brightness=_plain(shots.brightness),
         **({} if moved is None else moved.figures()),
-        bad=read.bad,
-        **pixel_figures(psi, read.excluded, found, noise_sigma, usable),
-        **compare_held_out(frames, residual, noise_sigma, read.kept & usable, found),
-        colour_error=_colour_error(psi, frames, usable, found),
+        bad=fitted.bad,
+        **pixel_figures(psi, fitted.excluded, relief, noise_sigma, usable),
+        **compare_held_out(frames, residual, noise_sigma, fitted.kept & usable, relief),
+        colour_error=_colour_error(psi, frames, usable, relief),
         parameters={
             key: result.parameters[key] for key in REPORTED_PARAMETERS if key in result.parameters
         },
-        short=read.short,
-        gains=read.gains,
+        short=fitted.short,
+        gains=fitted.gains,
         parallax=_parallax(result.light_field, psi.view_axes),
         **baselines.result(),
         blockiness=blockiness(frames, usable),
@@ -198,10 +187,10 @@ def gathered(
 
 
 def _colour_error(
-    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], found: Relief
+    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], relief: Relief
 ) -> float:
-    unseen = unseen_colour(psi, frames, usable, found.picture)
-    square = np.square(found.picture.mean(axis=-1, dtype=np.float64)).mean()
+    unseen = unseen_colour(psi, frames, usable, relief.picture)
+    square = np.square(relief.picture.mean(axis=-1, dtype=np.float64)).mean()
     return float(np.sqrt(unseen.mean() / max(square, 1e-12)))
 
 

@@ -47,7 +47,7 @@ def kept_readings(
 
 
 def compare_held_out(
-    frames: Array, residual: Array, noise_sigma: float, kept: NDArray[np.bool_], found: Relief
+    frames: Array, residual: Array, noise_sigma: float, kept: NDArray[np.bool_], relief: Relief
 ) -> dict[str, Any]:
     """Return figures of `Evidence`: how well a light field predicts readings kept from its fit.
 
@@ -57,7 +57,7 @@ def compare_held_out(
     kept = kept & np.isfinite(frames)
     if kept.sum() < FEWEST:
         return {"kept": 0, "explained": None, "noise_share": None}
-    smooth = found.level * (1 + found.masks)
+    smooth = relief.level * (1 + relief.masks)
     square, before = (
         float(np.mean(np.square(missed[kept], dtype=np.float64)))
         for missed in (residual, frames - smooth)
@@ -130,7 +130,7 @@ def _off_neighbours(
     step = 1 if psi.colour is None or psi.binning > 1 else 2
     return np.stack(
         [
-            frame - neighbours(frame, of_shot, step)[0].mean(axis=0)
+            frame - neighbours(frame, of_shot, step).values.mean(axis=0)
             for frame, of_shot in zip(frames, good, strict=True)
         ]
     )

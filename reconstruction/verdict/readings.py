@@ -6,7 +6,7 @@ coefficients are next to nothing. A quantised reading is a multiple of one step.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -39,23 +39,30 @@ REPEATED = 4
 def pixel_figures(
     psi: ImagingMatrix,
     excluded: Array,
-    found: Relief,
+    relief: Relief,
     noise_sigma: float,
     usable: NDArray[np.bool_],
 ) -> dict[str, Any]:
-    """Return figures of `Evidence` on single pixels. excluded: what unusable pixels read."""
+    """Return figures of `Evidence` on single pixels. excluded: the readings of unusable pixels.
+
+    A pixel is far off where all about it is smooth, and its light (reading over what the masks
+    pass) lies outside the neighbours' range by more than SPREADS of it, LEAST of the light, and
+    DEVIATIONS of the noise.
+    """
     step = 1 if psi.colour is None else 2
     off, compared = 0, 0
     for shot in range(psi.shots):
-        passed = 1 + found.masks[shot]
-        detail = (1 + found.read[shot]) / np.maximum(passed, DIMMEST)
-        good = found.good[shot] & (passed > DIMMEST)
-        around, known = neighbours(detail, good, step)
-        low, high, typical = around[1], around[-2], np.abs(around[3:5].mean(axis=0))
+        passed = 1 + relief.masks[shot]
+        detail = (1 + relief.read[shot]) / np.maximum(passed, DIMMEST)
+        good = relief.good[shot] & (passed > DIMMEST)
+        around = neighbours(detail, good, step)
+        # Without the least and the largest, which may be bad themselves; the median of eight.
+        low, high = around.values[1], around.values[-2]
+        typical = np.abs(around.values[3:5].mean(axis=0))
         spread = high - low
-        smooth = good & (known >= ENOUGH) & (spread < SMOOTH * typical)
+        smooth = good & (around.good >= ENOUGH) & (spread < SMOOTH * typical)
         apart = np.where(detail > high, detail - high, np.maximum(low - detail, 0))
-        light = found.level[shot] * passed
+        light = relief.level[shot] * passed
         wild = (apart > SPREADS * spread) & (apart * light > DEVIATIONS * noise_sigma)
         wild &= apart > LEAST * typical
         off += int((wild & smooth).sum())
@@ -67,43 +74,51 @@ def pixel_figures(
     return {
         "off": off / max(compared, 1),
         "unusable": float(1 - usable.mean()),
-        "saturated": _saturated(excluded, found, usable),
+        "saturated": _saturated(excluded, relief, usable),
         "blind": float((radius >= BLIND_PX).mean()),
         "hole_px": float(radius.max()),
         "hole_at": (int(hole[0]), int(hole[1])),
     }
 
 
-def _saturated(excluded: Array, found: Relief, usable: NDArray[np.bool_]) -> float:
+def _saturated(excluded: Array, relief: Relief, usable: NDArray[np.bool_]) -> float:
     """Return the share of readings that are not usable and above nearly all that are."""
     above = 0
     for shot, good in enumerate(usable):
         if good.any():
-            read = found.level[shot] * (1 + found.read[shot])
+            read = relief.level[shot] * (1 + relief.read[shot])
             limit = float(np.quantile(read[good], 0.99))
             above += int((excluded[shot][~good] >= limit).sum())
     return above / usable.size
 
 
-def neighbours(
-    values: Array, good: NDArray[np.bool_], step: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return the eight neighbours at a step in order, (8, y, x), and how many are good, (y, x).
+class Neighbours(NamedTuple):
+    """The eight neighbours of each pixel.
 
-    Those not good take the others' mean.
+    values: in ascending order, (8, y, x); those that are not good have the others' mean. good: how
+    many are good, (y, x).
     """
+
+    values: NDArray[np.float32]
+    good: NDArray[np.int64]
+
+
+def neighbours(values: Array, good: NDArray[np.bool_], step: int) -> Neighbours:
+    """Return the eight neighbours at a step, 1, or 2 to the next pixel of a Bayer colour."""
     rows, columns = values.shape
     padded = np.pad(np.where(good, values, np.nan), step, mode="reflect")
     places = [(i, j) for i in (0, step, 2 * step) for j in (0, step, 2 * step)]
     places.remove((step, step))
-    found = np.stack([padded[i : i + rows, j : j + columns] for i, j in places])
-    known = np.isfinite(found)
+    beside = np.stack([padded[i : i + rows, j : j + columns] for i, j in places])
+    known = np.isfinite(beside)
     count = known.sum(axis=0)
-    mean = np.where(known, found, 0).sum(axis=0) / np.maximum(count, 1)
-    return np.sort(np.where(known, found, mean), axis=0).astype(np.float32), count
+    mean = np.where(known, beside, 0).sum(axis=0) / np.maximum(count, 1)
+    in_order = np.sort(np.where(known, beside, mean), axis=0)
+    return Neighbours(in_order.astype(np.float32), count)
 
 
 def _cosines() -> NDArray[np.float64]:
+    """Return the orthonormal cosine transform of a block's rows, (frequency, sample)."""
     k = np.arange(BLOCK_PX)
     rows = np.cos(np.pi * (2 * k[None] + 1) * k[:, None] / (2 * BLOCK_PX))
     rows *= np.sqrt(2 / BLOCK_PX)
@@ -121,12 +136,13 @@ def blockiness(frames: Array, usable: NDArray[np.bool_]) -> float | None:
     frames, usable: (shot, pixel_y, pixel_x).
     """
     middle = tuple(slice(max(0, (n - MOST_PX) // 2), (n + MOST_PX) // 2) for n in frames.shape[1:])
-    found = []
+    contrasts = []
     for frame, good in zip(frames[:, *middle], usable[:, *middle], strict=True):
-        values = np.array([_smallness(frame[y:, x:], good[y:, x:]) for y, x in np.ndindex(8, 8)])
+        rasters = np.ndindex(BLOCK_PX, BLOCK_PX)
+        values = np.array([_smallness(frame[y:, x:], good[y:, x:]) for y, x in rasters])
         if np.isfinite(values).all():
-            found.append(float(np.median(values) - np.min(values)))
-    return max(found, default=None)
+            contrasts.append(float(np.median(values) - np.min(values)))
+    return max(contrasts, default=None)
 
 
 def _smallness(frame: Array, good: NDArray[np.bool_]) -> float:
@@ -134,6 +150,7 @@ def _smallness(frame: Array, good: NDArray[np.bool_]) -> float:
     blocks = _blocks(frame)[_blocks(good).all(axis=(1, 2))].astype(np.float64)
     if len(blocks) < FEWEST_BLOCKS:
         return np.nan
+    # The first coefficient is the mean: brightness, no detail.
     cosines = _cosines()
     sizes = np.abs(cosines @ blocks @ cosines.T).reshape(len(blocks), -1)[:, 1:]
     typical = np.sqrt(np.mean(np.square(sizes), axis=0)) + 1e-30

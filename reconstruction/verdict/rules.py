@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -200,42 +200,16 @@ def _sensitivity(e: Evidence) -> Sensitivity:
 
 
 def _shots(e: Evidence) -> Iterator[Reason]:
+    """Whether the shots belong together; of dark and confused ones nothing more is known."""
     if len(e.brightness) < 2:
         return
-    if e.left_out:
-        share = len(e.left_out) / len(e.brightness)
-        limits = LEFT_OUT_OF_ONE if _sensitivity(e).one_shot else LEFT_OUT
-        shots = ", ".join(str(shot + 1) for shot in e.left_out)
-        yield Reason(
-            f"{len(e.left_out)} of {len(e.brightness)} shots are excluded, as dark or as the same "
-            f"as another: {shots}",
-            share,
-            "check lamp and stage, and capture them again",
-            limits.level(share),
-        )
     kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
     bright = [(b or 0.0) if shot in kept else 1.0 for shot, b in enumerate(e.brightness)]
-    dark = [shot for shot, brightness in enumerate(bright, 1) if brightness < DARK]
-    if dark:
-        yield Reason(
-            f"shot {dark[0]} is dark",
-            bright[dark[0] - 1],
-            f"capture it again, or reconstruct without shot {dark[0]}",
-            "do not use",
-        )
+    yield from _left_out(e)
+    spoilt = [*_dark(bright), *_confused(e, kept)]
+    if spoilt:
+        yield spoilt[0]
         return
-    for shot in kept if len(kept) > 1 else []:
-        row = e.other_strengths[shot]
-        own = row[shot] or 0.0
-        other, t = max((strength or 0.0, t) for t, strength in enumerate(row) if t != shot)
-        if other > ANOTHERS and own < ANOTHERS:
-            yield Reason(
-                f"shot {shot + 1} shows the masks of shot {t + 1}",
-                other,
-                "the stage did not move, or frames are out of order: capture it again",
-                "do not use",
-            )
-            return
     yield from _evened(e, kept)
     apart = [abs(brightness - 1) for brightness in bright]
     worst = apart.index(max(apart))
@@ -245,19 +219,63 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         "let the lamp warm up, or divide the frames by a reference",
         FLICKER.level(apart[worst]),
     )
-    if e.motion is not None and e.motion > MOTION.doubt and e.moved_at and e.moved_px:
-        shot, y, x = e.moved_at
-        what, remedy = "shots saw different scenes", "hold scene and camera still"
-        if shot is not None:
-            what = f"shot {shot + 1} saw another scene than the others"
-            remedy += f", or reconstruct without shot {shot + 1}"
-        excluded = ", and is excluded there" if shot is not None and e.moved else ""
-        yield Reason(
-            f"{what} in {e.moved_px[0]}x{e.moved_px[1]} pixels about row {y}, column {x}{excluded}",
-            e.motion,
-            remedy,
-            MOTION.level(e.motion) if shot is None else "doubt",
-        )
+    yield from _motion(e)
+
+
+def _left_out(e: Evidence) -> Iterator[Reason]:
+    if not e.left_out:
+        return
+    count = len(e.brightness)
+    share = len(e.left_out) / count
+    limits = LEFT_OUT_OF_ONE if _sensitivity(e).one_shot else LEFT_OUT
+    shots = ", ".join(str(shot + 1) for shot in e.left_out)
+    yield Reason(
+        f"{len(e.left_out)} of {count} shots are excluded, as dark or as the same as another: "
+        f"{shots}",
+        share,
+        "check lamp and stage, and capture them again",
+        limits.level(share),
+    )
+
+
+def _dark(brightness: Sequence[float]) -> Iterator[Reason]:
+    for shot, of_shot in enumerate(brightness, 1):
+        if of_shot < DARK:
+            remedy = f"capture it again, or reconstruct without shot {shot}"
+            yield Reason(f"shot {shot} is dark", of_shot, remedy, "do not use")
+
+
+def _confused(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
+    """Shots that show the masks of another shot instead of their own."""
+    for shot in kept if len(kept) > 1 else []:
+        row = e.other_strengths[shot]
+        strongest, other = max((s or 0.0, t) for t, s in enumerate(row) if t != shot)
+        if strongest > ANOTHERS and (row[shot] or 0.0) < ANOTHERS:
+            yield Reason(
+                f"shot {shot + 1} shows the masks of shot {other + 1}",
+                strongest,
+                "the stage did not move, or frames are out of order: capture it again",
+                "do not use",
+            )
+
+
+def _motion(e: Evidence) -> Iterator[Reason]:
+    """Where shots saw different scenes: in a known shot, its readings there were left out."""
+    if e.motion is None or e.motion <= MOTION.doubt or not (e.moved_at and e.moved_px):
+        return
+    shot, row, column = e.moved_at
+    rows, columns = e.moved_px
+    what, remedy = "shots saw different scenes", "hold scene and camera still"
+    if shot is not None:
+        what = f"shot {shot + 1} saw another scene than the others"
+        remedy += f", or reconstruct without shot {shot + 1}"
+    excluded = ", and is excluded there" if shot is not None and e.moved else ""
+    yield Reason(
+        f"{what} in {rows}x{columns} pixels about row {row}, column {column}{excluded}",
+        e.motion,
+        remedy,
+        MOTION.level(e.motion) if shot is None else "doubt",
+    )
 
 
 def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
@@ -280,14 +298,21 @@ def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
     )
 
 
-def _strength(e: Evidence) -> tuple[float, float] | None:
-    """Return the masks' weakest strength among the shots, and its deviation; None if unknown."""
+class Strength(NamedTuple):
+    """How strongly the masks of a shot are seen, 1 where Psi is right, and its deviation."""
+
+    value: float
+    deviation: float
+
+
+def _weakest(e: Evidence) -> Strength | None:
+    """Return the masks' least strength among the shots; None if it is unknown."""
     known = [
-        (strength, error)
+        Strength(strength, error)
         for strength, error in zip(e.strengths, e.strength_errors, strict=True)
         if strength is not None and error is not None
     ]
-    return min(known) if known else None
+    return min(known, default=None)
 
 
 def _coding(e: Evidence) -> Iterator[Reason]:
@@ -297,8 +322,7 @@ def _coding(e: Evidence) -> Iterator[Reason]:
     four exceed the limit of doubt, twice that limit may pass unnoticed.
     """
     remedy = "calibrate beside this capture, or use masks that modulate a shot more"
-    weakest = _strength(e)
-    if weakest is None:
+    if _weakest(e) is None:
         yield Reason(
             f"the masks change neighbouring readings by {e.relief:.1%} only: the frames cannot "
             "show whether Psi is right",
@@ -338,85 +362,106 @@ def _psi_tolerance(e: Evidence, power: float) -> float:
     return shots**-power * _sensitivity(e).psi
 
 
+class Cause(NamedTuple):
+    """A possible error of masks or readings, see `displaced.Change`.
+
+    value, deviation: its size. gain: the fall of the squared residual by it alone.
+    """
+
+    name: str
+    value: float
+    deviation: float
+    gain: float
+
+    @property
+    def surely(self) -> float:
+        """The size that it has at least, by two deviations."""
+        return abs(self.value) - 2 * self.deviation
+
+
+NO_CAUSE = Cause("", 0.0, 0.0, 0.0)
+
+
 def _masks(e: Evidence) -> Iterator[Reason]:
     """The likeliest reason among possible errors of the masks, given the readings."""
-    weakest = _strength(e)
+    weakest = _weakest(e)
     if weakest is None:
         return
-    lost = 1 - weakest[0] - 2 * weakest[1]
-    moved = (e.displaced_px or 0.0) / max(weakest[0], LEAST_STRENGTH)
-    causes = _causes(e)
-    cause, value, deviation = _likeliest(causes)
+    strength = weakest.value
+    lost = 1 - strength - 2 * weakest.deviation
+    moved = (e.displaced_px or 0.0) / max(strength, LEAST_STRENGTH)
+    cause = _likeliest(_causes(e))
     # A wrong black level does several shots no more harm than one.
-    tolerance = _psi_tolerance(e, 0.0 if cause == "offset" else 0.85)
+    tolerance = _psi_tolerance(e, 0.0 if cause.name == "offset" else 0.85)
     weak = STRENGTH_LOST.times(tolerance).level(lost)
     displaced = DISPLACED_PX.times(_psi_tolerance(e, 0.85)).level(moved)
     shift = f"the masks' shadow is about {moved:.2f} pixels from its place in Psi"
-    sure = abs(value) - 2 * deviation
-    what, remedy = _named(cause, value, weakest[0])
-    if displaced != "trust" and weakest[0] > LEAST_STRENGTH:
-        level = displaced if LEVELS.index(displaced) > LEVELS.index(weak) else weak
-        yield Reason(shift, moved, DRIFT, level)
+    what, remedy = _in_words(cause, strength)
+    surfaces_fail = e.parameters.get("over_plain", 0.0) > UNLIKE_SURFACES
+    if displaced != "trust" and strength > LEAST_STRENGTH:
+        yield Reason(shift, moved, DRIFT, max(displaced, weak, key=LEVELS.index))
     elif weak != "trust":
-        yield Reason(what, weakest[0], remedy, weak)
-    elif cause == "gamma" and GAMMA.level(sure) != "trust":
-        yield Reason(what, value, remedy, GAMMA.level(sure))
-    elif _harms_modulation(e, cause) or (_harms_surfaces(e, lost, moved) and lost > SLIGHT_LOSS):
-        yield Reason(what, weakest[0], remedy, "doubt")
-    elif _harms_surfaces(e, lost, moved):
+        yield Reason(what, strength, remedy, weak)
+    elif cause.name == "gamma" and GAMMA.level(cause.surely) != "trust":
+        yield Reason(what, cause.value, remedy, GAMMA.level(cause.surely))
+    elif _changes_too_much(e, cause) or (surfaces_fail and lost > SLIGHT_LOSS):
+        yield Reason(what, strength, remedy, "doubt")
+    elif surfaces_fail and moved > SLIGHT_PX:
         yield Reason(shift, moved, DRIFT, "doubt")
-    elif "vignetting" in causes:
-        darker, deviation, gain = causes["vignetting"]
-        if gain > AS_LIKELY * max(each[2] for each in causes.values()):
-            level = VIGNETTING.times(_psi_tolerance(e, 0.5)).level(darker - 2 * deviation)
-            what, remedy = _named("vignetting", darker, weakest[0])
-            yield Reason(what, darker, remedy, level)
+    else:
+        yield from _vignetting(e, strength)
 
 
-def _harms_surfaces(e: Evidence, lost: float, moved: float) -> bool:
-    """Return whether a slight error of Psi leaves surfaces hardly better than total variation."""
-    over_plain = e.parameters.get("over_plain", 0.0)
-    return over_plain > UNLIKE_SURFACES and (lost > SLIGHT_LOSS or moved > SLIGHT_PX)
+def _vignetting(e: Evidence, strength: float) -> Iterator[Reason]:
+    """Light that the outermost rays lose, where that explains as much as any cause."""
+    causes = _causes(e)
+    darker = causes.get("vignetting")
+    if darker and darker.gain > AS_LIKELY * max(cause.gain for cause in causes.values()):
+        limits = VIGNETTING.times(_psi_tolerance(e, 0.5))
+        what, remedy = _in_words(darker, strength)
+        level = limits.level(darker.value - 2 * darker.deviation)
+        yield Reason(what, darker.value, remedy, level)
 
 
-def _harms_modulation(e: Evidence, cause: str) -> bool:
-    """Return whether a cause changes the masks' modulation by more than the light field allows."""
-    value, deviation, _ = _causes(e).get("contrast", (0.0, 0.0, 0.0))
-    sure = abs(value) - 2 * deviation
-    if cause in ("blur", "distance") and sure > NAMED_LOST * _psi_tolerance(e, 0.85):
+def _changes_too_much(e: Evidence, cause: Cause) -> bool:
+    """Return whether the masks' modulation is changed by more than the light field allows."""
+    changed = _causes(e).get("contrast", NO_CAUSE).surely
+    if cause.name in ("blur", "distance") and changed > NAMED_LOST * _psi_tolerance(e, 0.85):
         return True
     if not e.noise_share:
         return False
     limit = HARM * e.noise / e.noise_share**0.5 if e.stated is None else HARM_STATED * e.stated
-    return sure > max(limit, LEAST_EFFECT)
+    return changed > max(limit, LEAST_EFFECT)
 
 
-def _causes(e: Evidence) -> dict[str, tuple[float, float, float]]:
-    """Return value, deviation and gain of each cause that is known, by name."""
+def _causes(e: Evidence) -> dict[str, Cause]:
+    """Return each cause that is known, by name."""
     # Outer bands or times that are darker are the light's own.
     own = () if shows_parallax(e.view_axes) else ("vignetting",)
     return {
-        name: (value, deviation, gain)
+        name: Cause(name, value, deviation, gain)
         for name, (value, deviation, gain) in e.changes.items()
         if name not in own and value is not None and deviation is not None and gain is not None
     }
 
 
-def _likeliest(causes: dict[str, tuple[float, float, float]]) -> tuple[str, float, float]:
-    """Return the cause that alone explains most, its value and deviation; "" if none is sure.
+def _likeliest(causes: Mapping[str, Cause]) -> Cause:
+    """Return the cause that alone explains most; NO_CAUSE if it is not sure.
 
     Contrast, which names no cause, only where it explains clearly more.
     """
-    few = {"contrast": AS_LIKELY}
-    name = max(causes, key=lambda cause: few.get(cause, 1.0) * causes[cause][2], default="")
-    value, deviation, _ = causes.get(name, (0.0, 0.0, 0.0))
-    return (name, value, deviation) if abs(value) > SURE * deviation else ("", 0.0, 0.0)
+    likeliest = max(
+        causes.values(),
+        key=lambda cause: (AS_LIKELY if cause.name == "contrast" else 1.0) * cause.gain,
+        default=NO_CAUSE,
+    )
+    return likeliest if abs(likeliest.value) > SURE * likeliest.deviation else NO_CAUSE
 
 
-def _named(cause: str, value: float, strength: float) -> tuple[str, str]:
-    """Return a cause in words, with its size, and the remedy."""
+def _in_words(cause: Cause, strength: float) -> tuple[str, str]:
+    """Return a cause with its size, and the remedy."""
     weak = f"the masks' contrast is {strength:.0%} of that in Psi"
-    size, more = abs(value), value > 0
+    size, more = abs(cause.value), cause.value > 0
     if strength < LEAST_STRENGTH:
         return weak + ", as with other masks", DRIFT
     return {
@@ -425,7 +470,7 @@ def _named(cause: str, value: float, strength: float) -> tuple[str, str]:
             "capture darks; where these agree, look for stray light",
         ),
         "gamma": (
-            f"the readings follow the light to the power of {1 + value:.2f}",
+            f"the readings follow the light to the power of {1 + cause.value:.2f}",
             "store frames without gamma or tone curve, or linearise them",
         ),
         "blur": (
@@ -443,7 +488,7 @@ def _named(cause: str, value: float, strength: float) -> tuple[str, str]:
             "in Psi",
             "calibrate at this aperture, or close the aperture",
         ),
-    }.get(cause, (weak, DRIFT))
+    }.get(cause.name, (weak, DRIFT))
 
 
 def _compression(e: Evidence) -> Iterator[Reason]:
@@ -466,8 +511,8 @@ def _compression(e: Evidence) -> Iterator[Reason]:
 
 def _pixels(e: Evidence) -> Iterator[Reason]:
     # A shadow elsewhere makes readings differ from their neighbours, too.
-    weakest = _strength(e)
-    if weakest is None or weakest[0] > 1 - STRENGTH_LOST.doubt / 2 or e.off > OFF.refuse:
+    weakest = _weakest(e)
+    if weakest is None or weakest.value > 1 - STRENGTH_LOST.doubt / 2 or e.off > OFF.refuse:
         yield Reason(
             f"{e.off:.1%} of the readings differ from all their neighbours",
             e.off,

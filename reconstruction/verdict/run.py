@@ -31,7 +31,7 @@ from emmc_rig.reconstruction.tv import few_steps
 from emmc_rig.reconstruction.verdict.evidence import FittedFrames, gathered
 from emmc_rig.reconstruction.verdict.kept import kept_readings
 from emmc_rig.reconstruction.verdict.rules import MOTION, Verdict, verdict_from
-from emmc_rig.reconstruction.verdict.shadow import relief
+from emmc_rig.reconstruction.verdict.shadow import measured_relief
 from emmc_rig.reconstruction.verdict.shots import Motion, motion
 
 FEWEST_SHORT = 1e-3
@@ -105,7 +105,7 @@ class _Fitting:
     ) -> None:
         self.psi, self.read, self.notes, self._solve, self.seconds = psi, read, notes, solve, 0.0
         self.fitted = dataclasses.replace(read.frames, usable=read.frames.usable & ~read.kept)
-        self.relief = relief(psi, read.shown, read.frames.noise_sigma, read.frames.usable)
+        self.relief = measured_relief(psi, read.shown, read.frames.noise_sigma, read.frames.usable)
         colours = psi.colour is None or len(np.unique(psi.colour[0])) == COLOURS
         # Shots are carried to the time of the first one, which must see all colours.
         self.can_carry = psi.shots > 1 and find_method(name).films and colours
@@ -184,7 +184,7 @@ class _Fitting:
         )
         typical = self.read.frames.noise_sigma
         self.psi, self.read = self.psi.of_shots([0]), self.read.of_first_shot()
-        self.relief = relief(self.psi, self.read.shown, typical, self.read.frames.usable)
+        self.relief = measured_relief(self.psi, self.read.shown, typical, self.read.frames.usable)
 
     def _note(self, words: str) -> None:
         self.notes = (*self.notes, words)

@@ -66,7 +66,7 @@ def averaged(values: Array, good: NDArray, filters: NDArray[np.int64], deviation
     return np.stack([local_mean(*plane, deviation) for plane in planes])
 
 
-def relief_of(
+def predicted_relief(
     psi: ImagingMatrix, white: Array, picture: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return what a picture (y, x, c), seen in all views, makes a Psi read.
@@ -93,13 +93,13 @@ def relief_of(
     return level.astype(np.float32), np.where(level > 0, masks, 0).astype(np.float32)
 
 
-def relief(
+def measured_relief(
     psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_]
 ) -> Relief:
     """Return readings and masks around the smooth picture."""
     picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)
     white = psi.weights.sum(axis=(1, 2), dtype=np.float64)
-    level, masks = relief_of(psi, white, picture)
+    level, masks = predicted_relief(psi, white, picture)
     filters = channels(psi)
     floor = DIMMEST * float(np.median(level))
     good = usable & (level > max(floor, 3 * noise_sigma))
@@ -139,13 +139,16 @@ class ShadowStrength:
     relief: float
 
 
-def shadow(found: Relief) -> ShadowStrength:
+def shadow(relief: Relief) -> ShadowStrength:
     """Return how strongly the masks are seen in the readings."""
     strength, error = zip(
-        *(_slope(found.masks[s], found.seen[s], found.weight[s]) for s in range(len(found.masks))),
+        *(
+            _slope(relief.masks[s], relief.seen[s], relief.weight[s])
+            for s in range(len(relief.masks))
+        ),
         strict=True,
     )
-    added = found.masks[found.good]
+    added = relief.masks[relief.good]
     return ShadowStrength(
         np.array(strength),
         np.array(error),
@@ -153,19 +156,23 @@ def shadow(found: Relief) -> ShadowStrength:
     )
 
 
-def cross_strength(found: Relief) -> NDArray[np.float64]:
+def cross_strength(relief: Relief) -> NDArray[np.float64]:
     """Return how strongly each shot's readings show each shot's masks, (read, said)."""
-    shots = len(found.masks)
+    shots = len(relief.masks)
     return np.array(
         [
-            [_slope(found.masks[t], found.seen[s], found.weight[s])[0] for t in range(shots)]
+            [_slope(relief.masks[t], relief.seen[s], relief.weight[s])[0] for t in range(shots)]
             for s in range(shots)
         ]
     )
 
 
 def _slope(masks: Array, seen: Array, weight: Array) -> tuple[float, float]:
-    """Return the weighted regression of seen on masks and its deviation; NaN if unknown."""
+    """Return the weighted regression of seen on masks and its deviation; NaN if unknown.
+
+    slope = sum(w masks seen) / sum(w masks^2),  e = seen - slope masks
+    deviation = sqrt(sum((w masks e)^2)) / sum(w masks^2)
+    """
     square = float((weight * np.square(masks, dtype=np.float64)).sum())
     if square <= LEAST_RELIEF**2 * float(weight.sum(dtype=np.float64)):
         return np.nan, np.nan

@@ -7,7 +7,7 @@ in single shots: whole spots change their brightness.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -73,37 +73,41 @@ class ShotAgreement:
     masks: NDArray[np.float64]
 
 
-def compared(found: Relief) -> ShotAgreement:
+def compared(relief: Relief) -> ShotAgreement:
     """Return how the shots agree."""
-    kept = np.flatnonzero(found.good.any(axis=(1, 2)))
-    common = found.good[kept].all(axis=0)
-    ratio = np.ones(len(found.good))
+    kept = np.flatnonzero(relief.good.any(axis=(1, 2)))
+    common = relief.good[kept].all(axis=0)
+    ratio = np.ones(len(relief.good))
     if common.any():
         for shot in kept:
-            level = found.level[shot][common].astype(np.float64)
-            read = level * (1 + found.read[shot][common])
-            said = level * (1 + found.masks[shot][common])
+            level = relief.level[shot][common].astype(np.float64)
+            read = level * (1 + relief.read[shot][common])
+            said = level * (1 + relief.masks[shot][common])
             ratio[shot] = read.sum() / max(said.sum(), 1e-12)
-    return ShotAgreement(ratio / ratio[kept].mean() if len(kept) else ratio, cross_strength(found))
+    return ShotAgreement(ratio / ratio[kept].mean() if len(kept) else ratio, cross_strength(relief))
 
 
-def motion(found: Relief, residual: Array, noise_sigma: float) -> Motion | None:
+def motion(relief: Relief, residual: Array, noise_sigma: float) -> Motion | None:
     """Return where shots differ in what they saw; None for a single shot, and where the masks do
     not show.
 
     residual: what a light field of all shots leaves of the readings, (shot, pixel_y, pixel_x).
     """
-    shots = np.flatnonzero(found.good.any(axis=(1, 2)))
-    if len(shots) < 2 or not shadow(found).strength[shots].min() > LEAST_STRENGTH:
+    shots = np.flatnonzero(relief.good.any(axis=(1, 2)))
+    if len(shots) < 2 or not shadow(relief).strength[shots].min() > LEAST_STRENGTH:
         return None
-    apart, expected, noise = _differences(found, residual, shots, noise_sigma)
-    scans = [
-        (_windows(apart, side) / np.maximum(_windows(expected, side), noise) / limit, side)
+    differences = _differences(relief, residual, shots, noise_sigma)
+    apart = differences.apart
+    ratios = {
+        side: _windows(apart, side)
+        / np.maximum(_windows(differences.expected, side), differences.least)
+        / limit
         for side, limit in MOVED.items()
-    ]
+    }
     # Small windows place best.
-    worst = max(scans, key=lambda scan: float(scan[0].max()))
-    ratio, side = next((scan for scan in scans if scan[0].max() > 1), worst)
+    worst = max(ratios, key=lambda side: float(ratios[side].max()))
+    side = next((side for side, ratio in ratios.items() if ratio.max() > 1), worst)
+    ratio = ratios[side]
     peak = np.unravel_index(int(ratio.argmax()), ratio.shape)
     reach = np.ones((side + 2 * MARGIN_PX,) * 2, np.uint8)
     over = np.asarray((ratio >= AROUND * min(1.0, ratio.max())).any(axis=0), np.uint8)
@@ -119,7 +123,7 @@ def motion(found: Relief, residual: Array, noise_sigma: float) -> Motion | None:
             moved[differs[area]] |= inside
     area = int(areas[peak[1:]])
     x, y, width, height = (int(n) for n in boxes[area][:4])
-    mean = float(np.mean((found.level * (1 + found.masks))[found.good]))
+    mean = float(np.mean((relief.level * (1 + relief.masks))[relief.good]))
     return Motion(
         ratio=float(ratio.max()),
         effect=float(np.sqrt(_windows(apart, side)[peak])) / max(mean, 1e-12),
@@ -130,19 +134,32 @@ def motion(found: Relief, residual: Array, noise_sigma: float) -> Motion | None:
     )
 
 
+class Differences(NamedTuple):
+    """Squares by which shots differ in spots, in squared readings.
+
+    apart, expected: measured, and expected of noise and missing texture, (shot, pixel_y, pixel_x).
+    least: that is expected anywhere.
+    """
+
+    apart: Array
+    expected: Array
+    least: float
+
+
 def _differences(
-    found: Relief, residual: Array, shots: NDArray[np.intp], noise_sigma: float
-) -> tuple[Array, Array, float]:
-    """Return squares by which shots differ in spots, those expected, and the least expected.
+    relief: Relief, residual: Array, shots: NDArray[np.intp], noise_sigma: float
+) -> Differences:
+    """Return by how much shots differ in spots, and by how much they may.
 
-    The first two (shot, pixel_y, pixel_x).
+    Of readings m that are expected, the residual is a m + e, with `a` by least squares over a spot,
 
-    Of readings m that are expected, the residual is a m + e, with `a` by least squares over a spot:
+        a = sum(m residual) / sum(m^2),
+
     by how much the spot is brighter than the light field says. Where e is noise or texture that it
     lacks, m^2 a^2 differs between shots by e^2 / (4 pi SPOT_PX^2).
     """
-    good = found.good[shots]
-    expected = np.where(good, found.level[shots] * (1 + found.masks[shots]), 0).astype(np.float32)
+    good = relief.good[shots]
+    expected = np.where(good, relief.level[shots] * (1 + relief.masks[shots]), 0).astype(np.float32)
     left = np.where(good, residual[shots], 0).astype(np.float32)
     # A pixel that leaves far more than all about it is a bad one.
     around = np.stack([cv2.medianBlur(frame, NEAR_PX) for frame in np.abs(left)])
@@ -158,7 +175,7 @@ def _differences(
     noise = min(float(alone.mean()), noise_sigma**2)
     least = max(noise, (UNSURE * float(expected[good].mean())) ** 2, 1e-20)
     share = 1 / (4 * np.pi * SPOT_PX**2)
-    return apart, share * alone, share * least
+    return Differences(apart, share * alone, share * least)
 
 
 def _differing(squares: NDArray[np.floating], shots: NDArray[np.intp]) -> int | None:

@@ -30,8 +30,7 @@ SHOWN = {
     "emmc_rig/study/chart/charting.py": "a report's next command",
     "emmc_rig/study/design/designing.py": "a report's next command",
     "emmc_rig/study/design/search.py": "what made a camera is stored in it",
-    "emmc_rig/study/stability/stability_run.py": "a report's next command",
-    "emmc_rig/study/tables/tables_page.py": "a report's next command",
+    "emmc_rig/study/tables/tables_study.py": "a report's next command",
 }
 """Files that name commands and flags, and why."""
 OF_OTHERS = re.compile(r"(udevadm|systemctl|gphoto2)[a-z ]* --[a-z-]+")

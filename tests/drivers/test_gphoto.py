@@ -1,13 +1,13 @@
 """libgphoto2 as our camera, against our own simulated camera over PTP/IP (extra `gphoto2`).
 
-The simulated camera runs in a process of its own: libgphoto2 holds Python's lock while it waits.
+The simulated cameras run in a process of their own: libgphoto2 holds Python's lock while it waits.
 """
 
 import json
 import os
 import subprocess
 import sys
-from contextlib import closing, contextmanager
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ from emmc_rig.errors import AppError
 
 SERVER = """
 import json, sys
+from contextlib import ExitStack
 import numpy as np
 from emmc_rig.drivers.clock import SystemClock
 from emmc_rig.simulators.ptp import PtpCameraSimulator
@@ -36,51 +37,63 @@ from simulated_eos import EosCameraSimulator
 from ptpip_server import PtpIpServer
 
 mosaic = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
-given = json.loads(sys.argv[1])
-make = EosCameraSimulator if given["eos"] else PtpCameraSimulator
-if given["hidden"] is not None:
-    make.hidden = tuple(given["hidden"])
-camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=given["quality"])
-for fault in given["faults"]:
-    camera.faults.inject(fault)
-with PtpIpServer(camera) as server:
-    print(server.port, flush=True)
-    sys.stdin.read()
-    print(sum(bool(data) for _, data in camera.objects.values()))
+cameras, ports = {}, {}
+with ExitStack() as servers:
+    for name, given in json.loads(sys.argv[1]).items():
+        make = EosCameraSimulator if name.startswith("eos") else PtpCameraSimulator
+        quality = given.get("quality", "raw")
+        camera = make(lambda exposure_s: mosaic, SystemClock(), "grbg", quality=quality)
+        if "hidden" in given:
+            camera.hidden = tuple(given["hidden"])
+        for fault in given.get("faults", ()):
+            camera.faults.inject(fault)
+        cameras[name] = camera
+        ports[name] = servers.enter_context(PtpIpServer(camera)).port
+    print(json.dumps(ports), flush=True)
+    for name in sys.stdin:
+        print(sum(bool(data) for _, data in cameras[name.strip()].objects.values()), flush=True)
 """
+CAMERAS = {
+    "plain": {},
+    "eos": {},
+    "eos that shows every property": {"hidden": []},
+    "without settings": {"hidden": [int(item) for item in Property]},
+    "jpeg": {"quality": "jpeg"},
+    "torn": {"quality": "raw+jpeg", "faults": ["torn_raw"]},
+}
+"""hidden: the properties that a camera hides; each class hides some unless this list is given."""
 MOSAIC = np.random.default_rng(0).integers(0, 4095, (40, 48), dtype=np.uint16)
 
 
-@contextmanager
-def served(quality="raw", faults=(), eos=False, hidden=None):
-    """Serve a simulated camera; yield libgphoto2's name of it, and a list.
+class Served:
+    """CAMERAS in a process: libgphoto2's name of each, and how many files are on its card."""
 
-    The list gets the number of files left on the card when the camera ends. eos: a Canon EOS.
-    hidden: properties that this camera lacks, instead of those that such cameras usually lack.
-    """
-    reported = json.dumps({"quality": quality, "faults": faults, "eos": eos, "hidden": hidden})
-    process = subprocess.Popen(
-        [sys.executable, "-c", SERVER, reported],
+    def __init__(self, process):
+        self._process = process
+        ports = json.loads(process.stdout.readline())
+        self.names = {name: f"ptpip:127.0.0.1:{port}:{port}" for name, port in ports.items()}
+
+    def files_on_card(self, name):
+        self._process.stdin.write(f"{name}\n")
+        self._process.stdin.flush()
+        return int(self._process.stdout.readline())
+
+
+@pytest.fixture(scope="module")
+def served():
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVER, json.dumps(CAMERAS)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    known = []
-    try:
-        port = process.stdout.readline().strip()
-        yield f"ptpip:127.0.0.1:{port}:{port}", known
-    finally:
-        out, _ = process.communicate("", timeout=20)
-        known.append(int(out))
+    ) as process:
+        yield Served(process)
 
 
 @pytest.fixture(scope="module")
-def address():
-    with served() as (name, _):
-        yield name
+def address(served):
+    return served.names["plain"]
 
 
 @pytest.fixture
@@ -128,8 +141,8 @@ def test_settings_are_set_by_libgphoto2s_names_and_all_are_listed(address):
 
 
 @pytest.mark.slow
-def test_a_setting_without_a_value_is_left_out_and_does_not_end_the_process():
-    with served(eos=True, hidden=()) as (name, _), closing(GphotoCamera(name)) as camera:
+def test_a_setting_without_a_value_is_left_out_and_does_not_end_the_process(served):
+    with closing(GphotoCamera(served.names["eos that shows every property"])) as camera:
         # It lists the shutter twice, first by the standard's property, whose value is no choice.
         assert camera.details()["shutterspeed"] == "1/60"
         with pytest.raises(CameraSettingError, match="is not known"):
@@ -138,49 +151,48 @@ def test_a_setting_without_a_value_is_left_out_and_does_not_end_the_process():
         assert camera.snap().exposure_s == pytest.approx(0.008)
 
 
-def test_a_camera_without_any_settings_is_refused_in_one_line():
-    every = [int(item) for item in Property]
-    with served(hidden=every) as (name, _):
-        with closing(GphotoCamera(name)) as camera:
-            assert camera.gain_limits == (1.0, 1.0)
-            with pytest.raises(CameraSettingError, match="mode dial"):
-                camera.set_exposure_s(0.01)
-        with pytest.raises(CameraSettingError, match="iso cannot become 100"):
-            GphotoCamera(name, settings={"iso": 100})
+def test_a_camera_without_any_settings_is_refused_in_one_line(served):
+    name = served.names["without settings"]
+    with closing(GphotoCamera(name)) as camera:
+        assert camera.gain_limits == (1.0, 1.0)
+        with pytest.raises(CameraSettingError, match="mode dial"):
+            camera.set_exposure_s(0.01)
+    with pytest.raises(CameraSettingError, match="iso cannot become 100"):
+        GphotoCamera(name, settings={"iso": 100})
 
 
 @pytest.mark.slow
-def test_a_torn_file_is_no_frame_and_of_raw_with_jpeg_the_raw_file_is_taken_and_deleted():
-    torn = served("raw+jpeg", faults=["torn_raw"])
-    with torn as (name, known), closing(GphotoCamera(name, delete=True)) as camera:
+def test_a_torn_file_is_no_frame_and_of_raw_with_jpeg_the_raw_file_is_taken_and_deleted(served):
+    with closing(GphotoCamera(served.names["torn"], delete=True)) as camera:
         with pytest.raises(RawFrameError, match="torn"):
             camera.snap()
         for _ in range(2):
             np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
-    assert known[0] == 3
+    assert served.files_on_card("torn") == 3
 
 
 @pytest.mark.slow
-def test_an_eos_exposes_for_a_user_who_never_ran_libgphoto2(tmp_path):
+def test_an_eos_exposes_for_a_user_who_never_ran_libgphoto2(served, tmp_path):
     program = (
         "import sys; from emmc_rig.drivers.gphoto import GphotoCamera;"
         "camera = GphotoCamera(sys.argv[1]);"
         "camera.set_exposure_s(0.5); print(camera.snap().mosaic.shape); camera.close()"
     )
     home = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path / "config")}
-    with served(eos=True) as (name, _):
-        ran = subprocess.run(
-            [sys.executable, "-c", program, name], env=home, capture_output=True, text=True
-        )
+    ran = subprocess.run(
+        [sys.executable, "-c", program, served.names["eos"]],
+        env=home,
+        capture_output=True,
+        text=True,
+    )
     assert ran.stdout.strip() == "(40, 48)", ran.stderr
 
 
 @pytest.mark.slow
-def test_a_camera_set_to_jpeg_is_refused(monkeypatch):
+def test_a_camera_set_to_jpeg_is_refused(served, monkeypatch):
     monkeypatch.setattr("emmc_rig.drivers.gphoto.PAIR_LIMIT_S", 0.2)
     with (
-        served("jpeg") as (name, _),
-        closing(GphotoCamera(name)) as camera,
+        closing(GphotoCamera(served.names["jpeg"])) as camera,
         pytest.raises(CaptureError, match=r"gave EMMC0001.JPG: set its image quality to RAW"),
     ):
         camera.snap()

@@ -1,6 +1,6 @@
 """Grbl wire format, by transcript: the bytes are those of Grbl v1.1's documentation.
 
-Lines marked with a section are examples printed there; the others are built by its rules.
+Lines marked with a section are the section's examples; other lines follow its rules.
 """
 
 import pytest

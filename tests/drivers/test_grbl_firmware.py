@@ -81,5 +81,5 @@ def test_the_firmware_as_it_is_shipped_homes_moves_and_is_homed_anew_by_each_con
         with pytest.raises(LimitExceededError):
             stage.move_to_um({"x": 0.0})
     with closing(opened(link)) as port:
-        # It is idle, as it is after $X too: nobody knows that it was homed.
+        # Idle also follows `$X`, so this state is no proof of homing.
         assert not GrblStage(port, AXES, SYSTEM_CLOCK, CARE).is_homed("x")

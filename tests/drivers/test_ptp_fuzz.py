@@ -225,7 +225,7 @@ def test_a_hostile_camera_gives_frames_or_errors_of_the_driver_in_bounded_time()
 
 
 class SplittingFunction(PtpUsbFunction):
-    """An honest camera that cuts what it sends where it likes, at whole packets."""
+    """A camera that cuts its answers into pieces of whole packets at random places."""
 
     def __init__(self, camera, seed):
         super().__init__(camera, PACKET)

@@ -170,49 +170,25 @@ def test_thorlabs_apt_device_finds_the_axis_where_its_last_session_left_it(apt_c
 
 def test_the_apt_codec_writes_the_bytes_that_an_independent_one_writes():
     apt = pytest.importorskip("thorlabs_apt_device.protocol", reason="needs the extra `peers`")
-    here = {"source": 1, "dest": 0x50}
     position = apt_codec.encode_position(1, -123_456)
     velocity = apt_codec.encode_velocity(apt_codec.VelocityParameters(1, 0, 261, 767_367))
-    for theirs, ours in (
-        (apt.hw_req_info(**here), apt_codec.encode(Id.HW_REQ_INFO, 0x50)),
-        (apt.hw_no_flash_programming(**here), apt_codec.encode(Id.HW_NO_FLASH_PROGRAMMING, 0x50)),
-        (apt.hw_stop_updatemsgs(**here), apt_codec.encode(Id.HW_STOP_UPDATEMSGS, 0x50)),
-        (
-            apt.mod_set_chanenablestate(**here, chan_ident=1, enable_state=1),
-            apt_codec.encode(Id.MOD_SET_CHANENABLESTATE, 0x50, 1, apt_codec.ENABLE),
-        ),
-        (
-            apt.mot_move_home(**here, chan_ident=1),
-            apt_codec.encode(Id.MOT_MOVE_HOME, 0x50, 1),
-        ),
-        (
-            apt.mot_move_absolute(**here, chan_ident=1, position=-123_456),
-            apt_codec.encode(Id.MOT_MOVE_ABSOLUTE, 0x50, data=position),
-        ),
-        (
-            apt.mot_move_stop(**here, chan_ident=1, stop_mode=2),
-            apt_codec.encode(Id.MOT_MOVE_STOP, 0x50, 1, apt_codec.STOP_PROFILED),
-        ),
-        (
-            apt.mot_set_velparams(
-                **here, chan_ident=1, min_velocity=0, acceleration=261, max_velocity=767_367
-            ),
-            apt_codec.encode(Id.MOT_SET_VELPARAMS, 0x50, data=velocity),
-        ),
-        (
-            apt.mot_req_homeparams(**here, chan_ident=1),
-            apt_codec.encode(Id.MOT_REQ_HOMEPARAMS, 0x50, 1),
-        ),
-        (
-            apt.mot_set_genmoveparams(**here, chan_ident=1, backlash_distance=-123_456),
-            apt_codec.encode(Id.MOT_SET_GENMOVEPARAMS, 0x50, data=position),
-        ),
-        (
-            apt.mot_req_dcstatusupdate(**here, chan_ident=1),
-            apt_codec.encode(Id.MOT_REQ_DCSTATUSUPDATE, 0x50, 1),
-        ),
+    pace = {"min_velocity": 0, "acceleration": 261, "max_velocity": 767_367}
+    of = {"chan_ident": 1}
+    for name, theirs, parameters, data in (
+        ("hw_req_info", {}, (), None),
+        ("hw_no_flash_programming", {}, (), None),
+        ("hw_stop_updatemsgs", {}, (), None),
+        ("mod_set_chanenablestate", {**of, "enable_state": 1}, (1, apt_codec.ENABLE), None),
+        ("mot_move_home", of, (1,), None),
+        ("mot_move_absolute", {**of, "position": -123_456}, (), position),
+        ("mot_move_stop", {**of, "stop_mode": 2}, (1, apt_codec.STOP_PROFILED), None),
+        ("mot_set_velparams", {**of, **pace}, (), velocity),
+        ("mot_req_homeparams", of, (1,), None),
+        ("mot_set_genmoveparams", {**of, "backlash_distance": -123_456}, (), position),
+        ("mot_req_dcstatusupdate", of, (1,), None),
     ):
-        assert ours == theirs
+        ours = apt_codec.encode(Id[name.upper()], 0x50, *parameters, data=data)
+        assert ours == getattr(apt, name)(source=1, dest=0x50, **theirs), name
 
 
 def test_an_independent_apt_codec_reads_what_the_firmware_and_ours_write():

@@ -1,4 +1,4 @@
-"""Ports: found again by what they are, refused with who holds them, never waited on for ever."""
+"""Ports: an adapter is found under a new name, a refusal names the holder, every wait ends."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""An axis whose scale is unknown, or contradicted, never moves; one that is known goes there."""
+"""An axis of unknown or contradicted scale never moves; any other goes to its target."""
 
 from dataclasses import replace
 

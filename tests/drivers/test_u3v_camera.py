@@ -5,7 +5,7 @@ import errno
 import itertools
 import math
 import struct
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from random import Random
 
 import numpy as np
@@ -290,9 +290,10 @@ def test_recorded_bytes_of_another_format_or_size_are_refused(bench):
     struct.pack_into("<Q", original, len(original) - 12, 100)
     with pytest.raises(RawFrameError, match="100 bytes are not the 2880 of 40x48"):
         decode_frame(bytes(original))
-    struct.pack_into("<II", original, 28, 0x010C0059, 60_000)
-    with pytest.raises(RawFrameError, match="bytes are not the"):
-        decode_frame(bytes(original))
+    for width, needed in ((60_000, 3_600_000), (0, 0)):
+        struct.pack_into("<II", original, 28, 0x010C0059, width)
+        with pytest.raises(RawFrameError, match=f"100 bytes are not the {needed} of"):
+            decode_frame(bytes(original))
 
 
 SIZES = [(2, 2), (38, 46), (40, 48), (200, 514)]
@@ -370,6 +371,23 @@ def test_a_write_that_goes_wrong_is_not_repeated(bench, faults, fault, error):
         camera._control.write(0x100040, bytes(4))
     assert len(written) <= 1
     np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_a_write_that_was_done_in_part_is_an_error_but_an_old_camera_states_no_count(
+    bench, monkeypatch, count
+):
+    camera, execute = bench.open(), bench.simulator._execute
+
+    def answer(command, request_id, body):
+        if command != codec.WRITEMEM:
+            return execute(command, request_id, body)
+        return simulation._answer(0, codec.WRITEMEM_ACK, request_id, struct.pack("<HH", 0, count))
+
+    monkeypatch.setattr(bench.simulator, "_execute", answer)
+    in_part = pytest.raises(CameraFormatError, match="not all 4 bytes were written")
+    with in_part if count else nullcontext():
+        camera._control.write(0x100040, bytes(4))
 
 
 def test_a_camera_that_stays_silent_is_given_up_in_bounded_time(bench, faults):

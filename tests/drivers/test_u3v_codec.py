@@ -46,11 +46,8 @@ MANIFEST = bytes.fromhex(
 )
 
 
-def test_a_read_command_is_written_as_in_the_standard():
+def test_commands_are_written_as_in_the_standard():
     assert encode_read(1, 0x1D8, 8) == READ_SBRM
-
-
-def test_a_write_command_is_written_as_in_the_standard():
     assert encode_write(0xFFFE, 0x20004, (1).to_bytes(4, "little")) == WRITE_ENABLE
 
 

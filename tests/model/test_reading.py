@@ -46,7 +46,7 @@ def one_line(fault):
 
 
 def done_or_refused(call, error):
-    """Return whether a call succeeds; the only error allowed is an `error` of one line."""
+    """Return whether a call succeeds; the only exception allowed is `error`, of one line."""
     try:
         call()
     except error as fault:

@@ -208,7 +208,7 @@ class Usbfs(UMockdev.IoctlBase):
 
 
 def mock(bus):
-    """Return a testbed with the bus's device in it, and what answers for it; keep both."""
+    """Return a testbed with the bus's device in it, and the `Usbfs` that answers; keep both."""
     testbed = UMockdev.Testbed.new()
     usbfs = Usbfs(bus)
     raw = descriptors(bus, usbfs.plug)

@@ -29,9 +29,7 @@ from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.store import pool as pools
 from emmc_rig.store.folders import result_folder
 from emmc_rig.store.pool import WorkersError, opened_pool
-from emmc_rig.study.stability import stability_run
-from emmc_rig.study.stability.stability_run import run_stability
-from emmc_rig.study.stability.stability_study import stability_settings
+from emmc_rig.study.stability.stability_study import StabilityStudy, stability_settings
 
 pytestmark = pytest.mark.timing("workers that answer late are taken for lost")
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
@@ -98,12 +96,11 @@ def test_a_cluster_gives_the_bytes_of_this_machine(cluster, tmp_path):
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_shares_the_trials_of_a_sweep(cluster, tmp_path, monkeypatch):
     chosen = stability_settings(True, ["dark"], (32, 48), methods=("tv",), faults=("flicker",))
-    monkeypatch.setattr(stability_run, "_write", lambda *_: None)
-    ran = [
-        run_stability(chosen, tmp_path / name, Watcher(), cluster=address).curves
-        for name, address in (("here", None), ("there", cluster.scheduler_address))
-    ]
-    for here, there in zip(*ran, strict=True):
+    monkeypatch.setattr(StabilityStudy, "write", lambda *_: None)
+    ran = [StabilityStudy(chosen, tmp_path / name) for name in ("here", "there")]
+    for study, address in zip(ran, (None, cluster.scheduler_address), strict=True):
+        study.carry_out(Watcher(), cluster=address)
+    for here, there in zip(*(study.curves for study in ran), strict=True):
         assert there.levels == pytest.approx(here.levels, abs=1e-3)
 
 

@@ -48,6 +48,12 @@ def settings(method: Any = "lars", **more: Any):
     return SparseSettings(stride=6, solver=solver, flat_favour=1, **more)
 
 
+def solved(psi, truth, dictionary, chosen=None, usable=None, noise=0.0, **more):
+    """Return the result from the readings of a light field by Psi."""
+    frames = even_frames(psi.forward(truth), noise, usable)
+    return reconstruct_sparse(psi, frames, dictionary, chosen or settings(), **more)
+
+
 @pytest.mark.parametrize(
     ("method", "shots", "stored"),
     [
@@ -59,9 +65,7 @@ def settings(method: Any = "lars", **more: Any):
 def test_patches_of_few_atoms_come_back(random_psi, scene, method, shots, stored):
     dictionary, truth = scene
     psi = random_psi(shots, VIEWS, truth.shape[2:4], stored)
-    result = reconstruct_sparse(
-        psi, even_frames(psi.forward(truth), 0.0), dictionary, settings(method)
-    )
+    result = solved(psi, truth, dictionary, settings(method))
     assert psnr_db(result.light_field, truth) > 40
     assert result.status == "converged"
     assert result.parameters["patches"] == 20
@@ -77,9 +81,7 @@ def test_favoured_flat_atoms_keep_the_colour_of_an_even_scene(random_psi):
         chosen = SparseSettings(
             stride=6, flat_favour=favour, solver=BPDNSettings(method="lars", smallest_penalty=0.05)
         )
-        found = reconstruct_sparse(
-            psi, even_frames(psi.forward(truth), 0.0), dictionary, chosen
-        ).light_field
+        found = solved(psi, truth, dictionary, chosen).light_field
         losses.append(np.abs(found.mean(axis=(0, 1, 2, 3)) - [0.8, 0.5, 0.2]).max())
     assert losses[1] < 0.3 * losses[0]
 
@@ -87,7 +89,7 @@ def test_favoured_flat_atoms_keep_the_colour_of_an_even_scene(random_psi):
 def test_pixels_that_sum_samples_are_resolved(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(4, VIEWS, truth.shape[2:4], stored=1, binning=2)
-    result = reconstruct_sparse(psi, even_frames(psi.forward(truth), 0.0), dictionary, settings())
+    result = solved(psi, truth, dictionary)
     assert psnr_db(result.light_field, truth) > 40
 
 
@@ -108,9 +110,7 @@ def test_a_patch_without_usable_pixels_says_nothing(random_psi, scene):
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     usable = np.ones(psi.frames_shape, dtype=bool)
     usable[:, 6:12, 6:12] = False
-    result = reconstruct_sparse(
-        psi, even_frames(psi.forward(truth), 0.0, usable), dictionary, settings()
-    )
+    result = solved(psi, truth, dictionary, usable=usable)
     assert result.status == "incomplete"
     assert "1 patches hold no usable pixel, 36 samples" in result.advice
     assert not result.light_field[:, :, 6:12, 6:12].any()
@@ -126,13 +126,10 @@ def test_patches_of_equal_sensing_share_one_dictionary(random_psi, scene):
     weights = np.tile(tile, (1, 1, 1, 4, 1, 5))
     colour = np.tile(rng.integers(0, 3, (1, 6, 6), dtype=np.uint8), (1, 4, 5))
     psi = ImagingMatrix(weights, colour)
-    frames = psi.forward(truth)
-    shared = reconstruct_sparse(psi, even_frames(frames, 0.0), dictionary, settings("omp"))
+    shared = solved(psi, truth, dictionary, settings("omp"))
     assert shared.parameters["classes"] == 1
     nudged = weights * (1 + 1e-6 * rng.uniform(size=weights.shape)).astype(np.float32)
-    apart = reconstruct_sparse(
-        ImagingMatrix(nudged, colour), even_frames(frames, 0.0), dictionary, settings("omp")
-    )
+    apart = solved(ImagingMatrix(nudged, colour), truth, dictionary, settings("omp"))
     assert apart.parameters["classes"] == 20
     np.testing.assert_allclose(shared.light_field, apart.light_field, atol=1e-3)
 
@@ -140,11 +137,8 @@ def test_patches_of_equal_sensing_share_one_dictionary(random_psi, scene):
 def test_the_same_frames_give_the_same_bits(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(1, VIEWS, truth.shape[2:4])
-    frames = psi.forward(truth)
-    first, second = (
-        reconstruct_sparse(psi, even_frames(frames, 0.01), dictionary, SparseSettings(stride=2))
-        for _ in "ab"
-    )
+    chosen = SparseSettings(stride=2)
+    first, second = (solved(psi, truth, dictionary, chosen, noise=0.01) for _ in "ab")
     np.testing.assert_array_equal(first.light_field, second.light_field)
 
 
@@ -152,12 +146,7 @@ def test_a_step_limit_is_reported_with_advice(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     solver = BPDNSettings(method="ista", max_steps=1)
-    result = reconstruct_sparse(
-        psi,
-        even_frames(psi.forward(truth), 0.0),
-        dictionary,
-        SparseSettings(stride=6, solver=solver),
-    )
+    result = solved(psi, truth, dictionary, SparseSettings(stride=6, solver=solver))
     assert result.status == "incomplete"
     assert "raise max_steps" in result.advice
 
@@ -166,9 +155,7 @@ def test_progress_counts_the_patches(random_psi, scene):
     dictionary, truth = scene
     psi = random_psi(1, VIEWS, truth.shape[2:4])
     reported = []
-    reconstruct_sparse(
-        psi, even_frames(psi.forward(truth), 0.0), dictionary, settings(), on_step=reported.append
-    )
+    solved(psi, truth, dictionary, on_step=reported.append)
     assert reported[-1].step == reported[-1].total == 20
     assert [p.step for p in reported] == sorted(p.step for p in reported)
 

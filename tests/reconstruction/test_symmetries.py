@@ -114,6 +114,7 @@ def test_light_and_noise_of_another_brightness_scale_the_light_field(light, seed
     frames = noisy(psi, scene() / 2, seed)  # of light below 0.9, which is not clipped at 1
     found, brighter = by_tv(psi, frames), by_tv(psi, light * frames, light * NOISE)
     assert psnr_db(brighter / light, found) > 60
+    np.testing.assert_array_equal(by_tv(psi, frames / 2, NOISE / 2), found / 2)  # without rounding
 
 
 @settings(max_examples=4, deadline=None, derandomize=True)

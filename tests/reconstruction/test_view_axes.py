@@ -15,7 +15,7 @@ import emmc_rig as emmc
 from emmc_rig.formats.exports import open_export
 from emmc_rig.formats.registry import FORMATS
 from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
-from emmc_rig.model.errors import CameraError, SensingError, ViewOrderWarning
+from emmc_rig.model.errors import SensingError, ViewOrderWarning
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
 from emmc_rig.model.sensing import ImagingMatrix
@@ -67,6 +67,12 @@ def frames_of(psi, light):
     return (psi @ light + rng.normal(0, NOISE, psi.frames_shape)).astype(np.float32)
 
 
+def solved(views, axes, method="tv"):
+    """Return the result from the readings of `light_of` by `psi_of`."""
+    psi = psi_of(views, axes)
+    return emmc.reconstruct(psi, frames_of(psi, light_of(views, axes)), method, noise_sigma=NOISE)
+
+
 def cassi_file(folder, cells, bands=24, step=2):
     """Write the YAML of a mask whose shadow moves by `step` pixels from band to band."""
     lens_mm, mask_mm, pitch_um = 50, 0.5, 24
@@ -92,9 +98,7 @@ def cassi_file(folder, cells, bands=24, step=2):
 @pytest.fixture(scope="module")
 def bands():
     """A light field of 6 bands, reconstructed."""
-    psi = psi_of((1, 6), BANDS)
-    frames = frames_of(psi, light_of((1, 6), BANDS))
-    return emmc.reconstruct(psi, frames, "tv", noise_sigma=NOISE)
+    return solved((1, 6), BANDS)
 
 
 @pytest.mark.parametrize("axes", [BANDS, TIMES, ("time", "band")])
@@ -124,20 +128,21 @@ def test_a_psi_of_an_earlier_version_has_its_views_at_angles(tmp_path):
     assert psi.checksum() == hashlib.sha256(content).hexdigest()
 
 
-def test_other_names_of_view_axes_are_refused_in_one_line(tmp_path):
-    with pytest.raises(emmc.ERRORS, match=r"view_axes.*'angle', 'band'"):
-        ImagingMatrix(np.ones((1, 1, 2, 4, 3, 4)), None, view_axes=("angle", "colour"))
+@pytest.mark.parametrize(
+    ("stored", "words"),
+    [
+        ("angle,colour", r"psi\.h5: view_axes 'angle,colour': two of angle"),
+        ("angle,time", "checksum"),
+    ],
+)
+def test_other_view_axes_in_a_file_are_refused(tmp_path, stored, words):
     path = tmp_path / "psi.h5"
     psi_of((1, 3), BANDS).save(path)
     with h5py.File(path, "r+") as file:
-        file.attrs["view_axes"] = "angle,colour"
-    for opened in (ImagingMatrix.load, StoredPsi):
-        with pytest.raises(SensingError, match=r"psi\.h5: view_axes 'angle,colour': two of angle"):
+        file.attrs["view_axes"] = stored
+    for opened in (ImagingMatrix.load, lambda path: StoredPsi(path).verify()):
+        with pytest.raises(SensingError, match=words):
             opened(path)
-    with h5py.File(path, "r+") as file:
-        file.attrs["view_axes"] = "angle,time"
-    with pytest.raises(SensingError, match="checksum"):
-        ImagingMatrix.load(path)
 
 
 def test_a_cassi_described_by_a_file_has_the_matrix_of_its_shifted_masks(tmp_path):
@@ -186,17 +191,25 @@ def test_a_camera_at_angles_is_described_and_hashed_as_by_earlier_versions():
     assert Camera.model_validate_json(camera.model_dump_json()) == camera
 
 
+def described(**view_axes):
+    return lambda: emmc.camera({"title": "mine", **view_axes})
+
+
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("make", "words"),
     [
-        ("view_axes", ["angle", "colour"], "view_axes.1: .*'angle', 'band' or 'time'"),
-        ("view_axes", ["band"], "view_axes"),
-        ("view_axis", ["angle", "band"], "'view_axes'"),
+        (
+            lambda: ImagingMatrix(np.ones((1, 1, 2, 4, 3, 4)), None, view_axes=("angle", "colour")),
+            "view_axes.*'angle', 'band'",
+        ),
+        (described(view_axes=["angle", "colour"]), "view_axes.1: .*'angle', 'band' or 'time'"),
+        (described(view_axes=["band"]), "view_axes"),
+        (described(view_axis=["angle", "band"]), "'view_axes'"),
     ],
 )
-def test_a_camera_with_other_view_axes_is_refused_in_one_line(key, value, said):
-    with pytest.raises(CameraError, match=said) as fault:
-        emmc.camera({"title": "mine", key: value})
+def test_other_names_of_view_axes_are_refused_in_one_line(make, words):
+    with pytest.raises(emmc.ERRORS, match=words) as fault:
+        make()
     assert "\n" not in str(fault.value)
 
 
@@ -289,9 +302,7 @@ def test_pictures_that_are_alike_lack_parallax_only_where_they_are_angles(axes):
 
 
 def test_what_a_method_calls_disparity_is_a_shift_between_times():
-    psi = psi_of((6, 1), TIMES)
-    frames = frames_of(psi, light_of((6, 1), TIMES))
-    result = emmc.reconstruct(psi, frames, "adaptive-fast", noise_sigma=NOISE)
+    result = solved((6, 1), TIMES, "adaptive-fast")
     assert result.disparity is None
     assert {"shift", "shift_sigma"} <= set(result.maps)
     assert not any("disparit" in name for name in result.maps)
@@ -315,16 +326,19 @@ def test_a_row_of_views_is_a_light_field(views):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["tv", "adaptive-fast", "dict-omp", "tv-dict"])
 @pytest.mark.parametrize(
-    ("views", "axes", "shots", "closed"),
+    ("method", "views", "axes", "shots", "closed"),
     [
-        ((3, 3), ANGLES, 2, False),
-        ((3, 3), ANGLES, 3, True),
-        ((9, 9), ANGLES, 1, False),
-        ((1, 24), BANDS, 1, False),
-        ((1, 28), BANDS, 1, True),
-        ((8, 1), TIMES, 1, False),
+        ("tv", (3, 3), ANGLES, 3, True),
+        ("tv", (9, 9), ANGLES, 1, False),
+        ("tv", (1, 28), BANDS, 1, True),
+        ("tv-dict", (3, 3), ANGLES, 2, False),
+        ("tv-dict", (8, 1), TIMES, 1, False),
+        ("dict-omp", (1, 24), BANDS, 1, False),
+        ("adaptive-fast", (3, 3), ANGLES, 3, True),
+        ("adaptive-fast", (9, 9), ANGLES, 1, False),
+        ("adaptive-fast", (1, 28), BANDS, 1, True),
+        ("adaptive-fast", (8, 1), TIMES, 1, False),
     ],
 )
 def test_every_grid_of_views_is_reconstructed_and_kept(
@@ -355,21 +369,14 @@ def test_a_demo_of_bands_is_grey_and_speaks_of_bands(tmp_path):
     )  # fmt: skip
     assert code == 0
     assert "over the baseline (middle band in all places)" in output
-    words = (tmp_path / "out/report.html").read_text().split("<script")[0]
-    assert "parallax" not in words
-    assert "the true middle band in all places" in words
     opened = open_export(str(tmp_path / "out"))
     assert opened.view_axes == BANDS
-    light = opened.light_field
-    assert light.std() > 0.01
-    assert (light == light[..., :1]).all()
-    with h5py.File(tmp_path / "out/maps.h5") as maps:
-        assert maps.attrs["view_axes"] == "angle,band"
+    assert opened.light_field.std() > 0.01
+    assert (opened.light_field == opened.light_field[..., :1]).all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("as_zarr", [False, True])
-def test_blocks_of_a_capture_of_bands_are_kept_as_bands(tmp_path, as_zarr):
+def test_blocks_of_a_capture_of_bands_are_kept_as_bands(tmp_path):
     psi = psi_of((1, 6), BANDS, size=(64, 96))
     psi.save(tmp_path / PSI)
     frames = frames_of(psi, light_of((1, 6), BANDS, (64, 96)))
@@ -381,15 +388,17 @@ def test_blocks_of_a_capture_of_bands_are_kept_as_bands(tmp_path, as_zarr):
     (tmp_path / "out").mkdir()
     with opened_pool(1) as pool:
         metrics, _ = reconstruct_undrawn(
-            opened_capture(tmp_path), tmp_path / "out", "adaptive-fast", settings=settings,
-            pool=pool, as_zarr=as_zarr,
-        )  # fmt: skip
+            opened_capture(tmp_path),
+            tmp_path / "out",
+            "adaptive-fast",
+            settings=settings,
+            pool=pool,
+        )
     assert metrics["view_axes"] == list(BANDS)
     assert metrics["blocks"] == [1, 2]
     assert "disparit" not in str(metrics["verdict"]["reasons"])
-    if not as_zarr:
-        with h5py.File(tmp_path / "out" / MAPS) as maps:
-            assert maps.attrs["view_axes"] == "angle,band"
-            assert "shift" in maps
-            assert "disparity" not in maps
-        assert open_export(str(tmp_path / "out")).view_axes == BANDS
+    with h5py.File(tmp_path / "out" / MAPS) as maps:
+        assert maps.attrs["view_axes"] == "angle,band"
+        assert "shift" in maps
+        assert "disparity" not in maps
+    assert open_export(str(tmp_path / "out")).view_axes == BANDS

@@ -1,7 +1,5 @@
 """Every page has one head: the verdict, then what to do next."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,6 @@ from emmc_rig.formats.format import Export
 from emmc_rig.reconstruction.verdict.rules import LEVELS
 from emmc_rig.report.page import light_field_head, typed
 from emmc_rig.report.viewer import render_viewer
-from emmc_rig.study.chart.charting import chart_page
-from emmc_rig.study.stability.stability_run import stability_page
-from emmc_rig.study.tables.tables_page import tables_page
-
-NOT_ASKED: Any = None
-"""The study, where nothing was measured."""
 
 
 def head_of(page):
@@ -23,21 +15,6 @@ def head_of(page):
     assert main.startswith("<aside class="), main[:80]
     assert 'aria-label="Verdict"' in main[:80]
     return main[: main.index("</aside>")]
-
-
-@pytest.mark.parametrize(
-    "page",
-    [
-        lambda: tables_page([], {}, [], {}),
-        lambda: chart_page(NOT_ASKED, [], {}, {}),
-        lambda: stability_page([], [], []),
-    ],
-    ids=["tables", "chart", "stability"],
-)
-def test_a_page_with_nothing_measured_still_says_what_to_do_next(page):
-    head = head_of(page())
-    assert "What to do next" in head
-    assert "<code>emmc-rig " in head
 
 
 def test_a_viewer_of_a_scene_has_the_head_too(light_field):

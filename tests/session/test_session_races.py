@@ -91,7 +91,7 @@ def text_of(folder, place):
 
 
 def assert_loser_knows(folder, answer, commands):
-    """Whoever failed says which of the two held the session; at least one of them did its work."""
+    """Check that the failed program names the session's holder, and that a program succeeded."""
     assert set(answer["codes"]) <= {0, 1}, [text_of(folder, place) for place in (0, 1)]
     assert 0 in answer["codes"], [text_of(folder, place) for place in (0, 1)]
     for place, code in enumerate(answer["codes"]):

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.stats.qmc import Sobol
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.masks import CFA
 from emmc_rig.simulators.bench import NO_ERRORS, Bench, MountingErrors, lens_points_um, ray_points
+from emmc_rig.simulators.sobol import AXES, sobol_points
 
 SIZE = (12, 18)
 CENTRED = {"mask_x": 0.0, "mask_y": 0.0, "aperture_x": 0.0, "aperture_y": 0.0}
@@ -206,3 +208,17 @@ def test_rays_meet_the_lens_in_the_open_part_of_their_aperture_cell():
     away_um = at_um - middles_um[:, :, np.newaxis]
     assert 380 < np.abs(away_um).max() <= 400
     np.testing.assert_allclose(away_um[1, 2, :, 0], 800 * (points[1, 2, :, 2] - 0.5), atol=1e-9)
+
+
+@pytest.mark.parametrize("axes", range(1, AXES + 1))
+@pytest.mark.parametrize("count", [1, 2, 8, 128])
+def test_sobol_points_are_those_of_scipy(count, axes):
+    theirs = Sobol(axes, rng=np.random.default_rng(5)).random(count)
+    ours = sobol_points(count, axes, np.random.default_rng(5))
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_every_axis_of_sobol_points_has_one_in_each_of_as_many_intervals():
+    points = sobol_points(64, AXES, np.random.default_rng(1))
+    for axis in range(AXES):
+        assert sorted((64 * points[:, axis]).astype(int)) == list(range(64))

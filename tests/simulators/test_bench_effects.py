@@ -8,8 +8,9 @@ from scipy.optimize import brentq
 from scipy.special import erf, fresnel
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.compiling import njit
 from emmc_rig.model.noise import SensorNoise
-from emmc_rig.simulators.bench import NO_ERRORS, Bench, _met
+from emmc_rig.simulators.bench import NO_ERRORS, Bench, MaskRow, _find_cells, _met
 from emmc_rig.simulators.flaws import BoardFlaws, LampFlaws, OpticsFlaws, SensorFlaws, diffracted
 
 SIZE = (12, 18)
@@ -104,6 +105,45 @@ def test_a_tilted_mask_is_met_where_the_ray_crosses_its_plane():
     z = (DISTANCE_UM + slope * x) / (1 - slope * to)
     found = _met.py_func(x, 0.0, u, 0.0, LENS_UM, DISTANCE_UM, slope, 0.0, 0.0, 0.0, 1.52)
     assert found[0] == pytest.approx(x + to * z, abs=1e-3)
+
+
+THIN_AND_FLAT = MaskRow(
+    DISTANCE_UM, x_um=3.0, y_um=-5.0, column_per_x=2.0, column_per_y=0.1, row_per_x=-0.1,
+    row_per_y=2.0, bend_per_um2=0.0, edge_um=2.0, slope_x=0.0, slope_y=0.0, sag_per_um=0.0,
+    glass_um=0.0, index=1.52,
+)  # fmt: skip
+
+
+@njit
+def find_cells(place, plate, shape, first_x, ray_y, ray_u, ray_v, blur_x, blur_y, pitch_um):
+    _find_cells(
+        place, plate, 1, shape, first_x, ray_y, ray_u, ray_v, blur_x, blur_y, LENS_UM, pitch_um
+    )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"bend_per_um2": 4e-6},
+        {"slope_x": 0.3, "slope_y": -0.2, "sag_per_um": 1e-3},
+        {"glass_um": 150.0, "bend_per_um2": -4e-6},
+    ],
+)
+def test_a_row_of_rays_finds_the_cells_where_each_ray_meets_the_mask(changes):
+    mask, rows, columns, pitch_um = THIN_AND_FLAT._replace(**changes), 600, 800, 4.0
+    first_x, ray_y, ray_u, ray_v, blur_x, blur_y = -80.0, 50.0, 900.0, -700.0, 1.5, -0.5
+    place, shape = np.empty(40, np.int64), np.array([rows, columns])
+    ray = first_x, ray_y, ray_u, ray_v, blur_x, blur_y
+    find_cells(place, np.array(mask), shape, *ray, pitch_um)
+    for x, found in enumerate(place):
+        at = np.array([first_x + x * pitch_um, ray_y])
+        met = np.array(_met.py_func(*at, ray_u, ray_v, LENS_UM, mask.distance_um, *mask[9:]))
+        met += mask.bend_per_um2 * (at @ at) * at - [mask.x_um, mask.y_um]
+        met += mask.edge_um * np.array([blur_x, blur_y])
+        column = np.floor(met @ [mask.column_per_x, mask.column_per_y] + columns / 2)
+        row = np.floor(met @ [mask.row_per_x, mask.row_per_y] + rows / 2)
+        assert found == 1 + row * columns + column
 
 
 def test_an_edge_diffracts_as_fresnel_integrals_say():

@@ -26,7 +26,7 @@ def world(*things: Card | Ball, camera: CameraMotion = STANDING) -> World:
 
 
 def carried(view: np.ndarray, by_px: np.ndarray) -> np.ndarray:
-    """What every pixel's point looks like in a later view; 0 where it is not seen there."""
+    """The later view, sampled where each pixel's point went; 0 where the point is hidden."""
     y, x = np.indices(view.shape[:2], dtype=np.float32)
     to = np.where(np.isfinite(by_px), by_px, -1e3).astype(np.float32)
     return cv2.remap(view, x + to[..., 0], y + to[..., 1], cv2.INTER_CUBIC)

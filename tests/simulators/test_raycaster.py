@@ -154,7 +154,9 @@ def test_a_ball_s_shadow_falls_along_the_light_onto_the_card_behind_it():
     ball = Ball(-0.1, -0.1, quoted(2), radius, depth, texture=np.ones_like(SMOOTH))
     card = Card(np.ones_like(SMOOTH), 0.0, PICTURE_PLANE, tiled=True)
     tables = tabulated(World((card,), (ball,), UNLIT, ambient=0.0))
-    dark = 1 - rendered(tables, (1, 1), (96, 128)).light_field[0, 0, ..., 1]
+    view = rendered(tables, (1, 1), (96, 128)).light_field[0, 0]
+    assert np.ptp(view, axis=-1).max() < 1e-6, "white in white light has no colour"
+    dark = 1 - view[..., 1]
     x, y = picture_points((96, 128))
     dark[np.hypot(x + 0.1, y + 0.1) < 1.2 * radius] = 0
     shift = 4 * radius / 0.61

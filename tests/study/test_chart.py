@@ -12,8 +12,7 @@ from emmc_rig.process.cost import peak_memory_mib
 from emmc_rig.reconstruction.methods import installed_methods
 from emmc_rig.simulators.scenes import render
 from emmc_rig.study.chart.chart_points import ChartSettings, Configuration, Point, charted_points
-from emmc_rig.study.chart.charting import answer
-from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts, pareto_front
+from emmc_rig.study.chart.charting import POOLED, Chart, Mark, answer, charts, pareto_front
 from emmc_rig.study.scores import angular_snr_db, scored, swept_disparity
 from emmc_rig.study.trial import Capture
 

@@ -14,10 +14,9 @@ from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.simulators.scenes import render
 from emmc_rig.store.results import METRICS
-from emmc_rig.study.chart import chart_points, measure
-from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings
-from emmc_rig.study.chart.charting import COLUMNS, run_chart
-from emmc_rig.study.chart.measure import ChartStudy, measured
+from emmc_rig.study.chart import chart_points, charting
+from emmc_rig.study.chart.chart_points import Configuration, Point, chart_settings, measured
+from emmc_rig.study.chart.charting import CSV, ChartStudy
 from emmc_rig.study.trial import Capture
 
 SIZE = (24, 32)
@@ -36,17 +35,22 @@ def settings(**more):
     return chart_settings(True, scenes, cameras, SIZE, 1, **chosen)
 
 
+def charted(out, **more):
+    study = ChartStudy(settings(**more), out)
+    study.carry_out(Watcher())
+    return study
+
+
 @pytest.mark.slow
 def test_a_chart_holds_every_point(quick, tmp_path):
     measured_scene = tmp_path / "shed"
     save_views(measured_scene, render("near-planar", size=(30, 36)).light_field)
-    chosen = settings(scenes=["dark", str(measured_scene)])
-    outcome = run_chart(chosen, tmp_path / "out", Watcher())
     folder = tmp_path / "out"
+    outcome = charted(folder, scenes=["dark", str(measured_scene)])
     assert [chart.scene for chart in outcome.charts] == ["all scenes", "dark", "shed"]
     with open(folder / "chart.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == ChartStudy.columns[CSV]
     assert [(r["scene"], r["level"]) for r in rows] == [
         ("dark", "2 steps"), ("dark", "default"), ("shed", "2 steps"), ("shed", "default"),
     ]  # fmt: skip
@@ -85,9 +89,9 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr(measure, "measured", full)
+    monkeypatch.setattr(charting, "measured", full)
     with pytest.raises(AppError, match=r"nothing could be measured: .*not enough memory"):
-        run_chart(settings(), tmp_path / "out", Watcher())
+        charted(tmp_path / "out")
     assert not (tmp_path / "out" / ChartStudy.journal).read_text()
 
 
@@ -96,5 +100,5 @@ def test_when_every_point_fails_the_chart_says_why(quick, monkeypatch, tmp_path)
 def test_a_real_light_field_is_charted(quick, tmp_path):
     folder = os.environ["EMMC_LIGHTFIELDS"]
     scene = next(path for path in sorted(os.scandir(folder), key=str) if path.is_dir()).path
-    outcome = run_chart(settings(scenes=[scene]), tmp_path / "out", Watcher())
+    outcome = charted(tmp_path / "out", scenes=[scene])
     assert np.isfinite([mark.psnr_db for mark in outcome.charts[0].marks]).all()

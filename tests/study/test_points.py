@@ -9,7 +9,7 @@ import pytest
 
 from emmc_rig.errors import AppError, StoppedError
 from emmc_rig.progress import Watcher
-from emmc_rig.report.page import Head, Section, framed, number, part
+from emmc_rig.report.page import number
 from emmc_rig.study.points import Journal, NotApplicableError, Study, study_folder
 from emmc_rig.study.rows import csv_text, plain
 
@@ -22,6 +22,9 @@ class Squares(Study[int]):
 
     def __post_init__(self):
         self.calls: list[list[int]] = []
+
+    def planned(self):
+        return [1, 12]
 
     def inputs(self, point):
         if point < 0:
@@ -125,6 +128,28 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
         Squares(None, tmp_path / "missing").run([1], Watcher())
 
 
+@pytest.mark.parametrize(
+    ("fault", "error", "reported"),
+    [
+        (KeyboardInterrupt(), StoppedError, "run the same command again"),
+        (OSError(28, "No space left on device"), AppError, "No space left"),
+    ],
+)
+def test_a_stop_or_a_full_disk_while_the_page_is_written_keeps_what_is_measured(
+    tmp_path, monkeypatch, fault, error, reported
+):
+    def failing(*_):
+        raise fault
+
+    monkeypatch.setattr(Squares, "report", failing)
+    with pytest.raises(error, match=reported):
+        Squares(None, tmp_path / "out").carry_out(Watcher())
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["points.jsonl"]
+    study = Squares(None, tmp_path / "out")
+    study.run([1, 12], Watcher())
+    assert study.calls == []
+
+
 def test_a_torn_line_is_ignored_and_the_next_one_stands_alone(tmp_path):
     path = tmp_path / "points.jsonl"
     journal = Journal(path, lambda digest: {})
@@ -156,12 +181,6 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(tmp_path, monkeypatch):
     assert len(study.run(range(4), Watcher())) == 4
 
 
-def test_two_runs_may_share_a_folder(tmp_path):
-    first, other = (Squares(None, tmp_path) for _ in range(2))
-    assert first.run([1, 2], Watcher()) == other.run([1, 2], Watcher())
-    assert other.calls == []
-
-
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
     (tmp_path / "cat.jpg").write_text("meow")
     for place, why in ((tmp_path, "something else"), (tmp_path / "cat.jpg", "a file of that name")):
@@ -181,16 +200,6 @@ def test_rows_of_csv_are_quoted_and_unknown_values_are_empty():
 
 def test_a_result_is_kept_as_json_gives_it_back():
     assert plain({"a": (1, math.nan), "b": {2: -math.inf}}) == {"a": [1, None], "b": {"2": None}}
-
-
-def test_text_on_a_page_is_escaped():
-    body = part("wide_table", ["<b>"], [["</td>", "&"]])
-    head = Head("<trust>", "<u>", ["look at `<s>`"])
-    sections = [Section("one", "One", body)]
-    page = framed("<i>", ["&"], ["'"], sections, head=head)
-    for mark in ("<b>", "<i>", "<trust>", "<u>", "<s>"):
-        assert mark not in page
-    assert "&lt;/td&gt;" in page
 
 
 def test_a_figure_that_is_not_known_is_a_dash():

@@ -17,7 +17,6 @@ from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
 from emmc_rig.simulators.scenes import render
 from emmc_rig.store.results import METRICS
 from emmc_rig.study import trial
-from emmc_rig.study.stability import stability_run
 from emmc_rig.study.stability.curves import (
     POOLED,
     below_best,
@@ -29,9 +28,12 @@ from emmc_rig.study.stability.curves import (
     strength_at,
 )
 from emmc_rig.study.stability.faults import FAULTS, Point
-from emmc_rig.study.stability.stability_run import BREAKS_CSV, POINTS_CSV, run_stability
 from emmc_rig.study.stability.stability_study import (
+    BREAKS_CSV,
+    POINTS_CSV,
     StabilityStudy,
+    _head,
+    answers,
     planned,
     stability_settings,
 )
@@ -43,6 +45,12 @@ SIZE = (24, 32)
 def quick(**more):
     chosen = {"methods": ("tv",), "faults": ("flicker",), **more}
     return stability_settings(True, chosen.pop("scenes", ["dark"]), SIZE, **chosen)
+
+
+def swept(out, **more):
+    study = StabilityStudy(quick(**more), out)
+    study.carry_out(Watcher())
+    return study
 
 
 @pytest.fixture
@@ -59,7 +67,7 @@ def few_steps(monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """No charts: they take longer than a few steps do."""
-    monkeypatch.setattr(stability_run, "_write", lambda *_: None)
+    monkeypatch.setattr(StabilityStudy, "write", lambda *_: None)
 
 
 def test_a_curve_breaks_where_its_line_crosses_three_decibels_below_the_best():
@@ -68,6 +76,10 @@ def test_a_curve_breaks_where_its_line_crosses_three_decibels_below_the_best():
     assert below_best([30, 29, 28]) is None
     assert below_best([10, 30, 10]) == pytest.approx(1.15)
     assert below_best([None, None]) == 0
+    # A method that fails is broken from there on; nothing lies between one shot and two.
+    assert below_best([30, 29, None]) == 2
+    assert below_best([30, 20, 10], whole=True) == 1
+    assert crossing([1, 1, -1], whole=True) == 2
 
 
 def test_a_curve_breaks_where_it_crosses_the_copied_view():
@@ -76,15 +88,6 @@ def test_a_curve_breaks_where_it_crosses_the_copied_view():
     assert below_view([20, 24, 20], [22, 20, 22]) == pytest.approx(5 / 3)
     # A flat scene is its centre view, which nothing exceeds.
     assert below_view([30, 30, 30], [None, 25, 20]) is None
-
-
-def test_a_method_that_fails_is_broken_from_there_on():
-    assert below_best([30, 29, None]) == 2
-    assert crossing([1, 1, -1], whole=True) == 2
-
-
-def test_nothing_lies_between_one_shot_and_two():
-    assert below_best([30, 20, 10], whole=True) == 1
 
 
 @pytest.mark.parametrize(
@@ -103,45 +106,45 @@ def test_breaking_points_in_words(place, words):
     assert place_words(place, (0.1, 1, 10, 1000)) == words
 
 
-def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
-    levels = {"a": (30, 20, 10), "b": (20, 18, 14)}
-    results: dict[Point, dict] = {
-        Point(Capture(scene, "cam"), "mask-shift", strength, "tv"): {
-            "psnr_db": level,
-            "view_db": 15,
-        }
-        for scene, row in levels.items()
+def found(levels):
+    """Results at strengths 0, 1 and 4 by scene, fault and method, above a baseline of 5 dB."""
+    return {
+        Point(Capture(scene, "cam"), fault, strength, method): {"psnr_db": level, "view_db": 5}
+        for (scene, fault, method), row in levels.items()
         for strength, level in zip((0, 1, 4), row, strict=True)
     }
-    results[Point(Capture("a", "cam"), "occlusion", 0, "tv")] = {"psnr_db": 30, "view_db": 15}
+
+
+def test_curves_of_several_scenes_are_pooled_where_all_have_the_fault():
+    results: dict[Point, dict] = found(
+        {("a", "mask-shift", "tv"): (30, 20, 10), ("b", "mask-shift", "tv"): (20, 18, 14)}
+    )
+    results[Point(Capture("a", "cam"), "occlusion", 0, "tv")] = {"psnr_db": 30, "view_db": 5}
     results[Point(Capture("a", "cam"), "occlusion", 10, "tv")] = {"failed": "no light"}
-    found = curves(results)
-    pooled = [curve for curve in found if curve.scene == POOLED]
+    every = curves(results)
+    pooled = [curve for curve in every if curve.scene == POOLED]
     assert [curve.levels for curve in pooled] == [(25, 19, 12), (30, None)]
-    rows, methods = breaking_rows(found, POOLED)
+    rows, methods = breaking_rows(every, POOLED)
     assert methods == ("tv",)
     assert [fault.title for fault, _ in rows] == ["Mask shift", "Occlusion density"]
     assert rows[1][1] == ["10 / 10"]
 
 
 def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
-    levels = {
-        ("mask-shift", "tv"): (30, 29, 10),
-        ("flicker", "tv"): (30, 29, 29),
-        ("mask-shift", "dict-omp"): (30, 20, 10),
-        ("flicker", "dict-omp"): (30, 20, 10),
-    }
-    results: dict[Point, dict] = {
-        Point(Capture("a", "cam"), fault, strength, method): {"psnr_db": level, "view_db": 5}
-        for (fault, method), row in levels.items()
-        for strength, level in zip((0, 1, 4), row, strict=True)
-    }
-    head = stability_run._head(curves(results))
+    results = found(
+        {
+            ("a", "mask-shift", "tv"): (30, 29, 10),
+            ("a", "flicker", "tv"): (30, 29, 29),
+            ("a", "mask-shift", "dict-omp"): (30, 20, 10),
+            ("a", "flicker", "dict-omp"): (30, 20, 10),
+        }
+    )
+    head = _head(curves(results))
     assert head.level == "tv holds out best"
     assert "under 1 of 2 faults" in head.why
     assert any("for comparison, dict-omp: under 2 of 2" in line for line in head.next)
     # tv falls from 29 dB to 10 dB between 1 and 4 px, and never by flicker; dict-omp at 0.3.
-    shift, flicker = stability_run.answers(curves(results))
+    shift, flicker = answers(curves(results))
     assert shift == (
         "Mask shift: dict-omp has lost 3 dB at 0.3 px; tv has lost 3 dB at 1.2 px, the last."
     )
@@ -160,11 +163,10 @@ def test_a_full_sweep_is_of_all_faults():
 def test_a_sweep_holds_every_point(few_steps, tmp_path):
     shed = tmp_path / "shed"
     save_views(shed, render("near-planar", size=(30, 36)).light_field)
-    chosen = quick(scenes=["dark", str(shed)], faults=("flicker", "disparity-range"))
-    outcome = run_stability(chosen, tmp_path / "out", Watcher())
     folder = tmp_path / "out"
+    outcome = swept(folder, scenes=["dark", str(shed)], faults=("flicker", "disparity-range"))
     assert outcome.curves[0].scene == POOLED
-    assert any("Disparity range" in line and "shed" in line for line in outcome.left_out)
+    assert any("Disparity range" in line and "shed" in line for line in outcome.excluded())
     with open(folder / POINTS_CSV, newline="") as file:
         rows = list(csv.DictReader(file))
     with open(folder / BREAKS_CSV, newline="") as file:
@@ -186,7 +188,7 @@ def test_a_sweep_holds_every_point(few_steps, tmp_path):
 
 
 def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp_path):
-    run_stability(quick(faults=("flicker", "missing-shot")), tmp_path / "out", Watcher())
+    swept(tmp_path / "out", faults=("flicker", "missing-shot"))
     lines = (tmp_path / "out" / StabilityStudy.journal).read_text().splitlines()
     assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
 
@@ -194,23 +196,23 @@ def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp
 def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypatch, tmp_path):
     missing = replace(METHODS["dict-omp"], package="no_such_module")
     monkeypatch.setitem(METHODS, "dict-omp", missing)
-    outcome = run_stability(quick(methods=("tv", "dict-omp")), tmp_path / "out", Watcher())
-    assert outcome.left_out == ["dict-omp needs no_such_module: not installed"]
+    outcome = swept(tmp_path / "out", methods=("tv", "dict-omp"))
+    assert outcome.excluded() == ["dict-omp needs no_such_module: not installed"]
     assert {curve.method for curve in outcome.curves} == {"tv"}
     assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
 
 
 def test_workers_measure_what_one_process_does_each_trial_once(few_steps, undrawn, tmp_path):
-    chosen, found = quick(faults=("flicker", "missing-shot")), []
+    chosen, ran = quick(faults=("flicker", "missing-shot")), []
     for name, pool in (("alone", None), ("shared", Posting(backwards=True))):
         (tmp_path / name).mkdir()
         sweep = StabilityStudy(chosen, tmp_path / name)
-        found.append(sweep.run(planned(chosen), Watcher(), pool))
+        ran.append(sweep.run(planned(chosen), Watcher(), pool))
         lines = (tmp_path / name / StabilityStudy.journal).read_text().splitlines()
         assert len(lines) == len(FAULTS["flicker"].quick) + len(FAULTS["missing-shot"].quick) - 1
-    assert list(found[0]) == list(found[1])
-    for point, figures in found[0].items():
-        assert found[1][point]["psnr_db"] == pytest.approx(figures["psnr_db"], abs=1e-3)
+    assert list(ran[0]) == list(ran[1])
+    for point, figures in ran[0].items():
+        assert ran[1][point]["psnr_db"] == pytest.approx(figures["psnr_db"], abs=1e-3)
 
 
 def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path):
@@ -224,15 +226,13 @@ def test_an_interrupted_sweep_goes_on(few_steps, undrawn, monkeypatch, tmp_path)
 
     monkeypatch.setattr(trial, "reconstruct", stopping)
     with pytest.raises(StoppedError, match="1 of 4 points are kept"):
-        run_stability(quick(), tmp_path / "out", Watcher())
-    run_stability(quick(), tmp_path / "out", Watcher())
+        swept(tmp_path / "out")
+    swept(tmp_path / "out")
     assert len(calls) == 1 + 4
     kept = (tmp_path / "out" / StabilityStudy.journal).read_text()
-    run_stability(quick(), tmp_path / "out", Watcher())
+    swept(tmp_path / "out")
     assert len(calls) == 1 + 4
     assert (tmp_path / "out" / StabilityStudy.journal).read_text() == kept
-    run_stability(quick(seed=1), tmp_path / "out", Watcher())
-    assert len(calls) == 1 + 8
 
 
 def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
@@ -242,11 +242,11 @@ def test_a_method_that_fails_is_a_finding(undrawn, monkeypatch, tmp_path):
         return reconstruct(name, psi, frames, *others)
 
     monkeypatch.setattr(trial, "reconstruct", failing)
-    outcome = run_stability(quick(faults=("missing-shot",)), tmp_path / "out", Watcher())
+    outcome = swept(tmp_path / "out", faults=("missing-shot",))
     (curve,) = outcome.curves
     assert curve.levels[1:] == (None, None)
     assert place_words(curve.below_best(), curve.strengths) == "1"
-    assert any("no light in shot 3" in line for line in outcome.left_out)
+    assert any("no light in shot 3" in line for line in outcome.excluded())
 
 
 def test_the_command_prints_the_table(few_steps, run):

@@ -13,7 +13,7 @@ from emmc_rig.simulators.scenes import render
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.stability.mask_faults import misplaced_psi
-from emmc_rig.study.stability.shot_faults import flicker_gains
+from emmc_rig.study.stability.scene_faults import flicker_gains
 from emmc_rig.study.trial import Capture
 
 SCENE, SIZE = "near-planar", (32, 40)

@@ -1,23 +1,28 @@
-"""The points of a chart: captures, and methods with their settings.
+"""The points of a chart: captures, and methods with their settings; measured one at a time.
 
-Nothing is computed here. The methods are those of `reconstruction.methods.METHODS`, whatever they
-are; VARIATIONS adds settings for those it knows.
+The methods are all of `reconstruction.methods.METHODS`; VARIATIONS adds settings for some. The
+order of a measurement matters: frames, dictionary, a warm-up on a small window (which compiles and
+loads), the timed runs, the peak of memory; only then the light field is compared with the truth.
 """
 
 from __future__ import annotations
 
+import os
+import statistics
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from pydantic import Field
 
-from emmc_rig.errors import AppError
-from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.settings import Settings
-from emmc_rig.reconstruction.methods import METHODS, MethodSettings, installed_methods
+from emmc_rig.process.cost import forget_peak, peak_memory_mib
+from emmc_rig.reconstruction.methods import METHODS, MethodSettings, find_method, installed_methods
 from emmc_rig.simulators.scenes import STILL_SCENES
-from emmc_rig.study.trial import Capture
+from emmc_rig.study.rows import available_cores
+from emmc_rig.study.scores import scored
+from emmc_rig.study.trial import Capture, Trial, trial_of
 
 FAST_SCENES = ("near-planar", "deep-occlusions")
 FAST_CAMERAS = ("rgbw-bayer-1shot", "rgbw-bayer-3shots")
@@ -53,6 +58,9 @@ VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
 SLOW_METHODS = ("dict-lars", "dict-ista", "dict-fista", "dict-sl0")
 BESIDE_FRONT = ("best", "fast", "5 atoms, stride 9", "40 atoms", "stride 3")
 """Levels that take long, or that the front over all scenes does without: --fast has none."""
+
+WARM_UP_PX = 27
+"""Side of the window of the warm-up: large enough for patches, small enough to take no time."""
 
 
 @dataclass(frozen=True)
@@ -123,16 +131,13 @@ def chart_settings(
     return ChartSettings.model_validate(chosen)
 
 
-def check_methods(names: Sequence[str]) -> None:
-    """Raise AppError naming the nearest for a method that is not known."""
-    for name in names:
-        if name not in METHODS:
-            raise AppError(f"method {name}: {nearest_of(name, METHODS)}")
-
-
 def configurations(settings: ChartSettings) -> list[Configuration]:
-    """Return the methods with their settings, quick ones first."""
-    check_methods(settings.methods)
+    """Return the methods with their settings, quick ones first.
+
+    Raises ReconstructionError naming the nearest for a method that is not known.
+    """
+    for name in settings.methods:
+        find_method(name)
     chosen = settings.methods or [
         method for method in installed_methods() if not (settings.fast and method in SLOW_METHODS)
     ]
@@ -153,3 +158,62 @@ def charted_points(settings: ChartSettings) -> list[Point]:
         for camera in settings.cameras
         for configuration in configurations(settings)
     ]
+
+
+def measured(point: Point, chart: ChartSettings) -> dict:
+    """Return the figures of a point.
+
+    seconds: median of the repeats. cpu_seconds: likewise, of all cores together. peak_mib: memory
+    that the timed runs take at most, beyond the process with Psi, frames and dictionary.
+    """
+    trial, method = trial_of(point.capture), point.configuration.method
+    settings, dictionary = point.configuration.settings, chart.dictionary
+    trial.dictionary(method, dictionary)
+    _window(trial).solved(method, settings, dictionary)
+    load = os.getloadavg()[0]
+    forget_peak()
+    held_mib = peak_memory_mib()
+    wall, cpu, result = [], [], None
+    while len(wall) < chart.repeats and (not wall or sum(wall) < chart.enough_s):
+        result = None
+        cpu_started, started = time.process_time(), time.perf_counter()
+        result = trial.solved(method, settings, dictionary)
+        wall.append(time.perf_counter() - started)
+        cpu.append(time.process_time() - cpu_started)
+    assert result is not None
+    peak_mib = peak_memory_mib() - held_mib
+    scores = scored(
+        result.light_field, trial.truth, trial.disparity_px, result.maps.get("disparity")
+    )
+    return {
+        **asdict(scores),
+        "seconds": statistics.median(wall),
+        "fastest_s": min(wall),
+        "slowest_s": max(wall),
+        "cpu_seconds": statistics.median(cpu),
+        "repeats": len(wall),
+        "peak_mib": peak_mib,
+        "cores": available_cores(),
+        "load": load,
+        "steps": result.steps,
+        "status": result.status,
+        "advice": result.advice,
+        "shots": trial.psi.shots,
+        "views": "x".join(map(str, trial.psi.light_field_shape[:2])),
+        "rows": trial.psi.size[0],
+        "columns": trial.psi.size[1],
+    }
+
+
+def _window(trial: Trial) -> Trial:
+    """Return a corner of a trial; it has no truth."""
+    k = trial.psi.binning
+    side = WARM_UP_PX // k * k
+    rows, columns = (slice(0, min(side, length)) for length in trial.psi.size)
+    seen = (slice(None), slice(0, rows.stop // k), slice(0, columns.stop // k))
+    return replace(
+        trial,
+        psi=trial.psi.window(rows, columns),
+        readings=trial.readings[seen].copy(),
+        usable=trial.usable[seen].copy(),
+    )

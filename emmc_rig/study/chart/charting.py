@@ -1,18 +1,22 @@
-"""`emmc-rig chart`: measure the points, and write table, page, charts and metrics."""
+"""`emmc-rig chart`: which configurations nothing beats, their drawings, table, page and metrics."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
+from typing import ClassVar
 
+import numpy as np
 from matplotlib.axes import Axes
 
+from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError
-from emmc_rig.model.files import write_text
-from emmc_rig.progress import Watcher
+from emmc_rig.model.errors import ModelError
+from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.report.drawing import (
     FAINT,
     INK,
@@ -24,32 +28,323 @@ from emmc_rig.report.drawing import (
     sheet,
     titled,
 )
-from emmc_rig.report.page import (
-    Head,
-    Section,
-    embedded,
-    fragment,
-    framed,
-    number,
-    provenance_section,
-)
-from emmc_rig.store.folders import result_folder
-from emmc_rig.store.results import write_metrics
-from emmc_rig.study.chart.chart_points import ChartSettings, Point, charted_points
-from emmc_rig.study.chart.front import POOLED, Chart, Mark, charts
-from emmc_rig.study.chart.measure import ChartStudy
-from emmc_rig.study.points import study_folder
-from emmc_rig.study.rows import (
-    available_cores,
-    check_scene_names,
-    check_size,
-    csv_text,
-    machine,
-    provenance,
-)
+from emmc_rig.report.page import Head, Section, embedded, fragment, number
+from emmc_rig.study.chart.chart_points import Configuration, Point, charted_points, measured
+from emmc_rig.study.points import Report, Results, Study, Table
+from emmc_rig.study.rows import available_cores, check_scene_names, check_size, machine
+from emmc_rig.study.trial import method_inputs
 
+CSV, DRAWN = "chart.csv", "charts"
+POOLED = "all scenes"
 LINE_POINTS, LETTER_POINTS = 10.0, 4.6
 """Height of a line, and width of a letter, of the names at the front."""
+EXPECTED_ERRORS = (AppError, ModelError, ReconstructionError, CalibrationError, DriverError)
+MEANS = {
+    "ssim": ".3f", "angular_db": ".2f", "disparity_mae_px": ".2f", "floor_mae_px": ".2f",
+    "own_disparity_mae_px": ".2f", "cpu_seconds": ".3g", "peak_mib": ".0f", "steps": ".0f",
+}  # fmt: skip
+"""Figures of a point that the table shows as means over the scenes, and their formats."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A place in a chart: seconds and dB of a configuration, from its points."""
+
+    configuration: Configuration
+    seconds: float
+    psnr_db: float
+    points: tuple[Point, ...]
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Speed against accuracy of one scene, or pooled, through one camera.
+
+    replicate_db: of the true centre view in place of every view.
+    """
+
+    scene: str
+    camera: str
+    marks: tuple[Mark, ...]
+    replicate_db: float
+
+    @property
+    def key(self) -> str:
+        """A name that is fit for a file."""
+        return f"{self.camera}-{self.scene}".replace(" ", "-")
+
+    @property
+    def title(self) -> str:
+        """In words."""
+        return f"{self.scene}, {self.camera}"
+
+    def front(self) -> list[Mark]:
+        """Return the marks that none beats, from quick to accurate."""
+        return pareto_front(self.marks)
+
+
+def pareto_front(marks: Sequence[Mark]) -> list[Mark]:
+    """Return the marks for which no other is as quick and more accurate, or the reverse."""
+    found: list[Mark] = []
+    for mark in sorted(marks, key=lambda mark: (mark.seconds, -mark.psnr_db)):
+        if not found or mark.psnr_db > found[-1].psnr_db:
+            found.append(mark)
+    return found
+
+
+def charts(results: Mapping[Point, dict]) -> list[Chart]:
+    """Return for each camera the chart over all its scenes, then that of each scene.
+
+    Points that failed are left out.
+    """
+    singles: dict[str, dict[str, Chart]] = defaultdict(dict)
+    marks: dict[tuple[str, str], list[Mark]] = defaultdict(list)
+    for point, result in results.items():
+        if "failed" in result:
+            continue
+        camera, scene = point.capture.camera_name, point.capture.scene_name
+        mark = Mark(point.configuration, result["seconds"], result["psnr_db"], (point,))
+        marks[camera, scene].append(mark)
+        first = results[marks[camera, scene][0].points[0]]
+        singles[camera][scene] = Chart(
+            scene, camera, tuple(marks[camera, scene]), first["replicate_psnr_db"]
+        )
+    found: list[Chart] = []
+    for camera, scenes in singles.items():
+        pooled = _pooled(camera, list(scenes.values()))
+        found += [pooled] if len(scenes) > 1 and pooled.marks else []
+        found += scenes.values()
+    return found
+
+
+def _pooled(camera: str, singles: Sequence[Chart]) -> Chart:
+    """Return the chart of the configurations measured in every scene.
+
+    Seconds are their geometric mean, so that scenes of different sizes count alike; PSNR is the
+    mean.
+    """
+    found: dict[Configuration, list[Mark]] = defaultdict(list)
+    for chart in singles:
+        for mark in chart.marks:
+            found[mark.configuration].append(mark)
+    marks = [
+        Mark(
+            configuration,
+            float(np.exp(np.mean([np.log(mark.seconds) for mark in some]))),
+            float(np.mean([mark.psnr_db for mark in some])),
+            tuple(point for mark in some for point in mark.points),
+        )
+        for configuration, some in found.items()
+        if len(some) == len(singles)
+    ]
+    replicate_db = float(np.mean([chart.replicate_db for chart in singles]))
+    return Chart(POOLED, camera, tuple(marks), replicate_db)
+
+
+@dataclass
+class ChartStudy(Study[Point]):
+    """Speed against accuracy of every method; settings: ChartSettings."""
+
+    revision = 4
+    command, title, page = "chart", "Speed against accuracy", "chart.html"
+    style_sheets = ("chart.css",)
+    caveats = (
+        "Frames are simulated by the same Psi that reconstructs them, which favours all methods "
+        "alike.",
+        "Angular SNR: 0 dB is the baseline, the centre view in all places; below 0 dB parallax is "
+        "worse than none. Disparity error: mean, of a plane sweep on the estimate; in brackets, on "
+        "the truth.",
+        "Seconds: median of repeats after a warm-up, one run at a time, without making the "
+        "dictionary. Memory: what a run takes besides Psi, frames and dictionary.",
+    )
+    columns: ClassVar[Mapping[str, Sequence[str]]] = {
+        CSV: (
+            "scene", "camera", "method", "level", "settings", "psnr_db", "ssim", "angular_db",
+            "replicate_psnr_db", "disparity_mae_px", "floor_mae_px", "bad_share",
+            "own_disparity_mae_px", "seconds", "fastest_s", "slowest_s", "cpu_seconds", "repeats",
+            "peak_mib", "cores", "load", "shots", "views", "rows", "columns", "steps", "status",
+            "advice", "failed",
+        )
+    }  # fmt: skip
+
+    def planned(self) -> list[Point]:
+        """Return the points; raises for wrong input before anything is measured."""
+        check_scene_names(self.settings.scenes)
+        check_scene_names(self.settings.cameras, "cameras")
+        check_size(self.settings.size)
+        points = charted_points(self.settings)
+        for capture in dict.fromkeys(point.capture for point in points):
+            capture.scene_seen()
+        return points
+
+    def inputs(self, point: Point) -> dict[str, object]:
+        """Return everything that a point's figures depend on, as plain data."""
+        settings = self.settings
+        return {
+            **method_inputs(point.configuration.method, settings.dictionary),
+            "capture": point.capture.identity(),
+            "settings": point.configuration.settings.model_dump(mode="json"),
+            "cores": available_cores(),
+            "repeats": settings.repeats,
+            "enough_s": settings.enough_s,
+        }
+
+    def group(self, point: Point) -> Hashable:
+        """All points are measured one after the other."""
+        return None
+
+    def measured(self, points: Sequence[Point]) -> Results:
+        """Yield the points' figures, those of one capture after the other."""
+        for point in points:
+            try:
+                yield measured(point, self.settings)
+            except EXPECTED_ERRORS as fault:
+                yield {"failed": str(fault), "keep": False}
+            except MemoryError:
+                yield {"failed": "not enough memory", "keep": False}
+
+    def words(self, point: Point, result: dict) -> str:
+        """Return a measured point in words."""
+        took = f" (in {result['seconds']:.2f} s)" if "seconds" in result else ""
+        return super().words(point, result) + took
+
+    @property
+    def charts(self) -> list[Chart]:
+        """Charts of the measured points, pooled ones first."""
+        return charts(self.results)
+
+    def shown(self) -> Iterable[Table]:
+        """Return the fronts for a terminal: pooled over scenes where there are several."""
+        every = self.charts
+        for chart in [chart for chart in every if chart.scene == POOLED] or every:
+            rows = [
+                (mark.configuration.label, f"{mark.seconds:.3g}", f"{mark.psnr_db:.2f}")
+                for mark in chart.front()
+            ]
+            yield Table(chart.title, ("method", "s", "dB"), rows)
+
+    def report(self, new: Path) -> Report:
+        """Return the content of the files; raises AppError where nothing could be measured."""
+        drawn, every = new / DRAWN, self.charts
+        if not every:
+            raise AppError(f"nothing could be measured: {self.excluded()[0]}")
+        drawn.mkdir()
+        colours = colours_of(mark.configuration.method for chart in every for mark in chart.marks)
+        done = [result for result in self.results.values() if "failed" not in result]
+        loads = sorted(result["load"] for result in done)
+        load = f"{loads[0]:.1f} to {loads[-1]:.1f}, median {loads[len(loads) // 2]:.1f}"
+        fronts = {
+            f"{chart.camera}, {chart.scene}": [
+                {"method": m.configuration.label, "seconds": m.seconds, "psnr_db": m.psnr_db}
+                for m in chart.front()
+            ]
+            for chart in every
+        }
+        return Report(
+            _head(every[0]),
+            self._about(load, loads[-1] > available_cores() + 0.5, len(done)),
+            [self._section(chart, draw_chart(chart, colours, drawn)) for chart in every],
+            {CSV: [_row(*pair) for pair in self.results.items()]},
+            {
+                "points": len(self.results),
+                "seconds": self.seconds,
+                "machine": machine(),
+                "load": load,
+                "fronts": fronts,
+                "left_out": self.excluded(),
+                "settings": self.settings.model_dump(mode="json"),
+            },
+            {"Machine": machine(), "Load": load},
+        )
+
+    def _about(self, load: str, busy: bool, done: int) -> list[str]:
+        scenes, cameras = (
+            ", ".join(Path(name).stem for name in names)
+            for names in (self.settings.scenes, self.settings.cameras)
+        )
+        return [
+            f"{done} points on {scenes}, through {cameras}.",
+            f"{machine()}; load average while measuring {load}. "
+            + (
+                "The machine was busy: seconds are too long, CPU seconds less so."
+                if busy
+                else "The machine was quiet."
+            ),
+        ]
+
+    def _section(self, chart: Chart, path: Path) -> Section:
+        """Return a chart of the page, with a table of its marks, quick ones first."""
+        front = chart.front()
+        rows = [
+            {
+                "mark": mark,
+                "in_front": mark in front,
+                **_means([self.results[point] for point in mark.points]),
+            }
+            for mark in sorted(chart.marks, key=lambda mark: mark.seconds)
+        ]
+        body = fragment(
+            "chart_front.html", drawing=embedded(path), title=chart.title, rows=rows,
+            key=chart.key, answer=answer(chart),
+        )  # fmt: skip
+        return Section(chart.key, chart.title, body)
+
+
+def _row(point: Point, result: dict) -> dict[str, object]:
+    """Return a point as a row of chart.csv."""
+    configuration = point.configuration
+    return {
+        **result,
+        "scene": point.capture.scene_name,
+        "camera": point.capture.camera_name,
+        "method": configuration.method,
+        "level": configuration.level,
+        "settings": configuration.settings.model_dump_json(exclude_defaults=True),
+    }
+
+
+def _means(results: Sequence[dict]) -> dict[str, str]:
+    """Return the means over scenes, a dash where none is known."""
+    means = {}
+    for key, form in MEANS.items():
+        known = [result[key] for result in results if result[key] is not None]
+        means[key] = number(mean(known) if known else None, form)
+    return means
+
+
+def _head(chart: Chart) -> Head:
+    """Return the most accurate configuration and the quicker ones that none beats."""
+    *quicker, best = chart.front()
+    return Head(
+        f"{best.configuration.label} is the most accurate",
+        f"{chart.title}: {_accuracy(chart, best)}",
+        [
+            f"in {mark.seconds:.3g} s: {mark.configuration.label}, "
+            f"{best.psnr_db - mark.psnr_db:.2f} dB less"
+            for mark in reversed(quicker)
+        ]
+        + [f"use it: `emmc-rig reconstruct FRAMES --method {best.configuration.method}`"],
+    )
+
+
+def _accuracy(chart: Chart, mark: Mark) -> str:
+    gain_db = mark.psnr_db - chart.replicate_db
+    return (
+        f"{mark.psnr_db:.2f} dB in {mark.seconds:.3g} s, {gain_db:+.2f} dB against the baseline "
+        "(centre view in all places)"
+    )
+
+
+def answer(chart: Chart) -> str:
+    """Return in words which configuration is the most accurate, and what the quickest loses."""
+    quickest, best = chart.front()[0], chart.front()[-1]
+    words = f"{best.configuration.label} is the most accurate: {_accuracy(chart, best)}."
+    if quickest is best:
+        return words + " Nothing is quicker."
+    return (
+        f"{words} The quickest, {quickest.configuration.label}, takes {quickest.seconds:.3g} s and "
+        f"loses {best.psnr_db - quickest.psnr_db:.2f} dB."
+    )
 
 
 def draw_chart(chart: Chart, colours: Mapping[str, str], folder: Path) -> Path:
@@ -106,216 +401,3 @@ def _name(axes: Axes, front: Sequence[Mark], colours: Mapping[str, str]) -> None
             textcoords="offset points", fontsize=8, ha="right",
             color=colours[mark.configuration.method],
         )  # fmt: skip
-
-
-CAVEATS = (
-    "Frames are simulated by the same Psi that reconstructs them, which favours all methods alike.",
-    "Angular SNR: 0 dB is the baseline, the centre view in all places; below 0 dB parallax is "
-    "worse than none. Disparity error: mean, of a plane sweep on the estimate; in brackets, on the "
-    "truth.",
-    "Seconds: median of repeats after a warm-up, one run at a time, without making the dictionary. "
-    "Memory: what a run takes besides Psi, frames and dictionary.",
-)
-MEANS = {
-    "ssim": ".3f", "angular_db": ".2f", "disparity_mae_px": ".2f", "floor_mae_px": ".2f",
-    "own_disparity_mae_px": ".2f", "cpu_seconds": ".3g", "peak_mib": ".0f", "steps": ".0f",
-}  # fmt: skip
-"""Figures of a point that the table shows as means over the scenes, and how."""
-
-
-def chart_page(
-    study: ChartStudy,
-    about: Sequence[str],
-    charts: Mapping[Chart, Path],
-    provenance: Mapping[str, str],
-) -> str:
-    """Return the page. about: sentences under the title. charts: their SVG files."""
-    sections = [_chart_section(study, chart, path) for chart, path in charts.items()]
-    sections.append(provenance_section(provenance))
-    head = _head(next(iter(charts), None))
-    return framed("Speed against accuracy", about, CAVEATS, sections, ["chart.css"], head=head)
-
-
-def _head(chart: Chart | None) -> Head:
-    """Return the most accurate configuration and the quicker ones that none beats."""
-    if chart is None or not chart.marks:
-        why = "none of these methods could be measured"
-        return Head("nothing measured", why, ["list the methods: `emmc-rig reconstruct --list`"])
-    *quicker, best = chart.front()
-    return Head(
-        f"{best.configuration.label} is the most accurate",
-        f"{chart.title}: {_accuracy(chart, best)}",
-        [
-            f"in {mark.seconds:.3g} s: {mark.configuration.label}, "
-            f"{best.psnr_db - mark.psnr_db:.2f} dB less"
-            for mark in reversed(quicker)
-        ]
-        + [f"use it: `emmc-rig reconstruct FRAMES --method {best.configuration.method}`"],
-    )
-
-
-def _accuracy(chart: Chart, mark: Mark) -> str:
-    gain_db = mark.psnr_db - chart.replicate_db
-    return (
-        f"{mark.psnr_db:.2f} dB in {mark.seconds:.3g} s, {gain_db:+.2f} dB against the baseline "
-        "(centre view in all places)"
-    )
-
-
-def answer(chart: Chart) -> str:
-    """Return in words which configuration is the most accurate, and what the quickest loses."""
-    quickest, best = chart.front()[0], chart.front()[-1]
-    words = f"{best.configuration.label} is the most accurate: {_accuracy(chart, best)}."
-    if quickest is best:
-        return words + " Nothing is quicker."
-    return (
-        f"{words} The quickest, {quickest.configuration.label}, takes {quickest.seconds:.3g} s and "
-        f"loses {best.psnr_db - quickest.psnr_db:.2f} dB."
-    )
-
-
-def _chart_section(study: ChartStudy, chart: Chart, path: Path) -> Section:
-    front = chart.front()
-    rows = [
-        {
-            "mark": mark,
-            "in_front": mark in front,
-            **_means([study.results[point] for point in mark.points]),
-        }
-        for mark in sorted(chart.marks, key=lambda mark: mark.seconds)
-    ]
-    body = fragment(
-        "chart_front.html", drawing=embedded(path), title=chart.title, rows=rows, key=chart.key,
-        answer=answer(chart),
-    )  # fmt: skip
-    return Section(chart.key, chart.title, body)
-
-
-def _means(results: Sequence[dict]) -> dict[str, str]:
-    """Return the means over scenes, a dash where none is known."""
-    means = {}
-    for key, form in MEANS.items():
-        known = [result[key] for result in results if result[key] is not None]
-        means[key] = number(mean(known) if known else None, form)
-    return means
-
-
-CSV, PAGE, DRAWN = "chart.csv", "chart.html", "charts"
-COLUMNS = (
-    "scene", "camera", "method", "level", "settings", "psnr_db", "ssim", "angular_db",
-    "replicate_psnr_db", "disparity_mae_px", "floor_mae_px", "bad_share", "own_disparity_mae_px",
-    "seconds", "fastest_s", "slowest_s", "cpu_seconds", "repeats", "peak_mib", "cores", "load",
-    "shots", "views", "rows", "columns", "steps", "status", "advice", "failed",
-)  # fmt: skip
-"""Of chart.csv. An empty field is infinite, not known or not applicable."""
-
-
-@dataclass(frozen=True)
-class ChartOutcome:
-    """Charts and their page. left_out: points that are missing and why, in words."""
-
-    charts: list[Chart]
-    left_out: list[str]
-    page: Path
-    seconds: float
-
-    def shown(self) -> list[Chart]:
-        """Return the charts that a terminal shows: pooled where there are such."""
-        return [chart for chart in self.charts if chart.scene == POOLED] or self.charts
-
-
-def run_chart(settings: ChartSettings, out: Path, watcher: Watcher) -> ChartOutcome:
-    """Measure into a folder that outlives interruptions, and write everything.
-
-    Raises StoppedError at Ctrl-C, AppError for wrong input and a folder that cannot be written,
-    and the errors of the layers below; measured points are kept in each case.
-    """
-    started = time.perf_counter()
-    check_scene_names(settings.scenes)
-    check_scene_names(settings.cameras, "cameras")
-    check_size(settings.size)
-    points = charted_points(settings)
-    for capture in dict.fromkeys(point.capture for point in points):
-        capture.scene_seen()  # raises for wrong input before anything is measured
-    with study_folder(out, ChartStudy.journal, "chart") as folder:
-        study = ChartStudy(settings, folder)
-        results = study.run(points, watcher)
-        watcher.begin("draw", None)
-        left_out = [*dict.fromkeys(study.left_out.values()), *study.failures()]
-        if all("failed" in result for result in results.values()):
-            raise AppError(f"nothing could be measured: {left_out[0]}")
-        seconds = time.perf_counter() - started
-        outcome = ChartOutcome(charts(results), left_out, folder / PAGE, seconds)
-        with result_folder(folder, "chart", adds=True) as new:
-            _write(study, outcome, new)
-    return outcome
-
-
-def _write(study: ChartStudy, outcome: ChartOutcome, new: Path) -> None:
-    """Write the charts, chart.csv, the page and metrics.json."""
-    settings, drawn = study.settings, new / DRAWN
-    drawn.mkdir()
-    marks = [mark for chart in outcome.charts for mark in chart.marks]
-    colours = colours_of(mark.configuration.method for mark in marks)
-    load = _load(list(study.results.values()))
-    text = chart_page(
-        study, _about(study, load, outcome.left_out),
-        {chart: draw_chart(chart, colours, drawn) for chart in outcome.charts},
-        provenance(settings, outcome.seconds, Machine=machine(), Load=load),
-    )  # fmt: skip
-    write_text(new / CSV, csv_text([_row(*pair) for pair in study.results.items()], COLUMNS))
-    write_text(new / PAGE, text)
-    metrics = {
-        "points": len(study.results),
-        "seconds": outcome.seconds,
-        "machine": machine(),
-        "load": load,
-        "fronts": {
-            f"{chart.camera}, {chart.scene}": [
-                {"method": m.configuration.label, "seconds": m.seconds, "psnr_db": m.psnr_db}
-                for m in chart.front()
-            ]
-            for chart in outcome.charts
-        },
-        "left_out": outcome.left_out,
-        "settings": settings.model_dump(mode="json"),
-    }
-    write_metrics(new, metrics)
-
-
-def _row(point: Point, result: dict) -> dict[str, object]:
-    """Return a point as a row of chart.csv."""
-    configuration = point.configuration
-    return {
-        **result,
-        "scene": point.capture.scene_name,
-        "camera": point.capture.camera_name,
-        "method": configuration.method,
-        "level": configuration.level,
-        "settings": configuration.settings.model_dump_json(exclude_defaults=True),
-    }
-
-
-def _load(results: Sequence[dict]) -> str:
-    """Return how busy the machine was, in words."""
-    loads = sorted(result["load"] for result in results if "failed" not in result)
-    if not loads:
-        return "not measured"
-    return f"{loads[0]:.1f} to {loads[-1]:.1f}, median {loads[len(loads) // 2]:.1f}"
-
-
-def _about(study: ChartStudy, load: str, left_out: Sequence[str]) -> list[str]:
-    settings = study.settings
-    done = [result for result in study.results.values() if "failed" not in result]
-    busy = any(result["load"] > available_cores() + 0.5 for result in done)
-    return [
-        f"{len(done)} points on {', '.join(Path(s).stem for s in settings.scenes)}, through "
-        f"{', '.join(Path(c).stem for c in settings.cameras)}.",
-        f"{machine()}; load average while measuring {load}. "
-        + (
-            "The machine was busy: seconds are too long, CPU seconds less so."
-            if busy
-            else "The machine was quiet."
-        ),
-        *([f"Excluded: {'; '.join(left_out)}."] if left_out else []),
-    ]

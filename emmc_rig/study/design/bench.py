@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import yaml
 from pydantic import Field, model_validator
 
 from emmc_rig.errors import AppError
@@ -34,7 +33,7 @@ class Maker(Settings):
 
 
 class DesignBench(Settings):
-    """The bench: what is mounted, what can be, and what is to be seen.
+    """The bench: parts that are mounted, masks that fit, and the scene to see.
 
     cells_um: sides to try (default: from the smallest printable to three times that).
     size: of the pictures, samples; the mask file covers them at every shot.
@@ -120,8 +119,3 @@ def load_bench(path: Path | None) -> DesignBench:
     if path is None:
         return DesignBench()
     return validated(DesignBench, read_yaml(path, AppError), str(path), AppError)
-
-
-def bench_text(bench: DesignBench) -> str:
-    """Return a bench as YAML."""
-    return yaml.safe_dump(bench.model_dump(mode="json"), sort_keys=False, default_flow_style=None)

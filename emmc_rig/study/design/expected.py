@@ -18,8 +18,8 @@ Where surfaces meet, or a disparity is not known, rays are the sum of two textur
 the variance, at disparities d and e. The posterior mean of both, (T, T'), errs by
 P = K - K A' S^-1 A K with K = diag(C, C) / 2, A = (A_d, A_e) and S = A K A' + N in each opponent
 colour (Kay 1993, Estimation Theory, theorem 10.2), and the rays by trace(W P) / n^2, W the mean
-over views of the shifts' products. At d = e it is the error of one texture whose disparity is
-known. How well two are told apart separates cameras better: benchmarks/design_check.py measures it.
+over views of the shifts' products. At d = e this is the error of a single texture with a known
+disparity. Errors of two textures separate cameras better, as benchmarks/design_check.py measures.
 
 What rays hold that no texture on a plane explains (gloss, what is hidden) enters as a share `apart`
 of the texture's variance, white over rays: it disturbs the readings and is not recovered.

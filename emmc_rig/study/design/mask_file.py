@@ -79,7 +79,7 @@ def can_write_gdsii() -> bool:
 
 
 def write_gdsii(cells: NDArray[np.uint8], cell_um: float, path: Path) -> None:
-    """Write cells as GDSII; cells of one filter that touch in a row are one rectangle."""
+    """Write cells as GDSII; a run of equal filters in a row becomes a rectangle."""
     import gdstk
 
     library = gdstk.Library("emmc-rig", unit=1e-6, precision=1e-9)

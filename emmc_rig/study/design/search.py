@@ -37,7 +37,7 @@ AS_DESIGNED = Print()
 
 @dataclass(frozen=True)
 class Candidate:
-    """One mask. step_cells: (x, y) by which it moves from shot to shot, (0, 0) for one shot."""
+    """One mask. step_cells: (x, y), its motion from shot to shot; (0, 0) for one shot."""
 
     family: Family
     open_share: float
@@ -152,7 +152,7 @@ class Search:
 
 
 def search(bench: DesignBench, watcher: Watcher) -> Search:
-    """Return what was tried and what holds; raises AppError where nothing can be chosen."""
+    """Return the masks tried and the finalists; raises AppError where no mask can be chosen."""
     every = candidates(bench)
     watcher.begin("expected error of each mask, by theory", None)
     tried: dict[Candidate, Expected] = {}

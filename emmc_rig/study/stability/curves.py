@@ -1,4 +1,4 @@
-"""Measured points as curves, one per fault and method; where each of them breaks.
+"""Measured points as curves, one per fault and method; their breaking points and drawings.
 
 A place on a sweep is an index into its strengths, with a fraction between two of them.
 """
@@ -8,13 +8,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
+from emmc_rig.report.drawing import FAINT, INK, legend_below, save_drawing, sheet, titled
 from emmc_rig.study.stability.fault import Fault
 from emmc_rig.study.stability.faults import FAULTS, Point
 
 LOST_DB = 3.0
+PANEL_INCHES, PANELS_IN_ROW = (3.9, 2.75), 3
+FLOOR_DB = 6.0
+"""Below the least of the baseline: further down, a curve says nothing more."""
 POOLED = "all scenes"
 Levels = Sequence[float | None]
 """PSNR in dB by strength; None where a method failed."""
@@ -120,7 +128,7 @@ def curves(results: Mapping[Point, dict]) -> list[Curve]:
 def _curve(
     name: str, scenes: Sequence[str], fault: str, method: str, results: Mapping[Point, dict]
 ) -> Curve | None:
-    """Return one curve; of several scenes those that have every strength that any has."""
+    """Return one curve, averaged over the scenes with the most strengths measured."""
     by_scene = {
         scene: {
             point.strength: point
@@ -176,3 +184,74 @@ def break_row(curve: Curve) -> dict[str, object]:
         row[f"{name}_to"] = None if place is None else strength_at(curve.strengths, place)
         row[name] = place_words(place, curve.strengths)
     return row
+
+
+def draw_curves(curves: Sequence[Curve], colours: dict[str, str], path: Path) -> Path:
+    """Write a panel for each fault of some curves as SVG; return its path."""
+    faults = list(dict.fromkeys(curve.fault.name for curve in curves))
+    panels = [[curve for curve in curves if curve.fault.name == name] for name in faults]
+    figure, axes = sheet(len(panels), *PANEL_INCHES, columns=min(PANELS_IN_ROW, len(panels)))
+    for panel_axes, some in zip(axes, panels, strict=True):
+        _panel(panel_axes, some, colours)
+    _legend(figure, curves, colours)
+    return save_drawing(figure, path)
+
+
+def _panel(axes: Axes, curves: Sequence[Curve], colours: dict[str, str]) -> None:
+    fault, strengths = curves[0].fault, curves[0].strengths
+    views = next((c.views for c in curves if None not in c.views), curves[0].views)
+    axes.plot(*_known(views), ":", color=FAINT, linewidth=1.2, zorder=1)
+    floor = _limit(axes, curves)
+    for curve in curves:
+        colour = colours[curve.method]
+        places, levels = _known(curve.levels)
+        axes.plot(places, levels, "-o", color=colour, linewidth=1.5, markersize=3.6, zorder=2)
+        place = curve.below_best()
+        if place is not None and levels:
+            level = max(float(np.interp(place, places, levels)), floor)
+            axes.plot(
+                place, level, "x", color=colour, markersize=9, markeredgewidth=1.4, zorder=4,
+                clip_on=False,
+            )  # fmt: skip
+    axes.set_xticks(range(len(strengths)), [_tick(strength) for strength in strengths])
+    axes.set_xlim(-0.25, len(strengths) - 0.75)
+    axes.tick_params(labelsize=7.5)
+    titled(axes, fault.title, fault.unit)
+
+
+def _known(levels: Levels) -> tuple[list[int], list[float]]:
+    """Return places and levels where there are such."""
+    pairs = [(i, level) for i, level in enumerate(levels) if level is not None]
+    return [i for i, _ in pairs], [level for _, level in pairs]
+
+
+def _limit(axes: Axes, curves: Sequence[Curve]) -> float:
+    """End the axis a little below the baseline, where lower values add nothing; return where."""
+    views = [view for curve in curves for view in curve.views if view is not None]
+    levels = [level for curve in curves for level in curve.levels if level is not None]
+    if not levels:
+        return -math.inf
+    views = views or levels
+    low = max(min(levels), min(min(views), max(levels) - LOST_DB) - FLOOR_DB)
+    high = max(*levels, *views)
+    bottom = low - 0.06 * (high - low)
+    axes.set_ylim(bottom, high + 0.08 * (high - low))
+    return bottom
+
+
+def _tick(strength: float) -> str:
+    """Return a strength for a tick: short."""
+    if strength >= 1000:
+        return f"{strength / 1000:g}k"
+    return f"{strength:.3g}"
+
+
+def _legend(figure: Figure, curves: Sequence[Curve], colours: dict[str, str]) -> None:
+    methods = dict.fromkeys(curve.method for curve in curves)
+    lines = [Line2D([], [], color=colours[name], marker="o", markersize=4) for name in methods]
+    names = list(methods)
+    lines.append(Line2D([], [], color=INK, linestyle="", marker="x"))
+    names.append(f"{LOST_DB:g} dB below its best")
+    lines.append(Line2D([], [], color=FAINT, linestyle=":"))
+    names.append("baseline: true centre view in all places")
+    legend_below(figure, lines, names, 5)

@@ -1,4 +1,4 @@
-"""One way to fail: what a fault is, and its kinds."""
+"""The class of faults, and the names of their kinds."""
 
 from __future__ import annotations
 

@@ -6,12 +6,15 @@ from dataclasses import dataclass, replace
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import nearest_of
-from emmc_rig.study.stability import mask_faults, scene_faults, sensor_faults, shot_faults
+from emmc_rig.study.stability import mask_faults, scene_faults, sensor_faults
 from emmc_rig.study.stability.fault import Fault
 from emmc_rig.study.trial import Capture, Trial, trial_of, with_shots
 
-KINDS = (sensor_faults, mask_faults, shot_faults, scene_faults)
-FAULTS = {fault.name: fault for module in KINDS for fault in module.FAULTS}
+FAULTS = {
+    fault.name: fault
+    for module in (sensor_faults, mask_faults, scene_faults)
+    for fault in module.FAULTS
+}
 
 
 def find_fault(name: str) -> Fault:
@@ -50,7 +53,7 @@ class Point:
 
     @property
     def same_trial(self) -> Point:
-        """What all points of one trial have in common; a strength 0 is no fault."""
+        """The point without its method, equal for all points of a trial; strength 0 is no fault."""
         if self.fault and self.strength == 0:
             return Point(enough_shots(self.capture, FAULTS[self.fault]), None, 0.0)
         return replace(self, method="")

@@ -141,8 +141,8 @@ def chosen_parts(only: str | None) -> tuple[Part, ...]:
 def scenes_of(part: Part, scenes: Sequence[str]) -> list[str]:
     """Return which of the given scenes a part is about, in the paper's order.
 
-    The paper's synthetic scenes or the rest; either kind stands in for the other where it is
-    missing.
+    A part is about the paper's synthetic scenes, or about the rest. Where scenes of that kind are
+    missing, all scenes are returned.
     """
     synthetic = [scene for scene in scenes if paper.known_as(scene) in paper.SYNTHETIC]
     other = [scene for scene in scenes if scene not in synthetic]

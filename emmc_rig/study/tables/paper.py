@@ -38,7 +38,7 @@ class Printed(NamedTuple):
     method: str
 
 
-# Scene, then Dict-ADMM and TV-Dict of (i), of (ii) and of (iii) with three shots.
+# Columns: scene; Dict-ADMM and TV-Dict of (i), of (ii), and of (iii) with three shots.
 _TABLE_2_NOISE_FREE = """
 dragons        29.46 30.22  27.62 27.98  30.01 30.52
 dice           28.67 28.93  25.74 25.78  28.92 29.29
@@ -51,7 +51,7 @@ dice           26.75 27.02  25.42 25.54  25.05 25.33
 fish           27.07 27.47  25.07 25.20  26.18 26.42
 messerschmitt  29.98 30.67  29.64 29.75  28.46 29.21
 """
-# Scene, then (i), (ii) with one to three shots, (iii) with one to three.
+# Columns: scene; (i); (ii) with 1 to 3 shots; (iii) with 1 to 3 shots.
 _TABLE_3_DICT_ADMM = """
 seahorse   34.57  29.88 33.67 34.79  28.98 33.62 35.36
 rock       34.35  27.30 33.28 34.58  25.91 33.23 35.38
@@ -70,8 +70,8 @@ whiterose  34.54  28.23 33.29 34.71  27.42 33.29 35.54
 tulip      44.52  40.83 43.03 44.47  37.71 43.91 45.61
 buttercup  33.60  29.64 32.67 33.76  28.06 32.37 34.28
 """
-# Scene, then (i) with 3, 6, 9, 12 shots, (ii) with one to four, (iii) with one to four. The last
-# of Seahorse by Dict-ADMM is cut off in the copy that these numbers were read from.
+# Columns: scene; (i) with 3, 6, 9, 12 shots; (ii) with 1 to 4 shots; (iii) with 1 to 4 shots. The
+# last number of Seahorse by Dict-ADMM is cut off in the copy at hand.
 _TABLE_4_DICT_ADMM = """
 seahorse   29.14 32.73 34.51 35.62  26.41 29.17 30.67 31.70  26.00 29.11 30.79 -
 rock       26.38 31.98 34.21 35.53  23.19 26.91 29.23 30.81  22.88 26.73 29.30 30.93

@@ -1,4 +1,6 @@
-"""The scenes of the tables, the dictionary, which must not have seen them, and the cells' figures.
+"""`emmc-rig tables`: the paper's tables on given scenes, with figures of every cell.
+
+A dictionary that was trained on one of the scenes is refused.
 
 Frames are made with the Psi that reconstructs them, as the paper does: an inverse crime, which
 `emmc-rig demo` avoids.
@@ -7,9 +9,10 @@ Frames are made with the Psi that reconstructs them, as the paper does: an inver
 from __future__ import annotations
 
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +21,6 @@ from pydantic import Field
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.settings import Settings
-from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction import methods as solvers
 from emmc_rig.reconstruction.bpdn import BPDNSettings
 from emmc_rig.reconstruction.dictionary import Dictionary
@@ -26,14 +28,16 @@ from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.reconstruction.sparse import PatchEstimates, SparseSettings, estimate_patches
 from emmc_rig.reconstruction.tv import TVSettings
+from emmc_rig.report.page import Head, Section, number, part
 from emmc_rig.simulators.scenes import STILL_SCENES
-from emmc_rig.study.points import Results, Study
+from emmc_rig.study.points import Report, Results, Study, Table
 from emmc_rig.study.rows import SMALLEST_PX, dictionary_identity
 from emmc_rig.study.scores import scored
 from emmc_rig.study.tables import paper
-from emmc_rig.study.tables.cells import Cell, Part, Setup, cells_of
+from emmc_rig.study.tables.cells import METHODS, Cell, Part, Setup, cells_of, scenes_of
 from emmc_rig.study.trial import Capture, Trial, open_dictionary_once, trial_of
 
+CSV = "tables.csv"
 Size = tuple[int, int] | None
 VIEWS = (5, 5)
 _ENDINGS = (".h5", ".hdf5")
@@ -158,7 +162,10 @@ def _trained_on(dictionary: Dictionary) -> list[str] | None:
 
 @dataclass
 class TablesStudy(Study[Cell]):
-    """The cells of some tables; settings: TablesSettings. scenes: see `scene_specs`."""
+    """The paper's tables, ours beside the paper's; settings: TablesSettings.
+
+    parts: tables and parts of tables. scenes: see `scene_specs`.
+    """
 
     parts: tuple[Part, ...]
     scenes: dict[str, str]
@@ -166,6 +173,19 @@ class TablesStudy(Study[Cell]):
     noun = "cells"
     stage = "reconstruct"
     revision = 2
+    command, title, page = "tables", "The paper's tables, reproduced", "tables.html"
+    caveats = (
+        "The paper's figures are for orientation: its aperture variant of the MIT scenes and its "
+        "distance from mask to sensor are unknown. Compare methods and scenarios within one run.",
+        "The paper's means are over all of its scenes, whether they are measured here or not.",
+    )
+    columns: ClassVar[Mapping[str, Sequence[str]]] = {
+        CSV: (
+            "tables", "scene", "scenario", "shots", "r", "noise", "method", "psnr_db",
+            "paper_psnr_db", "ssim", "angular_db", "replicate_psnr_db", "noise_sigma", "rows",
+            "columns", "seconds", "steps", "status", "advice", "dictionary", "settings",
+        )
+    }  # fmt: skip
 
     @property
     def cells(self) -> list[Cell]:
@@ -182,8 +202,8 @@ class TablesStudy(Study[Cell]):
         )
         return opened
 
-    def measure(self, watcher: Watcher) -> dict[Cell, dict]:
-        """Return the results of all cells; raises as `run` does, and for wrong input before it."""
+    def planned(self) -> list[Cell]:
+        """Return the cells; raises AppError for a dictionary or a scene that does not fit."""
         for binning in {cell.setup.binning for cell in self.cells}:
             self.dictionary(binning)
         for cell in {cell.scene: cell for cell in self.cells}.values():
@@ -193,7 +213,7 @@ class TablesStudy(Study[Cell]):
                     f"{cell.scene}: {rows}x{columns} pixels, needs {SMALLEST_PX}x{SMALLEST_PX} or "
                     "more; leave the scene out"
                 )
-        return self.run(self.cells, watcher)
+        return self.cells
 
     def capture(self, cell: Cell) -> Capture:
         """Return the capture of a cell, of the whole scene."""
@@ -256,3 +276,120 @@ class TablesStudy(Study[Cell]):
                 "status": result.status,
                 "advice": result.advice,
             }
+
+    @property
+    def grids(self) -> list[Table]:
+        """The measured tables, as the page shows them."""
+        return [grid_of(part, self.results, list(self.scenes)) for part in self.parts]
+
+    def shown(self) -> Iterable[Table | str]:
+        """Return the tables for a terminal; ours above the paper's, as the widest would not fit."""
+        for grid in self.grids:
+            rows = [[cell.replace(" | ", "\n") for cell in row] for row in grid.rows]
+            yield grid._replace(rows=rows)
+        yield "PSNR in dB, the paper's below; compare figures within one run only"
+
+    def report(self, new: Path) -> Report:
+        """Return the content of the files; raises AppError where nothing could be measured."""
+        grids, cut = self.grids, self.settings.size
+        size = "whole views" if cut is None else f"the middle {cut[0]}×{cut[1]} pixels"
+        lead = part("lead", "PSNR in dB, the paper's after the bar.")
+        return Report(
+            _head(self.results),
+            [
+                f"{len(self.results)} reconstructions of {', '.join(self.scenes)}; {size}, "
+                "5×5 views, PSNR with peak 1 over all views, pixels and colours.",
+                "Equal total exposure for every setup; frames are made with the Psi that "
+                "reconstructs them, as in the paper.",
+            ],
+            [
+                Section(
+                    f"table-{index}",
+                    grid.title,
+                    lead + part("wide_table", grid.heads, grid.rows),
+                    grid.title.partition(":")[0],
+                )
+                for index, grid in enumerate(grids)
+            ],
+            {CSV: self._rows()},
+            {
+                "cells": len(self.results),
+                "seconds": self.seconds,
+                "scenes": self.scenes,
+                "tables": {grid.title: [grid.heads, *grid.rows] for grid in grids},
+                "settings": self.settings.model_dump(mode="json"),
+            },
+            {f"Scene {name}": spec for name, spec in self.scenes.items()},
+        )
+
+    def _rows(self) -> list[dict[str, object]]:
+        """Return the rows of tables.csv: one row per cell, in the order of the tables."""
+        names: dict[Cell, list[str]] = {}
+        for table in self.parts:
+            for cell in cells_of(table, list(self.scenes)):
+                names.setdefault(cell, []).append(table.name)
+        return [
+            {
+                **self.results[cell],
+                "scenario": cell.setup.scenario,
+                "shots": cell.setup.shots,
+                "r": f"1/{cell.setup.binning**2}" if cell.setup.binning > 1 else "1",
+                "noise": "yes" if cell.setup.noisy else "no",
+                "scene": cell.scene,
+                "method": cell.method,
+                "paper_psnr_db": cell.paper_psnr_db,
+                "tables": " ".join(names[cell]),
+                "dictionary": self.inputs(cell)["dictionary"],
+                "settings": self.settings.of(cell.setup).model_dump_json(exclude_defaults=True),
+            }
+            for cell in names
+            if cell in self.results
+        ]
+
+
+def grid_of(table: Part, results: Mapping[Cell, Mapping], scenes: Sequence[str]) -> Table:
+    """Return scenes by all methods, then means; a dash stands for what was not measured.
+
+    Cells are our PSNR in dB and the paper's, where it prints any, as "30.12 | 30.22".
+    """
+
+    def cell(setup: Setup, method: str, ours: Sequence[str], theirs: Sequence[str]) -> str:
+        """Return our mean over some scenes, and the paper's over others."""
+        cells = [Cell(scene, setup, method) for scene in ours]
+        measured = [results[cell]["psnr_db"] for cell in cells if cell in results]
+        printed = [Cell(scene, setup, method).paper_psnr_db for scene in theirs]
+        return _mean(measured) + (f" | {_mean(printed)}" if any(printed) else "")
+
+    shown, printed = scenes_of(table, scenes), scenes_of(table, list(paper.TITLES))
+    groups = [(scene, [scene], [scene]) for scene in shown] + [("mean", shown, printed)]
+    rows = [
+        (f"{name}, {title}", *(cell(setup, method, ours, theirs) for setup in table.setups))
+        for name, ours, theirs in groups
+        for method, title in METHODS.items()
+    ]
+    return Table(table.title, ("scene, method", *table.columns), rows)
+
+
+def _mean(levels: Sequence[float | None]) -> str:
+    known = [level for level in levels if level is not None]
+    return number(float(np.mean(known)) if known else None, ".2f")
+
+
+def _head(results: Mapping[Cell, Mapping]) -> Head:
+    """Return the method that is best in the mean over what all methods reconstructed."""
+    by_method: dict[str, list[float]] = {}
+    for cell, result in results.items():
+        if result["psnr_db"] is not None:
+            by_method.setdefault(cell.method, []).append(result["psnr_db"])
+    if not by_method:
+        raise AppError("nothing could be measured: no PSNR is finite")
+    means = {METHODS[name]: float(np.mean(levels)) for name, levels in by_method.items()}
+    best = max(means, key=lambda name: means[name])
+    return Head(
+        f"{best} is best in the mean",
+        ", ".join(f"{name} {db:.2f} dB" for name, db in means.items()),
+        [
+            "compare methods within a column, and scenarios within a row",
+            "measure on light fields of your own: `emmc-rig tables --scenes FOLDER`",
+        ],
+    )
