@@ -10,10 +10,9 @@ colour free. `locate` does all of it for a frame without a reference.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,7 +32,7 @@ LEAST_CORRELATION = 0.3
 """Of frame and shadow, below which the mask is not the design's."""
 CLEAR_CORRELATION = 0.6
 """Ends the search over rotations; a mirrored mask is named from this correlation on."""
-ROTATIONS_DEG = (0.5, -0.5, 1.0, -1.0, 1.5, -1.5, 2.0, -2.0)
+ROTATIONS_DEG = (0.0, 0.5, -0.5, 1.0, -1.0, 1.5, -1.5, 2.0, -2.0)
 """A quarter of a degree moves the rim of CROP_PX by a third of a pixel."""
 ORIENTATIONS = {
     "mirrored left to right": lambda cells: cells[:, :, ::-1],
@@ -44,10 +43,6 @@ ORIENTATIONS = {
     "mirrored and turned by 90 degrees": lambda cells: cells.transpose(0, 2, 1, 3),
     "mirrored and turned by 270 degrees": lambda cells: cells.transpose(0, 2, 1, 3)[:, ::-1, ::-1],
 }
-NOISE_QUANTILE = 0.9
-"""Of the gradients, the strongest tenth: edges of cells, hardly noise."""
-LEAST_STRAIGHTNESS = 0.3
-"""Of edges, from which on their direction says how the mask is turned."""
 LEVEL_CELLS = 8.0
 """Light varies more slowly than this over the picture, the mask faster."""
 LEAST_LEVEL = 0.05
@@ -149,44 +144,13 @@ def over_local_level(
     return reading, np.where(bright, np.float32(1), np.float32(np.inf))
 
 
-def edge_direction(plane: Array) -> tuple[float, float]:
-    """Return rotation in degrees and straightness (0 to 1) of the edges in a picture (y, x).
-
-    The mean of (g_x + i g_y)^4 over the strongest gradients g: the fourth power makes the four
-    directions of a square grid one (the structure tensor's idea, for four-fold symmetry).
-    """
-    smooth = cv2.GaussianBlur(plane, (0, 0), 1.0)
-    along_x = cv2.Scharr(smooth, cv2.CV_32F, 1, 0)[1:-1, 1:-1].ravel()
-    along_y = cv2.Scharr(smooth, cv2.CV_32F, 0, 1)[1:-1, 1:-1].ravel()
-    strength = np.hypot(along_x, along_y)
-    if not strength.size or not strength.max() > 0:
-        return 0.0, 0.0
-    strong = strength >= np.quantile(strength, NOISE_QUANTILE)
-    unit = (along_x[strong] + 1j * along_y[strong]) / strength[strong]
-    mean = np.average(unit**4, weights=strength[strong].astype(np.float64) ** 2)
-    # Rows count downwards: a positive angle from x to y looks clockwise.
-    return float(-np.degrees(np.angle(mean)) / 4), float(np.abs(mean))
-
-
-def _rotations_deg(board: Board) -> Iterator[float]:
-    """Yield rotations to try: none, that of the picture's edges, and a grid around none."""
-    yield 0.0
-    plane = np.where(board.usable, board.reading, board.reading[board.usable].mean())
-    if (board.channels != board.channels[0, 0]).any():
-        plane = cv2.blur(plane, (2, 2))
-    angle_deg, straightness = edge_direction(plane.astype(np.float32))
-    if straightness > LEAST_STRAIGHTNESS:
-        yield -angle_deg
-    yield from ROTATIONS_DEG
-
-
 def register(board: Board, mask: ShadowMask, start: Placement) -> Location:
     """Return the start, with the offset (and the rotation, if need be) found in a whiteboard.
 
     Raises CalibrationError with the correlation found when the design's shadow is not there.
     """
     best = Location(start, -1.0)
-    for turn in _rotations_deg(board):
+    for turn in ROTATIONS_DEG:
         turned = replace(start, rotation_rad=start.rotation_rad + np.deg2rad(turn))
         best = max(best, search(board, mask, turned), key=lambda found: found.correlation)
         if best.correlation >= CLEAR_CORRELATION:

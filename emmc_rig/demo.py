@@ -32,8 +32,7 @@ from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find
 from emmc_rig.reconstruction.result import Progress, Reconstruction
 from emmc_rig.reconstruction.verdict.rules import Verdict
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
-from emmc_rig.session.board_sets import whiteboards
-from emmc_rig.session.frame_means import decoded
+from emmc_rig.session.board_sets import decoded, whiteboards
 from emmc_rig.session.measured_psi import scale_of
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.readings import shot_frames, shot_readings

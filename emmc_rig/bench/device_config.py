@@ -3,24 +3,67 @@
 A stage is `PROTOCOL:PORT`; single settings may follow,
 `zaber:/dev/ttyUSB0,microstep_um=0.49609375`; its file wires names to axes. A camera is
 `DRIVER:ADDRESS`.
+
+Another package brings stages and cameras by entry point, see `docs/plugins.md`: it names a factory
+in the group `emmc_rig.stages` or `emmc_rig.cameras`, whose name then goes wherever ours do.
+
+    stage factory(address, settings: StageSettings, clock: Clock, **options) -> drivers.stage.Stage
+    camera factory(address, clock: Clock, **options) -> drivers.camera.Camera
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import Field, TypeAdapter, ValidationError, create_model
 
-from emmc_rig.bench.plugins import STAGES, plug_ins
 from emmc_rig.drivers.apt import ACTUATORS
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.stage import StageSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import shown_path
-from emmc_rig.model.reading import parse_yaml, read_yaml
+from emmc_rig.model.reading import one_line, parse_yaml, read_yaml
 from emmc_rig.model.settings import Settings, explain
+
+STAGE_PLUG_INS, CAMERA_PLUG_INS = "emmc_rig.stages", "emmc_rig.cameras"
+
+
+def plug_ins(group: str) -> set[str]:
+    """Return the names of a group's plug-ins."""
+    return set(entry_points(group=group).names)
+
+
+def open_plug_in(group: str, name: str, *arguments: object, **options: Any) -> Any:
+    """Return the device that a plug-in's factory opens; it must be closed.
+
+    Raises AppError with one line for a plug-in that cannot be loaded, does not take the options,
+    or fails, and for a name that two packages use; a `DriverError` of its own passes.
+    """
+    entry, *others = entry_points(group=group, name=name)
+    if others:
+        packages = " and ".join(map(_package, (entry, *others)))
+        raise AppError(f"plug-in {name} is in {packages}: uninstall all but one")
+    package = f"plug-in {name} ({_package(entry)})"
+    try:
+        factory = entry.load()
+    except (ImportError, AttributeError) as fault:
+        raise AppError(f"{package} cannot be loaded: {fault}") from fault
+    try:
+        return factory(*arguments, **options)
+    except (DriverError, AppError):
+        raise
+    except Exception as fault:
+        text = one_line(fault) or type(fault).__name__
+        raise AppError(f"{package} could not open its device: {text}") from fault
+
+
+def _package(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -123,7 +166,7 @@ PROTOCOLS: Mapping[str, type[SerialConfig]] = {
 def stage_protocols() -> dict[str, type[StageConfig]]:
     """Return every protocol that `--stage` takes; a plug-in replaces none of ours."""
     known: dict[str, type[StageConfig]] = {**PROTOCOLS, "mm": MicroManagerConfig}
-    return known | dict.fromkeys(sorted(plug_ins(STAGES) - known.keys()), PluginConfig)
+    return known | dict.fromkeys(sorted(plug_ins(STAGE_PLUG_INS) - known.keys()), PluginConfig)
 
 
 def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageConfig:

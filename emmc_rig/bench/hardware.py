@@ -17,8 +17,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.bench import plugins
 from emmc_rig.bench.device_config import (
+    CAMERA_PLUG_INS,
+    STAGE_PLUG_INS,
     AptConfig,
     CameraChoice,
     GrblConfig,
@@ -26,14 +27,15 @@ from emmc_rig.bench.device_config import (
     PluginConfig,
     SerialConfig,
     ZaberConfig,
+    open_plug_in,
     parse_camera,
     parse_stage,
+    plug_ins,
     settings_of,
     stage_of,
 )
 from emmc_rig.bench.environment import Source
 from emmc_rig.bench.hands import Attendant
-from emmc_rig.bench.plugins import STAGES, open_plug_in, plug_ins
 from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage
 from emmc_rig.drivers.apt import identify as identify_apt
 from emmc_rig.drivers.camera import Camera as CameraDevice
@@ -369,7 +371,7 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
     if isinstance(config, PluginConfig):
         care = config.stage_settings()
         return open_plug_in(
-            STAGES, config.protocol, config.port, care, SYSTEM_CLOCK, **config.options
+            STAGE_PLUG_INS, config.protocol, config.port, care, SYSTEM_CLOCK, **config.options
         )
     if isinstance(config, MicroManagerConfig):
         from emmc_rig.drivers.micromanager import MicroManagerStage, StageSetup, load_core
@@ -515,16 +517,16 @@ def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> 
     if choice.driver in CAMERAS:
         driver = CAMERAS[choice.driver].load()
         return driver.open_camera(choice.address, clock, backend, *_options(choice, driver))
-    others = plug_ins(plugins.CAMERAS)
+    others = plug_ins(CAMERA_PLUG_INS)
     if choice.driver not in others:
         known = ", ".join((CAMERA_HELP, SIMULATED, *(f"{name}:" for name in sorted(others))))
         raise AppError(f"{choice.source}: no such camera driver; use {known}")
-    return open_plug_in(plugins.CAMERAS, choice.driver, choice.address, clock, **choice.options)
+    return open_plug_in(CAMERA_PLUG_INS, choice.driver, choice.address, clock, **choice.options)
 
 
 def camera_drivers() -> set[str]:
     """Return every driver that `--camera` takes; a plug-in replaces none of ours."""
-    return {*CAMERAS, SIMULATED, *plug_ins(plugins.CAMERAS)}
+    return {*CAMERAS, SIMULATED, *plug_ins(CAMERA_PLUG_INS)}
 
 
 def _options(choice: CameraChoice, driver: Any) -> tuple[Any, ...]:

@@ -27,7 +27,7 @@ from types import ModuleType
 from typing import Any
 
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.captures.retries import GaveUpError
+from emmc_rig.captures.faults import GaveUpError
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import one_line
 from emmc_rig.session.planned import PlannedFrame

@@ -22,7 +22,7 @@ from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import Location, frame_board, locate, starting_placement
 from emmc_rig.calibration.openings import views_open
 from emmc_rig.calibration.shadow import SEARCH_UM, ShadowMask, shadow_mask
-from emmc_rig.captures.checks import FrameRefusedError
+from emmc_rig.captures.faults import FrameRefusedError
 from emmc_rig.captures.plan import Plan
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError

@@ -14,11 +14,10 @@ from itertools import count
 from typing import Any, NamedTuple
 
 from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
-from emmc_rig.captures.checks import FrameRefusedError
+from emmc_rig.captures.faults import FrameRefusedError, Mending
 from emmc_rig.captures.focus import FocusFound, focused, sharpness
 from emmc_rig.captures.metering import METERABLE_LEVELS, METERING_TRIES
 from emmc_rig.captures.plan import Plan
-from emmc_rig.captures.retries import Mending
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.drivers.stage import Stage, StageIdentity

@@ -19,9 +19,9 @@ from emmc_rig.bench.hardware import FOCUS, Rig
 from emmc_rig.bench.registration import Shift, registered
 from emmc_rig.captures.between import Between, HookError, plain
 from emmc_rig.captures.by_hand import places_in_session
-from emmc_rig.captures.checks import check
 from emmc_rig.captures.control import Control
 from emmc_rig.captures.devices import Devices, Spans
+from emmc_rig.captures.faults import check
 from emmc_rig.captures.focus import FocusFound
 from emmc_rig.captures.metering import Exposures
 from emmc_rig.captures.plan import Plan

@@ -33,7 +33,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from emmc_rig.progress import Event, Watcher
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.brightness import exposure_reasons, shot_exposures
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 

@@ -14,8 +14,8 @@ import numpy as np
 from emmc_rig.calibration.openings import CENTRED, views_open, window_place_um
 from emmc_rig.calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.captures.metering import BRACKET_STEP, MOST_STEPS
-from emmc_rig.captures.order import spread
 from emmc_rig.captures.plan import AUTO, METERING_EXPOSURE_S, Boards, Plan
+from emmc_rig.captures.schedule import spread
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid

@@ -18,12 +18,12 @@ from threading import Event
 from typing import Any, NamedTuple, Self
 
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.captures.checks import check, is_same
 from emmc_rig.captures.control import Control
 from emmc_rig.captures.engine import Engine, Facts
-from emmc_rig.captures.estimate import pace_of
+from emmc_rig.captures.faults import check, is_same
 from emmc_rig.captures.plan import Plan
 from emmc_rig.captures.recorder import Recorder
+from emmc_rig.captures.schedule import pace_of
 from emmc_rig.drivers.camera import Camera as CameraDevice
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import CaptureError

@@ -19,18 +19,16 @@ from emmc_rig.bench.rig_config import rig as choose_rig
 from emmc_rig.captures.amend import amendment
 from emmc_rig.captures.between import load_hook
 from emmc_rig.captures.by_hand import with_hands
-from emmc_rig.captures.checks import refuse_impossible
 from emmc_rig.captures.control import Control, interruptible
 from emmc_rig.captures.devices import identity_of
-from emmc_rig.captures.estimate import Estimate, pace_of
 from emmc_rig.captures.events import Listener, OnEvent, RunEnd, emit_end
 from emmc_rig.captures.expand import expand
+from emmc_rig.captures.faults import GaveUpError, refuse_impossible
 from emmc_rig.captures.film import refuse_impossible_film
 from emmc_rig.captures.metering import Exposures
-from emmc_rig.captures.order import ordered
 from emmc_rig.captures.plan import Plan, load_plan, planned_camera
 from emmc_rig.captures.replay import missing_words, replaying, there
-from emmc_rig.captures.retries import GaveUpError
+from emmc_rig.captures.schedule import Estimate, ordered, pace_of
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.captures.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.drivers.folder import FolderCamera, Recorded

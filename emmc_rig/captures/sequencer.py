@@ -20,16 +20,15 @@ from emmc_rig.bench.hardware import Rig
 from emmc_rig.bench.registration import LEAST_LIKENESS
 from emmc_rig.captures.between import Between
 from emmc_rig.captures.by_hand import WrongPlaceError
-from emmc_rig.captures.checks import refuse_impossible
 from emmc_rig.captures.control import Control, uninterrupted
 from emmc_rig.captures.engine import Engine, Facts
-from emmc_rig.captures.estimate import pace_of
 from emmc_rig.captures.events import RunEnd
+from emmc_rig.captures.faults import Budget, mending, refuse_impossible
 from emmc_rig.captures.film import FilmRun
 from emmc_rig.captures.metering import Exposures
 from emmc_rig.captures.plan import Plan
 from emmc_rig.captures.recorder import Recorder
-from emmc_rig.captures.retries import Budget, mending
+from emmc_rig.captures.schedule import pace_of
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError, StopCapture

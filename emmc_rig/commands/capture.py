@@ -29,8 +29,8 @@ from emmc_rig.progress import Event, Watcher
 
 if TYPE_CHECKING:
     from emmc_rig.captures.control import Control
-    from emmc_rig.captures.estimate import Estimate
     from emmc_rig.captures.events import RunEnd
+    from emmc_rig.captures.schedule import Estimate
     from emmc_rig.commands.capture_display import CaptureDisplay
     from emmc_rig.session.session import Session
 
@@ -226,7 +226,7 @@ def _estimate_words(expected: Estimate, most: str) -> str:
 
 def _say_complete(session: Session, outcome: RunEnd) -> None:
     """Print the counts of frames, reasons against the exposures, and the path of the page."""
-    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+    from emmc_rig.session.brightness import exposure_reasons, shot_exposures
     from emmc_rig.session.journal import ended
     from emmc_rig.session.session import REPORT
     from emmc_rig.store.results import shown_seconds

@@ -30,7 +30,7 @@ def list_sessions(
     from rich.table import Column
 
     from emmc_rig.errors import AppError
-    from emmc_rig.session.listing import sessions_in
+    from emmc_rig.session.verify import sessions_in
     from emmc_rig.store.results import shown_bytes
 
     with shown_progress("read sessions") as progress:
@@ -61,11 +61,10 @@ def list_sessions(
 def show(session: Folder) -> None:
     """Show a session's frames, plan and events, without reading the frames."""
     from emmc_rig.report.session_sheet import events
-    from emmc_rig.session.exposure import exposure_reasons, shot_exposures
-    from emmc_rig.session.listing import summary
+    from emmc_rig.session.brightness import exposure_reasons, shot_exposures
     from emmc_rig.session.planned import kind_name
     from emmc_rig.session.session import PLAN, Session, amended_name
-    from emmc_rig.session.verify import counts
+    from emmc_rig.session.verify import counts, summary
     from emmc_rig.store.results import shown_bytes
 
     opened = Session(session)

@@ -89,7 +89,7 @@ class Driving:
             self.begun += 1
             self._stopped_by_hand = False
             self._idle.clear()
-        self._publish(busy=what, stopped=False, stage="")
+        self._publish({"stage": ""}, busy=what, stopped=False)
         self._moves.put(steps)
 
     def stop(self) -> None:
@@ -111,7 +111,7 @@ class Driving:
                     self.stage.stop()
                 except (DriverError, ValueError) as fault:
                     self._stopped_by_hand = False
-                    self._publish(stage=f"not stopped: {fault}")
+                    self._publish({"stage": f"not stopped: {fault}"})
                     self._stop_sent.set()
                     break
                 self._stop_sent.set()
@@ -123,27 +123,27 @@ class Driving:
             with suppress(DriverError):
                 self._limits_um[axis] = self.stage.limits_um(axis)
         with self._reading:
-            self._publish(stage=self._read_positions(), axes=self._axes())
+            self._publish({"stage": self._read_positions()}, axes=self._axes())
         while not self._ending.is_set():
             try:
                 steps = self._moves.get(timeout=POLL_S)
             except Empty:
                 continue
-            trouble = ""
+            fault_of_move = ""
             try:
                 for step in steps:
                     if not self._stopped_by_hand:
                         step(self.stage)
             except (AppError, DriverError, ValueError) as fault:
-                trouble = str(fault)
+                fault_of_move = str(fault)
             with self._reading:  # whoever sees that it ended sees where it ended, and how
                 unread = self._read_positions()
                 stopped = self._stopped_by_hand
                 with self._lock:
                     self._busy = ""
                     self._idle.set()
-                trouble = "" if stopped else trouble
-                self._publish(busy="", stopped=stopped, axes=self._axes(), stage=trouble or unread)
+                trouble = {"stage": unread if stopped else fault_of_move or unread}
+                self._publish(trouble, busy="", stopped=stopped, axes=self._axes())
 
     def _follow(self) -> None:
         """Read positions while an axis moves; what goes wrong is the move's to report."""

@@ -29,7 +29,7 @@ from emmc_rig.calibration.scale import Scale, exposure_of
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.formats.format import Export
-from emmc_rig.live.server import Picture, Pictured, Query
+from emmc_rig.live.served_page import Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -45,8 +45,7 @@ from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.report.display import PART_PIXELS
 from emmc_rig.report.viewer import viewer_data
 from emmc_rig.session.brightness import is_dark
-from emmc_rig.session.measured_psi import session_scale
-from emmc_rig.session.scales import open_scale
+from emmc_rig.session.measured_psi import open_scale, session_scale
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import is_session
 
@@ -378,7 +377,7 @@ def export_of(
 def field_pictures(
     newest: Callable[[], Pictures | None],
 ) -> dict[str, Pictured]:
-    """Return what a `emmc_rig.live.server.Page` serves of a light field."""
+    """Return what a `served_page.Page` serves of a light field."""
 
     def light_field(query: Query) -> Picture | None:
         shown = newest()

@@ -14,17 +14,15 @@ import json
 import secrets
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from threading import Thread
-from typing import Any, Protocol
+from typing import Any
 
 import uvicorn
 from jinja2 import ChoiceLoader, PackageLoader
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -33,22 +31,19 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 
 from emmc_rig.errors import ERRORS, AppError
+from emmc_rig.live.served_page import Page, Picture
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.report.page import ENVIRONMENT, TEMPLATES
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = ("0.0.0.0", "::")
 PATIENCE_S = 10.0
-LARGEST = 1e12
-"""No position, exposure or number of pixels comes near it."""
 LONGEST_BODY = 1 << 17
 PAUSE_S = 0.04
 """At least between two states that are pushed."""
 MOST_VIEWS = 16
 """Whose last picture is kept; those asked for least recently go first."""
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
-COMMON_FILES = ("page.css", "viewer.css", "common.js", "viewer.js", "field.js")
-"""Of every page; the viewer is that of the reports."""
 PARTS_FOUND = ChoiceLoader([PackageLoader("emmc_rig.live", ""), TEMPLATES])
 PARTS = ENVIRONMENT.overlay(loader=PARTS_FOUND)
 HEADERS = {
@@ -61,49 +56,6 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-
-
-@dataclass(frozen=True)
-class Picture:
-    """What is encoded once for all who ask: key and number name it, make returns its bytes."""
-
-    key: Hashable
-    number: int
-    make: Callable[[], bytes]
-    media_type: str = "image/jpeg"
-
-
-Query = Mapping[str, str]
-Pictured = Callable[[Query], Picture | None]
-Action = Callable[..., Mapping[str, Any] | None]
-"""Both raise AppError with one line."""
-
-
-class Page(Protocol):
-    """What is served; every member may be used by any thread.
-
-    files: of the package `emmc_rig.live` or templates; the first is the page itself. pictures: by
-    name; each takes a query, and returns None while there is no picture. actions: of POST requests,
-    by name; a mapping returned is part of the answer. urgent: actions with a thread of their own.
-    """
-
-    files: tuple[str, ...]
-    pictures: Mapping[str, Pictured]
-    actions: Mapping[str, Action]
-    urgent: frozenset[str]
-
-    @property
-    def version(self) -> int:
-        """Grows with every change of the state."""
-        ...
-
-    def state(self) -> dict[str, Any]:
-        """Return the state, plain data with its `version`."""
-        ...
-
-    def touch(self) -> None:
-        """Note that the page is being viewed."""
-        ...
 
 
 def new_token() -> str:
@@ -145,12 +97,10 @@ def application(
         """Return the state as JSON, encoded once for all who ask."""
         nonlocal known
         page.touch()
-        if known[0] != page.version:
-            told = page.state()
-            data = json.dumps(
-                {**told, "read_only": read_only}, allow_nan=False, separators=(",", ":")
-            )
-            known = told["version"], data.encode()
+        if known[0] != page.state["version"]:
+            parts = {**page.state.snapshot(), "read_only": read_only}
+            data = json.dumps(parts, allow_nan=False, separators=(",", ":"))
+            known = parts["version"], data.encode()
         return known[1]
 
     def encoded_picture(wanted: Picture) -> bytes:
@@ -206,7 +156,7 @@ def application(
     async def events(request: Request) -> Response:
         async def states() -> AsyncIterator[bytes]:
             while True:
-                version = page.version
+                version = page.state["version"]
                 yield b"data: " + encoded_state() + b"\n\n"
                 if ending.is_set():  # also then: the last state says how it ended
                     return
@@ -214,7 +164,7 @@ def application(
                 while not ending.is_set() and time.monotonic() - asked_s < PATIENCE_S:
                     with suppress(TimeoutError):
                         await asyncio.wait_for(ending.wait(), PAUSE_S)
-                    if page.version > version:
+                    if page.state["version"] > version:
                         break
 
         return StreamingResponse(states(), media_type="text/event-stream")
@@ -228,28 +178,19 @@ def application(
         page_origin = f"{request.url.scheme}://{request.headers.get('host')}"
         if origin not in (None, page_origin):
             raise HTTPException(403, f"not from this page but from {origin}")
-        name = request.path_params["action"]
-        if name not in page.actions:
-            raise HTTPException(404, f"no action {name!r}: {', '.join(page.actions)}")
-        values = await _body(request)
-
-        def call() -> Mapping[str, Any]:
-            return page.actions[name](**values) or {}
-
-        try:
-            if name in page.urgent:
-                done = await asyncio.get_running_loop().run_in_executor(at_once, call)
-            else:
-                done = await run_in_threadpool(call)
-        except TypeError as fault:
-            raise HTTPException(400, f"{name}: these are not its values ({fault})") from fault
-        return JSONResponse({"done": name, **done})
+        name = request.path_params["order"]
+        if name not in page.orders:
+            raise HTTPException(404, f"no order {name!r}: {', '.join(page.orders)}")
+        order, values = page.orders[name], await _body(request)
+        threads = at_once if order.urgent else None
+        loop = asyncio.get_running_loop()
+        return JSONResponse(await loop.run_in_executor(threads, order.carry_out, name, values))
 
     made_app = Starlette(
         routes=[
             Route("/{token}/state", guarded(state), methods=["GET"]),
             Route("/{token}/events", guarded(events), methods=["GET"]),
-            Route("/{token}/do/{action}", guarded(act), methods=["GET", "POST"]),
+            Route("/{token}/do/{order}", guarded(act), methods=["GET", "POST"]),
             Route("/{token}/", guarded(shown), methods=["GET"]),
             Route("/{token}/{name}", guarded(shown), methods=["GET"]),
             Route("/{rest:path}", guarded(shown), methods=["GET", "POST"]),
@@ -307,15 +248,6 @@ def served(app: Starlette, host: str = "127.0.0.1") -> Iterator[int]:
         finally:
             server.should_exit = True
             thread.join(PATIENCE_S)
-
-
-def finite(value: object) -> float:
-    """Return a number that somebody sent; raises AppError for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise AppError(f"{value!r} is not a number")
-    if not abs(value) < LARGEST:
-        raise AppError("the value is not finite")
-    return float(value)
 
 
 async def _body(request: Request) -> dict[str, Any]:

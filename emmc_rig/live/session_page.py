@@ -18,7 +18,15 @@ from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.live.light_field import Pictures, export_of, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
-from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query
+from emmc_rig.live.served_page import (
+    COMMON_FILES,
+    Count,
+    Order,
+    PageState,
+    Picture,
+    Pictured,
+    Query,
+)
 from emmc_rig.model.errors import SensingError
 from emmc_rig.progress import Event, Watcher
 from emmc_rig.reconstruction.errors import ReconstructionError
@@ -38,18 +46,16 @@ class _EndedError(Exception):
 
 
 class SessionPage(Watcher):
-    """A `emmc_rig.live.server.Page`, and the watcher of the capture that it shows.
+    """A `served_page.Page`, and the watcher of the capture that it shows.
 
     folder: of the session. computes: reconstructs the light field after each shot, from the frames
     on the disk; without, the light field of the capture itself (`--until`) is shown.
     """
 
     files: tuple[str, ...] = ("session.html", "session.js", *COMMON_FILES)
-    urgent: frozenset[str] = frozenset({"pause", "stop", "done"})
 
     def __init__(self, folder: Path, control: Control, computes: bool = True) -> None:
         self._folder, self._control, self._computes = folder, control, computes
-        self._changed = threading.Condition()
         self._frames: dict[str, dict[str, Any]] = {}
         self._small: dict[str, bytes] = {}
         self._newest: tuple[int, RawFrame] | None = None
@@ -64,8 +70,7 @@ class SessionPage(Watcher):
         self._thread = threading.Thread(
             target=self._reconstruct, name="page light field", daemon=True
         )
-        self._state: dict[str, Any] = {
-            "version": 0,
+        parts = {
             "title": folder.name,
             "step": "",
             "paused": None,
@@ -87,19 +92,20 @@ class SessionPage(Watcher):
             "ended": False,
             "why": "",
             "light_field": None,
-            "trouble": {"light field": ""},
         }
+        self.state = PageState(parts)
         self.pictures: Mapping[str, Pictured] = {
             "newest.jpg": self._newest_picture,
             "frame.jpg": self._small_picture,
             **field_pictures(lambda: self._pictures),
         }
-        self.actions: Mapping[str, Action] = {
-            "pause": lambda: self._wish("pausing after this frame", control.pause),
-            "resume": lambda: self._wish("", control.resume),
-            "stop": lambda: self._wish("stopping after this frame", control.stop),
-            "retake": self._retake,
-            "done": self._answer,
+        pausing, stopping = "pausing after this frame", "stopping after this frame"
+        self.orders: Mapping[str, Order] = {
+            "pause": Order(lambda: self._steer(control.pause, pausing), urgent=True),
+            "resume": Order(lambda: self._steer(control.resume, "")),
+            "stop": Order(lambda: self._steer(control.stop, stopping), urgent=True),
+            "retake": Order(self._retake, ids=list[str]),
+            "done": Order(self._answer, urgent=True, number=Count),
         }
 
     def start(self) -> None:
@@ -109,20 +115,10 @@ class SessionPage(Watcher):
     def close(self, why: str = "") -> None:
         """Let those who look know that the capture is over; why: what ended it early."""
         self._ending.set()
-        self._publish(ended=True, why=why, step="", wish="")
-        with self._changed:
-            self._changed.notify_all()
+        self.state.publish(ended=True, why=why, step="", wish="")
+        with self.state.changed:
+            self.state.changed.notify_all()
         self._thread.join(PATIENCE_S)
-
-    @property
-    def version(self) -> int:
-        """Grows with every change of the state."""
-        return self._state["version"]
-
-    def state(self) -> dict[str, Any]:
-        """Return what is known, plain data."""
-        with self._changed:
-            return dict(self._state)
 
     def touch(self) -> None:
         """Take no notice: the capture goes on whether somebody looks or not."""
@@ -133,7 +129,7 @@ class SessionPage(Watcher):
             self._show_result(event.facts["shots"], event.objects["result"])
             return
         small = small_jpeg(event.objects["frame"]) if event.name == "frame.taken" else b""
-        with self._changed:
+        with self.state.changed:
             self._take_note(event, dict(event.facts), small)
 
     def _ask(self, what: str) -> dict[str, Any]:
@@ -166,11 +162,6 @@ class SessionPage(Watcher):
         words = f", estimated accuracy {stated}" if stated else ""
         self._show_field(f"{result.method}: {result.status}{words}", shots)
 
-    def _publish(self, **parts: Any) -> None:
-        with self._changed:
-            self._state.update(parts)
-            self._state["version"] += 1
-
     def _take_note(self, event: Event, facts: dict[str, Any], small: bytes) -> None:
         """Change the state by an event; small: the picture of a frame that was taken."""
         more: dict[str, Any] = {}
@@ -182,9 +173,9 @@ class SessionPage(Watcher):
                 if facts["step"] == "attend" and planned is not self._attended:
                     self._attended, self._refusal = planned, ""
                 if facts["step"] != "write":
-                    self._publish(step=f"{planned.id}: {facts['step']}")
+                    self.state.publish(step=f"{planned.id}: {facts['step']}")
             case "frame.taken":
-                number = self._state["frame"] + 1
+                number = self.state["frame"] + 1
                 self._small[facts["id"]] = small
                 self._newest = number, event.objects["frame"]
                 self._frames[facts["id"]] = {**facts, "number": number, "stored": False}
@@ -197,26 +188,26 @@ class SessionPage(Watcher):
             case "shot.done":
                 self._shots.add(facts["shot"])
                 self._wanted = self._computes
-                self._changed.notify_all()
+                self.state.changed.notify_all()
             case "pause":
                 if what := event.objects.get("asked"):
                     more = {"asked": self._ask(what), "by_hand": True}
-                self._publish(paused=facts, wish="", step="", **more)
+                self.state.publish(paused=facts, wish="", step="", **more)
             case "resume":
-                if before := self._state["asked"]:
+                if before := self.state["asked"]:
                     more = {"asked": None}
                     if before["hole"]:
                         more["last_hole"] = before["hole"]
-                self._publish(paused=None, wish="", step="", **more)
+                self.state.publish(paused=None, wish="", step="", **more)
             case "left" | "verdict" | "end":
-                self._publish(**{event.name: facts})
+                self.state.publish(**{event.name: facts})
             case "message":
                 if self._attended and facts["text"].startswith(f"{self._attended.id}, try "):
                     self._refusal = facts["text"].partition(": ")[2]
                     if wrong := self._wrong_hole():
                         more["last_hole"] = list(wrong)
-                lines = [*self._state["messages"], facts["text"]]
-                self._publish(messages=lines[-SHOWN_MESSAGES:], **more)
+                lines = [*self.state["messages"], facts["text"]]
+                self.state.publish(messages=lines[-SHOWN_MESSAGES:], **more)
 
     def _begin(self, facts: dict[str, Any]) -> None:
         """Show what is there already."""
@@ -240,27 +231,28 @@ class SessionPage(Watcher):
         taken = {frame.bench.shot for frame in session.needed if frame.is_still_shot} - missing
         self._shots |= taken
         self._wanted = bool(taken) and self._computes
-        self._changed.notify_all()
+        self.state.changed.notify_all()
         self._retaken = 0
         self._publish_frames(title=session.header["title"], planned=facts["planned"])
 
     def _publish_frames(self, **more: Any) -> None:
         known = list(self._frames.values())
-        self._publish(
+        self.state.publish(
             frames=[dict(frame) for frame in known[-SHOWN_FRAMES:]],
             taken=len(known),
             done=sum(frame["stored"] for frame in known),
             **more,
         )
 
-    def _wish(self, words: str, ask: Callable[[], None]) -> None:
-        ask()
-        self._publish(wish=words, held=self._control.paused)
+    def _steer(self, request: Callable[[], None], words: str) -> None:
+        """Pass a request on to the capture; words: on the page until it is carried out."""
+        request()
+        self.state.publish(wish=words, held=self._control.paused)
 
     def _answer(self, number: int) -> None:
         """Go on, unless the page asks for another work by now; number: of the work answered."""
-        with self._changed:
-            asked = self._state["asked"]
+        with self.state.changed:
+            asked = self.state["asked"]
             if asked is not None and asked["number"] == number:
                 self._control.answered = True
 
@@ -273,7 +265,7 @@ class SessionPage(Watcher):
                 raise AppError(f"frame {name}: others were exposed by it; begin another session")
         if not ids:
             raise AppError("choose the frames to take once more")
-        with self._changed:
+        with self.state.changed:
             for name in ids:
                 self._frames[name]["stored"] = False
                 if self._frames[name]["kind"] == "shot":
@@ -304,8 +296,8 @@ class SessionPage(Watcher):
 
     def _reconstruct(self) -> None:
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._wanted or self._ending.is_set())
+            with self.state.changed:
+                self.state.changed.wait_for(lambda: self._wanted or self._ending.is_set())
                 if self._ending.is_set():
                     return
                 self._wanted, shots = False, sorted(self._shots)
@@ -329,7 +321,7 @@ class SessionPage(Watcher):
         shown = None if self._pictures is None else self._pictures.facts()
         frames = self._frames.values()
         of = {frame["shot"] for frame in frames if frame["kind"] == "shot"}
-        self._publish(
+        self.state.publish(
             light_field={
                 "stage": stage,
                 "why": why,

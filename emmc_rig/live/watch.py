@@ -31,7 +31,16 @@ from emmc_rig.live.driving import Driving
 from emmc_rig.live.light_field import LiveLightField, field_pictures
 from emmc_rig.live.picture import View, encoded, picture
 from emmc_rig.live.save import Files, Found
-from emmc_rig.live.server import COMMON_FILES, Action, Picture, Pictured, Query, finite
+from emmc_rig.live.served_page import (
+    COMMON_FILES,
+    Number,
+    Order,
+    PageState,
+    Picture,
+    Pictured,
+    Query,
+    Switch,
+)
 from emmc_rig.live.steps import (
     AWAY_UM,
     LONGEST_UNASKED_S,
@@ -93,7 +102,7 @@ class Shown:
 
 
 class Watch:
-    """The page, a `emmc_rig.live.server.Page`; every method may be called by any thread.
+    """The page, a `served_page.Page`; every method may be called by any thread.
 
     stage: None for a bench without. look: changes the target of a simulated bench; targets: the
     names that it takes. centre_um: place of each axis that centres the mask and opens the aperture.
@@ -103,7 +112,6 @@ class Watch:
     """
 
     files: tuple[str, ...] = ("page.html", "page.js", *COMMON_FILES)
-    urgent: frozenset[str] = frozenset({"stop", "cancel"})
 
     def __init__(
         self,
@@ -125,7 +133,6 @@ class Watch:
         self._saved, self._following = saved or Files(), following
         self._found = Found()
         self._written: list[str] = []
-        self._news = threading.Condition()
         self._shown: Shown | None = None
         self._reference: RawFrame | None = None
         self._focus = FocusMeter()
@@ -135,8 +142,7 @@ class Watch:
         self._seek_at_s = 0.0
         self._gauge: MaskGauge | None = None
         self._drawn, self._latency_s = 0, 0.0
-        self._state: dict[str, Any] = {
-            "version": 0,
+        parts = {
             "frame": 0,
             "figures": None,
             "mask": None,
@@ -155,30 +161,31 @@ class Watch:
             "takes": self._saved.takes,
             "next": following,
         }
+        self.state = PageState(parts, self._advice)
         self.pictures: Mapping[str, Pictured] = {
             "picture.jpg": self._picture,
             **field_pictures(lambda: light_field and light_field.pictures()),
         }
-        self.actions: Mapping[str, Action] = {
-            "exposure": lambda seconds: self.set_exposure_s(finite(seconds)),
-            "gain": lambda factor: self.set_gain(finite(factor)),
-            "autoexpose": lambda longest_s=LONGEST_UNASKED_S: self.auto_expose(finite(longest_s)),
-            "cancel": self.cancel,
-            "jog": lambda axis, distance_um: self.jog(str(axis), finite(distance_um)),
-            "home": self.home,
-            "centre": self.centre,
-            "stop": self.stop,
-            "look": self.look_at,
-            "reference": self.take_reference,
-            "refocus": self._focus.forget,
-            "autofocus": lambda span_um: self.autofocus(finite(span_um)),
-            "preview": self.preview,
-            "save": self.save,
+        self.orders: Mapping[str, Order] = {
+            "exposure": Order(self.set_exposure_s, seconds=Number),
+            "gain": Order(self.set_gain, factor=Number),
+            "autoexpose": Order(self.auto_expose, longest_s=(Number, LONGEST_UNASKED_S)),
+            "cancel": Order(self.cancel, urgent=True),
+            "jog": Order(self.jog, axis=str, distance_um=Number),
+            "home": Order(self.home),
+            "centre": Order(self.centre),
+            "stop": Order(self.stop, urgent=True),
+            "look": Order(self.look_at, target=str),
+            "reference": Order(self.take_reference, taken=Switch),
+            "refocus": Order(self._focus.forget),
+            "autofocus": Order(self.autofocus, span_um=Number),
+            "preview": Order(self.preview, what=list[str]),
+            "save": Order(self.save),
         }
         self._asked_s = time.monotonic()
         self._ending = threading.Event()
         self._wishes: Queue[Callable[[], object]] = Queue()
-        self._driving = None if stage is None else Driving(stage, self._publish)
+        self._driving = None if stage is None else Driving(stage, self.state.publish)
         threads = {
             "live camera": self._take,
             "live levels": self._each(self._show_levels),
@@ -202,8 +209,8 @@ class Watch:
     def close(self) -> None:
         """Stop the stage, and end the threads; the devices stay open."""
         self._ending.set()
-        with self._news:
-            self._news.notify_all()
+        with self.state.changed:
+            self.state.changed.notify_all()
         if self._driving is not None:
             self._driving.close()
         for thread in self._threads:
@@ -211,33 +218,17 @@ class Watch:
                 thread.join(PATIENCE_S)
         if self.light_field is not None:
             self.light_field.close()
-        self._publish()
+        self.state.publish()
 
     def newest(self) -> Shown | None:
         """Return the newest frame and its number; None before the first."""
-        with self._news:
+        with self.state.changed:
             self._asked_s = time.monotonic()
             return self._shown
 
-    def frame(self) -> RawFrame | None:
-        """Return the newest frame; None before the first."""
-        newest = self.newest()
-        return None if newest is None else newest.frame
-
     def touch(self) -> None:
         """Let frames be taken."""
-        self.newest()
-
-    def state(self) -> dict[str, Any]:
-        """Return the state of the page, plain data."""
-        with self._news:
-            self._asked_s = time.monotonic()
-            return {**self._state, "trouble": dict(self._state["trouble"])}
-
-    @property
-    def version(self) -> int:
-        """Grows with every change of the state."""
-        return self._state["version"]
+        self._asked_s = time.monotonic()
 
     def _picture(self, query: Query) -> Picture | None:
         view = validated(View, dict(query), "the picture", AppError)
@@ -245,28 +236,24 @@ class Watch:
         if newest is None:
             return None
 
-        def make() -> bytes:
-            frame = self.frame()
-            assert frame is not None
-            return encoded(picture(frame, view))
+        key = view.model_dump_json()
+        return Picture(key, newest.number, lambda: encoded(picture(newest.frame, view)))
 
-        return Picture(view.model_dump_json(), newest.number, make)
-
-    def set_exposure_s(self, exposure_s: float) -> None:
+    def set_exposure_s(self, seconds: float) -> None:
         """Let the frames that follow be exposed for so long."""
         self._exposing, self._unexposed = 0, ""
-        self._wishes.put(lambda: self._camera.set_exposure_s(exposure_s))
+        self._wishes.put(lambda: self._camera.set_exposure_s(seconds))
 
-    def set_gain(self, gain: float) -> None:
-        """Let the frames that follow have this gain."""
-        self._wishes.put(lambda: self._camera.set_gain(gain))
+    def set_gain(self, factor: float) -> None:
+        """Let the frames that follow have this gain, a factor."""
+        self._wishes.put(lambda: self._camera.set_gain(factor))
 
     def auto_expose(self, longest_s: float = LONGEST_UNASKED_S) -> None:
         """Let exposures follow until the brightest thousandth lies within GOOD_LEVELS.
 
         None of them takes more than `longest_s`; a picture that stays dark is not exposed on.
         """
-        exposure_s, (shortest_s, _) = self._exposure_s, self._state["settings"]["exposure_limits_s"]
+        exposure_s, (shortest_s, _) = self._exposure_s, self.state["settings"]["exposure_limits_s"]
         self._longest_s = max(longest_s, shortest_s)
         self._dimmest_s = min(exposure_s, self._longest_s)
         if self._dimmest_s < exposure_s:
@@ -280,7 +267,7 @@ class Watch:
         """
         newest = self.newest()
         before_s = LONGEST_UNASKED_S if newest is None else newest.frame.exposure_s
-        shortest_s, longest_s = self._state["settings"]["exposure_limits_s"]
+        shortest_s, longest_s = self.state["settings"]["exposure_limits_s"]
         under_way = self._exposed_s
         self._exposing = 0
         if shortest_s < longest_s:
@@ -292,7 +279,7 @@ class Watch:
 
     @property
     def _exposure_s(self) -> float:
-        return self._state["settings"]["exposure_s"]
+        return self.state["settings"]["exposure_s"]
 
     def _break_off(self) -> bool:
         """Let the camera break off its exposure; False where it cannot."""
@@ -303,17 +290,17 @@ class Watch:
         """Show how long the exposure under way still takes, and break it off for a new setting."""
         while not self._ending.wait(COUNT_S):
             if (under_way := self._exposed_s) is None:
-                if self._state["exposing"] is not None:
-                    self._publish(exposing=None)
+                if self.state["exposing"] is not None:
+                    self.state.publish(exposing=None)
                 continue
             began_s, exposure_s = under_way
             left_s = began_s + exposure_s - time.monotonic()
             if not self._wishes.empty() and left_s > LONG_S:
                 self._break_off()
             # A camera that has its frames at once is not counted down.
-            elif time.monotonic() - began_s >= COUNT_S or self._state["exposing"] is not None:
+            elif time.monotonic() - began_s >= COUNT_S or self.state["exposing"] is not None:
                 left = {"exposure_s": exposure_s, "left_s": max(0.0, left_s)}
-                self._publish(exposing=left)
+                self.state.publish(exposing=left)
         self._break_off()
 
     def look_at(self, target: str) -> None:
@@ -326,9 +313,9 @@ class Watch:
 
     def take_reference(self, taken: bool) -> None:
         """Measure shifts from the present frame on; or no more."""
-        with self._news:
+        with self.state.changed:
             self._reference = self._shown.frame if taken and self._shown is not None else None
-        self._publish(reference=self._reference is not None)
+        self.state.publish(reference=self._reference is not None)
 
     def home(self) -> None:
         """Home all axes; raises AppError as `jog`."""
@@ -402,7 +389,7 @@ class Watch:
     def save(self) -> dict[str, Any]:
         """Write what was previewed, and return the files and the next command; raises AppError."""
         self._written = self._saved.save()
-        self._publish()
+        self.state.publish()
         return {"written": self._written, "next": self._following}
 
     def stop(self) -> None:
@@ -424,22 +411,25 @@ class Watch:
 
     def _forget_unexposed(self) -> None:
         """Say no more why an automatic exposure ended: it was of another picture."""
-        if self._unexposed and self._state["trouble"]["setting"] == self._unexposed:
-            self._publish(setting="")
+        if self._unexposed and self.state["trouble"]["setting"] == self._unexposed:
+            self.state.publish({"setting": ""})
         self._unexposed = ""
 
-    def _publish(self, **parts: Any) -> None:
-        """Replace parts of the state, by name, and wake who waits for it."""
-        with self._news:
-            for name, value in parts.items():
-                if name in self._state["trouble"]:
-                    self._state["trouble"][name] = value
-                else:
-                    self._state[name] = value
-            self._state["hint"] = self._hint()
-            self._state["steps"] = self._steps(self._state["hint"])
-            self._state["version"] += 1
-            self._news.notify_all()
+    def _advice(self) -> dict[str, Any]:
+        """Return the hint for the newest picture, and the steps from an unpacked box to a plan."""
+        hint = self._hint()
+        axes: tuple[str, ...] = ()
+        off_um: dict[str, float | None] = {}
+        if self._driving is not None:
+            axes = self._driving.stage.axes
+            for axis in (axis for axis in axes if axis in self._centre_um):
+                at_um = self._driving.position_um(axis)
+                off_um[axis] = None if at_um is None else at_um - self._centre_um[axis]
+        listed = steps(
+            self.state["figures"], self.state["mask"], off_um, axes, self._found,
+            self._saved.takes, self._written, hint,
+        )  # fmt: skip
+        return {"hint": hint, "steps": listed}
 
     def _away(self) -> list[str]:
         """Return the axes that stand elsewhere than centred, or not homed."""
@@ -455,7 +445,7 @@ class Watch:
 
         None also for a picture that was taken before the last move of the stage.
         """
-        figures = self._state["figures"]
+        figures = self.state["figures"]
         if figures is None or figures["moves"] is None or figures["moves"] != self._moved():
             return None
         away = self._away()
@@ -469,23 +459,9 @@ class Watch:
             return hint_of("Part of the picture is saturated.", "autoexpose")
         if level < UNDEREXPOSED:
             exposure_s = figures["exposure_s"] or self._exposure_s
-            longest_s = self._state["settings"]["exposure_limits_s"][1]
+            longest_s = self.state["settings"]["exposure_limits_s"][1]
             return exposure_hint(level, exposure_s, longest_s)
         return None
-
-    def _steps(self, hint: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-        """Return the steps from an unpacked box to a plan: see `emmc_rig.live.steps`."""
-        axes: tuple[str, ...] = ()
-        off_um: dict[str, float | None] = {}
-        if self._driving is not None:
-            axes = self._driving.stage.axes
-            for axis in (axis for axis in axes if axis in self._centre_um):
-                at_um = self._driving.position_um(axis)
-                off_um[axis] = None if at_um is None else at_um - self._centre_um[axis]
-        return steps(
-            self._state["figures"], self._state["mask"], off_um, axes, self._found,
-            self._saved.takes, self._written, hint,
-        )  # fmt: skip
 
     def _read_settings(self) -> dict[str, Any]:
         camera = self._camera
@@ -503,7 +479,7 @@ class Watch:
         stream, stood, streams = None, None, hasattr(self._camera, "stream")
         while not self._ending.is_set():
             started_s = time.monotonic()
-            with self._news:
+            with self.state.changed:
                 watched = started_s - self._asked_s < IDLE_S
             try:
                 if not self._wishes.empty() and stream is not None:
@@ -524,17 +500,18 @@ class Watch:
                     self._exposed_s = None
                 moves = moved if moved == self._moved() else None
                 still = moves if moves == stood or not streams else None
-                with self._news:
+                with self.state.changed:
                     number = self._shown.number + 1 if self._shown is not None else 1
                     self._shown = Shown(number, frame, time.monotonic(), still)
                 stood = moves
-                self._publish(frame=number, camera="")
+                self.state.publish({"camera": ""}, frame=number)
                 self._ending.wait(max(0.0, FASTEST_S - (time.monotonic() - started_s)))
             except ExposureStoppedError:
                 stream = None
             except (DriverError, StopIteration, ValueError) as fault:
                 stream = None
-                self._publish(camera=str(fault) or "the camera sends no more frames")
+                why = str(fault) or "the camera sends no more frames"
+                self.state.publish({"camera": why})
                 self._ending.wait(RETRY_S)
         if stream is not None:
             with suppress(DriverError):
@@ -557,10 +534,10 @@ class Watch:
                 wish()
                 done = True
             except (ValueError, DriverError) as fault:
-                self._publish(setting=str(fault))
+                self.state.publish({"setting": str(fault)})
         if done:
             self._seek_at_s = 0.0
-            self._publish(settings=self._read_settings(), setting=self._unexposed)
+            self.state.publish({"setting": self._unexposed}, settings=self._read_settings())
 
     def _each(self, work: Callable[[Shown], None]) -> Callable[[], None]:
         """Return a thread's work: `work` on the newest frame, again when there is a newer one."""
@@ -575,8 +552,8 @@ class Watch:
 
     def _after(self, number: int) -> Shown | None:
         """Return the newest frame when it is a later one than `number`; None at the end."""
-        with self._news:
-            self._news.wait_for(
+        with self.state.changed:
+            self.state.changed.wait_for(
                 lambda: (
                     self._ending.is_set()
                     or (self._shown is not None and self._shown.number > number)
@@ -589,9 +566,9 @@ class Watch:
         some = replace(frame, mosaic=thinned(frame.mosaic, LEVEL_PIXELS))
         found = figures(frame)
         level = level_of(frame, found)
-        with self._news:
+        with self.state.changed:
             reference = self._reference
-        self._publish(
+        self.state.publish(
             figures={
                 "frame": newest.number,
                 "level": level,
@@ -612,7 +589,7 @@ class Watch:
 
     def _give_up_exposing(self, why: str) -> None:
         self._exposing, self._unexposed = 0, why
-        self._publish(setting=why)
+        self.state.publish({"setting": why})
 
     def _expose_better(self, frame: RawFrame, level: float, dark: bool) -> None:
         """Choose the next exposure by a frame that was taken at the present one."""
@@ -624,7 +601,7 @@ class Watch:
             self._give_up_exposing(f"{DARK}, {where}: centre the mask first")
             return
         self._exposing -= 1
-        shortest_s, longest_s = self._state["settings"]["exposure_limits_s"]
+        shortest_s, longest_s = self.state["settings"]["exposure_limits_s"]
         limits_s = shortest_s, min(longest_s, self._longest_s)
         next_s = next_exposure_s(exposure_s, level, limits_s)
         if next_s is not None:
@@ -647,10 +624,10 @@ class Watch:
             self._ending.wait(POLL_S)
             return
         if is_dark(newest.frame):
-            self._publish(mask={"place": None, "why": DARK})
+            self.state.publish(mask={"place": None, "why": DARK})
             return
-        if self._state["mask"] == {"place": None, "why": DARK}:
-            self._publish(mask=None)  # what is measured now takes seconds
+        if self.state["mask"] == {"place": None, "why": DARK}:
+            self.state.publish(mask=None)  # what is measured now takes seconds
         try:
             if self._gauge is None:
                 self._gauge = MaskGauge(self._design, newest.frame.mosaic.shape)
@@ -660,7 +637,7 @@ class Watch:
         except (CalibrationError, CameraError) as fault:
             mask = {"place": None, "why": str(fault)}
             self._seek_at_s = time.monotonic() + SEEK_S
-        self._publish(mask=mask)
+        self.state.publish(mask=mask)
 
     def _mask_stands_um(self) -> tuple[float, float]:
         """Return where the mask stage stands from its centre, x and y; 0 where it is not known."""
@@ -682,16 +659,14 @@ class Watch:
         try:
             shown = self.light_field.update(newest.frame, self._shot(), newest.number)
         except AppError as fault:
-            self._publish(**{"light field": str(fault)})
+            self.state.publish({"light field": str(fault)})
             self._ending.wait(RETRY_S)
             return
         drawn = (shown["pictures"] or {}).get("number", 0)
         if drawn != self._drawn:
             self._drawn, self._latency_s = drawn, time.monotonic() - newest.at_s
-        self._publish(
-            light_field={"frame": newest.number, "latency_s": self._latency_s, **shown},
-            **{"light field": ""},
-        )
+        latest = {"frame": newest.number, "latency_s": self._latency_s, **shown}
+        self.state.publish({"light field": ""}, light_field=latest)
 
     def _shot(self) -> int | None:
         """Return the shot of the light field's Psi at which the mask stands; None: at none."""

@@ -100,7 +100,7 @@ def explain(error: ValidationError, cls: type[BaseModel]) -> str:
     """
     faults = error.errors()
     first = next((fault for fault in faults if fault["type"] == "extra_forbidden"), faults[0])
-    where = ".".join(str(part) for part in first["loc"]) or "the file"
+    where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
         valid = _keys_beside(cls, first["loc"])
@@ -109,9 +109,10 @@ def explain(error: ValidationError, cls: type[BaseModel]) -> str:
     message = first["msg"].replace("\n", " ")
     for pattern, words in _WORDS:
         message = re.sub(pattern, words, message)
-    if first["type"] == "value_error":
-        return f"{where}: {message.removeprefix('Value error, ')}"
-    return f"{where}: {message[:1].lower()}{message[1:]}"
+    message = message.removeprefix("Value error, ")
+    if first["type"] != "value_error":
+        message = message[:1].lower() + message[1:]
+    return f"{where}: {message}" if where else message
 
 
 _WORDS = (

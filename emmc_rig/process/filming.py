@@ -64,10 +64,10 @@ from emmc_rig.reconstruction.methods import (
 )
 from emmc_rig.reconstruction.verdict.rules import LEVELS
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.brightness import exposure_reasons, shot_exposures
 from emmc_rig.session.journal import FilmEntry, of_kind
+from emmc_rig.session.measured_psi import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.session.readings import FilmPlace, film_frames, film_places
-from emmc_rig.session.scales import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.session.session import Session
 from emmc_rig.store.folders import (
     kept_folder,

@@ -28,18 +28,19 @@ from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.inputs import check_frames
-from emmc_rig.session.board_sets import sensor_pairs
-from emmc_rig.session.frame_means import camera_of, taken_shots
+from emmc_rig.session.board_sets import camera_of, sensor_pairs, taken_shots
 from emmc_rig.session.measured_psi import (
+    CALIBRATION_FILE,
     PSI_PRODUCT,
     is_judged,
     measured_scale,
+    open_scale,
     psi_inputs,
     scale_of,
     session_outcome,
     stored_scale,
+    write_scale,
 )
-from emmc_rig.session.scales import CALIBRATION_FILE, open_scale, write_scale
 from emmc_rig.session.session import CALIBRATION, Session
 from emmc_rig.store.folders import result_folder
 from emmc_rig.store.products import record_product

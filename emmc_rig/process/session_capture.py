@@ -14,11 +14,10 @@ from emmc_rig.process.captures import Capture
 from emmc_rig.process.session_calibration import calibrated_scale
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.verdict.rules import Reason
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
-from emmc_rig.session.frame_means import frame_shape, session_darks, taken_shots
-from emmc_rig.session.measured_psi import psi_is_assumed
+from emmc_rig.session.board_sets import frame_shape, session_darks, taken_shots
+from emmc_rig.session.brightness import exposure_reasons, shot_exposures
+from emmc_rig.session.measured_psi import CALIBRATION_FILE, open_scale, psi_is_assumed
 from emmc_rig.session.readings import session_frames
-from emmc_rig.session.scales import CALIBRATION_FILE, open_scale
 from emmc_rig.session.session import CALIBRATION, Session
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION
 from emmc_rig.store.psi import PSI, StoredPsi

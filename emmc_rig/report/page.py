@@ -9,7 +9,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -202,25 +201,31 @@ def framed(
     lead: str = "",
     *,
     head: Head,
-    template: str = "page.html",
-    **more: Any,
+    kind: str = "",
+    scripts: Sequence[str] = (),
+    data: Mapping[str, object] | None = None,
 ) -> str:
     """Return a page.
 
-    about: sentences under the title. caveats: how to read it. styles: files beside the templates
-    that only this page needs. head: comes first. lead: HTML before the sections. template: extends
-    page.html; more: its values, also scripts, and the data that these read, by element's id.
+    about: sentences under the title. caveats: how to read it. styles, scripts: files beside the
+    templates that only this page needs. head: comes first. lead: HTML before the sections. kind:
+    class of the page, for its style. data: what the scripts read, by the id of its element.
     """
     return fragment(
-        template, title=title, about=about, caveats=caveats, sections=sections, styles=styles,
-        lead=lead, summary=head, **{"scripts": (), "data": {}, **more},
+        "page.html", title=title, about=about, caveats=caveats, sections=sections, styles=styles,
+        lead=lead, summary=head, kind=kind, scripts=scripts, data=data or {},
     )  # fmt: skip
 
 
 def provenance_section(provenance: Mapping[str, object]) -> Section:
     """Return where everything came from."""
     body = part("facts", provenance.items(), code=True)
-    return Section("provenance", "Provenance", body, about="Versions, command and settings.")
+    return Section(
+        "provenance",
+        "Provenance",
+        body,
+        about="What is needed to make this again: command, versions and settings.",
+    )
 
 
 def data_address(data: bytes, kind: str) -> str:

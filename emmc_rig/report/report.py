@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from emmc_rig.formats.format import Export
@@ -25,7 +26,15 @@ from emmc_rig.report.display import (
     reduced,
     round_up,
 )
-from emmc_rig.report.page import Card, estimated, framed, light_field_head
+from emmc_rig.report.page import (
+    Card,
+    Section,
+    estimated,
+    framed,
+    light_field_head,
+    part,
+    provenance_section,
+)
 from emmc_rig.report.viewer import poster, viewer_data
 from emmc_rig.store.results import stated_words
 
@@ -67,71 +76,109 @@ def write_report(path: str | Path, content: ReportContent) -> None:
 
 def render(content: ReportContent) -> str:
     """Return the page as text."""
-    rows, columns, height, width, _ = content.estimate.shape
+    metrics, axes = content.metrics, axes_of(content.metrics)
     disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
-    axes, listed = axes_of(content.metrics), _figures(content.metrics)
-    total_s, longest_s = (max(of(content.stage_s.values() or [0]), 1e-12) for of in (sum, max))
-    frames = content.frames
-    shots = content.metrics.get("shots", 0 if frames is None else len(frames))
     export = Export(
         content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
         view_axes=axes,
     )  # fmt: skip
+    turning = "Drag to look from another side, click to focus, scroll to open the aperture."
+    if not shows_parallax(axes):
+        name = picture_name(axes)
+        turning = f"Drag from {name} to {name}; scroll for a mean of several."
+    warnings = _warnings(content)
     return framed(
         content.title,
-        head=light_field_head(content.metrics, content.source),
-        template="report.html",
-        content=content,
+        [_about(content)],
+        head=light_field_head(metrics, content.source),
+        lead=part("cards", _cards(content))
+        + (part("notice", "Warnings", warnings) if warnings else "")
+        + part("viewer_section", poster(export, PART_PIXELS), turning),
+        sections=list(_sections(content)),
+        kind="report",
         styles=("viewer.css",),
-        warnings=_warnings(content),
-        cards=_cards(content),
-        cfa=None if content.described is None else content.described.sensor.cfa_name,
-        frames=None if frames is None else _frames(frames),
-        whiteboards=[
-            (label, _frames(frame[None])["pictures"][0]) for label, frame in content.whiteboards
-        ],
-        parallax=shows_parallax(axes),
-        picture=picture_name(axes),
-        views={"rows": rows, "columns": columns, "height": height, "width": width},
-        error=None if content.truth is None else _error(content.estimate, content.truth),
-        shots="1 shot" if shots == 1 else f"{shots} shots",
-        timings=[
-            (name, f"{s / longest_s:.1%}", f"{s:.2f} s ({s / total_s:.0%})")
-            for name, s in content.stage_s.items()
-        ],
-        total_s=sum(content.stage_s.values()),
-        figures=[row for row in listed if not row["of_method"]],
-        of_method=[row for row in listed if row["of_method"]],
-        provenance=_provenance(content),
-        data={"viewer-data": viewer_data(export, most_pixels=PART_PIXELS)},
-        poster=poster(export, PART_PIXELS),
         scripts=("viewer.js",),
+        data={"viewer-data": viewer_data(export, most_pixels=PART_PIXELS)},
     )
 
 
-def _frames(frames: Array) -> dict[str, Any]:
-    """Return frames (shot, y, x) as pictures on a common scale, and the ends of the scale."""
+def _about(content: ReportContent) -> str:
+    """Return the scene and the camera as a sentence."""
+    scene, camera, described = *map(content.metrics.get, ("scene", "camera")), content.described
+    title = "" if described is None else described.title
+    return (
+        (Markup("Scene <strong>{}</strong>, ").format(scene) if scene else Markup())
+        + (Markup("camera <strong>{}</strong>").format(camera) if camera else "")
+        + (": " if camera and title else "")
+        + title
+    )
+
+
+def _sections(content: ReportContent) -> Iterator[Section]:
+    """Yield the sections after the viewer, all of them folded; for experts the last."""
+    if content.frames is not None:
+        shots = content.metrics.get("shots", len(content.frames))
+        words = "1 shot" if shots == 1 else f"{shots} shots"
+        yield Section(
+            "captured", "What the sensor recorded", _captured(content.frames, content.described),
+            about=f"{words} from which the light field was computed.",
+        )  # fmt: skip
+    if content.truth is not None:
+        yield Section(
+            "error", "Where it is wrong", _error(content.estimate, content.truth),
+            about="|reconstructed − true| of linear values, mean over colours and "
+            f"{picture_name(axes_of(content.metrics))}s; white is 1.",
+        )  # fmt: skip
+    if content.whiteboards:
+        shown = [(label, _pictures(frame[None])[0]) for label, frame in content.whiteboards]
+        about = "Three of those from which Psi was measured; 1 is the brightest pixel."
+        yield Section("calibration", "Whiteboard frames", part("pictures", shown), about=about)
+    if seconds := content.stage_s:
+        total_s, longest_s = (max(of(seconds.values()), 1e-12) for of in (sum, max))
+        bars = [
+            (name, f"{s / longest_s:.1%}", f"{s:.2f} s ({s / total_s:.0%})")
+            for name, s in seconds.items()
+        ]
+        about = f"Seconds of each stage, {sum(seconds.values()):.1f} in all."
+        yield Section("timings", "Where the time went", part("bars", bars), about=about)
+    listed = _figures(content.metrics)
+    result, method = ([row for row in listed if row.of_method == own] for own in (False, True))
+    about = "Of accuracy, calibration and capture, each with its unit and meaning."
+    yield Section("figures", "All figures", part("figures", result), about=about)
+    yield provenance_section(_provenance(content))
+    if method:
+        about = "Settings and intermediate results, for experts."
+        yield Section("method", "Inside the method", part("figures", method), about=about)
+
+
+def _captured(frames: Array, camera: Camera | None) -> str:
+    """Return frames (shot, y, x) as HTML: pictures on a common scale, and their extremes."""
+    known, (_, rows, columns) = finite(frames), frames.shape
+    filters = "" if camera is None else f", colour filter {camera.sensor.cfa_name}"
+    words = (
+        f"{columns} × {rows} pixels{filters}. Normalised values: least {known.min():.3f}, mean "
+        f"{known.mean():.3f}, greatest {known.max():.3f} (1 is an open camera before a white "
+        "scene)."
+    )
+    shown = [(f"Shot {shot}", address) for shot, address in enumerate(_pictures(known), 1)]
+    return part("lead", words) + part("pictures", shown)
+
+
+def _pictures(frames: Array) -> list[str]:
+    """Return frames (shot, y, x) as addresses of pictures on a common scale."""
     frames = finite(frames)
     curve = DisplayCurve.fitted_to(frames)
     small = reduced(frames[None, ..., None], FRAME_PIXELS)[0, ..., 0]
-    return {
-        "pictures": [png_of(curve.encode(frame)) for frame in small],
-        "shape": frames.shape,
-        "least": frames.min(),
-        "mean": frames.mean(),
-        "greatest": frames.max(),
-    }
+    return [png_of(curve.encode(frame)) for frame in small]
 
 
-def _error(estimate: Array, truth: Array) -> dict[str, object]:
-    """Return the error averaged over views and colours as a picture, and its scale."""
+def _error(estimate: Array, truth: Array) -> str:
+    """Return the error averaged over views and colours as HTML: a map, and its scale."""
     absolute = np.abs(finite(estimate) - finite(truth)).mean(axis=(0, 1, -1))
     mean = reduced(absolute[None, None, ..., None], FRAME_PIXELS)[0, 0, ..., 0]
     scale = round_up(float(np.percentile(mean, 99.5)))
-    return {
-        "scale": scale,
-        "picture": png_of(heat(DisplayCurve(1 / scale, 1.0).encode(mean))),
-    }
+    picture = png_of(heat(DisplayCurve(1 / scale, 1.0).encode(mean)))
+    return part("heat_map", "Error map", picture, scale)
 
 
 class Figure(NamedTuple):
@@ -141,6 +188,19 @@ class Figure(NamedTuple):
     format: str = ""
     unit: str = ""
     meaning: str = ""
+
+
+class FigureRow(NamedTuple):
+    """A metric as the table of figures shows it; key: its name in metrics.json.
+
+    of_method: the metric describes the method's work, not the result.
+    """
+
+    key: str
+    label: str
+    value: str
+    meaning: str
+    of_method: bool
 
 
 ESTIMATES = "logarithm; the accuracy is estimated from it"
@@ -309,7 +369,7 @@ def _flat(metrics: Mapping[str, object], prefix: str = "") -> list[tuple[str, ob
     return rows
 
 
-def _figures(metrics: Mapping[str, object]) -> list[dict[str, Any]]:
+def _figures(metrics: Mapping[str, object]) -> list[FigureRow]:
     """Return the rows of the table of metrics."""
     rows, axes = [], axes_of(metrics)
     lost = "no parallax has been recovered" if shows_parallax(axes) else "they are not told apart"
@@ -321,10 +381,7 @@ def _figures(metrics: Mapping[str, object]) -> list[dict[str, Any]]:
         label, meaning = figure.label, figure.meaning
         if key in FIGURES:
             label, meaning = label.format(**words), meaning.format(**words)
-        rows.append({
-            "key": key, "label": label, "value": written, "meaning": meaning,
-            "of_method": name != key,
-        })  # fmt: skip
+        rows.append(FigureRow(key, label, written, meaning, of_method=name != key))
     return rows
 
 

@@ -29,13 +29,12 @@ from emmc_rig.report.page import (
     provenance_section,
     typed,
 )
-from emmc_rig.session.brightness import GOOD_LEVELS, thinned
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.brightness import GOOD_LEVELS, exposure_reasons, shot_exposures, thinned
 from emmc_rig.session.frame_file import decode_frame
 from emmc_rig.session.journal import DecidedEntry, FrameEntry, RetryEntry, ended, of_kind
-from emmc_rig.session.listing import reconstructed
 from emmc_rig.session.planned import KINDS, PlannedFrame
 from emmc_rig.session.session import REPORT, Session
+from emmc_rig.session.verify import reconstructed
 from emmc_rig.store.folders import result_folder
 from emmc_rig.store.results import shown_bytes, write_metrics
 

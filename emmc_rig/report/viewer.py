@@ -46,7 +46,7 @@ from emmc_rig.report.display import (
     webp_of,
     webp_quality,
 )
-from emmc_rig.report.page import VERDICTS, Head, estimated, framed, light_field_head
+from emmc_rig.report.page import VERDICTS, Head, estimated, fragment, framed, light_field_head
 
 Array = NDArray[np.floating]
 BYTES_PER_PIXEL = 0.36
@@ -93,8 +93,9 @@ def render_viewer(content: Export) -> str:
         content.title,
         [*([content.caption] if content.caption else []), *estimated(content.metrics)],
         head=light_field_head(content.metrics, content.source, viewer=True),
-        template="viewer_page.html", styles=("viewer.css",), scripts=("viewer.js",),
-        data={"viewer-data": viewer_data(content)}, poster=poster(content),
+        lead=fragment("viewer.html", poster=poster(content)),
+        kind="viewer-page", styles=("viewer.css",), scripts=("viewer.js",),
+        data={"viewer-data": viewer_data(content)},
     )  # fmt: skip
 
 
@@ -266,9 +267,9 @@ def render_film(film: Film) -> str:
         about += f", shown as {shown.shape[2]}x{shown.shape[3]}"
     return framed(
         film.folder.resolve().name, [f"{about}."], head=_film_head(film, metrics),
-        template="viewer_page.html", styles=("viewer.css",),
-        scripts=("viewer.js", "film.js"), data={"film-data": data},
-        poster=poster(film.first, most_pixels, like), film=True,
+        lead=fragment("viewer.html", poster=poster(film.first, most_pixels, like), film=True),
+        kind="viewer-page", styles=("viewer.css",), scripts=("viewer.js", "film.js"),
+        data={"film-data": data},
     )  # fmt: skip
 
 

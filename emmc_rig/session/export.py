@@ -30,8 +30,8 @@ from emmc_rig.drivers.dng import Facts
 from emmc_rig.drivers.raw import captured_at
 from emmc_rig.errors import AppError
 from emmc_rig.progress import Watcher
+from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.frame_file import dng_of
-from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import FrameEntry, ImportedEntry, RunEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import CAMERA, RIG, Session

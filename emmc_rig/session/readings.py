@@ -13,7 +13,7 @@ from emmc_rig.calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session.frame_means import decoded, taken_shots
+from emmc_rig.session.board_sets import decoded, taken_shots
 from emmc_rig.session.journal import FilmEntry, FrameEntry, of_kind
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.planned import PlannedFrame

@@ -47,7 +47,6 @@ from emmc_rig.reconstruction.adaptive.survey import Plain, checked, plain_of, un
 from emmc_rig.reconstruction.adaptive.sweep import STRIDE, mean_around, swept
 from emmc_rig.reconstruction.adaptive.times import (
     HELD_WINDOW_PX,
-    WINDOW_PX,
     OtherTime,
     of_samples,
     padded,
@@ -296,7 +295,7 @@ def followed(
     there, back = flow_between(before.earlier[-1].picture, plain.picture)
     by_flow, by_rest = carried_by(back), carried_by(np.zeros_like(back))
     missed, missed_still = (
-        mean_around(np.square(of), used.astype(np.float32), WINDOW_PX).sum(axis=0)
+        mean_around(np.square(of), used.astype(np.float32)).sum(axis=0)
         for *_, of in (by_flow, by_rest)
     )
     flows = missed_still > STILL * missed
@@ -316,7 +315,7 @@ def followed(
 
     def again(texture: Array, surfaces: Surfaces) -> Array:
         nonlocal beliefs
-        beliefs = swept(beliefs, fitted, texture, surfaces, settings.slope_px, settings.jump)
+        beliefs = swept(beliefs, fitted, texture, surfaces, settings)
         return search.per_pixel(beliefs, psi.size, psi.binning)
 
     inner = np.s_[margin : margin + psi.size[0], margin : margin + psi.size[1]]
@@ -373,7 +372,7 @@ def _still(
     """
     weight = used.astype(np.float32)
     changed, noise = (
-        mean_around(square, weight, WINDOW_PX)[0]
+        mean_around(square, weight)[0]
         for square in (np.square(bright.frames - before), 2 * bright.noise)
     )
     still = changed <= np.where(flows, *UNCHANGED) * noise

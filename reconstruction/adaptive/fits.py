@@ -74,7 +74,7 @@ def fitted_models(
     fitted = replace(bright, usable=given.usable & ~held)
 
     def again(volume: search.Volume, texture: Array, surfaces: Surfaces) -> Array:
-        beliefs = swept(volume, fitted, texture, surfaces, settings.slope_px, settings.jump)
+        beliefs = swept(volume, fitted, texture, surfaces, settings)
         return search.per_pixel(beliefs, given.psi.size, given.psi.binning)
 
     nearer = 1 if settings.nearer == "larger" else -1

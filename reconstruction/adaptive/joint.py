@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ Array = NDArray[np.floating]
 
 class TextureSettings(Settings):
     """Settings of the fit of texture and disparity."""
+
+    removed: ClassVar[tuple[str, ...]] = ("doubt",)
 
     steps: int = Field(default=16, ge=1)
     first_noise: float = Field(
@@ -53,9 +56,6 @@ class TextureSettings(Settings):
     slope_px: float = Field(default=0.3, gt=0, description="see `refine`")
     room_px: float = Field(
         default=0.5, ge=0, description="by which sharpening may leave the disparity searched"
-    )
-    doubt: float = Field(
-        default=0.025, gt=0, description="deviation of the texture when disparity is sharpened"
     )
 
 
@@ -152,7 +152,7 @@ def solve(
             seen = others(padded, margin, clean)
         left = settings.steps - 1 - step
         if step >= 2 and left < settings.refine_steps and left % 2 == 0:
-            doubted = precision / (1 + precision * settings.doubt**2 * rows_squared)
+            doubted = precision / (1 + precision * sigma**2 * rows_squared)
             residual = frames - surfaces.forward(now)
             padded = refined(
                 surfaces, padded, now, residual, doubted.astype(np.float32), settings.slope_px

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.adaptive import search
+from emmc_rig.reconstruction.adaptive import mixture, search
 from emmc_rig.reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
 from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
 from emmc_rig.reconstruction.adaptive.film import Film, followed
@@ -54,9 +54,6 @@ TEXTURED = 0.01
 """Variance of a patch's texture, over its squared brightness, from which it counts as textured. On
 middles of group A (96x96, one CFA shot) 11 to 100 % of such patches decide, of weaker ones 0 to
 25 %, whatever the mask: with them antinous was doubted."""
-MISFIT_WINDOW_PX = 8.0
-"""Deviation of the window in which the place of the largest residual is looked for. 2x 0.00, 0.5x
-0.00 dB."""
 
 
 def reconstruct_adaptive(
@@ -268,7 +265,7 @@ def misfit(residual: Array, noise: Array, fitted: NDArray[np.bool_]) -> dict[str
     count, all (shot, pixel_y, pixel_x).
     """
     relative = np.where(fitted, np.square(residual) / np.maximum(noise, 1e-20), 0)
-    around = cv2.GaussianBlur(relative.sum(axis=0, dtype=np.float64), (0, 0), MISFIT_WINDOW_PX)
+    around = cv2.GaussianBlur(relative.sum(axis=0, dtype=np.float64), (0, 0), mixture.WINDOW_PX)
     row, column = np.unravel_index(around.argmax(), around.shape)
     times = float(np.sqrt(relative.sum(dtype=np.float64) / max(int(fitted.sum()), 1)))
     return {"misfit": times, "misfit_row": float(row), "misfit_column": float(column)}

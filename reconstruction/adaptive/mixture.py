@@ -41,9 +41,6 @@ disparity errs in both directions among the rays of a pixel. Of buttercup, dice,
 deep-occlusions, three shots, 0.9 to 1.5; 1 and 1.5 lose 0.05 dB in the mean."""
 LEVELS = 65535
 """Number of steps of stored values in [0, 1]."""
-PRIOR_READINGS = 4.0
-"""Readings that the whole picture's mean square counts for at every place. 2x 0.00, 0.5x 0.00 dB.
-"""
 
 
 def shares_of(
@@ -64,15 +61,16 @@ def _shares(
     window_px: float,
     power: float,
 ) -> NDArray[np.float32]:
-    readings = _around(held.astype(np.float64), window_px) + PRIOR_READINGS
+    # The whole picture's mean square counts as one more reading at every place.
+    readings = _around(held.astype(np.float64), window_px) + 1
     excess = []
     for residual in residuals:
         square = np.where(held, np.square(residual, dtype=np.float64) - noise, 0)
         whole = max(float(square.sum() / held.sum()), 0.0)
-        excess.append((_around(square, window_px) + PRIOR_READINGS * whole) / readings)
+        excess.append((_around(square, window_px) + whole) / readings)
     allowed = np.where(held, noise, 0)
     whole = allowed.sum() / held.sum()
-    typical = (_around(allowed, window_px) + PRIOR_READINGS * whole) / readings
+    typical = (_around(allowed, window_px) + whole) / readings
     # A mean of n squares of Gaussian noise is off by sqrt(2 / n) of it.
     floor = typical * np.sqrt(2 / readings) + 1e-20
     inverse = np.maximum(excess, floor) ** -power

@@ -44,17 +44,19 @@ COARSE_SPACING = 3
 NEAR_PX, FAR_STEP_PX = 3.0, 1.0
 """Disparities beyond are evaluated this much apart. NEAR_PX: 2x -0.05, 0.5x -0.18 dB; FAR_STEP_PX:
 2x -0.02, 0.5x 0.00 dB."""
-START_PX, GROWTH_PX = 9.0, 3.0
-"""Disparities searched first, to both sides; by how much the range grows at a time. START_PX: 2x
-+0.05, 0.5x -0.04 dB; GROWTH_PX: 2x 0.00, 0.5x 0.00 dB."""
+START_PX = 9.0
+"""Disparities searched first, to both sides, and by how much the range grows at a time. 2x +0.05,
+0.5x -0.04 dB."""
 DECISIVE = 5.0
-"""Log-likelihood by which a patch must prefer its best disparity to the mean one to count. 2x 0.00,
-0.5x 0.00 dB."""
-WANTED = 0.01
-"""Share of the deciding patches at the end of the range that makes it grow. 2x 0.00, 0.5x 0.00 dB.
-"""
+"""Difference of log-likelihoods that matters. A patch decides if its best disparity exceeds the
+mean of its disparities by it. Disparities that lie less below the best contend with it, and are
+evaluated exactly: interpolated there instead, they made buttercup's crops 0.3 to 0.5 dB worse.
+2x 0.00, 0.5x -0.01 dB."""
 POSSIBLE = 0.02
-"""Probability above which a disparity is looked at again. 2x 0.00, 0.5x +0.05 dB."""
+"""Probability above which a disparity is looked at again, and share of the deciding patches at an
+end of the range from which the range grows. 2x 0.00, 0.5x +0.05 dB."""
+FLOOR = 1e-4
+"""Probability that a patch's evidence is worth nothing: its texture is none on a plane."""
 RARE_PX = 2.0
 """Disparity that half as many objects have as have none. Without it undecided patches of a smooth
 scene agreed on -6.5 px; with it group A loses 0.00 to 0.03 dB on average. 2x -0.01, 0.5x 0.00 dB.
@@ -72,9 +74,6 @@ textures of several lengths are compared: `adaptive-fast`, with a single length,
 it. The coarse search compares all: its disparities, far apart, would lose the right one. 2x +0.03,
 0.5x +0.01 dB.
 """
-CONTENDING = 4.0
-"""Log-likelihood below a patch's best within which it is evaluated at all disparities: interpolated
-there instead, it made buttercup's crops 0.3 to 0.5 dB worse. 2x 0.00, 0.5x -0.01 dB."""
 
 
 def compatibility(
@@ -100,14 +99,13 @@ def _normalised(beliefs: Array) -> Array:
     return beliefs / np.maximum(beliefs.sum(axis=-1, keepdims=True), 1e-30)
 
 
-def posteriors(evidence: Array, pairs: Array, rounds: int = 3, floor: float = 1e-4) -> Array:
+def posteriors(evidence: Array, pairs: Array, rounds: int = 3) -> Array:
     """Return the probability of each label at each patch, (row, column, L), float32.
 
-    evidence: (row, column, L) log-likelihoods. pairs: (L, L), see `compatibility`. floor: the
-    probability that a patch's evidence is worth nothing (its texture is none on a plane).
+    evidence: (row, column, L) log-likelihoods. pairs: (L, L), see `compatibility`.
     """
     own = np.exp((evidence - evidence.max(axis=-1, keepdims=True)).astype(np.float32))
-    own = np.float32(1 - floor) * _normalised(own) + np.float32(floor / own.shape[-1])
+    own = np.float32(1 - FLOOR) * _normalised(own) + np.float32(FLOOR / own.shape[-1])
     pairs = pairs.astype(np.float32)
     rows, columns, labels = own.shape
     messages = np.ones((4, rows, columns, labels), dtype=np.float32)
@@ -252,8 +250,8 @@ def coarse(
             float(np.mean(best[deciding] >= len(known) - 2)) if deciding.any() else 0.0,
         ]
         below, above = (
-            _reach(end, min(end + GROWTH_PX, furthest_px), FAR_STEP_PX)
-            if ends > WANTED
+            _reach(end, min(end + START_PX, furthest_px), FAR_STEP_PX)
+            if ends > POSSIBLE
             else known[:0]
             for end, ends in zip((-known[0], known[-1]), share, strict=True)
         )
@@ -437,7 +435,7 @@ def _near_best(evidence: NDArray[np.float32], every: int) -> NDArray[np.bool_]:
     evidence: (patch, label), of each `every`-th label; the labels returned lie between these.
     """
     known = np.isfinite(evidence)
-    good = evidence > evidence.max(axis=1, keepdims=True) - CONTENDING
+    good = evidence > evidence.max(axis=1, keepdims=True) - DECISIVE
     between = known[:, 1:] & known[:, :-1] & (good[:, 1:] | good[:, :-1])
     out = np.zeros((len(evidence), every * (evidence.shape[1] - 1) + 1), dtype=bool)
     for offset in range(1, every):

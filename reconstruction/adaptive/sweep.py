@@ -28,30 +28,26 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.adaptive.lanes import CUBIC, TAPS
 from emmc_rig.reconstruction.adaptive.rays import Surfaces
 from emmc_rig.reconstruction.adaptive.search import (
+    FLOOR,
+    SMOOTH_PX,
     Volume,
     compatibility,
     interpolated,
     places,
     posteriors,
 )
+from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
-FREEDOM = 3.0
-"""Of the Student t, as of the search's. 2x 0.00, 0.5x -0.01 dB."""
 RADIUS_PX, EDGE = 3, 1e-3
 """Of the guided filter; EDGE is the variance of the picture, in [0, 1], that counts as an edge.
 RADIUS_PX: 2x +0.03, 0.5x -0.01 dB; EDGE: 2x 0.00, 0.5x 0.00 dB."""
-VARIANCE_PX = 4.0
-"""Deviation of the window in which squared residuals are averaged. 2x 0.00, 0.5x +0.01 dB."""
+WINDOW_PX = 4.0
+"""Deviation of the window in which squared residuals of all readings are averaged. 2x 0.00, 0.5x
++0.01 dB."""
 STRIDE = 2
 """Pixels between those whose disparity is asked for. 2x -0.01, 0.5x 0.00 dB."""
-RARE, BEYOND_PX = 0.2, 0.25
-"""Percent of the patches, at either end, whose likeliest disparity may be left out: next to none
-lies there, and with so many planes some fit by chance. And how far beyond the others to look. Each:
-2x 0.00, 0.5x 0.00 dB."""
-LEAST_BELIEF = 1e-5
-"""Of a disparity that the patches do not believe in: they may be wrong. 2x 0.00, 0.5x 0.00 dB."""
 
 
 @njit(inline="always")
@@ -145,17 +141,17 @@ def plane_frames(psi: ImagingMatrix, texture: Array, disparity: float, margin: i
     return frames
 
 
-def _likelihood(residual: Array, variance: Array, used: Array, alike: Any) -> Array:
+def _likelihood(residual: Array, variance: Array, used: Array, alike: Any, freedom: float) -> Array:
     """Return the log-likelihood of every pixel (y, x) of residuals (shot, y, x), averaged.
 
     alike: the guided filter of the picture.
     """
-    surprise = np.log1p(np.square(residual) / (FREEDOM * variance)) * used
-    each = (-(FREEDOM + 1) / 2 * surprise.sum(axis=0)).astype(np.float32)
+    surprise = np.log1p(np.square(residual) / (freedom * variance)) * used
+    each = (-(freedom + 1) / 2 * surprise.sum(axis=0)).astype(np.float32)
     return np.asarray(alike.filter(each), dtype=np.float32) * (2 * RADIUS_PX + 1) ** 2
 
 
-def mean_around(values: Array, used: Array, window_px: float = VARIANCE_PX) -> Array:
+def mean_around(values: Array, used: Array, window_px: float = WINDOW_PX) -> Array:
     """Return the mean over the used pixels around, shots apart, of (shot, y, x).
 
     used: 1 or 0, of the type of the values.
@@ -173,8 +169,7 @@ def swept(
     given: Readings,
     texture: Array,
     surfaces: Surfaces,
-    slope_px: float,
-    jump: float,
+    settings: AdaptiveSettings,
 ) -> Volume:
     """Return what to believe of every STRIDE-th pixel's disparity, given texture and patches.
 
@@ -194,8 +189,9 @@ def swept(
     at = places(volume, rows.astype(float), columns.astype(float))
     half = max(psi.light_field_shape[:2]) // 2
     likeliest = volume.disparities[volume.probability.argmax(axis=-1)]
-    low, high = np.percentile(likeliest, (RARE, 100 - RARE))
-    within = (volume.disparities >= low - BEYOND_PX) & (volume.disparities <= high + BEYOND_PX)
+    # One evaluated disparity beyond the patches' likeliest, to both sides.
+    low, high = likeliest.min() - SMOOTH_PX, likeliest.max() + SMOOTH_PX
+    within = (volume.disparities >= low) & (volume.disparities <= high)
     within &= np.abs(volume.disparities) * half + TAPS <= margin
     labels = volume.disparities[within]
     evidence = np.empty((len(rows), len(columns), len(labels)), dtype=np.float32)
@@ -205,14 +201,15 @@ def swept(
         alike = cv2.ximgproc.createGuidedFilter(guide, RADIUS_PX, EDGE)
         for label, known in enumerate(all_known[first:last], first):
             of_plane = frames - plane_frames(psi, texture, labels[label], margin)
-            likelihood = _likelihood(of_plane, variance, weight, alike)[::STRIDE, ::STRIDE]
+            likelihood = _likelihood(of_plane, variance, weight, alike, settings.freedom)
+            likelihood = likelihood[::STRIDE, ::STRIDE]
             believed = interpolated(
                 volume, lambda grid, known=known: grid.probability[..., known], at
             )
-            evidence[..., label] = likelihood + np.log(believed + LEAST_BELIEF)
+            evidence[..., label] = likelihood + np.log(believed + np.float32(FLOOR / len(labels)))
 
     in_bands(work, len(labels))
-    chances = posteriors(evidence, compatibility(labels, slope_px * STRIDE, jump))
+    chances = posteriors(evidence, compatibility(labels, settings.slope_px * STRIDE, settings.jump))
     return replace(
         volume,
         disparities=labels,

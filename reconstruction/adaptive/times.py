@@ -32,9 +32,8 @@ from emmc_rig.reconstruction.adaptive.visibility import carried
 from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
-WINDOW_PX, HELD_WINDOW_PX = 4.0, 12.0
-"""Deviations of the windows that squared residuals are averaged in: of all readings, and of the few
-that are held out."""
+HELD_WINDOW_PX = 12.0
+"""Deviation of the window that squared residuals of the few held-out readings are averaged in."""
 ANOTHER = 4.0
 """Ratio of squared residuals of total variation, at another time over held-out readings, above
 which the other frame shows another scene."""
@@ -102,7 +101,7 @@ class OtherTime:
         """
         surfaces = self.surfaces(centre, margin, nearer, len(texture))
         missed = self.readings.frames - surfaces.forward(texture)
-        around = mean_around(np.square(missed), self.used.astype(np.float32), WINDOW_PX)
+        around = mean_around(np.square(missed), self.used.astype(np.float32))
         wrong = np.float32(doubt) * self.moving * np.maximum(around - self.readings.noise, 0)
         variance = self.readings.variance(misfit) + wrong
         precision = np.where(self.used, 1 / variance, 0).astype(np.float32)
@@ -172,9 +171,9 @@ def others_of(plain: Plain, shown: Sequence[tuple[Readings, Array]]) -> list[Oth
         then = np.stack([sampled(view, at + there) for view in views]).reshape(light_field.shape)
         weight = readings.usable.astype(np.float32)
         moves, still = (
-            mean_around(
-                np.square(readings.frames - readings.psi.forward(predicted)), weight, WINDOW_PX
-            ).sum(axis=0)
+            mean_around(np.square(readings.frames - readings.psi.forward(predicted)), weight).sum(
+                axis=0
+            )
             for predicted in (then, light_field)
         )
         rests = (still <= REST * moves).astype(np.float32)

@@ -14,8 +14,8 @@ from emmc_rig.captures import bench_check
 from emmc_rig.captures.bench_check import ability
 from emmc_rig.captures.by_hand import HandPlaces, with_hands
 from emmc_rig.captures.expand import expand
-from emmc_rig.captures.order import ordered
 from emmc_rig.captures.plan import Plan, planned_camera
+from emmc_rig.captures.schedule import ordered
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene

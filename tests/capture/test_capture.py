@@ -18,10 +18,9 @@ from watching import Acting
 
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
-from emmc_rig.captures.checks import check
 from emmc_rig.captures.control import Control, interruptible
+from emmc_rig.captures.faults import GaveUpError, Mending, check, mending
 from emmc_rig.captures.plan import Checks, Retries
-from emmc_rig.captures.retries import GaveUpError, Mending, mending
 from emmc_rig.captures.run import (
     begun_session,
     disk_faults_named,

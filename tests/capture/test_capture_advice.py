@@ -31,8 +31,7 @@ from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.rig_config import opened_rig
 from emmc_rig.captures import engine
 from emmc_rig.captures import run as capture_run
-from emmc_rig.captures.checks import SaturatedError
-from emmc_rig.captures.retries import HOPELESS
+from emmc_rig.captures.faults import HOPELESS, SaturatedError
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.model.files import Disk

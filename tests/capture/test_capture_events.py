@@ -10,10 +10,10 @@ from simulated_disk import SimulatedDisk
 
 import emmc_rig as emmc
 from emmc_rig.captures.control import Control
-from emmc_rig.captures.estimate import Pace
 from emmc_rig.captures.events import Listener
 from emmc_rig.captures.metering import Exposures
 from emmc_rig.captures.plan import load_plan
+from emmc_rig.captures.schedule import Pace
 from emmc_rig.captures.sequencer import Sequencer
 
 PLAN = {

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from emmc_rig.captures.estimate import Pace
 from emmc_rig.captures.expand import expand, exposures_s, fittings
-from emmc_rig.captures.order import ordered, travel_um
 from emmc_rig.captures.plan import (
     Boards,
     Darks,
@@ -20,6 +18,7 @@ from emmc_rig.captures.plan import (
     new_plan,
     planned_camera,
 )
+from emmc_rig.captures.schedule import Pace, ordered, travel_um
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import shipped_cameras

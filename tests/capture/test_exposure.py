@@ -11,15 +11,19 @@ from simulated_disk import SimulatedDisk
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.captures.amend import amendment
 from emmc_rig.captures.control import Control
+from emmc_rig.captures.faults import GaveUpError
 from emmc_rig.captures.metering import BRACKET_STEP, METERABLE_LEVELS, asked_of_scene
 from emmc_rig.captures.plan import Metering
-from emmc_rig.captures.retries import GaveUpError
 from emmc_rig.captures.run import _frozen, planned_frames
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.formats.scenes import fine_scene
-from emmc_rig.session.brightness import GOOD_LEVELS, next_exposure_s
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.brightness import (
+    GOOD_LEVELS,
+    exposure_reasons,
+    next_exposure_s,
+    shot_exposures,
+)
 from emmc_rig.session.journal import Figures, metered
 from emmc_rig.session.verify import verify
 from emmc_rig.simulators.clock import ManualClock

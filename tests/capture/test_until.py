@@ -20,9 +20,8 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.result import Reconstruction, Status
 from emmc_rig.report.session_sheet import events, sheet
 from emmc_rig.session.journal import DecidedEntry, UntilEntry, of_kind
-from emmc_rig.session.listing import summary
 from emmc_rig.session.session import JOURNAL, Session
-from emmc_rig.session.verify import verify
+from emmc_rig.session.verify import summary, verify
 
 pytestmark = pytest.mark.slow
 

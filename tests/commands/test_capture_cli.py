@@ -19,9 +19,9 @@ from capture_rigs import frames_in
 from programs import PROGRAM, done, one_line, program, refused, wait_until
 
 from emmc_rig.drivers.raw import decode_raw
-from emmc_rig.session.listing import sessions_in
 from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
+from emmc_rig.session.verify import sessions_in
 
 RIG = ["--rig", "simulated", "--scene", "near-planar", "--size", "24x32"]
 PATIENCE_S = 60.0

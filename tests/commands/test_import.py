@@ -19,8 +19,8 @@ from emmc_rig.captures.import_session import _Import as importing
 from emmc_rig.drivers.dng import Facts, encode_dng
 from emmc_rig.formats.cameras import shipped_camera_files
 from emmc_rig.process.reconstructing import open_frames
+from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.frame_means import decoded
 from emmc_rig.session.journal import ImportedEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify

@@ -6,6 +6,8 @@ from contextlib import contextmanager
 import pytest
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: extra `browser`")
+exceptions = pytest.importorskip("selenium.common.exceptions")
+waiting = pytest.importorskip("selenium.webdriver.support.ui")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 CHROMEDRIVER = shutil.which("chromedriver")
@@ -39,13 +41,38 @@ def complaints(driver):
     return [message for message in reported if not any(words in message for words in HARMLESS)]
 
 
+def wait(driver, holds, patience_s=60):
+    """Wait until that holds; what is drawn anew in between is looked up again."""
+    ignored = [exceptions.StaleElementReferenceException]
+    patient = waiting.WebDriverWait(driver, patience_s, 0.1, ignored)
+    patient.until(lambda _: holds())
+
+
+def drawn(driver):
+    """Wait for two frames of the browser: the page is laid out and painted anew."""
+    driver.execute_async_script(
+        "const end = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(end))"
+    )
+
+
 @contextmanager
-def at_width(driver, width):
-    """Show the page on a screen of that many pixels across."""
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+def on_screen(driver, width, height=900, scheme="light"):
+    """Show the page on a screen of so many pixels, below 500 px a phone's."""
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+    seen = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    yield
-    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", seen)
+    drawn(driver)
+    try:
+        yield
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+def fits(driver):
+    """Return whether the page is no wider than its screen."""
+    return driver.execute_script("return document.documentElement.scrollWidth <= innerWidth")
 
 
 def nameless(driver):

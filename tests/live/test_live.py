@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -37,6 +37,7 @@ from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, pic
 from emmc_rig.live.server import application
 from emmc_rig.live.server import served as serving
 from emmc_rig.live.watch import Watch
+from emmc_rig.report.page import source
 
 PATIENCE_S = 60.0
 TOKEN = "secret"
@@ -145,14 +146,16 @@ def watching(*arguments):
 
 def until(watch, holds):
     """Return the first state of which that holds."""
-    end_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end_s:
-        state = watch.state()
-        if holds(state):
-            return state
-        while watch.version == state["version"] and time.monotonic() < end_s:
-            time.sleep(0.005)
-    raise AssertionError(f"never came: {state}")
+
+    def looked():
+        watch.touch()
+        return holds(watch.state.snapshot())
+
+    with watch.state.changed:
+        came = watch.state.changed.wait_for(looked, PATIENCE_S)
+        state = watch.state.snapshot()
+    assert came, f"never came: {state}"
+    return state
 
 
 def test_frames_follow_each_other_and_wishes_are_carried_out_between_them():
@@ -218,7 +221,7 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
         place_um = lit["axes"]["mask_x"]["position_um"]
         assert place_um == pytest.approx(rig.zero_um["mask_x"], abs=0.5)
         until(watch, lambda state: state["frame"] > lit["frame"] + 1)
-        before = mosaic_of(watch)
+        before = watch.newest().frame.mosaic
         watch.jog("mask_x", 200.0)
         moved = until(
             watch,
@@ -228,7 +231,7 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
         )
         assert moved["axes"]["mask_x"]["position_um"] == pytest.approx(place_um + 200, abs=0.5)
         until(watch, lambda state: state["frame"] > moved["frame"] + 1)
-        after = mosaic_of(watch)
+        after = watch.newest().frame.mosaic
         assert before.mean() > 2 * rig.camera.snap().black_level_dn.mean()
         assert np.abs(after.astype(float) - before).mean() > 30
         watch.look_at("scene")
@@ -236,12 +239,6 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
             watch.look_at("moon")
         with pytest.raises(AppError, match="no axis 'x'"):
             watch.jog("x", 1.0)
-
-
-def mosaic_of(watch):
-    frame = watch.frame()
-    assert frame is not None
-    return frame.mosaic
 
 
 class SlowStage:
@@ -327,8 +324,8 @@ def test_positions_are_shown_while_an_axis_moves():
 def test_whoever_sees_that_a_move_ended_sees_where_and_how():
     stage, ended, published = SlowStage(), threading.Event(), []
 
-    def publish(**news):
-        published.append(news)
+    def publish(trouble=None, **news):
+        published.append({**news, **(trouble or {})})
         if news.get("busy") == "":
             ended.set()
 
@@ -594,6 +591,8 @@ def test_the_page_its_state_and_its_pictures_are_served():
         assert b"https://" not in page
         for name in Watch.files[1:]:
             assert ask("GET", f"/{TOKEN}/{name}")[0] == 200
+        for name in ("viewer.js", "viewer.css"):  # the reports have the same viewer
+            assert ask("GET", f"/{TOKEN}/{name}")[2].decode() == source(name)
         status, headers, data = ask("GET", f"/{TOKEN}/picture.jpg?kind=mosaic&part=0.5&px=64")
         assert (status, headers["Content-Type"]) == (200, "image/jpeg")
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), 1)
@@ -622,29 +621,44 @@ def test_strangers_are_refused():
         until(watch, lambda state: state["settings"]["exposure_s"] == 0.05)
 
 
-def test_values_that_make_no_sense_are_refused_in_one_line():
+@pytest.mark.parametrize(
+    ("order", "body", "why"),
+    [
+        ("exposure", "not json", "not JSON"),
+        ("exposure", "[1]", "send a JSON object"),
+        ("exposure", "{}", "exposure: seconds: field required"),
+        ("exposure", '{"seconds": "1"}', "exposure: seconds: input should be a number"),
+        ("exposure", '{"seconds": NaN}', "exposure: seconds: input should be a finite number"),
+        ("exposure", '{"seconds": 1e300}', "exposure: seconds: input should be less than 1"),
+        ("exposure", '{"seconds": true}', "exposure: seconds: a number is meant, not true"),
+        ("exposure", '{"second": 1}', "exposure: unknown key 'second': did you mean 'seconds'?"),
+        ("jog", '{"axis": 1, "distance_um": 1}', "jog: axis: input should be text"),
+        ("jog", '{"axis": "mask_x", "distance_um": 1}', "no stage here"),
+        ("centre", "{}", "it is not known where the masks are centred"),
+        ("home", '{"axis": "mask_x"}', "home: this order takes no arguments"),
+        ("look", '{"target": "moon"}', "cannot look at 'moon' here"),
+        ("reference", '{"taken": 1}', "reference: taken: input should be true or false"),
+        ("preview", '{"what": "mask"}', "preview: what: input should be a list"),
+    ],
+)
+def test_an_order_that_makes_no_sense_is_refused_in_one_clear_line(refusing, order, body, why):
+    status, _, reported = refusing("POST", f"/{TOKEN}/do/{order}", body)
+    assert (status, reported.decode().count("\n")) == (400, 1)
+    assert why in reported.decode()
+
+
+def test_unknown_orders_long_bodies_and_impossible_pictures_are_refused(refusing):
+    assert refusing("POST", f"/{TOKEN}/do/explode", "{}")[0] == 404
+    assert refusing("POST", f"/{TOKEN}/do/exposure", " " * 200_000)[0] == 413
+    for query in ("part=x", "part=nan", "kind=xray"):
+        assert refusing("GET", f"/{TOKEN}/picture.jpg?{query}")[0] == 400
+
+
+@pytest.fixture(scope="module")
+def refusing():
+    """Ask a page that no test changes."""
     with fake_page() as (_, ask):
-        for path, body in (
-            ("exposure", "not json"),
-            ("exposure", "[1]"),
-            ("exposure", "{}"),
-            ("exposure", '{"seconds": "1"}'),
-            ("exposure", '{"seconds": NaN}'),
-            ("exposure", '{"seconds": true}'),
-            ("exposure", '{"seconds": 1, "more": 2}'),
-            ("jog", '{"axis": "mask_x", "distance_um": 1}'),
-            ("centre", "{}"),
-            ("look", '{"target": "moon"}'),
-        ):
-            status, _, reported = ask("POST", f"/{TOKEN}/do/{path}", body)
-            assert status == 400, (path, body)
-            assert reported.endswith(b"\n")
-            assert reported.count(b"\n") == 1
-        assert ask("POST", f"/{TOKEN}/do/explode", "{}")[0] == 404
-        assert ask("POST", f"/{TOKEN}/do/exposure", " " * 200_000)[0] == 413
-        assert ask("GET", f"/{TOKEN}/picture.jpg?part=x")[0] == 400
-        assert ask("GET", f"/{TOKEN}/picture.jpg?part=nan")[0] == 400
-        assert ask("GET", f"/{TOKEN}/picture.jpg?kind=xray")[0] == 400
+        yield ask
 
 
 def test_read_only_shows_and_does_nothing():
@@ -666,10 +680,12 @@ def test_a_stop_is_carried_out_while_a_hundred_pages_follow():
         until(watch, lambda state: "no news" in state["trouble"]["camera"])
         watch.jog("mask_x", 1.0)
         assert stage.moving.wait(PATIENCE_S)
-        pages = [
-            threading.Thread(target=ask, args=("GET", f"/{TOKEN}/events"), daemon=True)
-            for _ in range(100)
-        ]
+
+        def follow():
+            with suppress(OSError, http.client.HTTPException):  # the server ends
+                ask("GET", f"/{TOKEN}/events")
+
+        pages = [threading.Thread(target=follow, daemon=True) for _ in range(100)]
         for page in pages:
             page.start()
         assert ask("POST", f"/{TOKEN}/do/stop", "{}")[0] == 200
@@ -691,11 +707,10 @@ def test_a_stop_is_carried_out_while_a_hundred_pages_follow():
         ("null", 403),
     ],
 )
-def test_only_the_page_itself_by_scheme_host_and_port_may_act(origin, status):
-    with fake_page() as (_, ask):
-        given = {"Origin": origin.format(port=ask.port)}
-        body = json.dumps({"seconds": 0.05})
-        assert ask("POST", f"/{TOKEN}/do/exposure", body, given)[0] == status
+def test_only_the_page_itself_by_scheme_host_and_port_may_act(refusing, origin, status):
+    given = {"Origin": origin.format(port=refusing.port)}
+    body = json.dumps({"seconds": 0.01})
+    assert refusing("POST", f"/{TOKEN}/do/exposure", body, given)[0] == status
 
 
 def test_who_goes_in_the_middle_of_a_request_leaves_no_traceback(capfd):

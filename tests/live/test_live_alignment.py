@@ -6,19 +6,22 @@ import pytest
 from mask_frames import BLACK, CAMERAS, SIZE, WHITE, bench_frame, frame_of
 
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.locator import edge_direction
 from emmc_rig.calibration.repeats import Repeats, repeats_of
 from emmc_rig.captures import focus
 from emmc_rig.captures.focus import REMEMBERED_S, FocusMeter, sharpness
 from emmc_rig.live.alignment import MaskGauge
 from emmc_rig.model.camera import Camera
 
-WITH_SHADOW = sorted(
+KINDS = (
+    "moving-colour-mask", "rgbw-bayer-1shot", "rgbw-mono", "scenario-i-rgb", "sensor-side-binary",
+)  # fmt: skip
+"""Cameras whose masks differ in what the shadow looks like: coloured or not, through filters or
+without, near the sensor or far. The other shipped cameras have one of these masks' kinds."""
+WITHOUT_SHADOW = sorted(
     name
     for name, camera in CAMERAS.items()
-    if [mask.distance_mm < camera.lens.distance_mm for mask in camera.masks.values()] == [True]
+    if [mask.distance_mm < camera.lens.distance_mm for mask in camera.masks.values()] != [True]
 )
-WITHOUT_SHADOW = sorted(CAMERAS.keys() - set(WITH_SHADOW))
 
 
 def with_pattern(**pattern):
@@ -30,8 +33,8 @@ def with_pattern(**pattern):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", WITH_SHADOW)
-def test_the_mask_of_every_shipped_camera_is_measured_to_a_tenth_of_a_degree_and_per_cent(name):
+@pytest.mark.parametrize("name", KINDS)
+def test_a_mask_of_every_kind_is_measured_to_a_tenth_of_a_degree_and_per_cent(name):
     camera = CAMERAS[name]
     truth = {"offset_um": (11.0, -7.0), "rotation_deg": 0.7, "stretch": 0.9965}
     frame = bench_frame(camera, **truth)
@@ -70,7 +73,7 @@ def test_how_a_mask_repeats_follows_from_its_cells(cells, expected):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offset_um", [(11.0, -7.0), (60.0, -110.0), (170.0, 20.0)])
+@pytest.mark.parametrize("offset_um", [(60.0, -110.0), (170.0, 20.0)])
 def test_a_mask_that_repeats_is_placed_but_for_its_repeats(offset_um):
     camera = with_pattern(kind="tile", cells=RANDOM[:8, :8].tolist())
     place = MaskGauge(camera, SIZE).measure(bench_frame(camera, offset_um=offset_um))
@@ -97,7 +100,7 @@ def test_cameras_without_one_mask_that_throws_a_shadow_say_so(name):
 
 
 @pytest.mark.slow
-def test_a_mask_turned_by_five_degrees_is_found_by_its_edges():
+def test_a_mask_turned_by_five_degrees_is_measured():
     camera = CAMERAS["rgbw-mono"]
     frame = bench_frame(camera, rotation_deg=-5.0)
     place = MaskGauge(camera, frame.mosaic.shape).measure(frame)
@@ -127,12 +130,6 @@ def test_nothing_is_said_of_the_mask_in_a_dark_picture_or_through_other_filters(
         gauge.measure(frame_of(np.full(SIZE, 2000), "bggr"))
     with pytest.raises(CalibrationError, match="72x96"):
         gauge.measure(frame_of(np.full((8, 8), 2000)))
-
-
-def test_edges_in_all_directions_have_no_straightness():
-    noise = np.random.default_rng(0).normal(size=(300, 400)).astype(np.float32)
-    assert edge_direction(noise)[1] < 0.1
-    assert edge_direction(np.ones((20, 20), np.float32)) == (0.0, 0.0)
 
 
 def noisy(blur, seed, level=1500.0, sigma=40.0, shape=(120, 160)):

@@ -11,6 +11,7 @@ from threading import Event, Thread, current_thread
 import pytest
 import yaml
 from fuzzing import FUZZ
+from pages import order
 from test_live import PATIENCE_S, until, watching
 
 from emmc_rig.bench.hardware import simulated_rig
@@ -77,12 +78,12 @@ def bench(tmp_path, monkeypatch):
 def click(page, name, values):
     """Do what a button does, unless it is refused."""
     with suppress(AppError):
-        page.actions[name](**values)
+        order(page, name, **values)
 
 
 def settled(watch):
     """Return the state of a picture that was taken where the stage stands now."""
-    before = watch.state()["frame"]
+    before = watch.state.snapshot()["frame"]
     return until(
         watch,
         lambda state: (
@@ -113,13 +114,13 @@ def offered(state, looked):
     return None
 
 
-@pytest.mark.parametrize("order", ORDERS, ids=lambda order: "-".join(order))
+@pytest.mark.parametrize("names", ORDERS, ids="-".join)
 def test_whoever_clicks_in_any_order_and_interrupts_comes_to_a_plan_by_what_is_offered(
-    bench, order
+    bench, names
 ):
     clock, watch, exposures_s, plan = bench
     settled(watch)
-    for name in order:
+    for name in names:
         (does, values), (interrupts, more) = CLICKS[name]
         clock.waits.clear()
         clock.free.clear()

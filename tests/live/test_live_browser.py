@@ -1,9 +1,10 @@
 """The set-up page in a browser: it follows the camera, jogs the stage, and says what goes wrong."""
 
 import re
+from contextlib import contextmanager
 
 import pytest
-from browsers import MARKS, complaints
+from browsers import MARKS, complaints, fits, on_screen, wait
 from test_live import FakeCamera, PatientCamera
 
 from emmc_rig.bench.hardware import simulated_rig
@@ -16,20 +17,16 @@ from emmc_rig.live.light_field import LiveLightField
 from emmc_rig.live.server import application, served
 from emmc_rig.live.session_page import SessionPage
 from emmc_rig.live.watch import Watch
-from emmc_rig.report.page import source
 from emmc_rig.simulators.bench import MountingErrors
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
-from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
 
 TOKEN = "a-secret"
-PATIENCE_S = 60
 WIDTH = "return document.getElementById('viewer-picture').width"
 
 
@@ -62,12 +59,6 @@ def page(browser, address):
     browser.get(address)
     wait(browser, lambda: frame_number(browser) > 0)
     return browser
-
-
-def wait(driver, holds):
-    """Wait until that holds; what is drawn anew in between is looked up again."""
-    patient = WebDriverWait(driver, PATIENCE_S, ignored_exceptions=[StaleElementReferenceException])
-    patient.until(lambda _: holds())
 
 
 def text(driver, name):
@@ -143,15 +134,6 @@ def test_from_a_dark_page_to_a_light_field_by_what_the_page_offers(page, rig):
     assert complaints(page) == []
 
 
-def test_the_viewer_of_the_page_is_that_of_the_reports(page):
-    served = page.execute_async_script(
-        "const done = arguments[0];"
-        "Promise.all(['viewer.js', 'viewer.css'].map(async (one) => (await fetch(one)).text()))"
-        ".then(done)"
-    )
-    assert served == [str(source(name)) for name in ("viewer.js", "viewer.css")]
-
-
 def test_keys_stop_jog_and_expose_and_a_button_keeps_the_focus(page, rig):
     click(page, "#centre")
     wait(page, lambda: text(page, "busy") == "")
@@ -177,31 +159,24 @@ def test_keys_stop_jog_and_expose_and_a_button_keeps_the_focus(page, rig):
         rig.stage.stop = original
 
 
-@pytest.mark.parametrize("width", [1600, 800, 390])
-def test_nothing_is_cut_off_at_any_width_and_every_control_has_a_name(page, width):
-    page.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride",
-        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500},
-    )
-    try:
-        wait(page, lambda: frame_number(page) > 0)
-        script = "return [document.documentElement.scrollWidth, window.innerWidth]"
-        needed, there = page.execute_script(script)
-        assert needed <= there
-        nameless = page.execute_script(
-            "return [...document.querySelectorAll('button, input, canvas, [tabindex]')]"
-            ".filter((one) => one.offsetParent && !(one.textContent.trim()"
-            " || one.getAttribute('aria-label') || one.labels?.length)).map((one) => one.outerHTML)"
-        )
-        assert nameless == []
-        low = page.execute_script(
-            "return innerWidth > 500 ? [] : [...document.querySelectorAll('button, summary')]"
-            ".filter((one) => one.offsetParent && one.getBoundingClientRect().height < 36)"
-            ".map((one) => one.outerHTML)"
-        )
-        assert low == []  # a finger hits them
-    finally:
-        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+NAMELESS = """
+return [...document.querySelectorAll("button, input, canvas, [tabindex]")].filter((control) =>
+  control.offsetParent && !(control.textContent.trim() || control.getAttribute("aria-label") ||
+    control.labels?.length)).map((control) => control.outerHTML)
+"""
+TOO_LOW_FOR_A_FINGER = """
+return [...document.querySelectorAll("button, summary")].filter((control) =>
+  control.offsetParent && control.getBoundingClientRect().height < 36)
+  .map((control) => control.outerHTML)
+"""
+
+
+def test_nothing_is_cut_off_at_any_width_and_every_control_has_a_name(page):
+    for width in (1600, 800, 390):
+        with on_screen(page, width):
+            assert fits(page), width
+            assert page.execute_script(NAMELESS) == []
+            assert width > 500 or page.execute_script(TOO_LOW_FOR_A_FINGER) == []
 
 
 def test_centring_lights_the_picture_and_jogging_moves_the_simulated_stage(page, rig):
@@ -235,27 +210,15 @@ def test_zoom_view_and_exposure_answer(page, rig):
     wait(page, lambda: rig.camera.exposure_s == pytest.approx(0.04))
 
 
-def test_what_is_refused_is_reported_on_the_page(page):
+def test_a_refusal_is_reported_floats_over_the_page_and_can_be_hidden(page):
+    click(page, "#centre")
+    wait(page, lambda: text(page, "busy") == "")
     step = page.find_element(By.ID, "step")
     step.clear()
     step.send_keys("ten")
-    wait(
-        page,
-        lambda: page.find_element(By.CSS_SELECTOR, "button[aria-label='mask_y up']").is_enabled(),
-    )
     click(page, "button[aria-label='mask_y up']")
-    wait(page, lambda: "not a number" in text(page, "trouble"))
-
-
-def test_a_wrong_token_is_refused(browser, address):
-    browser.get(address.replace(TOKEN, "guess"))
-    assert "wrong token" in browser.find_element(By.TAG_NAME, "body").text
-    browser.get_log("browser")
-
-
-def test_a_refusal_floats_over_the_page_and_can_be_hidden(page):
-    click(page, "#centre")
-    wait(page, lambda: text(page, "busy") == "")
+    said = "jog: distance_um: input should be a number"
+    wait(page, lambda: text(page, "trouble-text") == said)
     page.execute_script("act('jog', { axis: 'mask_x', distance_um: 1e9 })")
     wait(page, lambda: "mask_x cannot go to" in text(page, "trouble"))
     # At one moment: figures that come meanwhile may move the button.
@@ -288,25 +251,32 @@ def test_a_lost_connection_says_so_and_what_to_do(browser, tmp_path):
     browser.get_log("browser")
 
 
-def test_a_long_exposure_is_counted_down_where_the_picture_is_and_cancelled(browser):
-    watch = Watch(PatientCamera())
+@contextmanager
+def page_of(browser, camera):
+    """Show the page of a camera without a stage."""
+    watch = Watch(camera)
     watch.start()
     try:
         with served(application(watch, TOKEN)) as port:
             browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
-            wait(browser, lambda: frame_number(browser) > 0)
-            before = frame_number(browser)
-            field = browser.find_element(By.ID, "exposure")
-            field.clear()
-            field.send_keys("35000", Keys.ENTER)
-            shown = re.compile(r"exposing, 3[2-5] s left of 35")
-            wait(browser, lambda: shown.fullmatch(text(browser, "exposing-text")))
-            click(browser, "#cancel")
-            wait(browser, lambda: frame_number(browser) > before + 1)
-            wait(browser, lambda: not browser.find_element(By.ID, "exposing").is_displayed())
+            yield
             assert complaints(browser) == []
     finally:
         watch.close()
+
+
+def test_a_long_exposure_is_counted_down_where_the_picture_is_and_cancelled(browser):
+    with page_of(browser, PatientCamera()):
+        wait(browser, lambda: frame_number(browser) > 0)
+        before = frame_number(browser)
+        field = browser.find_element(By.ID, "exposure")
+        field.clear()
+        field.send_keys("35000", Keys.ENTER)
+        shown = re.compile(r"exposing, 3[2-5] s left of 35")
+        wait(browser, lambda: shown.fullmatch(text(browser, "exposing-text")))
+        click(browser, "#cancel")
+        wait(browser, lambda: frame_number(browser) > before + 1)
+        wait(browser, lambda: not browser.find_element(By.ID, "exposing").is_displayed())
 
 
 SHOWN = """
@@ -319,25 +289,16 @@ return ["picture", "histogram", "levels", "exposure", "gain", "focus", "rotation
 
 
 @pytest.mark.parametrize("size", [(1600, 900), (390, 844)])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_picture_levels_exposure_focus_mask_and_stop_are_in_view_without_scrolling(
-    page, size, scheme
-):
-    at = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 500}
-    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", at)
-    seen = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-    page.execute_cdp_cmd("Emulation.setEmulatedMedia", seen)
-    try:
-        page.execute_script("scrollTo(0, 0)")
-        page.execute_script("act('centre')")
-        wait(page, lambda: page.execute_script("return state.figures && !state.busy"))
-        wait(page, lambda: page.execute_script("return !picture.hidden"))
-        assert page.execute_script(SHOWN) == []
-        back = page.execute_script("return getComputedStyle(document.body).backgroundColor")
-        assert (int(back.split("(")[1].split(",")[0]) < 128) == (scheme == "dark")
-    finally:
-        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-        page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+def test_picture_levels_exposure_focus_mask_and_stop_are_in_view_without_scrolling(page, size):
+    page.execute_script("scrollTo(0, 0)")
+    page.execute_script("act('centre')")
+    wait(page, lambda: page.execute_script("return state.figures && !state.busy"))
+    wait(page, lambda: page.execute_script("return !picture.hidden"))
+    for scheme in ("light", "dark"):
+        with on_screen(page, *size, scheme):
+            wait(page, lambda: page.execute_script(SHOWN) == [])
+            back = page.execute_script("return getComputedStyle(document.body).backgroundColor")
+            assert (int(back.split("(")[1].split(",")[0]) < 128) == (scheme == "dark")
 
 
 def test_a_black_picture_says_why_and_the_next_step_stands_below_it(page, rig):
@@ -360,21 +321,13 @@ def test_a_black_picture_says_why_and_the_next_step_stands_below_it(page, rig):
 def test_no_camera_and_no_stage_are_explained_where_the_picture_would_be(browser):
     camera, gone = FakeCamera(), DriverError("no camera answers", "switch it on")
     camera.fault = gone
-    watch = Watch(camera)
-    watch.start()
-    try:
-        with served(application(watch, TOKEN)) as port:
-            browser.get(f"http://127.0.0.1:{port}/{TOKEN}/")
-            said = "No picture: no camera answers: switch it on. Trying again every second."
-            wait(browser, lambda: text(browser, "why") == said)
-            assert not browser.find_element(By.ID, "picture").is_displayed()
-            assert not browser.find_element(By.ID, "stop").is_displayed()
-            first = browser.find_element(By.CSS_SELECTOR, "#steps li").text
-            assert "by hand" in first
-            camera.fault = None
-            wait(browser, lambda: frame_number(browser) > 0)
-            camera.fault = gone
-            wait(browser, lambda: text(browser, "why").startswith("Not live, this is the last"))
-            assert complaints(browser) == []
-    finally:
-        watch.close()
+    with page_of(browser, camera):
+        said = "No picture: no camera answers: switch it on. Trying again every second."
+        wait(browser, lambda: text(browser, "why") == said)
+        assert not browser.find_element(By.ID, "picture").is_displayed()
+        assert not browser.find_element(By.ID, "stop").is_displayed()
+        assert "by hand" in browser.find_element(By.CSS_SELECTOR, "#steps li").text
+        camera.fault = None
+        wait(browser, lambda: frame_number(browser) > 0)
+        camera.fault = gone
+        wait(browser, lambda: text(browser, "why").startswith("Not live, this is the last"))

@@ -103,9 +103,9 @@ def test_the_mask_is_centred_by_what_was_measured_and_written(tmp_path):
         shown = watch.preview(["centre", "mask"])["diff"]
         assert "-zero_um" in shown
         assert path.read_text().startswith("# the bench in room 12\n")
-        assert not watch.state()["steps"][-1]["done"]
+        assert not watch.state.snapshot()["steps"][-1]["done"]
         assert watch.save() == {"written": [str(path)], "next": ""}
-        last = watch.state()["steps"][-1]
+        last = watch.state.snapshot()["steps"][-1]
         assert (last["done"], last["text"]) == (True, "wrote rig.yaml")
     written = yaml.safe_load(path.read_text())
     for axis, off_um in (("mask_x", 30.0), ("mask_y", -20.0)):

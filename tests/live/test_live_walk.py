@@ -13,16 +13,14 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from browsers import MARKS, complaints, open_browser
+from browsers import MARKS, complaints, drawn, on_screen, wait
 from programs import PROGRAM
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
-from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
-from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
-PATIENCE_S = 120
+PATIENCE_S = 60
 WIDTHS = {"desktop": 1600, "phone": 390}
 
 
@@ -30,24 +28,19 @@ def pictured(driver, name):
     """Write pictures of a page where the documentation wants them."""
     folder = os.environ.get("EMMC_PICTURES")
     for size, width in WIDTHS.items() if folder else ():
-        at = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", at)
         driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": size == "phone"})
-        driver.execute_script("scrollTo(0, 0)")
-        # Two frames of the browser: the page is laid out and painted anew.
-        driver.execute_async_script(
-            "const end = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(end))"
-        )
-        seen = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), 1)
+        with on_screen(driver, width):
+            driver.execute_script("scrollTo(0, 0)")
+            drawn(driver)
+            seen = cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), 1)
         assert seen is not None
         file = Path(str(folder)) / f"{name}-{size}.webp"
         assert cv2.imwrite(str(file), seen, [cv2.IMWRITE_WEBP_QUALITY, 60])
-    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
 
 
 @pytest.mark.slow
-def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
+def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(browser, tmp_path):
     plan = tmp_path / "plan.yaml"
     made = subprocess.run(
         [*PROGRAM, "capture", "--new", "rgbw-bayer-1shot"], cwd=tmp_path, check=True
@@ -56,67 +49,61 @@ def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(tmp_path):
     before = plan.read_text()
     command = [*PROGRAM, "live", "--rig", "simulated", "--plan", "plan.yaml"]
     environment = {**os.environ, "EMMC_SIZE": "48x64"}
-    with (
-        subprocess.Popen(
-            command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
-        ) as running,
-        open_browser(tmp_path / "profile") as driver,
-    ):
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+    ) as running:
         try:
             assert running.stdout is not None
-            driver.get(running.stdout.readline().strip())
-            patient = WebDriverWait(
-                driver, PATIENCE_S, ignored_exceptions=[StaleElementReferenceException]
-            )
-
-            def wait(holds):
-                patient.until(lambda _: holds())
+            browser.get(running.stdout.readline().strip())
 
             def text(css):
-                return driver.find_element(By.CSS_SELECTOR, css).text
+                return browser.find_element(By.CSS_SELECTOR, css).text
 
             def click(css):
                 def clicked():
-                    element = driver.find_element(By.CSS_SELECTOR, css)
+                    element = browser.find_element(By.CSS_SELECTOR, css)
                     able = element.is_enabled()
                     if able:
                         element.click()
                     return able
 
-                wait(clicked)
+                wait(browser, clicked)
 
             def done(step):
-                found = driver.find_element(By.CSS_SELECTOR, f"#steps li:nth-child({step})")
+                found = browser.find_element(By.CSS_SELECTOR, f"#steps li:nth-child({step})")
                 return "done" in (found.get_attribute("class") or "")
 
             # The page is dark, and says what to do about it; so do its steps.
-            wait(lambda: "away from the centre" in text("#hint"))
+            wait(browser, lambda: "away from the centre" in text("#hint"))
             assert "centre the mask first" in text("#steps li:nth-child(2)")
             click("#steps li:nth-child(1) button")
-            wait(lambda: done(1))
+            wait(browser, lambda: done(1))
             click("#steps li:nth-child(3) button")
             click("#steps li:nth-child(2) button")
-            wait(lambda: done(2))
-            wait(lambda: done(3))
+            wait(browser, lambda: done(2))
+            wait(browser, lambda: done(3))
             assert re.search(r"rotation -?\d\.\d\d . \d\.\d\d", text("#steps li:nth-child(3)"))
-            pictured(driver, "live")
+            pictured(browser, "live")
             click("#targets button:nth-child(1)")
             assert "by hand" in text("#steps li:nth-child(4)")
             click("#steps li:nth-child(2) button") if not done(2) else None
-            wait(lambda: done(2))
+            wait(browser, lambda: done(2))
             click("#steps li:nth-child(5) button")
-            wait(lambda: "+  - exposure_s: " in text("#diff"))
+            wait(browser, lambda: "+  - exposure_s: " in text("#diff"))
             click("#save")
-            wait(lambda: "wrote plan.yaml" in text("#saved"))
+            wait(browser, lambda: "wrote plan.yaml" in text("#saved"))
             assert text("#saved").endswith("next: emmc-rig capture plan.yaml --rig simulated")
-            assert not driver.find_element(By.ID, "diff").is_displayed()
+            assert not browser.find_element(By.ID, "diff").is_displayed()
             click("[data-show=views]")
-            wait(lambda: "adaptive: " in text("#field-stage"))
+            wait(browser, lambda: "adaptive: " in text("#field-stage"))
             assert "as by reconstruct" in text("#field-stage")
             assert re.search("trust|doubt|do not use", text("#field-stage"))
-            wait(lambda: driver.find_element(By.ID, "viewer").get_attribute("data-complete"))
-            pictured(driver, "light-field")
-            assert complaints(driver) == []
+            wait(
+                browser,
+                lambda: browser.find_element(By.ID, "viewer").get_attribute("data-complete"),
+            )
+            pictured(browser, "light-field")
+            assert complaints(browser) == []
         finally:
             running.send_signal(signal.SIGINT)
             # Before its output is closed, to which it writes a last line.

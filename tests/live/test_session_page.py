@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from asked_person import manned
+from pages import order
 from programs import PROGRAM
 
 import emmc_rig as emmc
@@ -66,7 +67,7 @@ class Acting(SessionPage):
         if self.todo:
             self.todo.pop(0)(self)
         else:
-            self.actions["stop"]()
+            order(self, "stop")
 
     def run(self, plan):
         front = FrontEnd(self, nobody, control=self.control)
@@ -77,14 +78,14 @@ class Acting(SessionPage):
 
 def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_whole(plan):
     page = Acting(
-        plan.with_name("plan-session"), lambda page: page.actions["retake"](["shot-1-e0-r0"])
+        plan.with_name("plan-session"), lambda page: order(page, "retake", ids=["shot-1-e0-r0"])
     )
     session, outcome = page.run(plan)
     assert outcome.complete
     lines = [e for e in session.journal.entries if getattr(e, "id", "") == "shot-1-e0-r0"]
     assert [line.kind for line in lines] == ["frame", "discarded", "frame"]
     assert page.reasons == [ALL_TAKEN, ALL_TAKEN]
-    state = page.state()
+    state = page.state.snapshot()
     assert state["done"] == state["planned"] == len(session.needed)
     assert Session(session.folder).is_complete
 
@@ -92,7 +93,7 @@ def test_a_frame_is_taken_again_where_somebody_wants_it_and_the_session_stays_wh
 def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan):
     page = Acting(plan.with_name("plan-session"))
     session, _ = page.run(plan)
-    state = page.state()
+    state = page.state.snapshot()
     json.dumps(state, allow_nan=False)
     shown = {frame["id"]: frame for frame in state["frames"]}
     assert set(shown) == set(session.stored)
@@ -115,7 +116,7 @@ def test_the_page_shows_every_frame_with_its_brightness_and_what_goes_wrong(plan
         ([], "choose"),
     ):
         with pytest.raises(AppError, match=why):
-            page.actions["retake"](ids)
+            order(page, "retake", ids=ids)
 
 
 def test_the_page_of_a_resumed_session_shows_what_was_taken_before(plan):
@@ -123,7 +124,7 @@ def test_the_page_of_a_resumed_session_shows_what_was_taken_before(plan):
     Acting(folder).run(plan)
     page = Acting(folder)
     session, _ = page.run(folder)
-    assert {frame["id"] for frame in page.state()["frames"]} == set(session.stored)
+    assert {frame["id"] for frame in page.state.snapshot()["frames"]} == set(session.stored)
     wanted = page.pictures["frame.jpg"]({"id": "shot-0-e0-r0"})
     assert wanted is not None
     assert wanted.make()[:2] == b"\xff\xd8"
@@ -149,7 +150,7 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
         capture_session(path, rig((32, 40)), None, None, front)
     finally:
         page.close()
-    reported = page.state()["light_field"]
+    reported = page.state.snapshot()["light_field"]
     assert reported["shots"] == [2, 2]
     assert "estimated accuracy" in reported["stage"]
     assert reported["pictures"]["views"] == [5, 5]
@@ -158,7 +159,7 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
     given = json.loads(wanted.make())
     assert given["views"] == {"rows": 5, "columns": 5, "height": 32, "width": 40}
     assert {overlay["key"] for overlay in given["overlays"]} >= {"disparity", "sigma"}
-    assert page.state()["ended"]
+    assert page.state.snapshot()["ended"]
 
 
 def test_the_last_state_reaches_who_looks_though_the_program_ends_at_once(tmp_path, monkeypatch):
@@ -206,18 +207,18 @@ class Answering(SessionPage):
     def ask(self, what):
         asks = {"asked": what}
         self.event(Event("pause", {"reason": what}, asks))
-        asked = self.state()["asked"]
-        self.asks.append((asked, self.state()["last_hole"]))
+        asked = self.state.snapshot()["asked"]
+        self.asks.append((asked, self.state.snapshot()["last_hole"]))
         assert not self.control.answered
-        self.actions["done"](asked["number"] - 1)
+        order(self, "done", number=asked["number"] - 1)
         assert not self.control.answered  # a press for the wish before it
         if len(self.asks) == self.stop_at:
-            self.actions["stop"]()
+            order(self, "stop")
         else:
-            self.actions["done"](asked["number"])
+            order(self, "done", number=asked["number"])
         self.control.until_answered()
         self.event(Event("resume", {"seconds": 0.0}, asks))
-        assert self.state()["asked"] is None
+        assert self.state.snapshot()["asked"] is None
 
 
 @pytest.mark.slow
@@ -227,7 +228,7 @@ def test_the_page_asks_for_a_hole_of_the_plate_and_says_which_one_it_was_instead
     plan, rig = manned(tmp_path, monkeypatch, {(1, 1): (1, 2)})
     page = Answering(tmp_path / "plan-session")
     capture_session(plan, rig, None, None, FrontEnd(page, page.ask, control=page.control))
-    assert page.state()["by_hand"]
+    assert page.state.snapshot()["by_hand"]
     holes = [(wish["hole"], last, wish["refusal"]) for wish, last in page.asks if wish["hole"]]
     assert holes == [
         ([0, 0], None, ""),

@@ -1,12 +1,13 @@
 """The page of a running capture in a browser: it follows, steers, and looks right at every size."""
 
 import threading
+from contextlib import contextmanager
 from queue import Queue
 
 import pytest
 import yaml
 from asked_person import manned
-from browsers import MARKS, complaints, open_browser
+from browsers import MARKS, complaints, fits, on_screen, wait
 
 import emmc_rig as emmc
 from emmc_rig.captures.control import Control
@@ -17,10 +18,8 @@ from emmc_rig.progress import Event
 from emmc_rig.session.session import Session
 
 pytest.importorskip("selenium", reason="needs selenium: extra `browser`")
-from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = MARKS
 PLAN = {
@@ -33,8 +32,17 @@ PLAN = {
 PATIENCE_S = 60
 
 
+@contextmanager
+def shown(browser, page):
+    """Show a page in the browser; yield a function from a CSS selector to the element."""
+    with served(application(page, "secret")) as port:
+        browser.get(f"http://127.0.0.1:{port}/secret/")
+        yield lambda css: browser.find_element(By.CSS_SELECTOR, css)
+        assert complaints(browser) == []
+
+
 @pytest.mark.slow
-def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_path):
+def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(browser, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_text(yaml.safe_dump(PLAN))
     rig = emmc.rig("simulated", scene="near-planar", size=(32, 40), rays=16)
@@ -46,62 +54,36 @@ def test_a_capture_is_followed_paused_repeated_and_finished_in_the_browser(tmp_p
         ),
         daemon=True,
     )
-    with (
-        served(application(page, "secret")) as port,
-        open_browser(tmp_path / "profile") as driver,
-    ):
-        driver.get(f"http://127.0.0.1:{port}/secret/")
-        patient = WebDriverWait(
-            driver, PATIENCE_S, ignored_exceptions=[StaleElementReferenceException]
-        )
-
-        def element(css):
-            return driver.find_element(By.CSS_SELECTOR, css)
-
-        def wait(holds):
-            patient.until(lambda _: holds())
-
+    with shown(browser, page) as element:
         page.start()
         run.start()
-        wait(lambda: "all frames are taken" in element("#waiting").text)
+        wait(browser, lambda: "all frames are taken" in element("#waiting").text)
         assert element("#title").text == PLAN["title"]
-        tiles = driver.find_elements(By.CSS_SELECTOR, ".tile")
+        tiles = browser.find_elements(By.CSS_SELECTOR, ".tile")
         assert len(tiles) == len(Session(folder).stored)
         assert "% of white" in tiles[0].text
         assert not element("#field-stage").is_displayed()  # over a raw frame it would be misread
-        wait(lambda: element("[data-show=views]").is_displayed())
+        wait(browser, lambda: element("[data-show=views]").is_displayed())
         element("[data-show=views]").click()
-        wait(lambda: "adaptive-fast: " in element("#field-stage").text)
-        wait(lambda: element("#viewer").get_attribute("data-complete"))
+        wait(browser, lambda: "adaptive-fast: " in element("#field-stage").text)
+        wait(browser, lambda: element("#viewer").get_attribute("data-complete"))
         assert element("#viewer-overlays").text.split("\n")[1:3] == ["nothing", "disparity"]
         tiles[0].click()
         assert element("#chosen").text == "1 chosen"
         element("#retake").click()
-        wait(lambda: "taken once more: shot-0-e0-r0" in element("#messages").text)
-        wait(lambda: "all frames are taken" in element("#waiting").text)
+        wait(browser, lambda: "taken once more: shot-0-e0-r0" in element("#messages").text)
+        wait(browser, lambda: "all frames are taken" in element("#waiting").text)
         for width in (1600, 800, 390):
-            driver.execute_cdp_cmd(
-                "Emulation.setDeviceMetricsOverride",
-                {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500},
-            )
-            needed, there = driver.execute_script(
-                "return [document.documentElement.scrollWidth, window.innerWidth]"
-            )
-            assert needed <= there
+            with on_screen(browser, width):
+                assert fits(browser), width
         element("#finish").click()
         run.join(PATIENCE_S)
         page.close()
-        wait(lambda: "Complete: every frame verified" in element("#end").text)
+        wait(browser, lambda: "Complete: every frame verified" in element("#end").text)
         assert not element("#finish").is_displayed()
-        assert complaints(driver) == []
 
 
-PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-
-
-def wait_for(driver, holds):
-    ignored = [StaleElementReferenceException]
-    WebDriverWait(driver, PATIENCE_S, ignored_exceptions=ignored).until(lambda _: holds())
+PHONE = 390, 844
 
 
 class Asking(SessionPage):
@@ -114,7 +96,7 @@ class Asking(SessionPage):
     def ask(self, what):
         asks = {"asked": what}
         self.event(Event("pause", {"reason": what}, asks))
-        self.wishes.put(self.state()["asked"])
+        self.wishes.put(self.state.snapshot()["asked"])
         self.control.until_answered()
         self.event(Event("resume", {"seconds": 0.0}, asks))
 
@@ -125,27 +107,21 @@ class Asking(SessionPage):
 
 
 @pytest.mark.slow
-def test_a_person_with_a_phone_sees_the_hole_and_answers_with_finger_or_foot(tmp_path, monkeypatch):
+def test_a_person_with_a_phone_sees_the_hole_and_answers_with_finger_or_foot(
+    browser, tmp_path, monkeypatch
+):
     plan, rig = manned(tmp_path, monkeypatch, {(1, 1): (1, 2)})
     page = Asking(tmp_path / "plan-session")
     front = FrontEnd(page, page.ask, control=page.control)
     run = threading.Thread(target=lambda: capture_session(plan, rig, None, None, front))
-    with (
-        served(application(page, "secret")) as port,
-        open_browser(tmp_path / "profile") as driver,
-    ):
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
-        driver.get(f"http://127.0.0.1:{port}/secret/")
+    with on_screen(browser, *PHONE), shown(browser, page) as element:
         page.start()
         run.start()
 
-        def element(css):
-            return driver.find_element(By.CSS_SELECTOR, css)
-
         def answer(asked):
-            wait_for(driver, lambda: element("#ask-text").text.lower() == asked["text"].lower())
-            wait_for(driver, lambda: element("#done").is_enabled())
-            top, bottom, height = driver.execute_script(
+            wait(browser, lambda: element("#ask-text").text.lower() == asked["text"].lower())
+            wait(browser, lambda: element("#done").is_enabled())
+            top, bottom, height = browser.execute_script(
                 "const box = document.getElementById('done').getBoundingClientRect();"
                 "return [box.top, box.bottom, innerHeight]"
             )
@@ -172,15 +148,14 @@ def test_a_person_with_a_phone_sees_the_hole_and_answers_with_finger_or_foot(tmp
             ("7", plate + "7 is wanted, 1 was the last"),
             ("7", plate + "7 is wanted, 8 was the last"),
         ]
-        wait_for(driver, lambda: not element("#done").is_displayed())
+        wait(browser, lambda: not element("#done").is_displayed())
         element("#finish").click()
         run.join(PATIENCE_S)
         page.close()
-        wait_for(driver, lambda: "Complete: every frame verified" in element("#end").text)
-        assert complaints(driver) == []
+        wait(browser, lambda: "Complete: every frame verified" in element("#end").text)
 
 
-def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
+def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(browser, tmp_path):
     page = SessionPage(tmp_path / "session", Control(), computes=False)
     kinds = {"dark": 20, "reference": 4, "whiteboard": 110, "open": 13, "shot": 3}
     names = [(kind, n) for kind, count in kinds.items() for n in range(count)]
@@ -193,26 +168,21 @@ def test_a_hundred_and_fifty_frames_are_a_short_page_on_a_phone(tmp_path):
     }  # fmt: skip
     page._small = dict.fromkeys(page._frames, b"")
     page._publish_frames(planned=len(names))
-    with (
-        served(application(page, "secret")) as port,
-        open_browser(tmp_path / "profile") as driver,
-    ):
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
-        driver.get(f"http://127.0.0.1:{port}/secret/")
+    with on_screen(browser, *PHONE), shown(browser, page):
         tiles = "return document.querySelectorAll('.tile').length"
-        wait_for(driver, lambda: driver.execute_script(tiles) == 150)
-        groups = driver.find_elements(By.CSS_SELECTOR, "#frames details")
+        wait(browser, lambda: browser.execute_script(tiles) == 150)
+        groups = browser.find_elements(By.CSS_SELECTOR, "#frames details")
         assert [group.get_attribute("open") is not None for group in groups] == [True] + 4 * [False]
         assert groups[0].text.startswith("Shots: the scene")
         assert "13, 70 % of white, 1 saturated" in groups[1].text
         tall = "return document.documentElement.scrollHeight"
-        assert driver.execute_script(tall) <= 2000
+        assert browser.execute_script(tall) <= 2000
         groups[2].find_element(By.TAG_NAME, "summary").click()
-        assert driver.execute_script(tall) <= 3000
+        assert browser.execute_script(tall) <= 3000
         more = groups[2].find_element(By.XPATH, "./button")
         assert more.text == "all 110"
         tile = "[...document.querySelectorAll('.tile')]"
-        shown = f"return {tile}.filter((one) => one.checkVisibility()).length"
-        assert driver.execute_script(shown) == 3 + 24
+        seen = f"return {tile}.filter((tile) => tile.checkVisibility()).length"
+        assert browser.execute_script(seen) == 3 + 24
         more.click()
-        assert driver.execute_script(shown) == 3 + 110
+        assert browser.execute_script(seen) == 3 + 110

@@ -17,8 +17,8 @@ from emmc_rig.captures.plan import load_plan
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.session import frame_means
-from emmc_rig.session.frame_means import camera_of
+from emmc_rig.session import board_sets
+from emmc_rig.session.board_sets import camera_of
 from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import Session
 from emmc_rig.simulators.bench import MountingErrors
@@ -193,7 +193,7 @@ def decoded_by(monkeypatch, *words):
         return call
 
     monkeypatch.setattr(Session, "__init__", counted("opened", Session.__init__))
-    monkeypatch.setattr(frame_means, "decode_frame", counted("decoded", frame_means.decode_frame))
+    monkeypatch.setattr(board_sets, "decode_frame", counted("decoded", board_sets.decode_frame))
     code, out, err = program(*words)
     assert code == 0, err
     monkeypatch.undo()

@@ -13,7 +13,7 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import OPPONENT, centre_view, psnr_db
 from emmc_rig.model.sensing import ImagingMatrix
-from emmc_rig.reconstruction.adaptive import assembly, method
+from emmc_rig.reconstruction.adaptive import assembly, method, search
 from emmc_rig.reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from emmc_rig.reconstruction.adaptive.joint import TextureSettings, solve
 from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
@@ -27,7 +27,6 @@ from emmc_rig.reconstruction.adaptive.search import (
     _between,
     _extended,
     _near_best,
-    _packed,
     _possible,
     _shared,
     _spanned,
@@ -87,29 +86,6 @@ def test_the_evidence_is_the_log_likelihood_of_a_dense_student_t(coded_psi, cfa,
         assert value == pytest.approx(dense.logpdf(data[rows]) - at_zero, abs=2e-2)
 
 
-def test_the_evidence_of_several_lengths_is_the_mean_likelihood_of_each(coded_psi):
-    psi = coded_psi(size=(14, 16))
-    rng = np.random.default_rng(0)
-    data = rng.normal(0, 0.1, psi.frames_shape).astype(np.float32)
-    patches = EvidencePatches(4, 3)
-    corners = np.stack(np.meshgrid(*patches.grid(data.shape[1:]), indexing="ij"), axis=-1)
-    given = psi, data, np.full(data.shape, 1e-4), np.ones(data.shape, bool)
-    where = np.full(corners[..., 0].size, 0.5), corners.reshape(-1, 2), patches.places(1)
-    disparities = np.linspace(-2, 2, 5)
-    long, short, both = (
-        patch_evidence(*given, *where, disparities, prior)
-        for prior in (TexturePrior(4.0), TexturePrior(1.0), TexturePrior(4.0, (1.0,)))
-    )
-    each = [found.log_likelihood.astype(np.float64) for found in (long, short)]
-    np.testing.assert_allclose(
-        both.log_likelihood, np.logaddexp(*each) - np.log(2), rtol=1e-5, atol=1e-4
-    )
-    shorter = each[1].max(axis=1) > each[0].max(axis=1)
-    assert 0 < shorter.mean() < 1
-    assert (long.kind != short.kind).any()
-    np.testing.assert_array_equal(both.kind, np.where(shorter, short.kind, long.kind))
-
-
 def evidence_of_patches(psi, prior, **given):
     """The evidence of 4x4 patches of noise at five disparities, and how many patches they are."""
     rng = np.random.default_rng(0)
@@ -130,6 +106,22 @@ def evidence_of_patches(psi, prior, **given):
         **given,
     )
     return found, len(corners)
+
+
+def test_the_evidence_of_several_lengths_is_the_mean_likelihood_of_each(coded_psi):
+    psi = coded_psi(size=(14, 16))
+    long, short, both = (
+        evidence_of_patches(psi, prior)[0]
+        for prior in (TexturePrior(4.0), TexturePrior(1.0), TexturePrior(4.0, (1.0,)))
+    )
+    each = [found.log_likelihood.astype(np.float64) for found in (long, short)]
+    np.testing.assert_allclose(
+        both.log_likelihood, np.logaddexp(*each) - np.log(2), rtol=1e-5, atol=1e-4
+    )
+    shorter = each[1].max(axis=1) > each[0].max(axis=1)
+    assert 0 < shorter.mean() < 1
+    assert (long.kind != short.kind).any()
+    np.testing.assert_array_equal(both.kind, np.where(shorter, short.kind, long.kind))
 
 
 def test_disparities_are_evaluated_where_a_patch_or_one_beside_it_asks(coded_psi):
@@ -168,6 +160,18 @@ def test_fewer_kinds_compared_never_fit_better_at_what_is_probed(coded_psi):
     best, kept = (found.log_likelihood[:, :4].max(axis=1) for found in (every, few))
     assert np.all(kept[~differ] == best[~differ])
     assert best.mean() > kept.mean()
+
+
+def test_readings_that_repeat_each_other_without_noise_have_finite_evidence(coded_psi):
+    psi = coded_psi(shots=2, size=(14, 16))
+    psi = replace(psi, weights=psi.weights[[0, 0]], colour=psi.colour[[0, 0]])
+    patches = EvidencePatches(4, 3)
+    zero, corner = np.zeros(psi.frames_shape, np.float32), np.array([[1, 2]])
+    found = patch_evidence(
+        psi, zero, zero, zero == 0, np.ones(1), corner, patches.places(2), np.zeros(1),
+        TexturePrior(),
+    )  # fmt: skip
+    assert np.isfinite(found.log_likelihood).all()
 
 
 def test_psi_of_surfaces_is_psi_of_their_light_field(random_psi, monkeypatch):
@@ -258,12 +262,13 @@ def test_the_nearer_of_two_planes_hides_the_further_and_uncovers_it_behind():
     assert (behind[1, 2, 5:15, 15:17] == 0).all()
 
 
-def test_beliefs_on_a_chain_are_the_exact_marginals():
+def test_beliefs_on_a_chain_are_the_exact_marginals(monkeypatch):
+    monkeypatch.setattr(search, "FLOOR", 0)
     rng = np.random.default_rng(3)
     evidence = rng.normal(size=(1, 4, 3))
     pairs = compatibility(np.array([-1.0, 0.0, 1.0]), 0.5, 0.1)
     joint = np.einsum("a,b,c,d,ab,bc,cd->abcd", *np.exp(evidence[0]), pairs, pairs, pairs)
-    found = posteriors(evidence, pairs, floor=0)
+    found = posteriors(evidence, pairs)
     for place in range(4):
         exact = joint.sum(axis=tuple(k for k in range(4) if k != place))
         np.testing.assert_allclose(found[0, place], exact / exact.sum(), rtol=1e-4)
@@ -385,13 +390,6 @@ def test_corners_of_a_second_grid_lie_between_and_cover_the_same_pixels():
     assert rows.tolist() == [0, 3, 9, 15, 21, 22]
     assert columns.tolist() == [0, 3, 9, 15, 21, 24]
     assert patches.grid((30, 32))[0].tolist() == [0, 6, 12, 18, 22]
-
-
-def test_patches_that_ask_for_the_same_disparities_follow_each_other():
-    asked = np.zeros((6, 5), dtype=bool)
-    for patch, labels in enumerate(([2, 3], [0, 4], [], [2], [2, 3], [0, 1])):
-        asked[patch, labels] = True
-    assert _packed(asked).tolist() == [5, 1, 3, 0, 4]
 
 
 def test_a_disparity_is_possible_near_where_the_rough_search_believes_it():
@@ -564,20 +562,16 @@ def test_every_reading_counts_by_its_own_noise(bayer):
     np.testing.assert_allclose(by_each, by_one, atol=1e-5)
 
 
-def test_a_noise_level_that_is_none_is_refused_in_one_line(bayer):
-    frames = even_frames(np.zeros(bayer.frames_shape, np.float32), 0.01)
-    wrong = np.full(bayer.frames_shape, 0.01)
-    wrong[0, 0, 0] = np.nan
-    with pytest.raises(ReconstructionError, match="a noise level of nan"):
-        reconstruct_adaptive(bayer, replace(frames, deviation=wrong))
-
-
 def test_bad_inputs_are_refused_in_one_line(bayer):
     with pytest.raises(ReconstructionError, match="frames of shape"):
         reconstruct_adaptive(bayer, even_frames(np.zeros((1, 4, 4), np.float32), 0.01))
     dark, small = np.zeros(bayer.frames_shape, np.float32), np.zeros((4, 4), np.float32)
     with pytest.raises(ReconstructionError, match="a disparity of shape"):
         reconstruct_adaptive(bayer, even_frames(dark, 0.01), disparity=small)
+    wrong = np.full(bayer.frames_shape, 0.01)
+    wrong[0, 0, 0] = np.nan
+    with pytest.raises(ReconstructionError, match="a noise level of nan"):
+        reconstruct_adaptive(bayer, replace(even_frames(dark, 0.01), deviation=wrong))
     tiny = bayer.window(slice(0, 4), slice(0, 4))
     with pytest.raises(ReconstructionError, match="do not fit a sensor"):
         reconstruct_adaptive(tiny, even_frames(np.zeros((1, 4, 4), np.float32), 0.01))
@@ -617,6 +611,8 @@ def test_a_sweep_with_the_right_texture_mends_a_wrong_disparity(bayer):
     used = np.ones(frames.shape, bool)
     rays = np.zeros_like(surfaces.disparity)
     wrong = Surfaces(bayer, rays, np.zeros(rays.shape, np.uint8), surfaces.margin)
-    found = swept(volume, Readings(bayer, frames, 0.003, noise, used), texture, wrong, 0.04, 0.05)
+    found = swept(
+        volume, Readings(bayer, frames, 0.003, noise, used), texture, wrong, AdaptiveSettings()
+    )
     disparity = per_pixel(found, bayer.size, 1)[4:-4, 26:-6]
     assert np.mean(np.abs(disparity - 0.75) < 0.13) > 0.9

@@ -78,7 +78,7 @@ def test_a_dark_line_inside_a_brighter_one_is_no_edge(camera_psi):
 
 
 def test_frames_too_small_to_tell_have_no_edges(coded_psi):
-    psi = coded_psi("rggb", 1, 1, (36, 60), (3, 3))
+    psi = coded_psi("rggb", 1, 1, (28, 60), (3, 3))
     light_field = np.ones(psi.light_field_shape, dtype=np.float32)
     assert found_edges(psi, noisy(psi, darkened(light_field))) is None
 

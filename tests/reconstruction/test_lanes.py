@@ -1,29 +1,12 @@
-"""Vector instructions of kernels against NumPy."""
+"""Taps of single rays against NumPy."""
 
 import numpy as np
 import pytest
 from numba import njit
 
-from emmc_rig.reconstruction.adaptive.lanes import (
-    LANES,
-    TAPS,
-    add_box,
-    add_taps,
-    read_box,
-    read_taps,
-)
+from emmc_rig.reconstruction.adaptive.lanes import TAPS, add_taps, read_taps
 
-WIDE, HEIGHT, START, AT = 40, 5, 3, 87
-
-
-@njit
-def reads_box(texture, cells, vectors):
-    return read_box(texture, AT, WIDE, cells, START, HEIGHT, vectors)
-
-
-@njit
-def adds_box(texture, cells, vectors, value):
-    add_box(texture, AT, WIDE, cells, START, HEIGHT, vectors, value)
+WIDE, AT = 40, 87
 
 
 @njit
@@ -34,28 +17,6 @@ def reads_taps(texture, fraction_y, fraction_x):
 @njit
 def adds_taps(texture, fraction_y, fraction_x, value):
     add_taps(texture, AT, WIDE, fraction_y, fraction_x, value)
-
-
-def below(texture, vectors):
-    """A view of what lies below the box."""
-    picture = texture.reshape(-1, WIDE)
-    top, left = divmod(AT, WIDE)
-    return picture[top : top + HEIGHT, left : left + vectors * LANES]
-
-
-@pytest.mark.parametrize("vectors", [1, 2, 3])
-@pytest.mark.parametrize("kind", [np.int16, np.float32])
-def test_boxes_are_read_and_added_as_sums_of_products(kind, vectors):
-    rng = np.random.default_rng(vectors)
-    texture = rng.normal(size=12 * WIDE).astype(np.float32)
-    cells = (100 * rng.normal(size=(START + HEIGHT * vectors + 2, LANES))).astype(kind)
-    box = cells[START : START + HEIGHT * vectors].reshape(HEIGHT, -1)
-    seen = float((box * below(texture, vectors)).sum(dtype=np.float64))
-    assert reads_box(texture, cells, vectors) == pytest.approx(seen, rel=1e-5, abs=1e-2)
-    expected = texture.copy()
-    below(expected, vectors)[:] += np.float32(0.3) * box
-    adds_box(texture, cells, vectors, np.float32(0.3))
-    np.testing.assert_allclose(texture, expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("fractions", [(0.0, 0.0), (0.3, 0.9), (1.0, 0.5)])

@@ -2,41 +2,12 @@
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy.fft import dctn, idctn
 from scipy.linalg import hadamard
 
 from emmc_rig.model.lightfield import OPPONENT, psnr_db
 from emmc_rig.reconstruction.adaptive.shrinkage import ALIKE, denoised
-from emmc_rig.reconstruction.adaptive.stacks import (
-    CELL,
-    SIDE,
-    STACK,
-    add_block,
-    cells_apart,
-    shrink_stack,
-    stack_block,
-)
-
-
-@njit
-def stacks_block(picture, at, wide, stack, number):
-    stack_block(picture, at, wide, stack, number)
-
-
-@njit
-def adds_block(stack, number, share, picture, at, wide):
-    add_block(stack, number, share, picture, at, wide)
-
-
-@njit
-def shrinks_stack(stack, count, least):
-    return shrink_stack(stack, count, least)
-
-
-@njit
-def squares_apart(guide, own, first, wide, squares, at, height, vectors):
-    cells_apart(guide, own, first, wide, squares, at, height, vectors)
+from emmc_rig.reconstruction.adaptive.stacks import SIDE, STACK
 
 
 def places_alike(guide, y, x, sigma, reach):
@@ -95,55 +66,6 @@ def test_pictures_are_denoised_as_block_by_block(colours, first, reach, step):
     expected = plainly_denoised(picture, guide, *settings)
     assert np.abs(expected - picture).max() > 0.05
     np.testing.assert_allclose(found, expected, atol=2e-5)
-
-
-def test_blocks_are_analysed_by_the_orthonormal_cosine_transform_and_put_back():
-    picture = np.random.default_rng(5).normal(size=(12, 19)).astype(np.float32)
-    top, left, number = 3, 10, 2
-    stack = np.full(4 * SIDE**2, -1, np.float32)
-    stacks_block(picture.ravel(), top * 19 + left, 19, stack, number)
-    block = picture[top : top + SIDE, left : left + SIDE]
-    by_block = stack.reshape(4, SIDE, SIDE)
-    # Rows and columns of the coefficients may be exchanged.
-    expected = np.asarray(dctn(block, norm="ortho"))
-    np.testing.assert_allclose(by_block[number].T, expected, atol=1e-5)
-    assert (np.delete(by_block, number, axis=0) == -1).all()
-    found = picture.copy()
-    adds_block(stack, number, np.float32(0.5), found.ravel(), top * 19 + left, 19)
-    expected = picture.copy()
-    expected[top : top + SIDE, left : left + SIDE] *= 1.5
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("count", [1, 2, 4, 8, 16])
-def test_stacks_are_shrunk_across_their_blocks_all_but_their_mean(count):
-    stack = np.random.default_rng(count).normal(size=(STACK, SIDE, SIDE)).astype(np.float32)
-    stack[:, 0, 0] *= 0.01
-    found = stack.ravel().copy()
-    kept = shrinks_stack(found, count, np.float32(0.8))
-    across = hadamard(count) / np.sqrt(count)
-    seen = np.einsum("kl,lij->kij", across, stack[:count])
-    left = np.where(np.abs(seen) < 0.8, 0, seen)
-    assert kept == np.count_nonzero(left)
-    left[0, 0, 0] = seen[0, 0, 0]
-    expected = stack.copy()
-    expected[:count] = np.einsum("kl,lij->kij", across, left)
-    np.testing.assert_allclose(found.reshape(stack.shape), expected, atol=1e-5)
-
-
-def test_squares_of_how_far_cells_are_apart_are_those_of_their_differences():
-    guide = np.random.default_rng(7).normal(size=(9, 30)).astype(np.float32)
-    (own_y, own_x), (top, left), (height, vectors) = (1, 5), (2, 3), (3, 2)
-    squares = np.full(height * vectors * SIDE + 3, -1, np.float32)
-    own, first = own_y * 30 + own_x, top * 30 + left
-    squares_apart(guide.ravel(), own, first, 30, squares, 2, height, vectors)
-    cell = guide[own_y : own_y + CELL, own_x : own_x + CELL]
-    others = np.lib.stride_tricks.sliding_window_view(guide, cell.shape)
-    expected = np.square(others - cell).sum(axis=(2, 3))
-    expected = expected[top : top + height, left : left + vectors * SIDE]
-    np.testing.assert_allclose(squares[2:-1].reshape(expected.shape), expected, rtol=1e-5)
-    assert (squares[:2] == -1).all()
-    assert squares[-1] == -1
 
 
 def test_what_repeats_is_kept_and_noise_is_removed():

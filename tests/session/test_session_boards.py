@@ -16,8 +16,14 @@ from emmc_rig.captures.control import Control
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.errors import AppError
 from emmc_rig.session import measured_psi
-from emmc_rig.session.board_sets import board_sets, sensor_pairs, whiteboards
-from emmc_rig.session.frame_means import mean_dark, mean_of, session_darks
+from emmc_rig.session.board_sets import (
+    board_sets,
+    mean_dark,
+    mean_of,
+    sensor_pairs,
+    session_darks,
+    whiteboards,
+)
 from emmc_rig.session.session import Session
 
 CHANNELS = np.full(SIZE, 3, np.uint8)

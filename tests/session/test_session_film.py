@@ -16,8 +16,8 @@ from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.frames import Exposure
+from emmc_rig.session.board_sets import decoded, taken_shots
 from emmc_rig.session.frame_file import FrameFile
-from emmc_rig.session.frame_means import decoded, taken_shots
 from emmc_rig.session.journal import FilmEntry
 from emmc_rig.session.measured_psi import session_scale
 from emmc_rig.session.readings import film_frames, film_places, session_frames

@@ -25,7 +25,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.session.exposure import exposure_reasons, shot_exposures
+from emmc_rig.session.brightness import exposure_reasons, shot_exposures
 from emmc_rig.session.frame_file import NO_FIGURES, decode_frame, frame_entry, frame_file
 from emmc_rig.session.readings import session_frames
 from emmc_rig.simulators.clock import ManualClock

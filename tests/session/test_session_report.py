@@ -19,8 +19,7 @@ from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.raw import RawFrame, decode_raw
 from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.report.session_sheet import run_times, sheet
-from emmc_rig.session.brightness import figures, thinned
-from emmc_rig.session.exposure import ShotExposure, exposure_reasons
+from emmc_rig.session.brightness import ShotExposure, exposure_reasons, figures, thinned
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry
 from emmc_rig.session.journal import RetryEntry
 from emmc_rig.session.session import Session

@@ -32,7 +32,7 @@ from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.model.files import SYSTEM_DISK, part_of, write_whole
 from emmc_rig.progress import Watcher
-from emmc_rig.session.frame_means import decoded
+from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.journal import (
     FrameEntry,
     Journal,
