@@ -340,6 +340,13 @@ def test_a_redrawn_mask_has_as_many_plates_as_shots():
     assert draw_plates(described, (6, 6))["m"].cells.shape[0] == 3
 
 
+def test_a_mask_in_the_lens_casts_no_shadow_that_diffraction_could_blur():
+    mask = {"distance_mm": 50, "cell_um": 24, "pattern": {"kind": "open"}}
+    described = {"title": "t", "masks": {"m": mask}}
+    assert Camera.model_validate(described).lens.distance_mm == mask["distance_mm"]
+    assert Camera.model_validate(described).warnings() == []
+
+
 def test_a_mask_whose_shadow_diffraction_blurs_is_warned_about():
     assert Camera.model_validate(VALID).warnings() == []
     (warning,) = Camera.model_validate(changed("masks", "near", "distance_mm", 5)).warnings()

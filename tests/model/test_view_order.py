@@ -14,12 +14,29 @@ from programs import program
 from view_files import save_views
 
 import emmc_rig as emmc
+from emmc_rig.model import view_order
 from emmc_rig.model.errors import ViewOrderWarning
 from emmc_rig.model.lightfield import load_views
 from emmc_rig.model.view_order import ViewOrder, order_of
 
 WRONG = [order for order in ViewOrder if order != ViewOrder.AS_NAMED]
 SIZE = (128, 160)
+
+
+@pytest.mark.parametrize(
+    ("as_named", "transposed", "order"),
+    [
+        (0.3, 0.8, ViewOrder.TRANSPOSED),
+        (0.7, 0.8, ViewOrder.AS_NAMED),  # the named order leaves nearly as little unexplained
+        (0.1, 0.5, ViewOrder.AS_NAMED),  # no order explains the changes between the views
+    ],
+)
+def test_another_order_is_taken_only_if_it_explains_the_views_far_better(
+    monkeypatch: pytest.MonkeyPatch, as_named: float, transposed: float, order: ViewOrder
+) -> None:
+    shares = {ViewOrder.AS_NAMED: [as_named], ViewOrder.TRANSPOSED: [0.0, transposed]}
+    monkeypatch.setattr(view_order, "_explained", lambda light_field: shares)
+    assert order_of(np.zeros((3, 3, 16, 16, 3))) == order
 
 
 def named(order: ViewOrder, lying: np.ndarray) -> np.ndarray:

@@ -163,6 +163,15 @@ def test_a_result_of_an_earlier_version_opens_without_its_frames():
             ask()
 
 
+def test_the_seconds_of_a_demo_are_those_of_its_reconstruction_without_compiling(tmp_path):
+    folder = tmp_path / "demo"
+    shutil.copytree(OLD, folder)
+    written = json.loads((folder / "metrics.json").read_text())
+    written |= {"seconds": {"scene": 1.0, "reconstruct": 5.0}, "compiling_seconds": 2.0}
+    (folder / "metrics.json").write_text(json.dumps(written))
+    assert emmc.open_result(folder).seconds == 3.0
+
+
 def test_a_verdict_of_version_0_2_lacks_figures_that_are_none_now():
     written = json.loads((OLD / "metrics.json").read_text())["verdict"]
     for name in ("over_flat", "parallax", "view_axes", "relief", "colour_error"):
