@@ -23,8 +23,8 @@ from emmc_rig.report.page import (
     Head,
     Section,
     data_address,
-    fragment,
     framed,
+    number,
     part,
     provenance_section,
     typed,
@@ -182,12 +182,39 @@ def _listed(name: str, title: str, lines: Sequence[str]) -> list[Section]:
 
 
 def _fit(metrics: Mapping) -> str:
-    undecided = metrics["fit"]["undecided"]
+    fit = metrics["fit"]
     rows = [
-        _fitted(parameter, metrics["parameters"][name], name in undecided)
+        _fitted(parameter, metrics["parameters"][name], name in fit["undecided"])
         for name, parameter in PARAMETERS.items()
     ]
-    return fragment("calibration_fit.html", fit=metrics["fit"], rows=rows, good_chi2=GOOD_CHI2)
+    heads = ("Parameter", "Fitted ± standard deviation", "What that says")
+    words = (
+        f"The fit {fit['status']} after {fit['steps']} steps; correlation with the design's shadow "
+        f"{number(fit['correlation'], '.4f')} (1 is the design's); residual "
+        f"{number(fit['chi2'], '.2f')} of the noise's variance (good: below {GOOD_CHI2}; above, "
+        "the mask has more than these parameters describe), "
+        f"{number(fit['outliers'], '.2%')} of the pixels excluded."
+    )
+    of_boards = (
+        "Whiteboard", "Brightness", "Mask moved x, y (um)", "Residual, x noise", "Excluded pixels"
+    )  # fmt: skip
+    boards = [
+        (
+            board["name"],
+            number(board["brightness"] - 1, "+z.2%"),
+            ", ".join(number(um, "+z.3f") for um in board["moved_um"]),
+            number(board["chi2"], ".2f"),
+            number(board["outliers"], ".2%"),
+        )
+        for board in fit["boards"]
+    ]
+    about = f"{len(boards)} whiteboards: brightness, movement and residual."
+    table = part("table", of_boards, boards, numbers=True)
+    return (
+        part("table", heads, rows)
+        + part("lead", words)
+        + part("folded", "boards", "Each whiteboard against the fit", about, table)
+    )
 
 
 def _fitted(parameter: _Parameter, found: Mapping[str, float], undecided: bool) -> tuple[str, ...]:

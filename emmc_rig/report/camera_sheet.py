@@ -29,12 +29,13 @@ from emmc_rig.model.geometry import centred_grid, fresnel_number, mask_position
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import grid_name, picture_name, place_name, shows_parallax
+from emmc_rig.report.drawing import FAINT, INK
 
 SHEET_SAMPLES = 64
 LISTING_SAMPLES = 24
 WEIGHTS_SHOWN = 20
 HALF_CELLS_SHOWN = 8
-INK, FAINT, BLOCKED, RAY, WARNING = "#1b1f27", "#8a919e", "#2b2f38", "#c2410c", "#b45309"
+BLOCKED, RAY, WARNING = "#2b2f38", "#c2410c", "#b45309"
 
 
 @dataclass(frozen=True)

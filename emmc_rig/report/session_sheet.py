@@ -25,6 +25,7 @@ from emmc_rig.report.page import (
     data_address,
     fragment,
     framed,
+    number,
     part,
     provenance_section,
     typed,
@@ -78,8 +79,7 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
     sections = []
     taken = of_kind(session.journal.entries, DecidedEntry)
     if taken:
-        last = ended(session.journal.entries)
-        body = fragment("session_shots.html", decisions=taken, spared=last and last.spared)
+        body = _decisions(taken, ended(session.journal.entries))
         about = f"The accuracy estimated after each of {len(taken)} shots, and which came next."
         sections.append(Section("decisions", "Choice of shots", body, about=about))
     happened = list(events(session))
@@ -101,6 +101,32 @@ def sheet(session: Session, pictures: int = MOST_PICTURES) -> str:
         session.header["title"], [_about(session)], sections=sections, styles=["session.css"],
         lead=lead, head=_head(session),
     )  # fmt: skip
+
+
+def _decisions(taken: Sequence[DecidedEntry], last: DecidedEntry | None) -> str:
+    """Return the accuracy estimated after each shot as HTML, and which shot came next."""
+
+    def numbers(shots: Sequence[int]) -> str:
+        return ", ".join(str(shot + 1) for shot in shots)
+
+    words = (
+        "After each shot the light field was reconstructed; its own standard deviation, checked on "
+        "validation readings, stands for the estimated accuracy."
+    )
+    if last is not None and last.spared:
+        words += f" Of the plan, shots {numbers(last.spared)} were not needed."
+    heads = ("Shots taken", "Estimated accuracy, dB", "Target, dB", "Next shot", "Why")
+    rows = [
+        (
+            numbers(entry.shots),
+            number(entry.stated_db, ".2f"),
+            number(entry.target_db, "g"),
+            "none" if entry.next is None else entry.next + 1,
+            "; ".join(filter(None, (entry.why, entry.advice))),
+        )
+        for entry in taken
+    ]
+    return part("lead", words) + part("table", heads, rows)
 
 
 def _head(session: Session) -> Head:

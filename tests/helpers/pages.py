@@ -15,7 +15,8 @@ class Page(html.parser.HTMLParser):
         for name, value in attributes:
             if name == "id":
                 self.ids.append(value)
-            if name in ("src", "href") and not value.startswith(("data:", "#")):
+            fetching = ("src", "href", "srcset", "data", "poster", "action", "xlink:href")
+            if name in fetching and not (value or "").startswith(("data:", "#")):
                 self.foreign.append(value)
 
 

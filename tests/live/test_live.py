@@ -185,13 +185,13 @@ def test_a_camera_in_trouble_is_reported_and_asked_again(monkeypatch):
 
 @pytest.mark.slow
 def test_no_frame_is_taken_when_nobody_looks(monkeypatch):
-    monkeypatch.setattr(watch_module, "IDLE_S", 0.4)
+    monkeypatch.setattr(watch_module, "IDLE_S", 0.1)
     camera = FakeCamera()
     with watching(camera) as watch:
         until(watch, lambda state: state["frame"])
-        time.sleep(1.0)
-        before = camera.taken
         time.sleep(0.5)
+        before = camera.taken
+        time.sleep(0.3)
         assert camera.taken == before
         until(watch, lambda state: state["frame"] > before)
 
@@ -382,7 +382,7 @@ def test_a_dark_picture_with_the_mask_away_offers_to_centre_it():
         assert "lamp" in lamp["hint"]["text"]
 
 
-@pytest.mark.parametrize("light", [0.03, 1.0, 20.0])
+@pytest.mark.parametrize("light", [0.03, 20.0])
 def test_automatic_exposure_brings_the_brightest_near_white_but_not_to_it(light):
     camera = FakeCamera()
     camera.light = light

@@ -142,7 +142,7 @@ def test_the_light_field_so_far_follows_the_shots_without_until(tmp_path):
             if len(shots) == 2:
                 shown.set()
 
-    page = Waiting(tmp_path / "plan-session", lambda page: shown.wait(60) and page.control.stop())
+    page = Waiting(tmp_path / "plan-session", lambda page: (shown.wait(60), page.control.stop()))
     page._computes = True
     page.start()
     try:
