@@ -269,7 +269,7 @@ def test_what_differs_between_two_plans_is_named():
     assert differences(other, plan) == ["settle_s is 0.5, not 0.0"]
     assert differences(plan, plan_of(shots=[{}]))[0] == "shots has 3 entries, not 1"
     assert differences(plan_of(shots=[{}]), plan) == ["shots has 1 entries, not 3"]
-    # What one plan has as a mapping or list, and the other as a single value.
+    # A value that is a mapping or list in the first plan, and a single value in the second.
     assert differences(plan_of(darks=None), plan)[0].startswith("darks is null, not {")
     assert differences(plan, plan_of(darks=None))[0].endswith(", not null")
     every, few = (plan_of(whiteboards={"views": views}) for views in ("all", [[2, 2]]))

@@ -438,7 +438,7 @@ def test_formulas_have_the_value_that_emvas_library_gives_them():
         try:
             theirs = nodes.get_node("K").value
         except Exception:
-            # It evaluates branches that do not count, and may find no value there.
+            # GenApi also evaluates unselected branches, which may have no value.
             return
         try:
             ours = features(knife + values).number("K")

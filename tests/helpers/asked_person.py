@@ -1,4 +1,4 @@
-"""A simulated bench with a person at it, who is asked for what no axis moves, and then does it."""
+"""A simulated bench with a person, who makes on request the moves for which there is no axis."""
 
 from contextlib import contextmanager
 from dataclasses import replace

@@ -1,9 +1,8 @@
 """A coded-mask bench that shares no code with the program: NumPy alone, own rays, electrons, DN.
 
 Rays run from 144 points of every pixel to whole aperture cells, whose shadow on the mask is a box:
-its mean transmittance is read from a table, made of sums over the mask. Lengths in um. It takes
-frames in the order in which it is asked, by its own clock, and knows the truth of what it took:
-`Bench.psi()`.
+its mean transmittance is read from a table, made of sums over the mask. Lengths in um. Frames
+follow the order of the requests, timed by the bench's own clock; `Bench.psi()` is the true Psi.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What lies in a folder, and which of it results say they wrote."""
+"""Files of a folder, and those that its list of results names."""
 
 import hashlib
 

@@ -1,7 +1,7 @@
 """The simulated still camera on a TCP port: PTP/IP, so that other programs can take pictures.
 
-Listens on this computer only, to one initiator at a time: a session ends with its command
-connection, and its event connection with it. Source: CIPA DC-005 (PTP over TCP/IP), clauses 2
+Listens on this computer only, to one initiator at a time: a session and its event
+connection end with its command connection. Source: CIPA DC-005 (PTP over TCP/IP), clauses 2
 and 3.
 """
 

@@ -2,7 +2,7 @@
 
 Started as a program, it reads a line `OFFSET_S FOLDER` for each meeting and forks a process for
 each command line in FOLDER/commands.json: a second one OFFSET_S after the first. They run in
-FOLDER, on a rig without time or light, and write what they say to 0.log and 1.log. The answer is a
+FOLDER, on a rig without time or light, and write their output to 0.log and 1.log. The answer is a
 line of JSON: their process ids, their exit codes, and the seconds until all of them had ended.
 """
 
@@ -69,7 +69,7 @@ def _forked(arguments, folder, name, wait_s):
 
 def main():
     """Serve until the input ends."""
-    # Made once: that takes longer than all that the programs do here.
+    # The command is built once: building it takes longer than the commands themselves.
     cli.app = typer.main.get_command(cli.app)  # type: ignore[assignment]
     for request in sys.stdin:
         offset, folder = request.split(maxsplit=1)

@@ -1,9 +1,9 @@
 """A disk in memory that can lose its power, fill up or fail between any two operations.
 
 What a real disk promises is kept, and nothing more: bytes are there after a power cut once their
-file was synced, names once their folder was. What was not synced may be there, in part, or not:
-`after_power_cut` draws one such outcome. Names of one folder survive in the order in which they
-changed, as on a journaling file system; the bytes of a file that grew may read as zeros.
+file was synced, names once their folder was. Unsynced bytes and names survive whole, in part, or
+not at all: `after_power_cut` draws such an outcome. Changes of a folder's names survive in their
+order, as on a journaling file system; the bytes of a file that grew may read as zeros.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from emmc_rig.model.files import Disk
 
 
 class PowerCutError(BaseException):
-    """The power went; no program can catch that, so this is no `Exception`."""
+    """A power cut: no program can catch it, so it is no `Exception`."""
 
 
 @dataclass(eq=False)
 class _File:
-    """Bytes as programs see them, and as they are on the platter."""
+    """A file: bytes as programs read them, and bytes on the platter."""
 
     data: bytearray = field(default_factory=bytearray)
     synced: bytes = b""
@@ -61,8 +61,8 @@ def _apply(entries: dict[str, _File | _Folder], names: dict[str, _File | _Folder
 class SimulatedDisk(Disk):
     """A `Disk` in memory.
 
-    before: called with number and name of every operation that writes, before it; what it raises
-    is what the operation raises. capacity_bytes: more than that gives `ENOSPC`, half written.
+    before: called before every operation that writes, with its number and name; the operation
+    raises the same exception. capacity_bytes: a larger write ends in `ENOSPC`, half written.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class SimulatedDisk(Disk):
         self._root = _Folder()
 
     def cut_power_at(self, number: int) -> None:
-        """Lose the power at that operation; it and all later ones raise `PowerCutError`."""
+        """Lose the power at an operation: that operation and later ones raise `PowerCutError`."""
 
         def before(now: int, name: str) -> None:
             if now >= number:
@@ -85,7 +85,7 @@ class SimulatedDisk(Disk):
         self.before = before
 
     def after_power_cut(self, rng: np.random.Generator) -> SimulatedDisk:
-        """Return a disk with one of the contents that this one may have after a power cut now."""
+        """Return a disk after a power cut, with contents drawn from the possible ones."""
         survived = SimulatedDisk(capacity_bytes=self.capacity_bytes)
         survived._root = _survivor(self._root, rng)
         return survived
@@ -100,7 +100,7 @@ class SimulatedDisk(Disk):
         self._grow(there if isinstance(there, _File) else self.create(path), data)
 
     def create(self, path: Path) -> _File:
-        """Begin an empty file; one of that name is emptied."""
+        """Begin an empty file; an existing file of that name is emptied."""
         self._operate("create")
         folder = self._folder(path.parent)
         there = folder.entries.get(path.name)

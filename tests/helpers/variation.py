@@ -53,7 +53,7 @@ def variation(light_field, order, metric=None):
 
 
 def gradient(light_field, order):
-    """Return all derivatives (index, v, u, y, x, c) that fit somewhere, 0 where they do not."""
+    """Return all derivatives (index, v, u, y, x, c); 0 where a derivative crosses the border."""
     matrix = difference_matrix(light_field.shape, order)
     return (matrix @ light_field.ravel()).reshape(-1, *light_field.shape)
 

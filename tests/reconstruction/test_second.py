@@ -30,7 +30,7 @@ def survey():
 
 
 def believing(survey, disparity, share=1.0):
-    """A survey whose patches are sure of a disparity, a share of them, and the others of none."""
+    """A survey in which a share of the patches has a certain disparity, and the other patches none."""
     rows, columns = survey.volume.decisive.shape
     wide = np.arange(rows * columns).reshape(rows, columns) < share * rows * columns
     probability = np.stack([~wide, wide], axis=-1).astype(np.float32)
