@@ -14,6 +14,7 @@ import numba
 import numpy as np
 import pytest
 import yaml
+from fuzzing import FUZZ
 from pools import Here, StoppedHereError, children
 from programs import PROGRAM, program
 
@@ -30,7 +31,7 @@ from emmc_rig.store.folders import result_folder
 
 CAMERA, SIZE, SCENE = "rgbw-bayer-1shot", (64, 80), "deep-occlusions"
 BLOCKS = {"blocks": {"whole": 1000, "side": 32, "blend": 4}, "tv": {"max_steps": 20}}
-KILLS = int(os.environ.get("EMMC_KILLS", "2"))
+KILLS = 2 * FUZZ
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -166,7 +167,7 @@ def wait_for(condition, process, steps=6000):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
 def test_killed_at_any_time_the_same_command_goes_on_to_the_same_bytes(place):
-    """Every run but the last of a result is killed; EMMC_KILLS says how many in all."""
+    """Every run but the last of a result is killed; KILLS in all."""
     rng = np.random.default_rng(KILLS)
     kills = finished = resumed = 0
     while kills < KILLS or kept(place, f"killed-{finished}").exists():

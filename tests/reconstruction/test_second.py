@@ -30,7 +30,7 @@ def survey():
 
 
 def believing(survey, disparity, share=1.0):
-    """A survey in which a share of the patches has a certain disparity, and the other patches none."""
+    """A survey: a share of the patches has a certain disparity, the other patches none."""
     rows, columns = survey.volume.decisive.shape
     wide = np.arange(rows * columns).reshape(rows, columns) < share * rows * columns
     probability = np.stack([~wide, wide], axis=-1).astype(np.float32)
