@@ -221,7 +221,7 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
         place_um = lit["axes"]["mask_x"]["position_um"]
         assert place_um == pytest.approx(rig.zero_um["mask_x"], abs=0.5)
         until(watch, lambda state: state["frame"] > lit["frame"] + 1)
-        before = watch.newest().frame.mosaic
+        before = mosaic_of(watch)
         watch.jog("mask_x", 200.0)
         moved = until(
             watch,
@@ -231,7 +231,7 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
         )
         assert moved["axes"]["mask_x"]["position_um"] == pytest.approx(place_um + 200, abs=0.5)
         until(watch, lambda state: state["frame"] > moved["frame"] + 1)
-        after = watch.newest().frame.mosaic
+        after = mosaic_of(watch)
         assert before.mean() > 2 * rig.camera.snap().black_level_dn.mean()
         assert np.abs(after.astype(float) - before).mean() > 30
         watch.look_at("scene")
@@ -239,6 +239,12 @@ def test_jogging_moves_the_simulated_stage_and_the_picture_changes(rig):
             watch.look_at("moon")
         with pytest.raises(AppError, match="no axis 'x'"):
             watch.jog("x", 1.0)
+
+
+def mosaic_of(watch):
+    newest = watch.newest()
+    assert newest is not None
+    return newest.frame.mosaic
 
 
 class SlowStage:
