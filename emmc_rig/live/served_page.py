@@ -51,7 +51,7 @@ class Order:
         urgent: bool = False,
         **arguments: Any,
     ) -> None:
-        fields = {
+        fields: dict[str, Any] = {
             name: kind if isinstance(kind, tuple) else (kind, ...)
             for name, kind in arguments.items()
         }

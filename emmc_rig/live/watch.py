@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from queue import Empty, Queue
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,6 +101,17 @@ class Shown:
     moves: int | None
 
 
+class LongExposure(NamedTuple):
+    """An exposure under way that is counted down; begun_s: on the monotonic clock."""
+
+    begun_s: float
+    exposure_s: float
+
+    def left_s(self) -> float:
+        """Return the seconds until its end."""
+        return self.begun_s + self.exposure_s - time.monotonic()
+
+
 class Watch:
     """The page, a `served_page.Page`; every method may be called by any thread.
 
@@ -138,11 +149,36 @@ class Watch:
         self._focus = FocusMeter()
         self._exposing, self._dimmest_s, self._longest_s = 0, 0.0, LONGEST_UNASKED_S
         self._unexposed = ""
-        self._exposed_s: tuple[float, float] | None = None
+        self._long_exposure: LongExposure | None = None
         self._seek_at_s = 0.0
         self._gauge: MaskGauge | None = None
         self._drawn, self._latency_s = 0, 0.0
-        parts = {
+        self.state = PageState(self._first_parts(), self._advice)
+        self.pictures: Mapping[str, Pictured] = {
+            "picture.jpg": self._picture,
+            **field_pictures(lambda: light_field and light_field.pictures()),
+        }
+        self.orders: Mapping[str, Order] = self._order_table()
+        self._asked_s = time.monotonic()
+        self._ending = threading.Event()
+        self._wishes: Queue[Callable[[], object]] = Queue()
+        self._driving = None if stage is None else Driving(stage, self.state.publish)
+        threads = {
+            "live camera": self._take,
+            "live levels": self._each(self._show_levels),
+            "live countdown": self._count_down,
+        }
+        if design is not None:
+            threads["live mask"] = self._each(self._show_mask)
+        if light_field is not None:
+            threads["live light field"] = self._each(self._show_light_field)
+        self._threads = [
+            threading.Thread(target=work, name=name, daemon=True) for name, work in threads.items()
+        ]
+
+    def _first_parts(self) -> dict[str, Any]:
+        """Return the state before the first frame."""
+        return {
             "frame": 0,
             "figures": None,
             "mask": None,
@@ -153,20 +189,18 @@ class Watch:
             "trouble": {"camera": "", "setting": "", "stage": "", "light field": ""},
             "exposing": None,
             "reference": False,
-            "targets": list(targets),
+            "targets": list(self.targets),
             "centre_um": self._centre_um,
             "light_field": None,
             "hint": None,
             "steps": [],
             "takes": self._saved.takes,
-            "next": following,
+            "next": self._following,
         }
-        self.state = PageState(parts, self._advice)
-        self.pictures: Mapping[str, Pictured] = {
-            "picture.jpg": self._picture,
-            **field_pictures(lambda: light_field and light_field.pictures()),
-        }
-        self.orders: Mapping[str, Order] = {
+
+    def _order_table(self) -> dict[str, Order]:
+        """Return the orders of the page by name."""
+        return {
             "exposure": Order(self.set_exposure_s, seconds=Number),
             "gain": Order(self.set_gain, factor=Number),
             "autoexpose": Order(self.auto_expose, longest_s=(Number, LONGEST_UNASKED_S)),
@@ -182,22 +216,6 @@ class Watch:
             "preview": Order(self.preview, what=list[str]),
             "save": Order(self.save),
         }
-        self._asked_s = time.monotonic()
-        self._ending = threading.Event()
-        self._wishes: Queue[Callable[[], object]] = Queue()
-        self._driving = None if stage is None else Driving(stage, self.state.publish)
-        threads = {
-            "live camera": self._take,
-            "live levels": self._each(self._show_levels),
-            "live countdown": self._count_down,
-        }
-        if design is not None:
-            threads["live mask"] = self._each(self._show_mask)
-        if light_field is not None:
-            threads["live light field"] = self._each(self._show_light_field)
-        self._threads = [
-            threading.Thread(target=call, name=name, daemon=True) for name, call in threads.items()
-        ]
 
     def start(self) -> None:
         """Begin to take frames."""
@@ -268,13 +286,13 @@ class Watch:
         newest = self.newest()
         before_s = LONGEST_UNASKED_S if newest is None else newest.frame.exposure_s
         shortest_s, longest_s = self.state["settings"]["exposure_limits_s"]
-        under_way = self._exposed_s
+        under_way = self._long_exposure
         self._exposing = 0
         if shortest_s < longest_s:
             chosen_s = min(before_s or LONGEST_UNASKED_S, self._exposure_s, LONGEST_UNASKED_S)
             self.set_exposure_s(max(chosen_s, shortest_s))
         if under_way is not None and not self._break_off():
-            left_s = sum(under_way) - time.monotonic()
+            left_s = under_way.left_s()
             raise AppError(f"this camera ends its exposure before it does anything: {left_s:.0f} s")
 
     @property
@@ -289,17 +307,19 @@ class Watch:
     def _count_down(self) -> None:
         """Show how long the exposure under way still takes, and break it off for a new setting."""
         while not self._ending.wait(COUNT_S):
-            if (under_way := self._exposed_s) is None:
+            if (under_way := self._long_exposure) is None:
                 if self.state["exposing"] is not None:
                     self.state.publish(exposing=None)
                 continue
-            began_s, exposure_s = under_way
-            left_s = began_s + exposure_s - time.monotonic()
+            left_s = under_way.left_s()
             if not self._wishes.empty() and left_s > LONG_S:
                 self._break_off()
             # A camera that has its frames at once is not counted down.
-            elif time.monotonic() - began_s >= COUNT_S or self.state["exposing"] is not None:
-                left = {"exposure_s": exposure_s, "left_s": max(0.0, left_s)}
+            elif (
+                time.monotonic() - under_way.begun_s >= COUNT_S
+                or self.state["exposing"] is not None
+            ):
+                left = {"exposure_s": under_way.exposure_s, "left_s": max(0.0, left_s)}
                 self.state.publish(exposing=left)
         self._break_off()
 
@@ -493,11 +513,11 @@ class Watch:
                     stream = self._camera.stream()  # pyright: ignore[reportAttributeAccessIssue]
                 moved = self._moved()
                 if self._exposure_s > LONG_S:
-                    self._exposed_s = time.monotonic(), self._exposure_s
+                    self._long_exposure = LongExposure(time.monotonic(), self._exposure_s)
                 try:
                     frame = next(stream) if stream is not None else self._camera.snap()
                 finally:
-                    self._exposed_s = None
+                    self._long_exposure = None
                 moves = moved if moved == self._moved() else None
                 still = moves if moves == stood or not streams else None
                 with self.state.changed:
