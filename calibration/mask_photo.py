@@ -229,17 +229,21 @@ def find_corners(light: Array, cells: tuple[int, int]) -> Array:
     whole = whole[(slice(kernel.shape[0], -kernel.shape[0]),) * 2]
     _, labels, stats, _ = cv2.connectedComponentsWithStats(whole)
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    points = np.argwhere((labels == largest) & (differs > 0))[:, ::-1].astype(np.int32)
-    hull = cv2.convexHull(points)
+    points = np.argwhere((labels == largest) & (differs > 0))[:, ::-1].astype(float)
     beside = points.min(axis=0) <= 1
     beyond = points.max(axis=0) >= np.array(light.shape[1::-1]) - 2
-    if beside.any() or beyond.any() or len(hull) < 4:
+    if beside.any() or beyond.any():
         raise nothing
-    # Half of the outer cells may look like the surround: the outermost ones decide.
-    corners = cv2.approxPolyN(hull, 4, ensure_convex=True).reshape(4, 2).astype(np.float64)
-    x, y = (corners - corners.mean(axis=0)).T
-    clockwise = corners[np.argsort(np.arctan2(y, x))]
-    return np.roll(clockwise, -int(clockwise.sum(axis=1).argmin()), axis=0)
+    angle = np.radians((cv2.minAreaRect(points.astype(np.float32))[2] + 45) % 90 - 45)
+    along = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
+    turned = points @ along.T
+    left, right, top, bottom = (
+        _side(turned[:, ::-1] if axis else turned, outward, cells[axis])
+        for axis, outward in ((0, -1), (0, 1), (1, -1), (1, 1))
+    )
+    pairs = ((left, top), (right, top), (right, bottom), (left, bottom))
+    middle = turned.mean(axis=0)
+    return np.array([_crossing(x_of, y_of, middle) for x_of, y_of in pairs]) @ along
 
 
 def _differs_from_surround(light: Array) -> NDArray[np.uint8]:
@@ -257,6 +261,42 @@ def _differs_from_surround(light: Array) -> NDArray[np.uint8]:
     differs = (difference > 0.3 * np.quantile(difference, 0.99)).astype(np.uint8)
     opened = cv2.morphologyEx(differs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return np.asarray(opened, np.uint8)
+
+
+def _side(points: Array, outward: int, count: int) -> NDArray[np.float64]:
+    """Return the quadratic (see polyval) of the outermost of points (x, y) as a function of y.
+
+    outward: -1 for the side of small x. Half of the outer cells may look like the surround: only
+    what lies outside of the last fit stays in the next.
+    """
+    low, high = points[:, 1].min(), points[:, 1].max()
+    bins = ((points[:, 1] - low) / (high - low + 1e-9) * 2 * count).astype(int)
+    outermost = np.full(2 * count, -np.inf)
+    np.maximum.at(outermost, bins, outward * points[:, 0])
+    y = low + (np.arange(2 * count) + 0.5) * (high - low) / (2 * count)
+    kept = np.isfinite(outermost) & (abs(np.linspace(-1, 1, 2 * count)) < 0.95)
+    y, x = y[kept], outermost[kept]
+    middle = y.mean()
+    use = np.ones(y.size, bool)
+    fit = np.polyfit(y - middle, x, 2)
+    tolerance = 0.15 * (high - low) / count
+    for _ in range(20):
+        beyond = x - np.polyval(fit, y - middle)
+        use = beyond > -tolerance
+        if use.sum() < 6:
+            break
+        fit = np.polyfit(y[use] - middle, x[use], 2)
+    straight = np.poly1d(outward * fit)(np.poly1d([1, -middle]))
+    return np.asarray(np.atleast_1d(straight.coeffs), np.float64)
+
+
+def _crossing(x_of: Array, y_of: Array, start: Array) -> Array:
+    """Return the point (x, y) with x = x_of(y) and y = y_of(x)."""
+    x, y = start
+    for _ in range(50):
+        x = np.polyval(x_of, y)
+        y = np.polyval(y_of, x)
+    return np.array([x, y])
 
 
 def _check_corners(corners: Array, photo: tuple[int, ...]) -> None:

@@ -176,11 +176,11 @@ def run_drift(
     known = read_calibration(known_folder)
     capture = read_frames(frames_folder)
     if capture.readings.shape != known.psi.frames_shape:
-        raise AppError(
-            f"{frames_folder / FRAMES}: {capture.readings.shape[0]} frames of "
-            f"{capture.readings.shape[1]} x {capture.readings.shape[2]} pixels; this calibration "
-            "is for {} of {} x {}".format(*known.psi.frames_shape)
+        found, expected = (
+            "{} frames of {} x {} pixels".format(*shape)
+            for shape in (capture.readings.shape, known.psi.frames_shape)
         )
+        raise AppError(f"{frames_folder / FRAMES}: {found}; this calibration is for {expected}")
     taken = capture.of_one_deviation()
     drift = find_drift(
         taken, known.colour, known.seen_mask, known.placement, known.stages, settings
@@ -189,8 +189,9 @@ def run_drift(
         raise AppError(f"{frames_folder}: {drift.words}")
     mended = known.psi_after(drift.placement) if drift.drifted else known.psi
     mended.save(out / PSI)
-    write_metrics(out, _figures(drift))
-    return _figures(drift)
+    figures = _figures(drift)
+    write_metrics(out, figures)
+    return figures
 
 
 def _figures(drift: Drift) -> dict:

@@ -228,7 +228,7 @@ def test_a_free_psi_is_taken_too_and_a_mask_far_off_is_refused_with_nothing_writ
 
 def test_drift_refuses_frames_of_another_size(run, calibrated, tmp_path):
     known, camera, truth = calibrated
-    frames = frames_of(tmp_path / "frames", camera, truth)
+    frames = frames_of(tmp_path / "frames {x}", camera, truth)
     with h5py.File(frames / "frames.h5", "a") as file:
         for name in ("readings", "deviation", "usable"):
             cut = np.asarray(file[name])[:, :-2]
@@ -236,7 +236,7 @@ def test_drift_refuses_frames_of_another_size(run, calibrated, tmp_path):
             file[name] = cut
     code, _, error = run("calibrate", "--drift", frames, "--known", known)
     assert code == 1
-    assert "this calibration is for 1 of 48 x 64" in " ".join(error.split())
+    assert "this calibration is for 1 frames of 48 x 64 pixels" in " ".join(error.split())
     code, _, error = run("calibrate", "--drift", frames, "--known", tmp_path)
     assert code == 1
     assert "name the folder of a calibration" in " ".join(error.split())
