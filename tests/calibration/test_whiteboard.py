@@ -6,7 +6,7 @@ import pytest
 from emmc_rig.calibration.boards import BoardFrame, BoardSet
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.frames import MeanFrame, SensorGain, average, photon_transfer
-from emmc_rig.calibration.scale import MANY, Scale
+from emmc_rig.calibration.scale import MANY, Scale, amplified
 from emmc_rig.calibration.whiteboard import ideal_boards, lamps_needed, measure_psi
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
 from emmc_rig.process.session_calibration import GivenFrame
@@ -218,3 +218,17 @@ def test_repeated_darks_show_how_rows_err_alike():
     # pixels' variance is 9 of 73.
     of_rows = 9 - 9 / 16
     assert np.mean(seen, axis=0) == pytest.approx([of_rows, 0.48 * 9], rel=0.08)
+
+
+def test_darks_at_another_gain_are_the_mean_and_the_noise_of_amplified_frames():
+    rng = np.random.default_rng(3)
+    rows = rng.normal(0, 4, (16, 24, 1))  # each row of each frame moves as a whole
+    dark = np.rint(200 + rows + rng.normal(0, 5, (16, 24, 32)))
+    at_one, at_three = (
+        average((100 + gain * (dark - 100)).astype(np.uint16), 0.1, WHITE_DN, "dark", lit=False)
+        for gain in (1, 3)
+    )
+    found = amplified(at_one, 3.0, np.full((2, 2), 100.0))
+    np.testing.assert_allclose(found.mean_dn, at_three.mean_dn, rtol=1e-6)
+    for name in ("variance_dn2", "level_variance_dn2", "rows_dn2"):
+        np.testing.assert_allclose(getattr(found, name), getattr(at_three, name), rtol=1e-6)

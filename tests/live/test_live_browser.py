@@ -295,7 +295,7 @@ def test_picture_levels_exposure_focus_mask_and_stop_are_in_view_without_scrolli
     wait(page, lambda: page.execute_script("return state.figures && !state.busy"))
     wait(page, lambda: page.execute_script("return !picture.hidden"))
     for scheme in ("light", "dark"):
-        with on_screen(page, *size, scheme):
+        with on_screen(page, size[0], size[1], scheme):
             wait(page, lambda: page.execute_script(SHOWN) == [])
             back = page.execute_script("return getComputedStyle(document.body).backgroundColor")
             assert (int(back.split("(")[1].split(",")[0]) < 128) == (scheme == "dark")

@@ -170,7 +170,7 @@ def test_excluding_saturated_pixels_is_better_than_believing_them(problem):
 def test_frames_and_noise_that_do_not_fit_are_refused(problem, change, noise, words):
     psi, frames = problem
     changed = change(frames)
-    if np.isscalar(changed):
+    if isinstance(changed, float):
         changed = np.where(np.arange(20) == 4, np.float32(changed), frames)
     with pytest.raises(ReconstructionError, match=words):
         reconstruct_tv(psi, even_frames(changed, noise))
