@@ -13,7 +13,11 @@ MOVED = {
     "drivers": "emmc_rig.drivers",
     "reconstruction": "emmc_rig.reconstruction",
     "simulators": "emmc_rig.simulators",
+    "emmc_rig.acquisition": "emmc_rig.captures",
     "emmc_rig.conformance": "emmc_rig.bench.conformance",
+    "emmc_rig.files": "emmc_rig.formats or emmc_rig.store",
+    "emmc_rig.pages": "emmc_rig.report",
+    "emmc_rig.processing": "emmc_rig.process",
 }
 """The old name of each package that plug-ins and notebooks import, and its name since 0.5."""
 
