@@ -95,9 +95,12 @@ def test_from_the_readmes_command_to_a_saved_plan_and_a_light_field(browser, tmp
             assert text("#saved").endswith("next: emmc-rig capture plan.yaml --rig simulated")
             assert not browser.find_element(By.ID, "diff").is_displayed()
             click("[data-show=views]")
-            # The next frame clears this text, so all of it is read at once.
-            finished = re.compile("adaptive: .*as by reconstruct.*(trust|doubt|do not use)", re.S)
-            wait(browser, lambda: finished.search(text("#field-stage")))
+
+            def has_verdict():
+                now = text("#field-stage")  # once: the next frame clears it
+                return "as by reconstruct" in now and re.search("trust|doubt|do not use", now)
+
+            wait(browser, has_verdict)
             wait(
                 browser,
                 lambda: browser.find_element(By.ID, "viewer").get_attribute("data-complete"),
