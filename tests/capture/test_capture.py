@@ -376,6 +376,24 @@ def test_a_fault_that_stays_stops_the_capture_with_everything_kept():
     assert Sequencer(session, plan, rig).run().complete
 
 
+def test_a_disk_that_damages_frames_again_and_again_spends_the_budget_of_the_session():
+    rig, _ = bench_rig(ONE_SHOT)
+    session, plan = started(rig, ONE_SHOT, retries=Retries(per_session=3))
+    spoilt, written = {frame.id for frame in session.frames[:2]}, []
+
+    def spoil(event):
+        name = event.facts["id"]
+        if name in spoilt:
+            session.disk.write(session.path_of(session.stored[name]), b"rot")
+            written.append(name)
+            assert len(written) < 20, "taken for ever"
+
+    with pytest.raises(GaveUpError, match=r"all 3 retries.*instead of"):
+        Sequencer(session, plan, rig, Acting(frame_written=spoil)).run()
+    assert len(written) == 4
+    assert set(session.stored) == {frame.id for frame in session.frames} - spoilt
+
+
 def test_the_budget_of_the_session_ends_it_too():
     rig, _ = bench_rig()
     session, plan = started(rig, retries=Retries(per_session=3))

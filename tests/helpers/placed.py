@@ -1,4 +1,4 @@
-"""Files of a folder, and those that its list of results names."""
+"""Files of a folder, and the files listed as results."""
 
 import hashlib
 

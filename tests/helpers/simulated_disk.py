@@ -20,7 +20,7 @@ from emmc_rig.model.files import Disk
 
 
 class PowerCutError(BaseException):
-    """A power cut: no program can catch it, so it is no `Exception`."""
+    """A power cut. Programs that catch every `Exception` must not catch it."""
 
 
 @dataclass(eq=False)
