@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -40,12 +40,15 @@ from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadine
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import register, starting_placement
 from emmc_rig.calibration.placement import (
+    PUPIL_SHARE,
+    PUPIL_X,
     SCALARS,
     Placement,
     Tolerances,
     labels,
     with_aperture_mean_one,
 )
+from emmc_rig.calibration.pupil_shape import CLEARLY_ROUND, likeliest_pupil, measured_light
 from emmc_rig.calibration.robust import correlation, deviation_of, tukey_loss, tukey_weights
 from emmc_rig.calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, ShadowMask
 from emmc_rig.model.blas import one_blas_thread
@@ -68,6 +71,12 @@ LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
+PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
+"""Where the pupil's parameters lie there."""
+STEPS_TO_PUPIL = 4
+"""Of the fit, before the views' light is looked at: the mask is then about where it stands."""
+HELD = 1e-6
+"""Of the tolerance of parameters that nothing depends on."""
 OWN = 3
 """Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
 BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
@@ -257,6 +266,8 @@ def _bench_prior(
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     deviations = Tolerances().deviations(camera.views)
+    if placement.pupil is None:
+        deviations[PUPIL] *= HELD
     if any(board.loose for board in boards):
         # Pinholes a little off their holes look like glass before the mask.
         deviations[SCALARS.index("glass_um")] *= OF_LOOSE
@@ -653,6 +664,12 @@ def fit_placement(
     bench, widths = _bench_prior(boards, camera, mask, start), FIRST_WIDTHS
     state, steps = _State(start, np.zeros((len(boards), OWN))), 0
     for samples in _widening_samples(boards, mask, settings):
+        if steps == 0 and start.pupil is None:
+            # A pupil that is not known leads the fit astray: it is looked for after a few steps.
+            few = settings.model_copy(update={"max_steps": STEPS_TO_PUPIL})
+            descent = _descend(mask, state, samples, bench.with_widths(widths), few)
+            state = _with_pupil_seen(mask, descent, samples, bench.with_widths(widths), settings)
+            bench = _bench_prior(boards, camera, mask, state.placement)
         descent = _descend(mask, state, samples, bench.with_widths(widths), settings)
         state, steps = descent.state, steps + descent.steps
     for _ in range(WIDTH_ROUNDS):
@@ -684,6 +701,43 @@ def fit_placement(
         moved_um=moved_um,
         astray2=astray2,
     )
+
+
+def _with_pupil_seen(
+    mask: ShadowMask,
+    descent: _Descent,
+    samples: Sequence[Sample],
+    prior: _Prior,
+    settings: FitSettings,
+) -> _State:
+    """Return the state with the round pupil that the views' light shows, as it is without one.
+
+    The pupil is taken where the readings become clearly likelier.
+    """
+    state, normal = descent.state, descent.normal
+    size = len(state.placement.vector())
+    vector, precision = state.vector(), prior.precision.copy()
+    precision[len(SCALARS) : size] = 0
+    pull = normal.gradient + precision * (prior.centre - vector)
+    matrix = normal.matrix + np.diag(precision)
+    seen = measured_light(state.placement.falloff, vector, matrix, pull, mask)
+    pupil = likeliest_pupil(seen, mask)
+    if pupil is None:
+        return state
+    # The weights were of views open to their edges.
+    even = tuple((1.0,) * mask.views[1] for _ in range(mask.views[0]))
+    start = replace(state, placement=replace(state.placement, aperture=even, pupil=pupil))
+    precision = prior.precision.copy()
+    precision[PUPIL] *= HELD**2
+    freed = _Prior(precision, prior.centre)
+    other = _descend(mask, start, samples, freed, settings)
+    losses = [
+        _loss(mask, each.state, samples, normal.spread, each_prior)
+        for each, each_prior in ((descent, prior), (other, freed))
+    ]
+    if losses[0] - losses[1] < CLEARLY_ROUND:
+        return state
+    return other.state
 
 
 def _contrast(board: Board) -> float:

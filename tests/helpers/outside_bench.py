@@ -8,18 +8,19 @@ follow the order of the requests, timed by the bench's own clock; `Bench.psi()` 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 POINTS = 12
+ACROSS = 8
+"""Parts along a side of an aperture cell that the pupil cuts, to which rays are traced."""
 FINER = 20
 BESIDE_UM = 300.0
 """How far beside the picture the mask is drawn: where rays aslant and a mask that moves reach."""
 GEOMETRY = (
     "lens_um", "mask_um", "pitch_um", "cell_um", "aperture_cell_um", "views", "offset_um",
-    "rotation_rad", "blur_um", "tilt", "glass_um", "astray_um",
+    "rotation_rad", "blur_um", "tilt", "glass_um", "astray_um", "pupil_um", "pupil_at_um",
 )  # fmt: skip
 TRACED: dict[Any, dict[tuple[float, float], np.ndarray]] = {}
 
@@ -37,6 +38,7 @@ class Optics:
     about the middle of the aperture. turn_sense: -1: "turned by 90 degrees" goes the other way.
     unfilled: by which the board's light falls in the outermost views (it does not fill the lens).
     astray_um: standard deviation by which aberrations displace the shadow of every view.
+    pupil_um, pupil_at_um: diameter and middle, x and y, of the round pupil; 0: the cells are open.
     """
 
     lens_um: float = 50_000.0
@@ -62,6 +64,8 @@ class Optics:
     unfilled: float = 0.0
     astray_um: float = 0.0
     turn_sense: int = 1
+    pupil_um: float = 0.0
+    pupil_at_um: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,8 @@ class Bench:
         self.offset = sensor.dsnu * fixed.standard_normal(self.size)
         self.hot = fixed.random(self.size) < sensor.hot
         self.passed = 1 + optics.aperture * fixed.standard_normal(optics.views)
+        self.parts, self.tables = self._open_parts(), dict[float, Any]()
+        self.passed = self.passed * self.parts[0].mean((2, 3))
         self.lens, self.dust = np.ones(self.size), np.ones(self.size)
         rows, columns = np.ogrid[: self.size[0], : self.size[1]]
         for _ in range(self.course.dust):
@@ -274,37 +280,75 @@ class Bench:
         x = (np.arange(columns) - (columns - 1) / 2) * self.optics.pitch_um
         return y[:, None], x[None, :]
 
+    def _open_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return open share, and y and x in um of the open part's middle, (v, u, part, part)."""
+        optics, (v, u), finer = self.optics, self._aperture(), 32
+        points = (np.arange(ACROSS * finer) + 0.5) / (ACROSS * finer) - 0.5
+        y, x = np.broadcast_arrays(
+            v[:, None, None, None] + points[:, None] * optics.aperture_cell_um,
+            u[None, :, None, None] + points * optics.aperture_cell_um,
+        )
+        radius = optics.pupil_um / 2 if optics.pupil_um else np.inf
+        at_x, at_y = optics.pupil_at_um
+        disk = (x - at_x) ** 2 + (y - at_y) ** 2 < radius**2
+        parts = (*optics.views, ACROSS, finer, ACROSS, finer)
+        share, *middle = (
+            values.reshape(parts).mean((3, 5)) for values in (1.0 * disk, disk * y, disk * x)
+        )
+        return share, *(values / np.maximum(share, 1e-12) for values in middle)
+
     def _traced(self, mask_x: float, mask_y: float) -> np.ndarray:
         optics = self.optics
         (v, u), (y, x) = self._aperture(), self._pixels()
         y, x = np.broadcast_arrays(y, x)
-        within = ((np.arange(POINTS) + 0.5) / POINTS - 0.5) * optics.pitch_um
-        within *= POINTS / np.sqrt(POINTS**2 - 1)  # the variance of a whole pixel
-        cosine, sine = np.cos(optics.rotation_rad), np.sin(optics.rotation_rad)
         passed = np.zeros((*optics.views, *self.size))
-        for j, at_v in enumerate(v):
-            for i, at_u in enumerate(u):
-                stray_x, stray_y = self.astray[:, j, i]
-                for dy in within:
-                    for dx in within:
-                        to_x = (at_u - x - dx) / optics.lens_um
-                        to_y = (at_v - y - dy) / optics.lens_um
-                        far = optics.mask_um + optics.tilt[0] * x + optics.tilt[1] * y
-                        steep = 1 + to_x**2 + to_y**2
-                        inside = 1 / np.sqrt(1.52**2 * steep - steep + 1)
-                        far = far + optics.glass_um * (inside - 1 / 1.52)
-                        on_x = x + dx + far * to_x - optics.offset_um[0] - mask_x + stray_x
-                        on_y = y + dy + far * to_y - optics.offset_um[1] - mask_y + stray_y
-                        column = cosine * on_x + sine * on_y
-                        row = -sine * on_x + cosine * on_y
-                        passed[j, i] += self._box(row, column)
-        return passed / POINTS**2
+        for j, i in np.ndindex(optics.views):
+            stray = self.astray[:, j, i]
+            place = mask_x - stray[0], mask_y - stray[1]
+            share, at_y, at_x = (values[j, i] for values in self.parts)
+            if share.min() == 1:
+                passed[j, i] = self._through(y, x, v[j], u[i], place)
+                continue
+            # A cell that is cut: rays to small parts, each a box of the aperture of its own.
+            for part in zip(*np.nonzero(share), strict=True):
+                seen = self._through(y, x, at_y[part], at_x[part], place, 1 / ACROSS)
+                passed[j, i] += share[part] / share.sum() * seen
+        return passed
 
-    @cached_property
-    def _boxes(self) -> tuple[np.ndarray, tuple[float, float]]:
+    def _through(
+        self, y: Any, x: Any, at_v: Any, at_u: Any, place: Any, part: float = 1.0
+    ) -> np.ndarray:
+        """Return what the mask at a place passes of a square part of the aperture, (y, x).
+
+        at_v, at_u: its middle; part: its side, of an aperture cell's.
+        """
+        optics = self.optics
+        # The pixels' points need not be many before a part that is small as well.
+        count = POINTS if part == 1 else POINTS // 3
+        within = ((np.arange(count) + 0.5) / count - 0.5) * optics.pitch_um
+        within *= count / np.sqrt(count**2 - 1)  # the variance of a whole pixel
+        cosine, sine = np.cos(optics.rotation_rad), np.sin(optics.rotation_rad)
+        passed = np.zeros(self.size)
+        for dy in within:
+            for dx in within:
+                to_x = (at_u - x - dx) / optics.lens_um
+                to_y = (at_v - y - dy) / optics.lens_um
+                far = optics.mask_um + optics.tilt[0] * x + optics.tilt[1] * y
+                steep = 1 + to_x**2 + to_y**2
+                inside = 1 / np.sqrt(1.52**2 * steep - steep + 1)
+                far = far + optics.glass_um * (inside - 1 / 1.52)
+                on_x = x + dx + far * to_x - optics.offset_um[0] - place[0]
+                on_y = y + dy + far * to_y - optics.offset_um[1] - place[1]
+                column = cosine * on_x + sine * on_y
+                row = -sine * on_x + cosine * on_y
+                passed += self._box(row, column, part)
+        return passed / count**2
+
+    def _boxes(self, part: float) -> tuple[np.ndarray, tuple[float, float]]:
         """Return the mean transmittance of boxes about corners of the fine grid, and their origin.
 
         (row, column, colour), and where the mask's middle is among them, in steps of the grid.
+        part: side of the box on the aperture, of a cell's.
         """
         optics, fine_um = self.optics, self.optics.cell_um / FINER
         spare = [
@@ -318,7 +362,7 @@ class Bench:
         if optics.blur_um:
             found = _blurred(found, optics.blur_um / fine_um)
         middle = [count / 2 for count in found.shape[:2]]
-        reach = optics.mask_um / optics.lens_um * optics.aperture_cell_um / 2 / fine_um
+        reach = optics.mask_um / optics.lens_um * optics.aperture_cell_um * part / 2 / fine_um
         whole, part = int(reach), reach - int(reach)
         for axis in (0, 1):
             area = np.moveaxis(found, axis, 0).cumsum(0)
@@ -330,9 +374,11 @@ class Bench:
             found = np.moveaxis(sums / (2 * reach), 0, axis)
         return np.ascontiguousarray(found), (middle[0] - whole - 1, middle[1] - whole - 1)
 
-    def _box(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    def _box(self, row: np.ndarray, column: np.ndarray, part: float) -> np.ndarray:
         """Return what the mask passes of aperture cells seen about places, um from its middle."""
-        boxes, (middle_row, middle_column) = self._boxes
+        if part not in self.tables:
+            self.tables[part] = self._boxes(part)
+        boxes, (middle_row, middle_column) = self.tables[part]
         row = row * (FINER / self.optics.cell_um) + middle_row
         column = column * (FINER / self.optics.cell_um) + middle_column
         height, width, colours = boxes.shape
