@@ -52,7 +52,7 @@ class ViewLight(NamedTuple):
 def measured_light(
     falloff: float, vector: Array, matrix: Array, pull: Array, mask: ShadowMask
 ) -> ViewLight:
-    """Return the views' shares of the light by one Gauss-Newton step that believes nothing of the weights.
+    """Return the views' shares of the light, by one Gauss-Newton step without the weights' prior.
 
     falloff, vector: of the placement, and all parameters. matrix, pull: normal equations, with the
     prior of the other parameters. The falloff is held: the weights take its place.

@@ -59,6 +59,8 @@ Array = NDArray[np.floating]
 Pixels = NDArray[np.int64]
 TABLE_STEPS = 256
 """Of a cell: linear interpolation errs by (1/256)^2 / 8 = 2e-6 of the shares' second derivative."""
+WIDTH = 4
+"""Kind of the tables' derivative by the box's width, which a pupil that is fitted needs."""
 FAR_OUT = 7.0
 """Deviations beyond which a Gaussian's tail is 0: 1e-12 of it lies there."""
 CUT_WIDTHS = 16
@@ -69,6 +71,7 @@ STRIPS_PER_CELL, FEWEST_STRIPS, MOST_STRIPS = 4.0, 3, 12
 of 25 mm behind 5 x 5 views of 5 mm is then up to 0.07 % off, with half of them 0.25 %."""
 PUPIL_STEPS = {"pupil_x_um": 10.0, "pupil_y_um": 10.0, "pupil_share": 1e-3}
 """Of differences by the pupil's parameters: a five-hundredth of a view of 5 mm."""
+OF_BOX = ("share", "x_um", "y_um", "width_um", "height_um")
 TAILS = 4.0
 """Deviations of the blur that a footprint reaches beyond its boxes: 3e-5 of it lies beyond."""
 NARROWEST_CELLS = 1e-3
@@ -211,7 +214,7 @@ def _fill_tables(tables, reach, pixel, boxes, sigma, by_ratio):
             before[:] = 0
             for cell in range(cells):
                 if cell == cells - 1:
-                    below, by_t, by_rho, by_blur = 1.0, 0.0, 0.0, 0.0
+                    below, by_t, by_b, by_rho, by_blur = 1.0, 0.0, 0.0, 0.0, 0.0
                 else:
                     t = cell + 1 - reach - i / (places - 1)
                     below, by_t, by_a, by_b, by_blur = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -228,6 +231,9 @@ def _fill_tables(tables, reach, pixel, boxes, sigma, by_ratio):
                     by_rho = by_a * by_ratio[0, w] + by_b * by_ratio[1, w]
                 tables[0, w, i, cell] = below - before[0]
                 before[0] = below
+                if kinds > WIDTH:
+                    tables[WIDTH, w, i, cell] = by_b - before[WIDTH]
+                    before[WIDTH] = by_b
                 if kinds > 1:
                     # A footprint that begins farther on has its cells' edges nearer.
                     tables[1, w, i, cell] = before[1] - by_t
@@ -237,24 +243,26 @@ def _fill_tables(tables, reach, pixel, boxes, sigma, by_ratio):
 
 
 def share_tables(
-    mask: ShadowMask, placement: Placement, derivatives: bool = True, widths: int = 1
+    mask: ShadowMask, placement: Placement, kinds: int = WIDTH + 1, widths: int = 1
 ) -> tuple[NDArray[np.float64], float]:
     """Return the tables (kind, width, place, cell), and the reach of a footprint to either side.
 
-    kind: the shares, and their derivatives by position in cells, by rho and by blur_um. width: of
-    the box on the aperture; their squares are `widths` even steps up to the cell's, the last.
-    place: where the footprint begins within its first cell. reach: in cells.
+    kind: the first `kinds` of the shares, and their derivatives by position in cells, by rho, by
+    blur_um and by the width of the box on the aperture in um. width: of that box; their squares are
+    `widths` even steps up to the cell's, the last. place: where the footprint begins within its
+    first cell. reach: in cells.
     """
     ratio = mask.distance_um * (1 + placement.distance_share) / mask.lens_um
     pixel, aperture = mask.pixel_um / mask.cell_um, mask.aperture_um / mask.cell_um
     reach = ((1 - ratio) * pixel + ratio * aperture) / 2 + TAILS * placement.blur_um / mask.cell_um
     count = int(np.ceil(2 * reach)) + 1
-    tables = np.empty((4 if derivatives else 1, widths, TABLE_STEPS + 1, count))
+    tables = np.empty((kinds, widths, TABLE_STEPS + 1, count))
     boxes = aperture * (np.sqrt(np.linspace(0, 1, widths)) if widths > 1 else np.ones(1))
     by_ratio = np.stack([np.full(widths, -pixel), boxes])
     sigma = placement.blur_um / mask.cell_um
     _fill_tables(tables, reach, (1 - ratio) * pixel, ratio * boxes, sigma, by_ratio)
-    tables[3:] /= mask.cell_um
+    tables[WIDTH - 1 :] /= mask.cell_um
+    tables[WIDTH:] *= ratio
     return tables, reach
 
 
@@ -283,7 +291,7 @@ class _Boxes(NamedTuple):
     part: NDArray[np.float64]
     """(box, 2): how far the box's squared width lies from there towards the next width's."""
     slopes: NDArray[np.float64]
-    """(box, 3, 3): of share, x_um and y_um by PUPIL_STEPS' parameters; no boxes without a pupil."""
+    """(box, 3, 5): of OF_BOX by PUPIL_STEPS' parameters; no boxes without a pupil."""
 
     def of_views(self, views_open: NDArray[np.bool_]) -> _Boxes:
         """Return the boxes of the open views, (v, u)."""
@@ -310,18 +318,18 @@ def _is_cut(found: Openings) -> bool:
 
 
 def _pupil_slopes(mask: ShadowMask, placement: Placement, found: Openings) -> NDArray[np.float64]:
-    """Return the slopes of share, x_um and y_um of every box by the pupil, (box, 3, 3)."""
+    """Return the slopes of every box by the pupil, see `_Boxes`."""
     if placement.pupil is None:
-        return np.zeros((0, 3, 3))
+        return np.zeros((0, len(PUPIL_STEPS), len(OF_BOX)))
     boxes = [tuple(view) for view in found.view]
     whole = [view for view in boxes if boxes.count(view) == 1]
-    slopes = np.zeros((len(boxes), len(PUPIL_STEPS), 3))
+    slopes = np.zeros((len(boxes), len(PUPIL_STEPS), len(OF_BOX)))
     for p, (name, step) in enumerate(PUPIL_STEPS.items()):
         ahead, behind = (
             openings(mask, replace(placement, **{name: getattr(placement, name) + by}), whole=whole)
             for by in (step, -step)
         )
-        for k, what in enumerate(("share", "x_um", "y_um")):
+        for k, what in enumerate(OF_BOX):
             slopes[:, p, k] = (getattr(ahead, what) - getattr(behind, what)) / (2 * step)
         # The middle of an opening that is shut means nothing.
         slopes[np.minimum(ahead.share, behind.share) <= 0, p, 1:] = 0
@@ -603,15 +611,29 @@ def _add_ray_slopes(slope, rays, b, x_um, y_um, square, u_um, v_um, light, point
 
 
 @njit(forceinline=True)
-def _add_pupil_slopes(slope, rays, boxes, k, by_x, by_y, light):
-    """Add to slope (parameter,) the derivatives of box k's reading by the pupil's parameters.
+def _sum_widenings(cells, top, left, channel, down, across):
+    """Return the derivatives of what a footprint passes by its box's width and height, in um."""
+    height, width = cells.shape[0], cells.shape[1]
+    wider, higher = 0.0, 0.0
+    for a in range(max(-top, 0), min(down.shape[1], height - top)):
+        for b in range(max(-left, 0), min(across.shape[1], width - left)):
+            cell = cells[top + a, left + b, channel]
+            wider += cell * down[0, a] * across[WIDTH, b]
+            higher += cell * down[WIDTH, a] * across[0, b]
+    return wider, higher
 
-    The box's share of the light and its middle follow the pupil, and xi by rho times the middle.
-    light: derivative of the reading by the box's share.
+
+@njit(forceinline=True)
+def _add_pupil_slopes(slope, rays, of_box, by_share, by_x, by_y, by_width, by_height):
+    """Add to slope (parameter,) the derivatives of one box's reading by the pupil's parameters.
+
+    xi follows the box's middle by rho. of_box: (3, 5), see `_Boxes`. by_share ... by_height:
+    derivatives of the reading by the box's share, by xi, and by the box's sides.
     """
-    for p in range(boxes.slopes.shape[1]):
-        moved = by_x * boxes.slopes[k, p, 1] + by_y * boxes.slopes[k, p, 2]
-        slope[PUPIL_X + p] += light * boxes.slopes[k, p, 0] + rays.distance_share * moved
+    for p in range(of_box.shape[0]):
+        moved = rays.distance_share * (by_x * of_box[p, 1] + by_y * of_box[p, 2])
+        sized = by_width * of_box[p, 3] + by_height * of_box[p, 4]
+        slope[PUPIL_X + p] += by_share * of_box[p, 0] + moved + sized
 
 
 @njit(cache=True, parallel=True, fastmath=True)
@@ -676,8 +698,12 @@ def _read(pixels, channels, cells, tables, turns, rays, boxes, weights, out):
                 )  # fmt: skip
                 slope[scalars + view] += share / aperture[v, u] * through
                 if boxes.slopes.shape[0] > 0:
+                    wider, higher = _sum_widenings(cells, top, left, channel, down, across)
                     by_share = share / boxes.share[k] * through
-                    _add_pupil_slopes(slope, rays, boxes, k, by_x, by_y, by_share)
+                    _add_pupil_slopes(
+                        slope, rays, boxes.slopes[k], by_share, by_x, by_y, gain * wider,
+                        gain * higher,
+                    )  # fmt: skip
                 if by_view.shape[0] > 0:
                     blur_x, blur_y, crossed = _sum_softenings(
                         cells, top, left, channel, down, across
@@ -749,11 +775,11 @@ class Shadow:
         self.mask, self.placement = mask, placement
         self._openings = openings(mask, placement)
         self._widths = CUT_WIDTHS if _is_cut(self._openings) else 1
-        self._tables, self._reach = share_tables(mask, placement, False, self._widths)
+        self._tables, self._reach = share_tables(mask, placement, 1, self._widths)
         self._turns = _turns(placement)
         span = np.array([(count - 1) / 2 * mask.aperture_cell_um for count in mask.views])
         self._far_um = max(float(np.hypot(*span)), 1.0)
-        self._set_boxes(np.zeros((0, 3, 3)))
+        self._set_boxes(np.zeros((0, len(PUPIL_STEPS), len(OF_BOX))))
 
     def _set_boxes(self, slopes: NDArray[np.float64]) -> None:
         """Keep boxes and light of the views; slopes: see `_Boxes`."""
@@ -884,7 +910,8 @@ class Shadow:
         """Return the readings and what is asked for; by_view needs slopes."""
         views_open, stage_um, frame = opening
         if slopes and len(self._tables) == 1:
-            self._tables = share_tables(self.mask, self.placement, True, self._widths)[0]
+            kinds = WIDTH if self.placement.pupil is None else WIDTH + 1
+            self._tables = share_tables(self.mask, self.placement, kinds, self._widths)[0]
             self._set_boxes(_pupil_slopes(self.mask, self.placement, self._openings))
         count, views = len(pixels), self._weights.aperture.size
         out = _Seen(

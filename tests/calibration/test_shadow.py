@@ -17,11 +17,13 @@ from emmc_rig.calibration.placement import (
 from emmc_rig.calibration.shadow import (
     ANY_COLOUR,
     OF_VIEW,
+    PUPIL_STEPS,
     TABLE_STEPS,
     Shadow,
     shadow_mask,
     share_tables,
 )
+
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.pupil import Pupil
@@ -123,16 +125,16 @@ def test_derivatives_are_those_of_the_readings(name, pupil, binning):
     place = labels(VIEWS).index(name)
     _, slopes = Shadow(mask, at).with_slopes(pixels, colours, open_views, (12.0, 3.0))
     step = np.zeros(len(at.vector()))
-    # The tables' interpolation errs with the reach of the blur: a small step would see that.
-    step[place] = 0.2 if name == "blur_um" else 1e-3 * max(abs(at.vector()[place]), 0.01)
+    # A small step would see the tables' interpolation, and the lines that cut a pupil.
+    large = {"blur_um": 0.2, **PUPIL_STEPS}
+    step[place] = large.get(name, 1e-3 * max(abs(at.vector()[place]), 0.01))
     ahead, behind = (
         Shadow(mask, at.moved(sign * step)).readings(pixels, colours, open_views, (12.0, 3.0))
         for sign in (1, -1)
     )
     expected = (ahead - behind) / (2 * step[place])
     error = np.linalg.norm(slopes[:, place] - expected) / np.linalg.norm(expected)
-    # By the pupil, the changes of the boxes' widths are left out.
-    assert error < (0.1 if "pupil" in name else 0.01)
+    assert error < 0.01
 
 
 @pytest.mark.parametrize(

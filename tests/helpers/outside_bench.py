@@ -324,7 +324,7 @@ class Bench:
         """
         optics = self.optics
         # The pixels' points need not be many before a part that is small as well.
-        count = POINTS if part == 1 else POINTS // 3
+        count = POINTS if part == 1 else POINTS // 2
         within = ((np.arange(count) + 0.5) / count - 0.5) * optics.pitch_um
         within *= count / np.sqrt(count**2 - 1)  # the variance of a whole pixel
         cosine, sine = np.cos(optics.rotation_rad), np.sin(optics.rotation_rad)
