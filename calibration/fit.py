@@ -16,18 +16,17 @@ C N diag(tau^2) N^T C, N the information between its parameters and the views' o
 
 What all pixels of one whiteboard share is no noise of single pixels: shutter and lamp change its
 brightness, and the mask stands a little elsewhere. Each whiteboard has these three of its own,
-normal about 0, of the widths that make the readings likeliest; brightness in addition by what
-repeats of a whiteboard differ among themselves, over their number.
+normal about 0, of the covariance that the causes have which the readings show (see `causes`);
+brightness in addition by what repeats of a whiteboard differ among themselves, over their number.
 
-Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963; of the widths (evidence):
-MacKay 1992.
+Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -37,6 +36,24 @@ from pydantic import Field
 from scipy.ndimage import correlate1d
 
 from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadiness2
+from emmc_rig.calibration.causes import (
+    CREEP,
+    HANDS,
+    LAMP,
+    LEAST_MOVED_UM,
+    OWN,
+    STAGE,
+    Cause,
+    FoundCause,
+    Geometry,
+    OwnInformation,
+    covariance_of,
+    doubt_lone_move,
+    find_causes,
+    possible_causes,
+    through_pinhole,
+    with_sizes,
+)
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import register, starting_placement
 from emmc_rig.calibration.placement import (
@@ -68,22 +85,12 @@ LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
-OWN = 3
-"""Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
-BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
-MOVES_UM = np.geomspace(0.002, 10.0, 12)
-"""Widths of the whiteboards' own that are tried: the least are far below what noise shows."""
 LOOSE_UM = 0.5
-"""Width of where a hand puts a pinhole, as a move of the mask: 0.2 mm of 50 mm at 0.12 mm."""
+"""By which a hand's pinhole seems to move the mask, at first: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
 """Of the width of the prior of glass, which a displaced pinhole imitates."""
-LEAST_MOVED_UM = 0.25
-"""Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
-rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
-CLEARLY_LIKELIER = 0.5
-"""Difference of log evidence: less than this tells nothing."""
-WIDTH_ROUNDS = 2
-"""The widths depend on the fit and the fit on the widths: so many times in turn."""
+CAUSE_ROUNDS = 2
+"""The causes depend on the fit and the fit on the causes: so many times in turn."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -144,8 +151,10 @@ class Fit:
     chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
     undecided: names of parameters that the prior decides more than the whiteboards.
     more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
-    brightness_spread: relative standard deviation of the whiteboards' brightness, beyond what their
-        repeats show; references vary likewise, which the covariance does not count.
+    own, own_deviation: (board, OWN), brightness over 1 and place of the mask by which whiteboards
+        differ, um, as the causes let them.
+    causes: why whiteboards differ, the strongest first. A lamp that is not steady makes references
+        differ likewise, which the covariance does not count.
     moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
         covariance counts.
     astray2: (OF_VIEW,), variances of the views' own displacements and softenings, um^2.
@@ -162,9 +171,20 @@ class Fit:
     undecided: tuple[str, ...]
     more_boards: int
     boards: tuple[BoardCheck, ...]
-    brightness_spread: float = 0.0
+    own: NDArray[np.float64]
+    own_deviation: NDArray[np.float64]
+    causes: tuple[FoundCause, ...] = ()
     moved_um: float = 0.0
     astray2: tuple[float, ...] = ()
+
+    @property
+    def brightness_spread(self) -> float:
+        """Standard deviation of all whiteboards' brightness, relative; 0: a steady lamp."""
+        return self.width(LAMP)
+
+    def width(self, cause: str) -> float:
+        """Return the width of a cause by name, 0 of those that were not found."""
+        return next((found.width for found in self.causes if found.name == cause), 0.0)
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -172,16 +192,8 @@ class Fit:
         return float(np.sqrt(self.covariance[index, index]))
 
 
-class _Widths(NamedTuple):
-    """Standard deviations of what whiteboards have of their own, about 0."""
-
-    brightness: float
-    """Relative."""
-    moved_um: float
-    """Of the mask, along either axis."""
-
-
-FIRST_WIDTHS = _Widths(brightness=2e-3, moved_um=0.2)
+FIRST_WIDTHS = {LAMP: 2e-3, STAGE: 0.2}
+"""Of what whiteboards have of their own, before their causes are known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,35 +230,47 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """Precisions and centres of all parameters, in the order of `_State.vector`."""
+    """Precision (all, all) and centre (all,) of all parameters, in the order of `_State.vector`."""
 
     precision: NDArray[np.float64]
     centre: NDArray[np.float64]
 
     def loss(self, state: _State) -> float:
         """Return what the prior adds to the loss."""
-        return 0.5 * float(np.sum(self.precision * (state.vector() - self.centre) ** 2))
+        off = state.vector() - self.centre
+        return 0.5 * float(off @ self.precision @ off)
+
+    def pull(self, state: _State) -> NDArray[np.float64]:
+        """Return the gradient by which the prior draws the parameters to their centre, (all,)."""
+        return np.asarray(self.precision @ (self.centre - state.vector()), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class _BenchPrior:
-    """What is known before the fit, apart from the widths of the whiteboards' own.
+    """What is known before the fit.
 
     precision, centre: of the placement, (parameter,). own2: (board, OWN), variances beside those of
-    the widths: brightness as repeats show it, and places of pinholes that hands put.
+    the causes: brightness as repeats show it. causes: those possible; always: those that act.
     """
 
     precision: NDArray[np.float64]
     centre: NDArray[np.float64]
     own2: NDArray[np.float64]
+    causes: Mapping[str, Cause]
+    always: tuple[str, ...]
 
-    def with_widths(self, widths: _Widths) -> _Prior:
-        """Return the prior of all parameters."""
-        own2 = self.own2 + np.square([widths.brightness, widths.moved_um, widths.moved_um])
-        return _Prior(
-            np.concatenate([self.precision, 1 / own2.ravel()]),
-            np.concatenate([self.centre, np.zeros(own2.size)]),
-        )
+    def with_widths(self, widths: Mapping[str, float]) -> _Prior:
+        """Return the prior of all parameters; widths: of the causes, by name."""
+        own = np.linalg.inv(covariance_of(self.causes, widths, self.own2))
+        size = len(self.centre)
+        precision = np.zeros((size + len(own), size + len(own)))
+        precision[:size, :size] = np.diag(self.precision)
+        precision[size:, size:] = own
+        return _Prior(precision, np.concatenate([self.centre, np.zeros(len(own))]))
+
+    def first_widths(self, ratio: float) -> dict[str, float]:
+        """Return the widths before the causes are known."""
+        return FIRST_WIDTHS | dict.fromkeys(self.always, LOOSE_UM / ratio)
 
 
 def _bench_prior(
@@ -257,13 +281,16 @@ def _bench_prior(
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     deviations = Tolerances().deviations(camera.views)
-    if any(board.loose for board in boards):
+    loose = any(board.loose for board in boards)
+    if loose:
         # Pinholes a little off their holes look like glass before the mask.
         deviations[SCALARS.index("glass_um")] *= OF_LOOSE
     own2 = np.zeros((len(boards), OWN))
     own2[:, 0] = unsteadiness2(boards) / np.array([board.repeats for board in boards])
-    own2[[board.loose for board in boards], 1:] = LOOSE_UM**2
-    return _BenchPrior(1 / deviations**2, centre, own2)
+    ratio = mask.distance_um / mask.lens_um
+    causes = possible_causes(boards, Geometry(ratio, mask.aperture_cell_um))
+    known = {cause.name: cause for cause in causes}
+    return _BenchPrior(1 / deviations**2, centre, own2, known, (HANDS,) if loose else ())
 
 
 def _all_residuals(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> list[Array]:
@@ -399,10 +426,10 @@ def _descend(
     damping = 1e-3
     normal = _normal_equations(mask, state, samples)
     for step in range(settings.max_steps):
-        pull = prior.precision * (prior.centre - state.vector())
+        pull = prior.pull(state)
         loss = _loss(mask, state, samples, normal.spread, prior)
         while True:
-            matrix = normal.matrix + np.diag(prior.precision)
+            matrix = normal.matrix + prior.precision
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
             trial = _step_within_limits(state, matrix, normal.gradient + pull)
             trial_loss = _loss(mask, trial, samples, normal.spread, prior)
@@ -410,7 +437,7 @@ def _descend(
                 break
             damping *= 8
         damping = max(damping / 5, 1e-7)
-        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior.precision)
+        deviations = 1 / np.sqrt(np.diag(normal.matrix + prior.precision))
         size = float(np.max(np.abs(trial.vector() - state.vector()) / deviations))
         if trial_loss <= loss:
             state = trial
@@ -442,38 +469,25 @@ def _step_within_limits(state: _State, matrix: Array, gradient: Array) -> _State
     return state.moved(move)
 
 
-def _likeliest_widths(descent: _Descent, bench: _BenchPrior) -> _Widths:
-    """Return the widths of brightness and place that make the readings likeliest, at a fit.
+def _own_information(descent: _Descent, bench: _BenchPrior) -> OwnInformation:
+    """Return what the readings say of the whiteboards' own parameters, the placement's taken out.
 
-    With the readings linear in the parameters, x of them from the prior's centre, the log evidence
-    of widths is, but for a constant,
+    With x the parameters from the prior's centre, p those of the placement, o the own ones, and P
+    the placement's prior precision,
 
-        1/2 g^T H^-1 g - 1/2 log|H| + 1/2 log|P_own|,
-        H = matrix + P,    g = gradient + matrix x
-
-    P the prior's precision at these widths, P_own of the whiteboards' own.
+        g = gradient + matrix x
+        S = matrix_oo - matrix_op (matrix_pp + P)^-1 matrix_po
+        h = g_o - matrix_op (matrix_pp + P)^-1 g_p
     """
     normal, state = descent.normal, descent.state
     away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
     pull = normal.gradient + normal.matrix @ away
-
-    def evidence(widths: _Widths) -> float:
-        precision = bench.with_widths(widths).precision
-        factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
-        seen = np.linalg.solve(factor, pull)
-        own = precision[len(bench.precision) :]
-        return float(0.5 * seen @ seen - np.log(np.diag(factor)).sum() + 0.5 * np.log(own).sum())
-
-    tried = {_Widths(*pair): evidence(_Widths(*pair)) for pair in product(BRIGHTNESSES, MOVES_UM)}
-    best = max(tried, key=lambda widths: tried[widths])
-    least = _Widths(BRIGHTNESSES[0], MOVES_UM[0])
-    # A width that is hardly likelier than the smallest counts as 0.
-    likely = tried[best] - CLEARLY_LIKELIER
-    steady = tried[best._replace(brightness=least.brightness)] > likely
-    still = tried[best._replace(moved_um=least.moved_um)] > likely or best.moved_um < LEAST_MOVED_UM
-    return _Widths(
-        least.brightness if steady else best.brightness,
-        least.moved_um if still else best.moved_um,
+    size = len(bench.centre)
+    of_placement = normal.matrix[:size, :size] + np.diag(bench.precision)
+    across = np.linalg.solve(of_placement, normal.matrix[:size, size:]).T
+    return OwnInformation(
+        normal.matrix[size:, size:] - across @ normal.matrix[:size, size:],
+        pull[size:] - across @ pull[:size],
     )
 
 
@@ -630,6 +644,27 @@ def _rows_covariance(
     return np.asarray(errors.own_dn2 * covariance @ added @ covariance, np.float64)
 
 
+def settled(fit: Fit, boards: Sequence[Board]) -> list[Board]:
+    """Return whiteboards as they would be without what the causes made of them.
+
+    boards: those of the fit, in order. Each has the mask's place as fitted, and the brightness of
+    the others; hands no longer count.
+    """
+    found = []
+    for board, (brighter, x_um, y_um) in zip(boards, fit.own.tolist(), strict=True):
+        level = np.float32(1 + brighter)
+        found.append(
+            replace(
+                board,
+                reading=board.reading / level,
+                variance=board.variance / level**2,
+                stage_um=(board.stage_um[0] + x_um, board.stage_um[1] + y_um),
+                loose=False,
+            )
+        )
+    return found
+
+
 @one_blas_thread()
 def fit_placement(
     boards: Sequence[Board],
@@ -650,23 +685,28 @@ def fit_placement(
     if start is None:
         soft = starting_placement(camera, mask)
         start = register(max(boards, key=_contrast), mask, soft).placement
-    bench, widths = _bench_prior(boards, camera, mask, start), FIRST_WIDTHS
+    bench = _bench_prior(boards, camera, mask, start)
+    prior = bench.with_widths(bench.first_widths(mask.distance_um / mask.lens_um))
     state, steps = _State(start, np.zeros((len(boards), OWN))), 0
     for samples in _widening_samples(boards, mask, settings):
-        descent = _descend(mask, state, samples, bench.with_widths(widths), settings)
+        descent = _descend(mask, state, samples, prior, settings)
         state, steps = descent.state, steps + descent.steps
-    for _ in range(WIDTH_ROUNDS):
-        widths = _likeliest_widths(descent, bench)
-        descent = _descend(mask, state, samples, bench.with_widths(widths), settings)
+    for _ in range(CAUSE_ROUNDS):
+        own = _own_information(descent, bench)
+        found = find_causes(own, list(bench.causes.values()), bench.own2, bench.always)
+        prior = bench.with_widths({cause.name: cause.width for cause in found})
+        descent = _descend(mask, state, samples, prior, settings)
         state, steps = descent.state, steps + descent.steps
     checks = tuple(_check_board(mask, state, sample, index) for index, sample in enumerate(samples))
     _refuse_unexplained(alike := _fitted_correlation(mask, state, samples))
     normal, placement = descent.normal, with_aperture_mean_one(state.placement)
-    covariance, astray2 = _covariance(mask, descent, samples, bench.with_widths(widths))
+    everything, astray2 = _covariance(mask, descent, samples, prior)
+    size = len(placement.vector())
+    covariance, own_covariance = everything[:size, :size], everything[size:, size:]
     undecided, more = _find_undecided(placement, covariance, len(boards))
-    # A pinhole that a hand put a little off looks like a mask that moved, and is none.
-    firm = [check for check, board in zip(checks, boards, strict=True) if not board.loose]
-    moved_um = _farthest_um(widths.moved_um if len(firm) == len(checks) else 0.0, firm)
+    causes = with_sizes(found, list(bench.causes.values()), state.own, own_covariance, bench.own2)
+    causes = doubt_lone_move(causes, boards)
+    moved_um = _astray_um(causes, checks, boards)
     covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement=placement,
@@ -680,7 +720,9 @@ def fit_placement(
         undecided=undecided,
         more_boards=more,
         boards=checks,
-        brightness_spread=float(widths.brightness),
+        causes=tuple(causes),
+        own=state.own,
+        own_deviation=np.sqrt(np.diag(own_covariance)).reshape(state.own.shape),
         moved_um=moved_um,
         astray2=astray2,
     )
@@ -716,17 +758,16 @@ def _widening_samples(
 def _covariance(
     mask: ShadowMask, descent: _Descent, samples: Sequence[Sample], prior: _Prior
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
-    """Return the placement's covariance, and the variances of the views' own, see `Fit`.
+    """Return the covariance of all parameters, and the variances of the views' own, see `Fit`.
 
     C = (matrix + P)^-1 of all parameters, and what the views' own and rows that err alike add.
     """
     state, normal = descent.state, descent.normal
-    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
+    covariance = np.asarray(np.linalg.inv(normal.matrix + prior.precision), np.float64)
     terms = _view_terms(mask, state, samples, normal.spread)
     of_views, astray2 = _bias_covariance(covariance, terms)
     of_rows = _rows_covariance(mask, state, samples, normal.spread, covariance)
-    size = len(state.placement.vector())
-    return (covariance + of_views + of_rows)[:size, :size], astray2
+    return covariance + of_views + of_rows, astray2
 
 
 def _refuse_unexplained(alike: float) -> None:
@@ -756,17 +797,26 @@ def _find_undecided(
     return tuple(name for name, share in names if share > MOST_OF_PRIOR), more
 
 
-def _farthest_um(width_um: float, checks: Sequence[BoardCheck]) -> float:
-    """Return how far from the fitted place the mask may stand, um: 0 where it seems to stand still.
+def _astray_um(
+    causes: Sequence[FoundCause], checks: Sequence[BoardCheck], boards: Sequence[Board]
+) -> float:
+    """Return how far from the fitted place the mask may stand in a shot, um: 0 where it stays.
 
-    The largest significant move: the width of all moves takes a single outlier for chance.
+    What the stage does by chance, what it creeps by from the middle of the capture to its end, and
+    the largest move that is sure of a whole aperture: the width of all takes an outlier for chance.
     """
-    sure = [
-        float(np.hypot(*check.moved_um))
-        for check in checks
-        if np.hypot(*check.moved_um) > max(LEAST_MOVED_UM, SURE_MOVE * check.moved_deviation_um)
-    ]
-    return max([width_um if width_um > MOVES_UM[0] else 0.0, *sure])
+    far_um = [cause.width for cause in causes if cause.name == STAGE]
+    far_um += [float(np.hypot(*cause.size)) / 2 for cause in causes if cause.name == CREEP]
+    if not any(cause.name == CREEP for cause in causes):
+        perhaps = any(cause.name == HANDS and STAGE in cause.instead for cause in causes)
+        far_um += [
+            float(np.hypot(*check.moved_um))
+            for check, board in zip(checks, boards, strict=True)
+            if (perhaps or not through_pinhole(board))
+            and np.hypot(*check.moved_um)
+            > max(LEAST_MOVED_UM, SURE_MOVE * check.moved_deviation_um)
+        ]
+    return max([0.0, *far_um])
 
 
 def shares_of_prior(
