@@ -45,18 +45,18 @@ NEARLY = 3.0
 """Difference of the log evidence of causes that fit nearly alike: a factor of 20."""
 LONE = 0.9
 """Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
-LAMP, STAGE, CREEP = "lamp", "stage", "creep"
+LAMP, STAGE, CREEP, LENS = "lamp", "stage", "creep", "lens"
 HOLES, HANDS, EXPOSURE, PLATE, TURN = "holes", "hands", "exposure", "plate", "turn"
-OF_PINHOLES = (HOLES, HANDS, EXPOSURE, PLATE, TURN)
-"""Causes that only whiteboards through the pinhole have."""
+SHIFTING = (STAGE, HANDS, HOLES, PLATE, TURN)
+"""Causes that aberrations of the views imitate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
     """A possible cause. columns: (own parameter of all whiteboards, coefficient), for a coefficient
     of 1. widths: standard deviations of the coefficients that are tried, in the cause's unit:
-    LAMP, HOLES, EXPOSURE relative; STAGE, CREEP (over the whole capture) um of the mask; HANDS,
-    PLATE um of the plate; TURN rad.
+    LAMP, HOLES, EXPOSURE relative; STAGE, CREEP (over the whole capture) and LENS (aberrations that
+    displace every view's shadow) um of the mask; HANDS, PLATE um of the plate; TURN rad.
     """
 
     name: str
@@ -161,14 +161,28 @@ def _moves(of_boards: Array) -> NDArray[np.float64]:
     return np.hstack([_own_columns(of_boards, 1), _own_columns(of_boards, 2)])
 
 
+def with_lens(causes: Sequence[Cause], displacements: int) -> list[Cause]:
+    """Return the causes with LENS, over the own parameters and then the views' displacements.
+
+    displacements: number of the latter, um, by x and y of every view.
+    """
+    more = [
+        replace(cause, columns=np.pad(cause.columns, ((0, displacements), (0, 0))))
+        for cause in causes
+    ]
+    own = len(causes[0].columns)
+    of_views = np.vstack([np.zeros((own, displacements)), np.eye(displacements)])
+    return [*more, Cause(LENS, of_views, MOVED_STEPS * LEAST_MOVED_UM / 5)]
+
+
 def covariance_of(
     causes: Mapping[str, Cause], widths: Mapping[str, float], own2: Array
 ) -> NDArray[np.float64]:
     """Return the covariance of the own parameters, (own, own), beforehand.
 
-    own2: (board, OWN), variances known beside the causes.
+    own2: (own,), variances known beside the causes.
     """
-    total = np.diag((own2 + np.square(LEAST_OWN)).ravel())
+    total = np.diag(own2)
     for name, width in widths.items():
         total += width**2 * causes[name].columns @ causes[name].columns.T
     return total
@@ -293,17 +307,20 @@ def with_sizes(
 
         gain = tau^2 A^T Sigma^-1,    c = gain p,    cov c = tau^2 - gain A tau^2 + gain C gain^T
 
-    own: (board, OWN). own_covariance: (own, own).
+    own: (own,). own_covariance: (own, own). Causes in views are left as they are.
     """
     known = {cause.name: cause for cause in causes}
-    widths = {cause.name: cause.width for cause in found}
+    widths = {cause.name: cause.width for cause in found if cause.name in known}
     inverse = np.linalg.inv(covariance_of(known, widths, own2))
     sized = []
     for cause in found:
+        if cause.name not in known:
+            sized.append(cause)
+            continue
         columns, tau2 = known[cause.name].columns, cause.width**2
         gain = tau2 * columns.T @ inverse
         spread = tau2 * (np.eye(len(gain)) - gain @ columns) + gain @ own_covariance @ gain.T
         deviation = np.sqrt(np.maximum(np.diag(spread), 0.0))
-        size = tuple(map(float, gain @ own.ravel()))
+        size = tuple(map(float, gain @ own))
         sized.append(replace(cause, size=size, deviation=tuple(map(float, deviation))))
     return tuple(sized)

@@ -16,6 +16,7 @@ from emmc_rig.calibration.causes import (
     HANDS,
     HOLES,
     LAMP,
+    LENS,
     PLATE,
     STAGE,
     TURN,
@@ -274,6 +275,7 @@ SHORT = {
     EXPOSURE: "other exposures of the pinhole than noted",
     PLATE: "a plate that stands off its place",
     TURN: "a plate that is turned",
+    LENS: "aberrations of the lens",
 }
 """Causes as alternatives are named."""
 
@@ -373,6 +375,16 @@ def _stage_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: Sha
     )
 
 
+def _lens_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    if cause.width < LEAST_MOVE_UM:
+        return ""
+    return (
+        f"aberrations of the lens displace the shadows of the views by {cause.width:.1f} um (root "
+        "mean square): the deviation of the fitted Psi includes them, and whiteboards through the "
+        "pinhole before every view measure them"
+    )
+
+
 _WORDS = {
     LAMP: _lamp_words,
     HOLES: _holes_words,
@@ -382,4 +394,5 @@ _WORDS = {
     TURN: _turn_words,
     CREEP: _creep_words,
     STAGE: _stage_words,
+    LENS: _lens_words,
 }

@@ -41,7 +41,10 @@ from emmc_rig.calibration.causes import (
     HANDS,
     LAMP,
     LEAST_MOVED_UM,
+    LEAST_OWN,
+    LENS,
     OWN,
+    SHIFTING,
     STAGE,
     Cause,
     FoundCause,
@@ -52,6 +55,7 @@ from emmc_rig.calibration.causes import (
     find_causes,
     possible_causes,
     through_pinhole,
+    with_lens,
     with_sizes,
 )
 from emmc_rig.calibration.errors import CalibrationError
@@ -249,8 +253,8 @@ class _Prior:
 class _BenchPrior:
     """What is known before the fit.
 
-    precision, centre: of the placement, (parameter,). own2: (board, OWN), variances beside those of
-    the causes: brightness as repeats show it. causes: those possible; always: those that act.
+    precision, centre: of the placement, (parameter,). own2: (own,), variances beside those of the
+    causes: brightness as repeats show it. causes: those possible; always: those that act.
     """
 
     precision: NDArray[np.float64]
@@ -285,12 +289,12 @@ def _bench_prior(
     if loose:
         # Pinholes a little off their holes look like glass before the mask.
         deviations[SCALARS.index("glass_um")] *= OF_LOOSE
-    own2 = np.zeros((len(boards), OWN))
-    own2[:, 0] = unsteadiness2(boards) / np.array([board.repeats for board in boards])
+    own2 = np.tile(np.square(LEAST_OWN), (len(boards), 1))
+    own2[:, 0] += unsteadiness2(boards) / np.array([board.repeats for board in boards])
     ratio = mask.distance_um / mask.lens_um
     causes = possible_causes(boards, Geometry(ratio, mask.aperture_cell_um))
     known = {cause.name: cause for cause in causes}
-    return _BenchPrior(1 / deviations**2, centre, own2, known, (HANDS,) if loose else ())
+    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, (HANDS,) if loose else ())
 
 
 def _all_residuals(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> list[Array]:
@@ -469,28 +473,6 @@ def _step_within_limits(state: _State, matrix: Array, gradient: Array) -> _State
     return state.moved(move)
 
 
-def _own_information(descent: _Descent, bench: _BenchPrior) -> OwnInformation:
-    """Return what the readings say of the whiteboards' own parameters, the placement's taken out.
-
-    With x the parameters from the prior's centre, p those of the placement, o the own ones, and P
-    the placement's prior precision,
-
-        g = gradient + matrix x
-        S = matrix_oo - matrix_op (matrix_pp + P)^-1 matrix_po
-        h = g_o - matrix_op (matrix_pp + P)^-1 g_p
-    """
-    normal, state = descent.normal, descent.state
-    away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
-    pull = normal.gradient + normal.matrix @ away
-    size = len(bench.centre)
-    of_placement = normal.matrix[:size, :size] + np.diag(bench.precision)
-    across = np.linalg.solve(of_placement, normal.matrix[:size, size:]).T
-    return OwnInformation(
-        normal.matrix[size:, size:] - across @ normal.matrix[:size, size:],
-        pull[size:] - across @ pull[:size],
-    )
-
-
 class _ViewTerms(NamedTuple):
     """Normal equations of the views' own displacements and softenings, see `Shadow.slopes_by_view`.
 
@@ -563,6 +545,72 @@ def _bias_covariance(
     moved = covariance @ mixed
     added = np.asarray((moved * expected[kind]) @ moved.T, np.float64)
     return added, tuple(float(expected[place]) for place in KINDS)
+
+
+def _find_causes(
+    mask: ShadowMask, descent: _Descent, samples: Sequence[Sample], bench: _BenchPrior
+) -> list[FoundCause]:
+    """Return why whiteboards differ, at a fit.
+
+    Aberrations displace the shadows of the views as pinholes do that stand off their holes, and
+    are tried where something does.
+    """
+    causes = list(bench.causes.values())
+    own = _own_information(descent, bench)
+    found = find_causes(own, causes, bench.own2, bench.always)
+    if not any(cause.name in SHIFTING for cause in found) or bench.always:
+        return found
+    terms = _view_terms(mask, descent.state, samples, descent.normal.spread)
+    displaced = np.flatnonzero(np.resize(KINDS, len(terms.pull)) == KINDS[0])
+    own = _own_information(descent, bench, terms, displaced)
+    own2 = np.concatenate([bench.own2, np.full(len(displaced), LEAST_OWN[1] ** 2)])
+    return find_causes(own, with_lens(causes, len(displaced)), own2)
+
+
+def _own_widths(found: Sequence[FoundCause], ratio: float) -> dict[str, float]:
+    """Return the widths of the causes that act on whiteboards' own parameters, by name.
+
+    Aberrations displace what a single view shows: each whiteboard through the pinhole has the place
+    of its view, as if hands had put the pinhole there, and the placement is not bent to follow.
+    """
+    widths = {cause.name: cause.width for cause in found}
+    displaced = widths.pop(LENS, 0.0)
+    if displaced:
+        widths[HANDS] = float(np.hypot(widths.get(HANDS, 0.0), displaced / ratio))
+    return widths
+
+
+def _own_information(
+    descent: _Descent,
+    bench: _BenchPrior,
+    terms: _ViewTerms | None = None,
+    displaced: Sequence[int] | NDArray[np.intp] = (),
+) -> OwnInformation:
+    """Return what the readings say of the whiteboards' own parameters, the placement's taken out.
+
+    With x the parameters from the prior's centre, p those of the placement, o the own ones, and P
+    the placement's prior precision,
+
+        g = gradient + matrix x
+        S = matrix_oo - matrix_op (matrix_pp + P)^-1 matrix_po
+        h = g_o - matrix_op (matrix_pp + P)^-1 g_p
+
+    terms, displaced: of the views, and which of theirs count as own as well.
+    """
+    normal, state = descent.normal, descent.state
+    away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
+    matrix, pull = normal.matrix, normal.gradient + normal.matrix @ away
+    if terms is not None:
+        chosen = np.asarray(displaced)
+        mixed, of_views = terms.mixed[:, chosen], terms.own[np.ix_(chosen, chosen)]
+        matrix = np.block([[matrix, mixed], [mixed.T, of_views]])
+        pull = np.concatenate([pull, terms.pull[chosen] + mixed.T @ away])
+    size = len(bench.centre)
+    of_placement = matrix[:size, :size] + np.diag(bench.precision)
+    across = np.linalg.solve(of_placement, matrix[:size, size:]).T
+    return OwnInformation(
+        matrix[size:, size:] - across @ matrix[:size, size:], pull[size:] - across @ pull[:size]
+    )
 
 
 class _RowErrors(NamedTuple):
@@ -692,9 +740,8 @@ def fit_placement(
         descent = _descend(mask, state, samples, prior, settings)
         state, steps = descent.state, steps + descent.steps
     for _ in range(CAUSE_ROUNDS):
-        own = _own_information(descent, bench)
-        found = find_causes(own, list(bench.causes.values()), bench.own2, bench.always)
-        prior = bench.with_widths({cause.name: cause.width for cause in found})
+        found = _find_causes(mask, descent, samples, bench)
+        prior = bench.with_widths(_own_widths(found, mask.distance_um / mask.lens_um))
         descent = _descend(mask, state, samples, prior, settings)
         state, steps = descent.state, steps + descent.steps
     checks = tuple(_check_board(mask, state, sample, index) for index, sample in enumerate(samples))
@@ -704,7 +751,9 @@ def fit_placement(
     size = len(placement.vector())
     covariance, own_covariance = everything[:size, :size], everything[size:, size:]
     undecided, more = _find_undecided(placement, covariance, len(boards))
-    causes = with_sizes(found, list(bench.causes.values()), state.own, own_covariance, bench.own2)
+    causes = with_sizes(
+        found, list(bench.causes.values()), state.own.ravel(), own_covariance, bench.own2
+    )
     causes = doubt_lone_move(causes, boards)
     moved_um = _astray_um(causes, checks, boards)
     covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
@@ -721,8 +770,10 @@ def fit_placement(
         more_boards=more,
         boards=checks,
         causes=tuple(causes),
-        own=state.own,
-        own_deviation=np.sqrt(np.diag(own_covariance)).reshape(state.own.shape),
+        own=_without_aberrations(state.own, causes, boards),
+        own_deviation=_without_aberrations(
+            np.sqrt(np.diag(own_covariance)).reshape(state.own.shape), causes, boards
+        ),
         moved_um=moved_um,
         astray2=astray2,
     )
@@ -778,6 +829,21 @@ def _refuse_unexplained(alike: float) -> None:
             f"design is {alike:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use calibration method free"
         )
+
+
+def _without_aberrations(
+    own: NDArray[np.float64], causes: Sequence[FoundCause], boards: Sequence[Board]
+) -> NDArray[np.float64]:
+    """Return own parameters or their deviations, (board, OWN), 0 for moves that are the views' own.
+
+    What aberrations make of a view is part of Psi, and not to be taken out.
+    """
+    names = {cause.name for cause in causes}
+    if LENS not in names or HANDS in names:
+        return own
+    kept = own.copy()
+    kept[[through_pinhole(board) for board in boards], 1:] = 0.0
+    return kept
 
 
 def _find_undecided(

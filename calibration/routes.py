@@ -24,6 +24,7 @@ from emmc_rig.calibration.boards import (
 )
 from emmc_rig.calibration.choice import (
     LARGEST_CHI2,
+    OPEN,
     HeldOut,
     choose,
     judge,
@@ -156,7 +157,8 @@ def calibrate(
         psis |= _measure_views(task, modelled, empty, on_plane)
     _count_common_errors(task, modelled, psis)
     judged = {name: psi.judged for name, psi in psis.items() if name in routes}
-    chosen, why = choose(list(judged.values()))
+    stated = {name: psi.calibration.stated_error for name, psi in psis.items()}
+    chosen, why = choose(list(judged.values()), stated)
     refusals.refuse_another_bench(chosen)
     advice += _count_residual(chosen, psis[chosen.route].calibration)
     calibrations = {name: psi.calibration for name, psi in psis.items()}
@@ -428,7 +430,7 @@ def _measure_views(
     def judged(name: str, known: Calibration, boards: BoardSet) -> _RoutePsi:
         predicted = predicted_by_psi(known.psi, still)
         variance = prediction_variance(known.deviation, still, task.design.binning)
-        held = worst({"open aperture": judge(name, still, predicted, variance)})
+        held = worst({OPEN: judge(name, still, predicted, variance)})
         return _RoutePsi(known, held, boards.exposures)
 
     psis = {"free": judged("free", free, pinholes)}
@@ -629,10 +631,7 @@ def _judged_model(
         unsteady2 = slow2 + fast2 / board.repeats
         return judge(name, board, predicted, unsteady=float(np.sqrt(unsteady2)))
 
-    groups = {
-        ("open aperture" if i == 0 else "mask moved"): judged(board)
-        for i, board in enumerate(judges)
-    }
+    groups = {(OPEN if i == 0 else "mask moved"): judged(board) for i, board in enumerate(judges)}
     for board in seen:
         if not board.views_open.all():
             v, u = np.argwhere(board.views_open)[[0, -1]].T

@@ -370,20 +370,25 @@ def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
         fit_placement([], CAMERA, MASK)
 
 
-def test_the_simplest_method_at_the_noise_is_chosen():
+def test_the_surest_method_that_predicts_to_the_noise_is_chosen():
     def judged(route, chi2):
-        return HeldOut(route, chi2, 0.0, np.zeros((2, 2), np.float32))
+        return HeldOut(route, chi2, 0.0, np.ones((64, 64), np.float32))
 
-    def pick(*pairs):
-        return choose([judged(*pair) for pair in pairs])[0].route
+    def pick(**routes):
+        held = [judged(route, chi2) for route, (chi2, _) in routes.items()]
+        return choose(held, {route: stated for route, (_, stated) in routes.items()})
 
-    assert pick(("free", 1.0), ("mixed", 1.1), ("parametric", 1.2)) == "parametric"
-    assert pick(("parametric", 3.0), ("mixed", 1.2), ("free", 1.0)) == "mixed"
-    assert pick(("parametric", 9.0), ("mixed", 5.0), ("free", 2.5)) == "free"
-    assert choose([judged("mixed", 1.24)])[1].startswith(
+    # 5 sqrt(2 / 4096) = 0.11 is chance.
+    assert pick(free=(1.0, 0.005), parametric=(1.1, 0.001))[0].route == "parametric"
+    assert pick(free=(1.0, 0.005), combined=(1.02, 0.004))[0].route == "combined"
+    assert pick(free=(1.0, 0.005), parametric=(1.3, 0.001))[0].route == "free"
+    assert pick(mixed=(1.4, 0.002), parametric=(1.3, 0.003))[0].route == "mixed"
+    assert pick(mixed=(9.0, 0.002), free=(2.5, 0.003))[0].route == "free"
+    assert pick(mixed=(1.24, 0.002))[1].startswith(
         "calibration good: residual 1.24 x noise variance (limit 1.5)"
     )
-    assert choose([judged("mixed", 8.0)])[1].startswith("calibration doubtful: residual 8.00 x")
+    doubtful = pick(mixed=(8.0, 0.002))[1]
+    assert doubtful.startswith("calibration doubtful: residual 8.00 x")
 
 
 def test_dark_current_is_drawn_as_a_line_between_two_dark_exposures(few):
