@@ -148,8 +148,8 @@ def choose(judged: Sequence[HeldOut], stated: Mapping[str, float]) -> tuple[Held
     """Return the description to use, and why in words.
 
     Of those that predict the open whiteboard, which none has fitted, to the noise and what they
-    state, the one that states the least error. stated: relative error that each states of its Psi, by route. Raises CalibrationError
-    with none to choose from.
+    state, the one that states the least error. stated: relative error that each states of its Psi,
+    by route. Raises CalibrationError with none to choose from.
     """
     if not judged:
         raise CalibrationError("no calibration method gave a Psi: capture whiteboards")

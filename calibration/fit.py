@@ -1,10 +1,10 @@
 """The parametric route: the placement of a known mask from a few whiteboards, robust and weighted.
 
 Levenberg-Marquardt on the posterior of readings weighed by the noise, Tukey's biweight (dust, bad
-pixels) and a wide prior (the bench's tolerances). The normal equations are summed over chunks of
-pixels: time is linear in the pixels, memory is that of one chunk. The fit begins on the middle of
-the picture, registered by correlation, and widens: a small turn or stretch that moves the corner
-by pixels moves the middle by little.
+pixels) and a wide prior (the bench's tolerances). Time and memory are linear in the pixels drawn:
+the slopes of 100 000 pixels by 44 parameters are 35 MB. The fit begins on the middle of the
+picture, registered by correlation, and widens: a small turn or stretch that moves the corner by
+pixels moves the middle by little.
 
 Through a real lens every view sees the mask a little displaced and a little softer than the
 placement has it (aberrations). Neighbouring views are coded nearly alike, so that a displacement of
@@ -33,6 +33,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.linalg import solve_triangular
 from scipy.ndimage import correlate1d
 
 from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadiness2
@@ -75,7 +76,7 @@ from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
 CHUNK = 4096
-"""Pixels whose slopes are held at once: by 41 parameters 1.3 MB, about a core's cache."""
+"""Pixels whose slopes by view are held at once: by 25 views 4 MB."""
 FIRST_WINDOW_PX = 64
 """Half a side: a turn of half a degree moves the window's corner by less than a pixel."""
 FEWEST_PIXELS = 400
@@ -297,60 +298,46 @@ def _bench_prior(
     return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, (HANDS,) if loose else ())
 
 
-def _all_residuals(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> list[Array]:
-    """Return the residuals of every whiteboard's sample, in deviations."""
-    shadow, residuals = Shadow(mask, state.placement), []
-    for index, sample in enumerate(samples):
-        opening = state.opening(sample.board, index)
-        predicted = shadow.readings(sample.pixels, sample.channels, *opening)
-        residuals.append((sample.reading - state.brightness(index) * predicted) / sample.deviation)
-    return residuals
-
-
 def _robust_spread(residuals: Sequence[Array]) -> float:
     """Return the robust deviation of the residuals in units of the noise, at least 1."""
     return max(1.0, deviation_of(np.concatenate(residuals)))
 
 
-class _Chunk(NamedTuple):
-    """Some pixels of one whiteboard's sample."""
+def _with_own_slopes(read: Array, slope: Array, brightness: float) -> NDArray[np.float64]:
+    """Return slopes of a whiteboard's readings, (n, parameter + OWN), from those of the shadow.
 
-    pixels: NDArray[np.int64]
-    """(n, 2), row and column."""
-    channels: NDArray[np.uint8]
-    """(n,), the colour that each pixel sees."""
-    opening: Opening
+    By the placement, the whiteboard's brightness, and the mask's move in x and y. read: (n,),
+    readings of the shadow.
+    """
+    rows = [brightness * slope, read[:, None], brightness * slope[:, OFFSETS]]
+    return np.concatenate(rows, axis=1)
+
+
+class _Linear(NamedTuple):
+    """Readings of a whiteboard's sample, linear in the parameters around a state."""
+
     residual: Array
     """(n,), in deviations."""
-    deviation: Array
-    """(n, 1), of a reading."""
+    slope: Array
+    """(n, parameter + OWN), of the reading, over its deviation."""
 
-    def slopes(self, shadow: Shadow, brightness: float) -> tuple[Array, Array]:
-        """Return the shadow's readings (n,), and slopes of the whiteboard's, (n, parameter + OWN).
-
-        By the placement, the whiteboard's brightness, and the mask's move in x and y.
-        """
-        read, slope = shadow.with_slopes(self.pixels, self.channels, *self.opening)
-        return read, _with_own_slopes(read, slope, brightness)
+    def read(self, sample: Sample) -> Array:
+        """Return the readings of the shadow, (n,): the slope by the whiteboard's brightness."""
+        return self.slope[:, -OWN] * sample.deviation
 
 
-def _with_own_slopes(read: Array, slope: Array, brightness: float) -> NDArray[np.float64]:
-    rows = [brightness * slope, read, brightness * slope[:, OFFSETS]]
-    return np.column_stack(rows).astype(np.float64, copy=False)
-
-
-def _pixel_chunks(state: _State, sample: Sample, index: int, residual: Array) -> Iterator[_Chunk]:
-    """Yield the pixels of a sample, CHUNK at a time."""
-    opening = state.opening(sample.board, index)
-    for first in range(0, len(residual), CHUNK):
-        part = slice(first, first + CHUNK)
-        yield _Chunk(
-            sample.pixels[part],
-            sample.channels[part],
-            opening,
-            residual[part],
-            sample.deviation[part, None],
-        )
+def _linear_readings(
+    mask: ShadowMask, state: _State, samples: Sequence[Sample]
+) -> tuple[_Linear, ...]:
+    """Return every whiteboard's readings and slopes at a state."""
+    shadow, found = Shadow(mask, state.placement), []
+    for index, sample in enumerate(samples):
+        opening, brightness = state.opening(sample.board, index), state.brightness(index)
+        read, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
+        slope = _with_own_slopes(read, slope, brightness)
+        slope /= sample.deviation[:, None]
+        found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slope))
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,57 +356,65 @@ class _NormalEquations:
     count: int
 
 
-def _normal_equations(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample]
-) -> _NormalEquations:
-    """Return the normal equations of all samples, chunk by chunk.
+def _normal_equations(state: _State, linear: Sequence[_Linear]) -> _NormalEquations:
+    """Return the normal equations of all whiteboards.
 
-    r = (reading - (1 + brightness) shadow) / deviation       of a pixel
-    spread = max(1, 1.4826 median |r|)
-    w = (1 - (r / (4.685 spread))^2)^2, 0 beyond                Tukey's weight
-    J = d((1 + brightness) shadow) / d(parameters) / (deviation spread)
-    matrix = sum w J^T J,    gradient = sum w J^T r / spread
+    With r residuals over the spread, J their slopes, and w Tukey's weights of r,
+
+        matrix = J^T diag(w) J,    gradient = J^T (w r)
     """
-    shadow = Shadow(mask, state.placement)
-    residuals = _all_residuals(mask, state, samples)
-    spread = _robust_spread(residuals)
+    spread = _robust_spread([each.residual for each in linear])
     size = len(state.vector())
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
-    for index, sample in enumerate(samples):
+    for index, (residual, slope) in enumerate(linear):
         places = state.places(index)
-        for chunk in _pixel_chunks(state, sample, index, residuals[index]):
-            _, slope = chunk.slopes(shadow, state.brightness(index))
-            slope = slope / (chunk.deviation * spread)
-            scaled = chunk.residual / spread
-            weight = tukey_weights(scaled)
-            matrix[np.ix_(places, places)] += slope.T @ (slope * weight[:, None])
-            gradient[places] += slope.T @ (weight * scaled)
-            inside = weight > 0
-            squares += float((chunk.residual[inside] ** 2).sum())
-            kept += int(inside.sum())
-    count = sum(map(len, residuals))
+        weight = tukey_weights(residual / spread)
+        rooted = slope * (np.sqrt(weight) / spread)[:, None]
+        matrix[np.ix_(places, places)] += rooted.T @ rooted
+        gradient[places] += slope.T @ (weight * residual) / spread**2
+        inside = weight > 0
+        squares += float((residual[inside] ** 2).sum())
+        kept += int(inside.sum())
+    count = sum(len(each.residual) for each in linear)
     return _NormalEquations(matrix, gradient, spread, squares, kept, count)
+
+
+class _Point(NamedTuple):
+    """A state, and the readings around it."""
+
+    state: _State
+    linear: tuple[_Linear, ...]
+    """Of each whiteboard."""
+    normal: _NormalEquations
+
+    def loss(self, spread: float, prior: _Prior) -> float:
+        """Return the loss of the residuals, at a spread, and of the prior."""
+        of_readings = sum(tukey_loss(each.residual / spread) for each in self.linear)
+        return of_readings + prior.loss(self.state)
+
+
+def _point(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> _Point:
+    linear = _linear_readings(mask, state, samples)
+    return _Point(state, linear, _normal_equations(state, linear))
 
 
 class _Descent(NamedTuple):
     """The end of Levenberg-Marquardt steps."""
 
-    state: _State
+    point: _Point
     steps: int
     converged: bool
-    normal: _NormalEquations
-    """At the state."""
 
 
 def _descend(
     mask: ShadowMask,
-    state: _State,
+    point: _Point,
     samples: Sequence[Sample],
     prior: _Prior,
     settings: FitSettings,
 ) -> _Descent:
-    """Return the state after Levenberg-Marquardt steps on these samples.
+    """Return the point after Levenberg-Marquardt steps on these samples.
 
         loss(p) = sum rho(r(p) / spread) + 1/2 (p - centre)^T P (p - centre)
         H = matrix + P,    (H + damping diag H) step = gradient + P (centre - p)
@@ -428,34 +423,28 @@ def _descend(
     grows until the loss falls. The last step is small in standard deviations, or gains little.
     """
     damping = 1e-3
-    normal = _normal_equations(mask, state, samples)
     for step in range(settings.max_steps):
+        state, normal = point.state, point.normal
         pull = prior.pull(state)
-        loss = _loss(mask, state, samples, normal.spread, prior)
+        loss = point.loss(normal.spread, prior)
         while True:
             matrix = normal.matrix + prior.precision
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            trial = _step_within_limits(state, matrix, normal.gradient + pull)
-            trial_loss = _loss(mask, trial, samples, normal.spread, prior)
+            moved = _step_within_limits(state, matrix, normal.gradient + pull)
+            # With its slopes: nearly every trial is the next point.
+            trial = _point(mask, moved, samples)
+            trial_loss = trial.loss(normal.spread, prior)
             if trial_loss <= loss or damping > 1e6:
                 break
             damping *= 8
         damping = max(damping / 5, 1e-7)
         deviations = 1 / np.sqrt(np.diag(normal.matrix + prior.precision))
-        size = float(np.max(np.abs(trial.vector() - state.vector()) / deviations))
+        size = float(np.max(np.abs(moved.vector() - state.vector()) / deviations))
         if trial_loss <= loss:
-            state = trial
-        normal = _normal_equations(mask, state, samples)
+            point = trial
         if size < settings.tolerance or loss - trial_loss < LEAST_GAIN:
-            return _Descent(state, step + 1, True, normal)
-    return _Descent(state, settings.max_steps, False, normal)
-
-
-def _loss(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float, prior: _Prior
-) -> float:
-    residuals = _all_residuals(mask, state, samples)
-    return sum(tukey_loss(residual / spread) for residual in residuals) + prior.loss(state)
+            return _Descent(point, step + 1, True)
+    return _Descent(point, settings.max_steps, False)
 
 
 def _step_within_limits(state: _State, matrix: Array, gradient: Array) -> _State:
@@ -487,27 +476,26 @@ class _ViewTerms(NamedTuple):
     """(view x OF_VIEW,): gradient of the log likelihood by the views' own."""
 
 
-def _view_terms(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float
-) -> _ViewTerms:
+def _view_terms(mask: ShadowMask, point: _Point, samples: Sequence[Sample]) -> _ViewTerms:
     """Return the normal equations of the views' own, at a fit; weights as in the placement's."""
-    shadow = Shadow(mask, state.placement)
+    shadow, state, spread = Shadow(mask, point.state.placement), point.state, point.normal.spread
     size, own_size = len(state.vector()), OF_VIEW * mask.views[0] * mask.views[1]
     terms = _ViewTerms(
         np.zeros((size, own_size)), np.zeros((own_size, own_size)), np.zeros(own_size)
     )
-    residuals = _all_residuals(mask, state, samples)
-    for index, sample in enumerate(samples):
-        for chunk in _pixel_chunks(state, sample, index, residuals[index]):
-            where = chunk.pixels, chunk.channels, *chunk.opening
-            slope, by_view = shadow.slopes_by_view(*where)
-            slope = _with_own_slopes(shadow.readings(*where), slope, state.brightness(index))
-            scaled, scale = chunk.residual / spread, 1 / (chunk.deviation * spread)
-            slope, by_view = slope * scale, by_view * scale
-            weighted = by_view * tukey_weights(scaled)[:, None]
-            terms.mixed[state.places(index)] += slope.T @ weighted
-            terms.own[...] += by_view.T @ weighted
-            terms.pull[...] += weighted.T @ scaled
+    for index, (sample, (residual, slope)) in enumerate(zip(samples, point.linear, strict=True)):
+        opening, places = state.opening(sample.board, index), state.places(index)
+        weight = tukey_weights(residual / spread) / spread**2
+        # Views that are closed have no part in the readings.
+        parts = np.flatnonzero(np.repeat(sample.board.views_open.ravel(), OF_VIEW))
+        for first in range(0, len(residual), CHUNK):
+            part = slice(first, first + CHUNK)
+            _, by_view = shadow.slopes_by_view(sample.pixels[part], sample.channels[part], *opening)
+            by_view = by_view[:, parts] / sample.deviation[part, None]
+            weighted = by_view * weight[part, None]
+            terms.mixed[np.ix_(places, parts)] += slope[part].T @ weighted
+            terms.own[np.ix_(parts, parts)] += by_view.T @ weighted
+            terms.pull[parts] += weighted.T @ residual[part]
     return terms
 
 
@@ -532,10 +520,9 @@ def _bias_covariance(
     evidence, squares = [], []
     for taus in product(TAUS_UM, repeat=max(KINDS) + 1):
         tau = np.array(taus)[kind]
-        values, vectors = np.linalg.eigh(tau[:, None] * left * tau)
-        values = 1 + np.maximum(values, 0)
-        seen = vectors.T @ (tau * pull)
-        likelihood = 0.5 * float(np.sum(seen**2 / values - np.log(values)))
+        factor = np.linalg.cholesky(np.eye(len(pull)) + tau[:, None] * left * tau)
+        seen = solve_triangular(factor, tau * pull, lower=True, check_finite=False)
+        likelihood = 0.5 * float(seen @ seen) - float(np.log(np.diag(factor)).sum())
         # Steps of the grid grow with tau.
         beforehand = np.log(taus) - 2 * np.log1p(np.square(taus) / TAU_UM**2 / 3)
         evidence.append(likelihood + float(beforehand.sum()))
@@ -548,7 +535,7 @@ def _bias_covariance(
 
 
 def _find_causes(
-    mask: ShadowMask, descent: _Descent, samples: Sequence[Sample], bench: _BenchPrior
+    mask: ShadowMask, point: _Point, samples: Sequence[Sample], bench: _BenchPrior
 ) -> list[FoundCause]:
     """Return why whiteboards differ, at a fit.
 
@@ -556,13 +543,13 @@ def _find_causes(
     are tried where something does.
     """
     causes = list(bench.causes.values())
-    own = _own_information(descent, bench)
+    own = _own_information(point, bench)
     found = find_causes(own, causes, bench.own2, bench.always)
     if not any(cause.name in SHIFTING for cause in found) or bench.always:
         return found
-    terms = _view_terms(mask, descent.state, samples, descent.normal.spread)
+    terms = _view_terms(mask, point, samples)
     displaced = np.flatnonzero(np.resize(KINDS, len(terms.pull)) == KINDS[0])
-    own = _own_information(descent, bench, terms, displaced)
+    own = _own_information(point, bench, terms, displaced)
     own2 = np.concatenate([bench.own2, np.full(len(displaced), LEAST_OWN[1] ** 2)])
     return find_causes(own, with_lens(causes, len(displaced)), own2)
 
@@ -581,7 +568,7 @@ def _own_widths(found: Sequence[FoundCause], ratio: float) -> dict[str, float]:
 
 
 def _own_information(
-    descent: _Descent,
+    point: _Point,
     bench: _BenchPrior,
     terms: _ViewTerms | None = None,
     displaced: Sequence[int] | NDArray[np.intp] = (),
@@ -597,7 +584,7 @@ def _own_information(
 
     terms, displaced: of the views, and which of theirs count as own as well.
     """
-    normal, state = descent.normal, descent.state
+    normal, state = point.normal, point.state
     away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
     matrix, pull = normal.matrix, normal.gradient + normal.matrix @ away
     if terms is not None:
@@ -638,7 +625,7 @@ def _row_errors(known: Sequence[Rows], height: int) -> _RowErrors | None:
 
 
 def _rows_covariance(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float, covariance: Array
+    point: _Point, samples: Sequence[Sample], covariance: Array
 ) -> NDArray[np.float64]:
     """Return what rows that err alike add to the covariance C.
 
@@ -665,20 +652,17 @@ def _rows_covariance(
     def apart(by_row: Array) -> Array:
         return by_row - by_row.mean(axis=0)
 
-    shadow = Shadow(mask, state.placement)
+    state, spread = point.state, point.normal.spread
     added, of_references = np.zeros((size, size)), np.zeros((height, size))
     of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
-    for index, residual in enumerate(_all_residuals(mask, state, samples)):
+    for index, (residual, slope) in enumerate(point.linear):
         sample, rows = samples[index], known[index]
         # By an error of the whiteboard, and of its reference: a reading is their ratio.
         by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
-        for chunk in _pixel_chunks(state, sample, index, residual):
-            read, slope = chunk.slopes(shadow, state.brightness(index))
-            weight = tukey_weights(chunk.residual / spread)[:, None]
-            pull = slope * (weight / np.square(chunk.deviation * spread))
-            where = chunk.pixels[:, :1], state.places(index)
-            np.add.at(by_row, where, pull)
-            np.add.at(read_by_row, where, pull * read[:, None])
+        weight = tukey_weights(residual / spread) / (sample.deviation * spread**2)
+        pull, where = slope * weight[:, None], (sample.pixels[:, :1], state.places(index))
+        np.add.at(by_row, where, pull)
+        np.add.at(read_by_row, where, pull * point.linear[index].read(sample)[:, None])
         white_dn, reference_dn = rows.white_dn
         by_row, read_by_row = by_row / white_dn, read_by_row / reference_dn
         added += squared(apart(by_row)) / sample.board.repeats
@@ -737,17 +721,18 @@ def fit_placement(
     prior = bench.with_widths(bench.first_widths(mask.distance_um / mask.lens_um))
     state, steps = _State(start, np.zeros((len(boards), OWN))), 0
     for samples in _widening_samples(boards, mask, settings):
-        descent = _descend(mask, state, samples, prior, settings)
-        state, steps = descent.state, steps + descent.steps
+        descent = _descend(mask, _point(mask, state, samples), samples, prior, settings)
+        state, steps = descent.point.state, steps + descent.steps
     for _ in range(CAUSE_ROUNDS):
-        found = _find_causes(mask, descent, samples, bench)
+        found = _find_causes(mask, descent.point, samples, bench)
         prior = bench.with_widths(_own_widths(found, mask.distance_um / mask.lens_um))
-        descent = _descend(mask, state, samples, prior, settings)
-        state, steps = descent.state, steps + descent.steps
-    checks = tuple(_check_board(mask, state, sample, index) for index, sample in enumerate(samples))
-    _refuse_unexplained(alike := _fitted_correlation(mask, state, samples))
-    normal, placement = descent.normal, with_aperture_mean_one(state.placement)
-    everything, astray2 = _covariance(mask, descent, samples, prior)
+        descent = _descend(mask, descent.point, samples, prior, settings)
+        steps += descent.steps
+    point, state = descent.point, descent.point.state
+    checks = tuple(_check_board(point, sample, index) for index, sample in enumerate(samples))
+    _refuse_unexplained(alike := _fitted_correlation(point, samples))
+    normal, placement = point.normal, with_aperture_mean_one(state.placement)
+    everything, astray2 = _covariance(mask, point, samples, prior)
     size = len(placement.vector())
     covariance, own_covariance = everything[:size, :size], everything[size:, size:]
     undecided, more = _find_undecided(placement, covariance, len(boards))
@@ -807,17 +792,16 @@ def _widening_samples(
 
 
 def _covariance(
-    mask: ShadowMask, descent: _Descent, samples: Sequence[Sample], prior: _Prior
+    mask: ShadowMask, point: _Point, samples: Sequence[Sample], prior: _Prior
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return the covariance of all parameters, and the variances of the views' own, see `Fit`.
 
     C = (matrix + P)^-1 of all parameters, and what the views' own and rows that err alike add.
     """
-    state, normal = descent.state, descent.normal
-    covariance = np.asarray(np.linalg.inv(normal.matrix + prior.precision), np.float64)
-    terms = _view_terms(mask, state, samples, normal.spread)
-    of_views, astray2 = _bias_covariance(covariance, terms)
-    of_rows = _rows_covariance(mask, state, samples, normal.spread, covariance)
+    information = point.normal.matrix + prior.precision
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    of_views, astray2 = _bias_covariance(covariance, _view_terms(mask, point, samples))
+    of_rows = _rows_covariance(point, samples, covariance)
     return covariance + of_views + of_rows, astray2
 
 
@@ -911,9 +895,9 @@ def shares_of_prior(
     return share
 
 
-def _fitted_correlation(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> float:
+def _fitted_correlation(point: _Point, samples: Sequence[Sample]) -> float:
     """Return the correlation of readings and fit, every colour of a whiteboard with its level."""
-    residuals = np.concatenate(_all_residuals(mask, state, samples))
+    residuals = np.concatenate([each.residual for each in point.linear])
     reading, deviation = (
         np.concatenate([getattr(sample, name) for sample in samples])
         for name in ("reading", "deviation")
@@ -925,35 +909,33 @@ def _fitted_correlation(mask: ShadowMask, state: _State, samples: Sequence[Sampl
     return correlation(reading, reading - residuals * deviation, np.concatenate(channels))
 
 
-def _check_board(mask: ShadowMask, state: _State, sample: Sample, index: int) -> BoardCheck:
+def _check_board(point: _Point, sample: Sample, index: int) -> BoardCheck:
     """Return how far one board's brightness and mask are off, the placement as fitted.
 
     Robust least squares of the board alone, without the prior of its own: the fit's values, of
     which the prior has held back a part, and the steps (brightness, x, y) that are left.
     """
-    shadow = Shadow(mask, state.placement)
-    board = sample.board
-    opening = state.opening(board, index)
-    fitted, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
-    rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
-    residual = (sample.reading - state.brightness(index) * fitted) / sample.deviation
+    residual, slope = point.linear[index]
+    brightness = point.state.brightness(index)
+    # Of the shadow itself, as if the whiteboard had the brightness of all.
+    rows = np.stack([slope[:, -OWN], *(slope[:, OFFSETS] / brightness).T], axis=1)
     weight, step, matrix = np.ones(len(residual)), np.zeros(OWN), np.eye(OWN)
     for _ in range(8):
         matrix = rows.T @ (rows * weight[:, None])
         step = np.linalg.solve(matrix, rows.T @ (weight * residual))
         left = residual - rows @ step
         weight = tukey_weights(left / _robust_spread([left]))
-    brightness, x_um, y_um = map(float, state.own[index] + step)
+    brightness, x_um, y_um = map(float, point.state.own[index] + step)
     spread = _robust_spread([residual])
     inside = tukey_weights(residual / spread) > 0
     brightness_deviation, *moved_deviations = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
     return BoardCheck(
-        name=board.name,
+        name=sample.board.name,
         brightness=1 + brightness,
         brightness_deviation=float(brightness_deviation),
         moved_um=(x_um, y_um),
         moved_deviation_um=float(max(moved_deviations)),
-        taken_s=board.taken_s,
+        taken_s=sample.board.taken_s,
         chi2=float(np.mean(residual[inside] ** 2)),
         outliers=float(1 - inside.mean()),
     )
