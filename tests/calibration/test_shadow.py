@@ -23,7 +23,6 @@ from emmc_rig.calibration.shadow import (
     shadow_mask,
     share_tables,
 )
-
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.geometry import centred_grid
 from emmc_rig.model.pupil import Pupil
