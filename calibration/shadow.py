@@ -59,8 +59,9 @@ Array = NDArray[np.floating]
 Pixels = NDArray[np.int64]
 TABLE_STEPS = 256
 """Of a cell: linear interpolation errs by (1/256)^2 / 8 = 2e-6 of the shares' second derivative."""
-WIDTH = 4
-"""Kind of the tables' derivative by the box's width, which a pupil that is fitted needs."""
+KINDS, WIDTH = 4, 4
+"""Of the tables; after them, where a pupil is fitted, the derivative by the place of the box's
+squared width among the tables' widths."""
 FAR_OUT = 7.0
 """Deviations beyond which a Gaussian's tail is 0: 1e-12 of it lies there."""
 CUT_WIDTHS = 16
@@ -69,9 +70,11 @@ CUT_WIDTHS = 16
 STRIPS_PER_CELL, FEWEST_STRIPS, MOST_STRIPS = 4.0, 3, 12
 """Of a cut view, by the width of a whole view's shadow in cells of the mask: Psi of a round pupil
 of 25 mm behind 5 x 5 views of 5 mm is then up to 0.07 % off, with half of them 0.25 %."""
-PUPIL_STEPS = {"pupil_x_um": 10.0, "pupil_y_um": 10.0, "pupil_share": 1e-3}
-"""Of differences by the pupil's parameters: a five-hundredth of a view of 5 mm."""
-OF_BOX = ("share", "x_um", "y_um", "width_um", "height_um")
+PUPIL_STEPS = {"pupil_x_um": 100.0, "pupil_y_um": 100.0, "pupil_share": 8e-3}
+"""Of differences by the pupil's parameters: of the order of the lines by which views are cut (see
+`emmc_rig.model.pupil`), whose steps smaller ones would see: 10 um are 5 % off."""
+OF_BOX = ("share", "x_um", "y_um", "width", "height")
+"""What follows the pupil: width and height as places of their squares among the tables' widths."""
 TAILS = 4.0
 """Deviations of the blur that a footprint reaches beyond its boxes: 3e-5 of it lies beyond."""
 NARROWEST_CELLS = 1e-3
@@ -214,7 +217,7 @@ def _fill_tables(tables, reach, pixel, boxes, sigma, by_ratio):
             before[:] = 0
             for cell in range(cells):
                 if cell == cells - 1:
-                    below, by_t, by_b, by_rho, by_blur = 1.0, 0.0, 0.0, 0.0, 0.0
+                    below, by_t, by_rho, by_blur = 1.0, 0.0, 0.0, 0.0
                 else:
                     t = cell + 1 - reach - i / (places - 1)
                     below, by_t, by_a, by_b, by_blur = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -231,9 +234,6 @@ def _fill_tables(tables, reach, pixel, boxes, sigma, by_ratio):
                     by_rho = by_a * by_ratio[0, w] + by_b * by_ratio[1, w]
                 tables[0, w, i, cell] = below - before[0]
                 before[0] = below
-                if kinds > WIDTH:
-                    tables[WIDTH, w, i, cell] = by_b - before[WIDTH]
-                    before[WIDTH] = by_b
                 if kinds > 1:
                     # A footprint that begins farther on has its cells' edges nearer.
                     tables[1, w, i, cell] = before[1] - by_t
@@ -243,14 +243,13 @@ def _fill_tables(tables, reach, pixel, boxes, sigma, by_ratio):
 
 
 def share_tables(
-    mask: ShadowMask, placement: Placement, kinds: int = WIDTH + 1, widths: int = 1
+    mask: ShadowMask, placement: Placement, kinds: int = KINDS, widths: int = 1
 ) -> tuple[NDArray[np.float64], float]:
     """Return the tables (kind, width, place, cell), and the reach of a footprint to either side.
 
-    kind: the first `kinds` of the shares, and their derivatives by position in cells, by rho, by
-    blur_um and by the width of the box on the aperture in um. width: of that box; their squares are
-    `widths` even steps up to the cell's, the last. place: where the footprint begins within its
-    first cell. reach: in cells.
+    kind: the first `kinds` of the shares, and their derivatives by position in cells, by rho and by
+    blur_um. width: of the box on the aperture; their squares are `widths` even steps up to the
+    cell's, the last. place: where the footprint begins within its first cell. reach: in cells.
     """
     ratio = mask.distance_um * (1 + placement.distance_share) / mask.lens_um
     pixel, aperture = mask.pixel_um / mask.cell_um, mask.aperture_um / mask.cell_um
@@ -261,8 +260,7 @@ def share_tables(
     by_ratio = np.stack([np.full(widths, -pixel), boxes])
     sigma = placement.blur_um / mask.cell_um
     _fill_tables(tables, reach, (1 - ratio) * pixel, ratio * boxes, sigma, by_ratio)
-    tables[WIDTH - 1 :] /= mask.cell_um
-    tables[WIDTH:] *= ratio
+    tables[3:] /= mask.cell_um
     return tables, reach
 
 
@@ -299,11 +297,12 @@ class _Boxes(NamedTuple):
         return _Boxes(*(values[chosen] if len(values) else values for values in self))
 
 
-def _boxes_of(found: Openings, mask: ShadowMask, slopes: NDArray[np.float64]) -> _Boxes:
-    """Return the boxes; slopes: see `_Boxes`."""
-    last = CUT_WIDTHS - 1 if _is_cut(found) else 0
-    widths = np.stack([found.width_um, found.height_um], axis=1)
-    place = last * np.minimum(np.square(widths / max(mask.aperture_um, 1e-9)), 1.0)
+def _boxes_of(
+    found: Openings, mask: ShadowMask, widths: int, slopes: NDArray[np.float64]
+) -> _Boxes:
+    """Return the boxes; widths: that the tables have; slopes: see `_Boxes`."""
+    last = widths - 1
+    place = _width_places(found, mask) if last else np.zeros((len(found.share), 2))
     # A whole view's box is the cell: rounding must not lead beside the last table.
     place = np.where(place > last - 1e-9, last, place)
     width = np.minimum(place.astype(np.int64), last)
@@ -313,8 +312,10 @@ def _boxes_of(found: Openings, mask: ShadowMask, slopes: NDArray[np.float64]) ->
     return _Boxes(*rows, slopes[opened] if len(slopes) else slopes)
 
 
-def _is_cut(found: Openings) -> bool:
-    return len(found.share) > 0 and bool((found.share < 1 - 1e-9).any())
+def _width_places(found: Openings, mask: ShadowMask) -> NDArray[np.float64]:
+    """Return where the squares of width and height lie among the tables' widths, (box, 2)."""
+    widths = np.stack([found.width_um, found.height_um], axis=1)
+    return (CUT_WIDTHS - 1) * np.square(widths / max(mask.aperture_um, 1e-9))
 
 
 def _pupil_slopes(mask: ShadowMask, placement: Placement, found: Openings) -> NDArray[np.float64]:
@@ -325,13 +326,12 @@ def _pupil_slopes(mask: ShadowMask, placement: Placement, found: Openings) -> ND
     whole = [view for view in boxes if boxes.count(view) == 1]
     slopes = np.zeros((len(boxes), len(PUPIL_STEPS), len(OF_BOX)))
     for p, (name, step) in enumerate(PUPIL_STEPS.items()):
-        ahead, behind = (
-            openings(mask, replace(placement, **{name: getattr(placement, name) + by}), whole=whole)
-            for by in (step, -step)
-        )
-        for k, what in enumerate(OF_BOX):
-            slopes[:, p, k] = (getattr(ahead, what) - getattr(behind, what)) / (2 * step)
-        # The middle of an opening that is shut means nothing.
+        near = (replace(placement, **{name: getattr(placement, name) + by}) for by in (step, -step))
+        ahead, behind = (openings(mask, other, whole=whole) for other in near)
+        changes = [ahead.share - behind.share, ahead.x_um - behind.x_um, ahead.y_um - behind.y_um]
+        widths = _width_places(ahead, mask) - _width_places(behind, mask)
+        slopes[:, p] = np.column_stack([*changes, widths]) / (2 * step)
+        # Middle and width of an opening that is shut mean nothing.
         slopes[np.minimum(ahead.share, behind.share) <= 0, p, 1:] = 0
     return slopes
 
@@ -503,7 +503,7 @@ def _ray_on_mask(rays, x_um, y_um, u_um, v_um):
 def _interpolate_shares(tables, start, width, part_of_width, shares):
     """Set shares (kind, cell) to those of a footprint from `start`, in cells; return its first.
 
-    width, part_of_width: of the box, see `_Boxes`.
+    width, part_of_width: of the box, see `_Boxes`. shares may have kind WIDTH as well.
     """
     first = int(np.floor(start))
     steps = tables.shape[2] - 1
@@ -520,6 +520,12 @@ def _interpolate_shares(tables, start, width, part_of_width, shares):
                 above = part * tables[kind, width + 1, below + 1, k]
                 wider = (1 - part) * tables[kind, width + 1, below, k] + above
                 shares[kind, k] += part_of_width * (wider - shares[kind, k])
+    if shares.shape[0] > WIDTH:
+        lower = min(width, tables.shape[1] - 2)
+        for k in range(tables.shape[3]):
+            above = tables[0, lower + 1, below + 1, k] - tables[0, lower, below + 1, k]
+            here = tables[0, lower + 1, below, k] - tables[0, lower, below, k]
+            shares[WIDTH, k] = (1 - part) * here + part * above
     return first
 
 
@@ -612,7 +618,7 @@ def _add_ray_slopes(slope, rays, b, x_um, y_um, square, u_um, v_um, light, point
 
 @njit(forceinline=True)
 def _sum_widenings(cells, top, left, channel, down, across):
-    """Return the derivatives of what a footprint passes by its box's width and height, in um."""
+    """Return the derivatives of what a footprint passes by its box's width and height."""
     height, width = cells.shape[0], cells.shape[1]
     wider, higher = 0.0, 0.0
     for a in range(max(-top, 0), min(down.shape[1], height - top)):
@@ -653,9 +659,11 @@ def _read(pixels, channels, cells, tables, turns, rays, boxes, weights, out):
     views_v, views_u = aperture.shape
     kinds, scalars = tables.shape[0], len(SCALARS)
     parts = rays.binning * rays.binning
+    fitted = kinds > 1 and boxes.slopes.shape[0] > 0
     b = turns / rays.cell_um
     for n in prange(pixels.shape[0]):
-        across, down = np.empty((kinds, tables.shape[3])), np.empty((kinds, tables.shape[3]))
+        rows = WIDTH + 1 if fitted else kinds
+        across, down = np.empty((rows, tables.shape[3])), np.empty((rows, tables.shape[3]))
         gradient = np.zeros(scalars + views_v * views_u)
         channel = channels[n]
         readings[n] = 0.0
@@ -697,7 +705,7 @@ def _read(pixels, channels, cells, tables, turns, rays, boxes, weights, out):
                     share,
                 )  # fmt: skip
                 slope[scalars + view] += share / aperture[v, u] * through
-                if boxes.slopes.shape[0] > 0:
+                if fitted:
                     wider, higher = _sum_widenings(cells, top, left, channel, down, across)
                     by_share = share / boxes.share[k] * through
                     _add_pupil_slopes(
@@ -774,7 +782,8 @@ class Shadow:
     def __init__(self, mask: ShadowMask, placement: Placement) -> None:
         self.mask, self.placement = mask, placement
         self._openings = openings(mask, placement)
-        self._widths = CUT_WIDTHS if _is_cut(self._openings) else 1
+        # A pupil whose slopes are asked for may cut a view that it leaves whole now.
+        self._widths = 1 if placement.pupil is None else CUT_WIDTHS
         self._tables, self._reach = share_tables(mask, placement, 1, self._widths)
         self._turns = _turns(placement)
         span = np.array([(count - 1) / 2 * mask.aperture_cell_um for count in mask.views])
@@ -783,7 +792,7 @@ class Shadow:
 
     def _set_boxes(self, slopes: NDArray[np.float64]) -> None:
         """Keep boxes and light of the views; slopes: see `_Boxes`."""
-        self._boxes = _boxes_of(self._openings, self.mask, slopes)
+        self._boxes = _boxes_of(self._openings, self.mask, self._widths, slopes)
         aperture = np.array(self.placement.aperture, dtype=np.float64)
         opened = self._openings.shares(self.mask.views)
         by_pupil = np.zeros((len(PUPIL_STEPS), *self.mask.views))
@@ -910,8 +919,7 @@ class Shadow:
         """Return the readings and what is asked for; by_view needs slopes."""
         views_open, stage_um, frame = opening
         if slopes and len(self._tables) == 1:
-            kinds = WIDTH if self.placement.pupil is None else WIDTH + 1
-            self._tables = share_tables(self.mask, self.placement, kinds, self._widths)[0]
+            self._tables = share_tables(self.mask, self.placement, KINDS, self._widths)[0]
             self._set_boxes(_pupil_slopes(self.mask, self.placement, self._openings))
         count, views = len(pixels), self._weights.aperture.size
         out = _Seen(
