@@ -22,6 +22,8 @@ DARKEST_REFERENCE_DN = 50.0
 """Above the dark: with rounding of 1 DN a ratio is known to 1 % of it and better."""
 
 
+NEARLY = 0.75
+"""Of a view: a pupil beside the middle shuts views on one side that are as far out as others."""
 Opening = tuple[NDArray[np.bool_], tuple[float, float], int]
 """Views open, (view_y, view_x); place of the mask in um, x and y; shot."""
 
@@ -227,6 +229,8 @@ def as_readings(
 ) -> list[Board]:
     """Return the whiteboards as readings.
 
+    Whiteboards of views that the pupil shuts are left out.
+
     usable: (pixel_y, pixel_x), pixels known to be good; a pixel whose reference is not bright
     enough to divide by is left out as well. Raises CalibrationError for frames of another size,
     a reference that is missing, and whiteboards too dark to use.
@@ -234,7 +238,7 @@ def as_readings(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
-    found = []
+    found, dark = [], []
     for board in boards.frames:
         reference = boards.reference(board.shot, board.lamp)
         if reference is None:
@@ -247,8 +251,38 @@ def as_readings(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
+        if is_dark(taken, boards):
+            dark.append(board)
+            continue
         found.append(_board(board, taken, reference, boards, gain, layout, good))
+    refuse_dark(dark, boards.frames)
     return found
+
+
+def is_dark(frame: MeanFrame, boards: BoardSet) -> bool:
+    """Return whether a whiteboard's frame has hardly any light."""
+    above_dn = np.median(frame.mean_dn - boards.dark_at(frame.exposure_s).mean_dn)
+    return float(above_dn) < DARKEST_REFERENCE_DN / 10
+
+
+def refuse_dark(dark: Sequence[BoardFrame], frames: Sequence[BoardFrame]) -> None:
+    """Raise CalibrationError for dark whiteboards, except of views that the lens's pupil shuts.
+
+    frames: all that were taken. Shut are views that lie farther out than all whose pinholes give
+    light.
+    """
+    lit = [board.pinhole for board in frames if board.pinhole and board not in dark]
+    views = [board.pinhole for board in frames if board.pinhole]
+    middle = (np.max(views, axis=0) + np.min(views, axis=0)) / 2 if views else np.zeros(2)
+
+    def out(view: tuple[int, int]) -> float:
+        return float(np.hypot(*(np.array(view) - middle)))
+
+    for board in dark:
+        if not (board.pinhole and lit and out(board.pinhole) > max(map(out, lit)) - NEARLY):
+            raise CalibrationError(
+                f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
+            )
 
 
 def _board(
@@ -277,10 +311,6 @@ def _board(
         raise CalibrationError(
             f"the reference whiteboard under the {board.lamp} lamp is less than "
             f"{DARKEST_REFERENCE_DN:g} DN above the dark: raise the lamp or the exposure"
-        )
-    if float(np.median(frame.mean_dn - dark.mean_dn)) < DARKEST_REFERENCE_DN / 10:
-        raise CalibrationError(
-            f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
         )
     channels = channels_of(layout, board.shot)
     if layout.colour is None and board.lamp in LAMP_COLOURS:
