@@ -100,7 +100,8 @@ def pupil_finding(fit: Fit, mask: ShadowMask) -> list[str]:
     spread = max(fit.deviation("pupil_x_um"), fit.deviation("pupil_y_um")) / 1e3
     words = (
         f"the lens's {pupil.shape} pupil is {pupil.diameter_mm:.2f} +- {size_spread:.2f} mm "
-        f"across, its middle at ({x_mm:+.2f}, {y_mm:+.2f}) +- {spread:.2f} mm from that of the views"
+        f"across, its middle at ({x_mm:+.2f}, {y_mm:+.2f}) +- {spread:.2f} mm from the middle of "
+        "the views"
     )
     for names, least, most in (
         ("less than half open", LEAST_SHARE, 0.5),
