@@ -13,7 +13,7 @@ from emmc_rig.calibration.routes import calibrate
 from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.pupil import Pupil, cell_openings
 
-SIZE, LARGER = (32, 40), (48, 64)
+SIZE, LARGER = (24, 32), (48, 64)
 VIEWS = (5, 5)
 EVERY_VIEW = tuple(np.ndindex(VIEWS))
 SOME_VIEWS = ((0, 0), (2, 2), (4, 4), (0, 4), (4, 0))

@@ -17,7 +17,7 @@ Array = np.ndarray
 POINTS = 12
 COARSE_POINTS, COARSE_PARTS = 6, 6
 """Along a pixel and along an aperture cell, of rays that meet two masks."""
-ACROSS, PART_POINTS = 6, 4
+ACROSS, PART_POINTS = 6, 8
 """Parts along a piece of the aperture that the pupil cuts, and along a pixel the points from which
 rays run to each."""
 FINER = 20
