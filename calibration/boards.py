@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,8 +22,11 @@ DARKEST_REFERENCE_DN = 50.0
 """Above the dark: with rounding of 1 DN a ratio is known to 1 % of it and better."""
 
 
-NEARLY = 0.75
-"""Of a view: a pupil beside the middle shuts views on one side that are as far out as others."""
+BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
+"""Rows and columns to the views beside a view."""
+CLEARLY_CUT = 0.9
+"""Of the brightest view's light: a pupil that shuts a view cuts those beside it. Views of a bench
+differ by 5 %."""
 Opening = tuple[NDArray[np.bool_], tuple[float, float], int]
 """Views open, (view_y, view_x); place of the mask in um, x and y; shot."""
 
@@ -238,12 +241,11 @@ def as_readings(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
-    found, dark = [], []
-    for board in boards.frames:
+    found = []
+    for board, taken in lit_boards(boards):
         reference = boards.reference(board.shot, board.lamp)
         if reference is None:
             raise CalibrationError(f"{board.name}: no reference whiteboard under that lamp")
-        taken = board.frame
         for frame, what in ((taken, board.name), (reference, "reference"), (boards.dark, "dark")):
             if frame.mean_dn.shape != expected:
                 raise CalibrationError(
@@ -251,38 +253,51 @@ def as_readings(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        if is_dark(taken, boards):
-            dark.append(board)
-            continue
         found.append(_board(board, taken, reference, boards, gain, layout, good))
-    refuse_dark(dark, boards.frames)
     return found
 
 
-def is_dark(frame: MeanFrame, boards: BoardSet) -> bool:
-    """Return whether a whiteboard's frame has hardly any light."""
-    above_dn = np.median(frame.mean_dn - boards.dark_at(frame.exposure_s).mean_dn)
-    return float(above_dn) < DARKEST_REFERENCE_DN / 10
+def lit_boards(boards: BoardSet) -> Iterator[tuple[BoardFrame, MeanFrame]]:
+    """Yield the whiteboards that have light, with their frames.
 
-
-def refuse_dark(dark: Sequence[BoardFrame], frames: Sequence[BoardFrame]) -> None:
-    """Raise CalibrationError for dark whiteboards, except of views that the lens's pupil shuts.
-
-    frames: all that were taken. Shut are views that lie farther out than all whose pinholes give
-    light.
+    Raises CalibrationError at the end for dark ones, except of views that the lens's pupil shuts.
     """
-    lit = [board.pinhole for board in frames if board.pinhole and board not in dark]
-    views = [board.pinhole for board in frames if board.pinhole]
-    middle = (np.max(views, axis=0) + np.min(views, axis=0)) / 2 if views else np.zeros(2)
-
-    def out(view: tuple[int, int]) -> float:
-        return float(np.hypot(*(np.array(view) - middle)))
-
+    dark, rates = [], dict[tuple[int, int], float]()
+    for board in boards.frames:
+        frame = board.frame
+        if frame.mean_dn.shape == boards.dark.mean_dn.shape:
+            light_dn = frame.mean_dn - boards.dark_at(frame.exposure_s).mean_dn
+            above_dn = float(np.median(light_dn))
+            if above_dn < DARKEST_REFERENCE_DN / 10:
+                dark.append(board)
+                continue
+            if board.pinhole is not None:
+                rates[board.pinhole] = above_dn / frame.exposure_s
+        yield board, frame
+    shut = {board.pinhole for board in dark if board.pinhole is not None}
     for board in dark:
-        if not (board.pinhole and lit and out(board.pinhole) > max(map(out, lit)) - NEARLY):
+        if board.pinhole is None or not _is_shut(board.pinhole, shut, rates):
             raise CalibrationError(
                 f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
             )
+
+
+def _is_shut(
+    view: tuple[int, int], dark: set[tuple[int, int]], rates: Mapping[tuple[int, int], float]
+) -> bool:
+    """Return whether the pupil, not the lamp, may be why a view is dark.
+
+    dark: all views that are. rates: light of the others, in DN/s. Then the views beside have
+    clearly less light than the brightest; or, where none of these was taken, the opposite view is
+    dark as well.
+    """
+    beside = [(view[0] + down, view[1] + right) for down, right in BESIDE]
+    lit = [rates[near] for near in beside if near in rates]
+    if lit:
+        return max(lit) < CLEARLY_CUT * max(rates.values())
+    views = np.array([*dark, *rates])
+    v, u = (views.min(axis=0) + views.max(axis=0) - view).tolist()
+    return bool(rates) and (v, u) != view and (v, u) in dark
 
 
 def _board(

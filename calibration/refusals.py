@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.calibration.board_angle import BoardAngle
-from emmc_rig.calibration.boards import Board, BoardSet, Sample, is_dark, refuse_dark
+from emmc_rig.calibration.boards import Board, BoardSet, Sample, lit_boards
 from emmc_rig.calibration.causes import CREEP, OF_PLATE, through_pinhole
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.errors import CalibrationError
@@ -86,7 +86,8 @@ def refuse_unfit(sets: Sequence[BoardSet]) -> None:
                     f"{DARKEST_REFERENCE_DN:g} DN above the dark: is the lamp on? Else raise it, "
                     "or the exposure"
                 )
-        refuse_dark([b for b in boards.frames if is_dark(b.frame, boards)], boards.frames)
+        for _ in lit_boards(boards):
+            pass
         _refuse_saturated(boards)
 
 
