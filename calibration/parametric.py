@@ -109,6 +109,23 @@ def coefficient_plane(
     return plane
 
 
+def widening_plane(
+    samples_shadow: Shadow,
+    layout: PsiLayout,
+    place: tuple[int, int, int, int],
+    stage_um: tuple[float, float],
+) -> NDArray[np.float32]:
+    """Return slopes of `coefficient_plane` by the relative area of the hole, (y, x)."""
+    shot, v, u, stored = place
+    scale = layout.weights_shape[4] * layout.binning**2
+    plane = np.empty(layout.size, dtype=np.float32)
+    chosen = views_open((layout.weights_shape[1], layout.weights_shape[2]), (v, u))
+    for band, samples, channels in _bands(layout, shot, stored):
+        by_area = samples_shadow.with_widening(samples, channels, chosen, stage_um, shot)[2]
+        plane[band] = by_area.reshape(plane[band].shape) / scale
+    return plane
+
+
 def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
     """Return Psi with the mask stage at `stages`, one (x, y) in um per shot."""
     weights = np.empty(layout.weights_shape, dtype=np.float32)

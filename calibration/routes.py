@@ -42,7 +42,7 @@ from emmc_rig.calibration.colours import (
 )
 from emmc_rig.calibration.defects import find_defects, loss_variance, moved_dust
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.fit import OFFSETS, fit_placement, settled
+from emmc_rig.calibration.fit import LARGER, OFFSETS, fit_placement, settled
 from emmc_rig.calibration.frames import MeanFrame
 from emmc_rig.calibration.levels import Levels, fit_levels
 from emmc_rig.calibration.locator import SOFT_EDGES
@@ -56,6 +56,7 @@ from emmc_rig.calibration.parametric import (
     of_samples,
     psi_deviation,
     shot_stages,
+    widening_plane,
 )
 from emmc_rig.calibration.planning import pinhole_worth
 from emmc_rig.calibration.shadow import Shadow, ShadowMask, shadow_mask
@@ -358,14 +359,14 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
     fit = fit_placement(readings.seen, task.camera, mask)
     refusals.refuse_odd_fit(fit, readings.seen, mask)
     advice, findings = words.fit_advice(fit), list[str]()
-    dusty = moved_dust(Shadow(mask, fit.placement), settled(fit, readings.seen))
+    dusty = moved_dust(Shadow(mask, fit.placement), settled(fit, readings.seen, mask))
     if dusty.any():
         findings.append(words.dust_finding(dusty))
         readings = readings.without(dusty)
         fit = fit_placement(readings.seen, task.camera, mask, start=fit)
     of_causes = words.cause_lines(fit, readings.seen, mask)
     findings, advice = [*of_causes.findings, *findings], [*of_causes.advice, *advice]
-    seen = settled(fit, readings.seen)
+    seen = settled(fit, readings.seen, mask)
     models = {"parametric": with_misfit(Parametric(fit, mask), seen)}
     if {"mixed", "combined"} & task.routes and task.design.binning == 1:
         task.on_stage("defects of the mask")
@@ -552,12 +553,12 @@ def _list_unwatched(
 
 def _fit_with_defects(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
     """Return the fit with defects: found, and the placement refined with them in the mask."""
-    settled_boards = settled(parametric.fit, seen)
+    settled_boards = settled(parametric.fit, seen, parametric.mask)
     defects = find_defects(settled_boards, parametric.mask, parametric.fit.placement)
     if defects.count == 0:
         return Parametric(parametric.fit, parametric.mask, defects)
     fit = fit_placement(seen, camera, defects.mask, start=parametric.fit)
-    again = find_defects(settled(fit, seen), parametric.mask, fit.placement)
+    again = find_defects(settled(fit, seen, parametric.mask), parametric.mask, fit.placement)
     return Parametric(fit, parametric.mask, again)
 
 
@@ -642,23 +643,6 @@ def _judged_model(
     return worst(groups)
 
 
-def _lost_at_aperture_edge(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
-    """Return the share of a single pinhole's light that the aperture's edge keeps from it.
-
-    moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
-    pinhole pushed outward by d the middle of what is left is d / 2 further. The fit
-    takes part of it for another distance: the loss counts in the deviation.
-    """
-    ratio = mask.distance_um / mask.lens_um
-    left = 1.0
-    view = np.argwhere(board.views_open)[0].tolist()
-    for place, count, moved in zip(view, mask.views, reversed(moved_um), strict=True):
-        # A pinhole further out shows the mask further in.
-        outward_um = -moved / ratio * (place == count - 1) + moved / ratio * (place == 0)
-        left *= 1 - min(max(2 * outward_um / mask.aperture_cell_um, 0.0), 0.5)
-    return 1 - left
-
-
 def _correct_pinholes(
     known: Calibration, model: Parametric, seen: Sequence[Board], layout: PsiLayout
 ) -> None:
@@ -674,9 +658,10 @@ def _correct_pinholes(
         for board, own, unsure in zip(seen, model.fit.own, model.fit.own_deviation, strict=True)
         if board.views_open.sum() == 1
     )
-    for board, (brighter, off_x, off_y), (unsure, unsure_x, unsure_y) in pinholes:
+    for board, own, deviations in pinholes:
+        brighter, off_x, off_y = own[:3].tolist()
+        unsure, unsure_x, unsure_y = deviations[:3].tolist()
         (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
-        lost = _lost_at_aperture_edge((off_x, off_y), board, model.mask)
         for stored in range(layout.weights_shape[4]):
             place = board.shot, v, u, stored
 
@@ -686,12 +671,15 @@ def _correct_pinholes(
             right = at(x_um, y_um)
             index = board.shot, v, u, slice(None), stored
             moved = right - at(x_um + off_x, y_um + off_y)
+            by_area = widening_plane(shadow, layout, place, (x_um + off_x, y_um + off_y))
+            moved = moved - own[LARGER] * by_area
             weights[index] = weights[index] / (1 + brighter) + moved
             variance = sum(
                 np.square(at(x_um + by_x, y_um + by_y) - right)
                 for by_x, by_y in ((unsure_x, 0.0), (0.0, unsure_y))
             )
-            variance += np.square(np.hypot(lost, unsure) * right)
+            variance += np.square(unsure * right)
+            variance += np.square(deviations[LARGER] * by_area)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
 
 
