@@ -30,7 +30,8 @@ from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
 from emmc_rig.calibration.levels import Levels
 from emmc_rig.calibration.placement import Placement
 from emmc_rig.calibration.planning import PinholeWorth
-from emmc_rig.calibration.shadow import ShadowMask
+from emmc_rig.calibration.shadow import ShadowMask, openings
+from emmc_rig.model.pupil import LEAST_SHARE
 
 LARGEST_FLICKER = 0.01
 """Of a whiteboard's brightness against the others: more is named."""
@@ -63,6 +64,8 @@ NOTEWORTHY = {
     ),
 }
 USUAL = Placement()
+LEAST_OPEN = 0.995
+"""Of every view: a pupil that covers less is not worth a word."""
 
 
 def mask_findings(fit: Fit, names: Sequence[str] = tuple(NOTEWORTHY)) -> list[str]:
@@ -84,6 +87,34 @@ def mask_findings(fit: Fit, names: Sequence[str] = tuple(NOTEWORTHY)) -> list[st
                 )
             )
     return found
+
+
+def pupil_finding(fit: Fit, mask: ShadowMask) -> list[str]:
+    """Return the pupil's size and centre, and the views that it leaves less than half open."""
+    pupil = fit.placement.fitted_pupil()
+    if pupil is None:
+        return []
+    opened = openings(mask, fit.placement).shares(mask.views)
+    if opened.min() > LEAST_OPEN:
+        return []
+    x_mm, y_mm = pupil.centre_mm
+    size_spread = fit.deviation("pupil_share") * pupil.diameter_mm / (1 + fit.placement.pupil_share)
+    spread = max(fit.deviation("pupil_x_um"), fit.deviation("pupil_y_um")) / 1e3
+    words = (
+        f"the lens's {pupil.shape} pupil is {pupil.diameter_mm:.2f} +- {size_spread:.2f} mm "
+        f"across, its middle at ({x_mm:+.2f}, {y_mm:+.2f}) +- {spread:.2f} mm from the middle of "
+        "the views"
+    )
+    for names, least, most in (
+        ("less than half open", LEAST_SHARE, 0.5),
+        ("shut", -1, LEAST_SHARE),
+    ):
+        views = [
+            f"({v}, {u})" for v, u in np.argwhere((opened > least) & (opened <= most)).tolist()
+        ]
+        if views:
+            words += f"; {names}: view{'s' * (len(views) > 1)} {', '.join(views)}"
+    return [words]
 
 
 def level_findings(levels: Levels | None) -> list[str]:

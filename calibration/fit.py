@@ -84,7 +84,14 @@ from emmc_rig.calibration.robust import (
     tukey_loss,
     tukey_weights,
 )
-from emmc_rig.calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, ShadowMask
+from emmc_rig.calibration.shadow import (
+    ANY_COLOUR,
+    OF_VIEW,
+    Shadow,
+    ShadowMask,
+    light_slopes,
+    openings,
+)
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings
@@ -824,7 +831,7 @@ def fit_placement(
     everything, astray2 = _covariance(mask, point, whole, prior)
     size = len(placement.vector())
     covariance, own_covariance = everything[:size, :size], everything[size:, size:]
-    undecided, more = _find_undecided(placement, covariance, len(boards))
+    undecided, more = _find_undecided(mask, placement, covariance, len(boards))
     causes = with_sizes(
         found, list(bench.causes.values()), state.own.ravel(), own_covariance, bench.own2
     )
@@ -962,14 +969,14 @@ def _without_aberrations(
 
 
 def _find_undecided(
-    placement: Placement, covariance: NDArray[np.float64], boards: int
+    mask: ShadowMask, placement: Placement, covariance: NDArray[np.float64], boards: int
 ) -> tuple[tuple[str, ...], int]:
     """Return the parameters that the prior decides, and how many more boards would decide them.
 
     share^-2 = 1 + have, the precision that `boards` whiteboards have added to the prior's; it grows
     with their number. Decided: a share below MOST_OF_PRIOR.
     """
-    shares = shares_of_prior(placement, covariance, Tolerances())
+    shares = shares_of_prior(mask, placement, covariance, Tolerances())
     rows, columns = np.shape(placement.aperture)
     names = zip(labels((rows, columns)), shares, strict=True)
     have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
@@ -1001,28 +1008,25 @@ def _astray_um(
 
 
 def shares_of_prior(
-    placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances
+    mask: ShadowMask,
+    placement: Placement,
+    covariance: NDArray[np.float64],
+    tolerances: Tolerances,
 ) -> NDArray[np.float64]:
     """Return every parameter's deviation over that of the prior, by their labels.
 
-    Of the aperture's weights what counts is their share of the light: neither their common level
-    nor what a falloff in their place would say is to be decided.
+    Of the aperture's weights what counts is the views' share of the light: neither their common
+    level is to be decided, nor what a falloff or another pupil in their place would say.
     """
-    weights = np.array(placement.aperture)
-    views = weights.shape
-    prior = tolerances.deviations((views[0], views[1]))
-    share = np.sqrt(np.diag(covariance)) / prior
-    v, u = ((np.arange(count) - (count - 1) / 2) for count in views)
-    far = (v[:, None] ** 2 + u**2).ravel()
-    far = far / max(far.max(), 1e-12)
-    count, first = weights.size, len(SCALARS)
-    slopes = np.zeros((count, len(covariance)))
-    slopes[:, first:] = np.diag(1 / weights.ravel())
-    slopes[:, SCALARS.index("falloff")] = far / (1 + placement.falloff * far)
-    slopes -= slopes.mean(axis=0)
+    count, first = mask.views[0] * mask.views[1], len(SCALARS)
+    share = np.sqrt(np.diag(covariance)) / tolerances.deviations(mask.views)
+    opened = openings(mask, placement).shares(mask.views).ravel()
+    slopes = light_slopes(mask, placement)
+    slopes = opened[:, None] * (slopes - opened @ slopes / opened.sum())
     spread = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
-    share[first:] = np.minimum(spread / tolerances.aperture, 1.0)
+    share[first : first + count] = np.minimum(spread / tolerances.aperture, 1.0)
     share[SCALARS.index("falloff")] = 0.0
+    share[PUPIL] = 0.0
     return share
 
 

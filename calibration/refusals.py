@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.calibration.board_angle import BoardAngle
-from emmc_rig.calibration.boards import Board, BoardSet, Sample
+from emmc_rig.calibration.boards import Board, BoardSet, Sample, lit_boards
 from emmc_rig.calibration.causes import CREEP, OF_PLATE, through_pinhole
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.errors import CalibrationError
@@ -90,11 +90,8 @@ def refuse_unfit(sets: Sequence[BoardSet]) -> None:
                     f"{DARKEST_REFERENCE_DN:g} DN above the dark: is the lamp on? Else raise it, "
                     "or the exposure"
                 )
-        for board in boards.frames:
-            if np.median(_above_dn(board.frame, boards)) < DARKEST_REFERENCE_DN / 10:
-                raise CalibrationError(
-                    f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
-                )
+        for _ in lit_boards(boards):
+            pass
         _refuse_saturated(boards)
 
 
@@ -190,7 +187,9 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
             shadow = Shadow(mask, register(board, mask, designed_placement(camera)).placement)
         if board.views_open.sum() > 1:
             continue
-        clearest.append(np.percentile(board.reading[board.usable], 98) * board.views_open.size)
+        # Of the light that the pupil, as described, leaves to this view.
+        share = float(shadow.opened[board.views_open][0] / shadow.opened.sum())
+        clearest.append(np.percentile(board.reading[board.usable], 98) / share)
         sample = board.sampled(np.inf, SAMPLED, rng)
         own.append(_correlation(sample, shadow, board.views_open))
         orders = (turned(board.views_open) for turned in ORDERS.values())
@@ -200,7 +199,8 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
         )
     assert shadow is not None
     if own:
-        if np.mean(clearest) > BRIGHTEST_VIEWS:
+        # A middle view alone is brighter where a round pupil shuts others.
+        if len(clearest) > 1 and np.mean(clearest) > BRIGHTEST_VIEWS:
             _raise_dim_references(float(np.mean(clearest)))
         means = np.mean(others, axis=0)
         if means.max() > np.mean(own) + MIRRORED:

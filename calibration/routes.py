@@ -385,6 +385,7 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
         )
     best = models.get("mixed", models["parametric"])
     refusals.refuse_tilted_board(best.shadow, [*readings.judges, *seen])
+    findings += words.pupil_finding(best.fit, best.mask)
     findings += words.mask_findings(best.fit)
     findings += filter(None, [best.mask.repeats.words])
     return _Modelled(readings, plain, models, bare, psis, advice, findings)

@@ -275,6 +275,34 @@ def openings(mask: ShadowMask, placement: Placement, **how: Any) -> Openings:
     return cell_openings(pupil, mask.views, mask.aperture_cell_um, fill, strips=strips, **how)
 
 
+def light_slopes(mask: ShadowMask, placement: Placement) -> NDArray[np.float64]:
+    """Return the relative slopes of the light of every view, (view, parameter).
+
+    Of a_j open_j (1 + falloff far_j); by the pupil, of what is open. Views that are all but shut
+    count as LEAST_SHARE open.
+    """
+    found = openings(mask, placement)
+    opened = np.maximum(found.shares(mask.views), LEAST_SHARE)
+    weights, first = np.array(placement.aperture), len(SCALARS)
+    slopes = np.zeros((weights.size, first + weights.size))
+    slopes[:, first:] = np.diag(1 / weights.ravel())
+    far = far_shares(mask.views).ravel()
+    slopes[:, FALLOFF] = far / (1 + placement.falloff * far)
+    changes = _pupil_slopes(mask, placement, found)
+    for p in range(changes.shape[1] if len(changes) else 0):
+        change = np.zeros(mask.views)
+        np.add.at(change, tuple(found.view.T), changes[:, p, 0])
+        slopes[:, PUPIL_X + p] = (change / opened).ravel()
+    return slopes
+
+
+def far_shares(views: tuple[int, int]) -> NDArray[np.float64]:
+    """Return |u|^2 of every view as a share of the outermost's, (v, u)."""
+    v, u = (centred_grid(count, 1.0) for count in views)
+    far = v[:, None] ** 2 + u**2
+    return far / max(float(far.max()), 1e-12)
+
+
 class _Boxes(NamedTuple):
     """The boxes through which the views look, without those that are shut."""
 

@@ -354,5 +354,8 @@ def _describe(file: h5py.File, outcome: Outcome, scale: Scale) -> None:
         for name in SCALARS:
             file.attrs[name] = getattr(known.fit.placement, name)
         file["aperture"] = np.array(known.fit.placement.aperture)
+        if known.fit.placement.pupil is not None:
+            # As described, or of the shape that the whiteboards show: the scalars are relative.
+            file.attrs["pupil"] = known.fit.placement.pupil.model_dump_json()
         if known.defects is not None:
             file["lost"] = known.defects.lost
