@@ -219,7 +219,7 @@ class _Evidence(NamedTuple):
     curvature: NDArray[np.float64]
 
     def add(self, shadow: Shadow, parts: Iterable[_Part], residuals: Array) -> None:
-        """Add those of pixels whose residuals, in deviations, are not 0."""
+        """Add gradients and curvatures by all pixels that have a residual, in deviations."""
         for part in parts:
             there = residuals[part.place] != 0
             if not there.any():
