@@ -67,12 +67,15 @@ from emmc_rig.calibration.causes import (
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import register, starting_placement
 from emmc_rig.calibration.placement import (
+    PUPIL_SHARE,
+    PUPIL_X,
     SCALARS,
     Placement,
     Tolerances,
     labels,
     with_aperture_mean_one,
 )
+from emmc_rig.calibration.pupil_shape import CLEARLY_ROUND, likeliest_pupil, measured_light
 from emmc_rig.calibration.robust import (
     correlation,
     deviation_of,
@@ -105,6 +108,12 @@ LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
+PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
+"""Where the pupil's parameters lie there."""
+STEPS_TO_PUPIL = 4
+"""Of the fit, before the views' light is looked at: the mask is then about where it stands."""
+HELD = 1e-6
+"""Of the tolerance of parameters that nothing depends on."""
 LOOSE_UM = 0.5
 """By which a hand's pinhole seems to move the mask, at first: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
@@ -316,6 +325,8 @@ def _bench_prior(
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     deviations = Tolerances().deviations(camera.views)
+    if placement.pupil is None:
+        deviations[PUPIL] *= HELD
     loose = any(board.loose for board in boards)
     if loose:
         # Pinholes a little off their holes look like glass before the mask.
@@ -762,9 +773,18 @@ def fit_placement(
         state = _State(start or _registered(boards, camera, mask), np.zeros((len(boards), OWN)))
         windows = [*_widening_samples(boards, mask, settings), whole]
     bench = _bench_prior(boards, camera, mask, state.placement)
-    prior = bench.with_widths(bench.first_widths(ratio))
+    widths = bench.first_widths(ratio)
+    prior = bench.with_widths(widths)
     for samples in windows:
-        descent = _descend(mask, _point(mask, state, samples), samples, prior, settings, FIRST_GAIN)
+        point = _point(mask, state, samples)
+        if steps == 0 and not isinstance(start, Fit) and state.placement.pupil is None:
+            # A pupil that is not known leads the fit astray: it is looked for after a few steps.
+            few = settings.model_copy(update={"max_steps": STEPS_TO_PUPIL})
+            point = _descend(mask, point, samples, prior, few, FIRST_GAIN).point
+            point = _with_pupil_seen(mask, point, samples, prior, settings)
+            bench = _bench_prior(boards, camera, mask, point.state.placement)
+            prior = bench.with_widths(widths)
+        descent = _descend(mask, point, samples, prior, settings, FIRST_GAIN)
         state, steps = descent.point.state, steps + descent.steps
     found, off_plate = list[FoundCause](), False
     for turn, least_gain in enumerate(CAUSE_GAINS):
@@ -818,6 +838,39 @@ def _registered(boards: Sequence[Board], camera: Camera, mask: ShadowMask) -> Pl
     """Return where the mask is, by the whiteboard of most contrast."""
     soft = starting_placement(camera, mask)
     return register(max(boards, key=_contrast), mask, soft).placement
+
+
+def _with_pupil_seen(
+    mask: ShadowMask,
+    point: _Point,
+    samples: Sequence[Sample],
+    prior: _Prior,
+    settings: FitSettings,
+) -> _Point:
+    """Return the point with the round pupil that the views' light shows, as it is without one.
+
+    The pupil is taken where the readings become clearly likelier.
+    """
+    state, normal = point.state, point.normal
+    weights = slice(len(SCALARS), len(state.placement.vector()))
+    precision = prior.precision.copy()
+    precision[weights, weights] = 0
+    pull = normal.gradient + precision @ (prior.centre - state.vector())
+    seen = measured_light(
+        state.placement.falloff, state.vector(), normal.matrix + precision, pull, mask
+    )
+    pupil = likeliest_pupil(seen, mask)
+    if pupil is None:
+        return point
+    # The weights were of views open to their edges.
+    even = tuple((1.0,) * mask.views[1] for _ in range(mask.views[0]))
+    start = replace(state, placement=replace(state.placement, aperture=even, pupil=pupil))
+    precision = prior.precision.copy()
+    precision[PUPIL, PUPIL] *= HELD**2
+    freed = _Prior(precision, prior.centre)
+    other = _descend(mask, _point(mask, start, samples), samples, freed, settings, FIRST_GAIN).point
+    likelier = point.loss(normal.spread, prior) - other.loss(normal.spread, freed)
+    return other if likelier > CLEARLY_ROUND else point
 
 
 def _contrast(board: Board) -> float:
