@@ -57,7 +57,6 @@ from emmc_rig.calibration.parametric import (
     psi_deviation,
     shot_stages,
 )
-from emmc_rig.calibration.placement import Placement
 from emmc_rig.calibration.planning import pinhole_worth
 from emmc_rig.calibration.shadow import Shadow, ShadowMask, shadow_mask
 from emmc_rig.calibration.whiteboard import (
@@ -149,7 +148,7 @@ def calibrate(
         shadow, found = _compare_with_design(task, readings)
         findings += found
     if task.modelled:
-        modelled = _fit_models(task, readings, shadow and shadow.placement)
+        modelled = _fit_models(task, readings)
         readings, shadow = modelled.readings, modelled.shadow
         advice += modelled.advice
         findings += modelled.findings
@@ -345,11 +344,8 @@ def _compare_with_design(task: _Task, readings: _Readings) -> tuple[Shadow | Non
     return shadow, words.mask_findings(fit, ("distance_share", "clear"))
 
 
-def _fit_models(task: _Task, readings: _Readings, registered: Placement | None) -> _Modelled:
-    """Return the fits of the mask, its dust and defects, and Psi by them.
-
-    registered: where the mask was seen to be; None: not looked for yet.
-    """
+def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
+    """Return the fits of the mask, its dust and defects, and Psi by them."""
     few = task.steady.few
     if few is None:
         raise CalibrationError("the calibration method parametric was given no whiteboards")
@@ -359,8 +355,7 @@ def _fit_models(task: _Task, readings: _Readings, registered: Placement | None) 
         refusals.refuse_without_mask(board)
     plain = shadow_mask(task.camera, task.design.size)
     mask = task.as_filtered(plain)
-    start = registered and replace(registered, blur_um=SOFT_EDGES * mask.cell_um)
-    fit = fit_placement(readings.seen, task.camera, mask, start=start)
+    fit = fit_placement(readings.seen, task.camera, mask)
     refusals.refuse_odd_fit(fit, readings.seen, mask)
     advice, findings = words.fit_advice(fit), list[str]()
     dusty = moved_dust(Shadow(mask, fit.placement), settled(fit, readings.seen))
