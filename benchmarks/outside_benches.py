@@ -45,12 +45,12 @@ FIRST_TURNED = REPEATS * (REFERENCES + BOARDS + HELD) + 1
 TRUE = 0.5, 1.5
 """True over stated error, of benches whose stated error counts as true."""
 PLACES = 9
-"""Places of a mask that creeps, or moments of a lens that warms, one of which Psi may describe."""
+"""Moments of a capture with a creeping mask or a warming lens; the Psi of the closest counts."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A bench: what is wrong with it, what is captured, and the words that name it.
+    """A bench with its flaws, its whiteboards, and the pattern of the line that names the flaw.
 
     named: pattern of the line that names what is wrong; empty: nothing is to be said. fault: to be
     mended rather than calibrated; it may be refused.
@@ -141,8 +141,8 @@ def measure(bench: str, size: tuple[int, int], seed: int) -> dict[str, Any]:
     routes = ROUTES if "pinholes" not in case.sets else ROUTES[:2]
     if case.two_masks:
         camera, built, routes = *_second_mask(camera, built), ("free",)
-    sets = Photographer(built).sets(**{"pinholes": ALL_VIEWS, **case.sets})
     try:
+        sets = Photographer(built).sets(**{"pinholes": ALL_VIEWS, **case.sets})
         found, seconds = lab.timed(calibrate, camera, camera.psi(size), routes, **sets)
     except CalibrationError as refused:
         said = str(refused)
