@@ -104,6 +104,13 @@ CASES = {
         "mask moved", course={"moves_um": ((FIRST_TURNED, 0.5),)}, sets=TURNED
     ),
     "lens warms": Case(course={"focus_um": 1.0}),
+    "round pupil": Case("pupil", optics={"pupil_um": 9000.0, "pupil_at_um": (100.0, -60.0)}),
+    "round pupil within the views": Case("pupil", optics={"pupil_um": 7500.0}),
+    "round pupil, glare, plate turned": Case(
+        "plate is turned",
+        True,
+        optics={"pupil_um": 9000.0, "glare_after": 0.01, "plate_turn_deg": 2.0},
+    ),
     "two masks": Case(two_masks=True),
     "dust moves": Case(
         "dust moved", True, course={"dust": 5, "dust_from": FIRST_BOARD}
