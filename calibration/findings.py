@@ -27,6 +27,7 @@ from emmc_rig.calibration.causes import (
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.colours import Crosstalk
 from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
+from emmc_rig.calibration.glare import Glare
 from emmc_rig.calibration.levels import Levels
 from emmc_rig.calibration.placement import Placement
 from emmc_rig.calibration.planning import PinholeWorth
@@ -165,6 +166,23 @@ def unwatched(missing: Sequence[str]) -> list[str]:
     return [
         f"not measured: {what} ({cost}); add `{line}` under whiteboards in the plan"
         for what, cost, line in lacking
+    ]
+
+
+def glare_findings(glare: Glare | None) -> list[str]:
+    """Return how much of the light is spread over the picture."""
+    if glare is None:
+        return []
+    kinds = ("in front of", glare.in_front), ("behind", glare.behind)
+    where = " and ".join(
+        f"{share:.2%} {place}" if glare.in_front and glare.behind else place
+        for place, share in kinds
+        if share
+    )
+    return [
+        f"veiling glare of {glare.total:.2%} +- {glare.deviation:.2%}, {where} the colour filters: "
+        "Psi has it as of an even scene; what scatters between mask and sensor (bare metal, glass "
+        "without coating, dust on it) can be blackened or cleaned"
     ]
 
 

@@ -49,9 +49,11 @@ class Parametric:
 
 
 def shot_stages(camera: Camera) -> Stages:
-    """Return where the mask stage stands in every shot, x and y in um: as the camera says."""
-    (name,) = camera.masks
-    return [shot.offset_um.get(name, (0.0, 0.0)) for shot in camera.shots]
+    """Return where the mask stage stands in every shot, x and y in um: as the camera says.
+
+    All masks that move are on one stage.
+    """
+    return [next(iter(shot.offset_um.values()), (0.0, 0.0)) for shot in camera.shots]
 
 
 def _bands(
