@@ -219,7 +219,7 @@ class _Evidence(NamedTuple):
     curvature: NDArray[np.float64]
 
     def add(self, shadow: Shadow, parts: Iterable[_Part], residuals: Array) -> None:
-        """Add those of pixels whose residuals, in deviations, are not 0."""
+        """Add gradients and curvatures by all pixels that have a residual, in deviations."""
         for part in parts:
             there = residuals[part.place] != 0
             if not there.any():
@@ -250,27 +250,28 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
     clean = np.concatenate([_residual(shadow, board) for board in boards])
     evidence = _Evidence(np.zeros(size), np.zeros(size))
     evidence.add(shadow, _parts(boards), clean)
-    chosen, seen, losses = np.zeros(size, bool), sparse.csr_array((len(clean), 0)), np.zeros(0)
-    covariance = sparse.csr_array((chosen.size, chosen.size))
+    chosen, seen, losses = np.zeros(0, np.int64), sparse.csr_array((len(clean), 0)), np.zeros(0)
+    count = evidence.gradient.size
+    covariance = sparse.csr_array((count, count))
     for _ in range(ROUNDS):
         changes = seen @ losses
         spread = max(1.0, deviation_of(clean + changes))
         changed = _Evidence(evidence.gradient.copy(), np.zeros(size))
         changed.add(shadow, _parts(boards), changes)
-        curvature = evidence.curvature / spread**2
         deviations = np.abs(changed.gradient) / (spread * np.sqrt(evidence.curvature + 1e-300))
-        more = (deviations > SUPPORT) & (curvature > 1 / SIZE**2) & ~chosen
-        if not (chosen | more).any() or (chosen | more).mean() > LARGEST_SHARE:
+        more = (deviations > SUPPORT) & (evidence.curvature > (spread / SIZE) ** 2)
+        more.ravel()[chosen] = False
+        taken = len(chosen) + int(more.sum())
+        if taken == 0 or taken > LARGEST_SHARE * count:
             break
         if more.any():
-            chosen |= more
-            rows = [_seen_grains(shadow, part, chosen) for part in _parts(boards)]
-            seen = sparse.csr_array(sparse.vstack(rows))
-        where = np.flatnonzero(chosen)
-        losses, covariance = _solve_losses(seen, clean, where, chosen.size, spread)
-    lost = np.zeros(size)
-    lost[chosen] = losses
-    return Defects(lost.astype(np.float32), covariance, _with_losses(fine, placement, lost))
+            rows = [_seen_grains(shadow, part, more) for part in _parts(boards)]
+            seen = sparse.csr_array(sparse.hstack([seen, sparse.vstack(rows)]))
+            chosen = np.concatenate([chosen, np.flatnonzero(more)])
+        losses, covariance = _solve_losses(seen, clean, chosen, count, spread)
+    lost = np.zeros(size, np.float32)
+    lost.ravel()[chosen] = losses
+    return Defects(lost, covariance, _with_losses(fine, placement, lost))
 
 
 def mask_with_losses(mask: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:

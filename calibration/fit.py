@@ -46,6 +46,7 @@ from emmc_rig.calibration.causes import (
     LEAST_MOVED_UM,
     LEAST_OWN,
     LENS,
+    OF_HOLES,
     OF_PLATE,
     OWN,
     PLATE,
@@ -113,6 +114,8 @@ LEAST_CURVATURE = 0.3
 MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
+LARGER = 3
+"""Where the hole's area lies in a whiteboard's own parameters."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
 PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
@@ -128,6 +131,8 @@ OF_LOOSE = 0.05
 CAUSE_GAINS = (FIRST_GAIN, LEAST_GAIN, LEAST_GAIN)
 """The causes depend on the fit and the fit on the causes: in turn, to these last gains; the third
 time where pinholes stand off their holes."""
+UNLIKE = 0.3
+"""Of a reading's share that an area differs by: what the shape of a cut hole may make beside it."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -188,8 +193,8 @@ class Fit:
     chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
     undecided: names of parameters that the prior decides more than the whiteboards.
     more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
-    own, own_deviation: (board, OWN), brightness over 1 and place of the mask by which whiteboards
-        differ, um, as the causes let them.
+    own, own_deviation: (board, OWN), brightness over 1, place of the mask, um, and area of
+        the hole over 1, by which whiteboards differ, as the causes let them.
     causes: why whiteboards differ, the strongest first. A lamp that is not steady makes references
         differ likewise, which the covariance does not count.
     moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
@@ -236,10 +241,14 @@ A narrow width would bend the placement, and bent causes would be found there.""
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The placement, and each whiteboard's own: (board, OWN)."""
+    """The placement, and each whiteboard's own: (board, OWN).
+
+    widening: whether holes of the pinhole may be larger than views.
+    """
 
     placement: Placement
     own: NDArray[np.float64]
+    widening: bool = False
 
     def vector(self) -> NDArray[np.float64]:
         """Return all parameters as one vector: of the placement, then of each whiteboard."""
@@ -249,7 +258,7 @@ class _State:
         """Return the state after a step, within what is possible."""
         size = len(step) - self.own.size
         own = self.own + step[size:].reshape(self.own.shape)
-        return _State(self.placement.moved(step[:size]), own)
+        return _State(self.placement.moved(step[:size]), own, self.widening)
 
     def opening(self, board: Board, index: int) -> Opening:
         """Return parameters of the mask's shadow, at the mask position of one whiteboard."""
@@ -299,15 +308,17 @@ class _BenchPrior:
     geometry: Geometry
 
     def about(
-        self, found: Sequence[FoundCause], own: NDArray[np.float64], boards: Sequence[Board]
+        self, found: Sequence[FoundCause], state: _State, boards: Sequence[Board]
     ) -> _BenchPrior:
         """Return the prior with causes about where pinholes stand by those found."""
+        own = state.own
         known = [cause for cause in found if cause.name in self.causes]
         causes, none = list(self.causes.values()), np.zeros((own.size, own.size))
         sized = with_sizes(known, causes, own.ravel(), none, self.own2)
         off_um = pinholes_off_um(sized, boards, self.geometry.cell_um)
-        again = possible_causes(boards, self.geometry, off_um)
-        return replace(self, causes={cause.name: cause for cause in again})
+        geometry = replace(self.geometry, pupil=state.placement.fitted_pupil())
+        again = possible_causes(boards, geometry, off_um)
+        return replace(self, causes={cause.name: cause for cause in again}, geometry=geometry)
 
     def with_widths(self, widths: Mapping[str, float]) -> _Prior:
         """Return the prior of all parameters; widths: of the causes, by name."""
@@ -341,7 +352,8 @@ def _bench_prior(
     own2 = np.tile(np.square(LEAST_OWN), (len(boards), 1))
     own2[:, 0] += unsteadiness2(boards) / np.array([board.repeats for board in boards])
     ratio = mask.distance_um / mask.lens_um
-    geometry = Geometry(ratio, mask.aperture_cell_um, mask.views)
+    pupil = placement.fitted_pupil()
+    geometry = Geometry(ratio, mask.aperture_cell_um, mask.views, pupil)
     known = {cause.name: cause for cause in possible_causes(boards, geometry)}
     always = (HANDS,) if loose else ()
     return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry)
@@ -350,16 +362,6 @@ def _bench_prior(
 def _robust_spread(residuals: Sequence[Array]) -> float:
     """Return the robust deviation of the residuals in units of the noise, at least 1."""
     return max(1.0, deviation_of(np.concatenate(residuals)))
-
-
-def _with_own_slopes(read: Array, slope: Array, brightness: float) -> NDArray[np.float64]:
-    """Return slopes of a whiteboard's readings, (n, parameter + OWN), from those of the shadow.
-
-    By the placement, the whiteboard's brightness, and the mask's move in x and y. read: (n,),
-    readings of the shadow.
-    """
-    rows = [brightness * slope, read[:, None], brightness * slope[:, OFFSETS]]
-    return np.concatenate(rows, axis=1)
 
 
 class _Linear(NamedTuple):
@@ -378,12 +380,22 @@ class _Linear(NamedTuple):
 def _linear_readings(
     mask: ShadowMask, state: _State, samples: Sequence[Sample]
 ) -> tuple[_Linear, ...]:
-    """Return every whiteboard's readings and slopes at a state."""
+    """Return every whiteboard's readings and slopes at a state.
+
+    reading = (1 + brightness) (shadow, with the mask moved, + larger d(shadow)/d(area))
+    """
     shadow, found = Shadow(mask, state.placement), []
     for index, sample in enumerate(samples):
         opening, brightness = state.opening(sample.board, index), state.brightness(index)
-        read, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
-        slope = _with_own_slopes(read, slope, brightness)
+        where = sample.pixels, sample.channels, *opening
+        if state.widening and sample.board.views_open.sum() == 1:
+            read, slope, by_area = shadow.with_widening(*where)
+            read = read + by_area * state.own[index, LARGER]
+        else:
+            read, slope = shadow.with_slopes(*where)
+            by_area = np.zeros(len(read))
+        own = read, *(brightness * slope[:, OFFSETS].T), brightness * by_area
+        slope = np.concatenate([brightness * slope, np.stack(own, axis=1)], axis=1)
         slope /= sample.deviation[:, None]
         found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slope))
     return tuple(found)
@@ -733,23 +745,27 @@ def _rows_covariance(
     return np.asarray(errors.own_dn2 * covariance @ added @ covariance, np.float64)
 
 
-def settled(fit: Fit, boards: Sequence[Board]) -> list[Board]:
-    """Return whiteboards as they would be without what the causes made of them.
+def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
+    """Return the whiteboards with the effects of the causes taken out.
 
-    boards: those of the fit, in order. Each has the mask's place as fitted, and the brightness of
-    the others; hands no longer count.
+    boards: those of the fit, in order. Each has the mask's place as fitted, the brightness of the
+    others, and the area of a view; hands no longer count.
     """
-    found = []
-    for board, (brighter, x_um, y_um) in zip(boards, fit.own.tolist(), strict=True):
-        level = np.float32(1 + brighter)
+    shadow, found = Shadow(mask, fit.placement), []
+    for board, own in zip(boards, fit.own, strict=True):
+        level = np.float32(1 + own[0])
+        stage_um = (board.stage_um[0] + float(own[1]), board.stage_um[1] + float(own[2]))
+        reading = board.reading / level
+        if own[LARGER] and board.views_open.sum() == 1:
+            pixels = np.argwhere(np.ones(reading.shape, dtype=bool))
+            where = pixels, board.channels.ravel(), board.views_open, stage_um, board.shot
+            wider = shadow.with_widening(*where)[2] * own[LARGER]
+            reading = reading - wider.reshape(reading.shape).astype(np.float32)
+        # What is cut of a hole has another shape as well as another area.
+        shape = (UNLIKE * own[LARGER] * np.maximum(reading, 0)) ** 2
+        variance = (board.variance / level**2 + shape).astype(np.float32)
         found.append(
-            replace(
-                board,
-                reading=board.reading / level,
-                variance=board.variance / level**2,
-                stage_um=(board.stage_um[0] + x_um, board.stage_um[1] + y_um),
-                loose=False,
-            )
+            replace(board, reading=reading, variance=variance, stage_um=stage_um, loose=False)
         )
     return found
 
@@ -795,9 +811,12 @@ def fit_placement(
         state, steps = descent.point.state, steps + descent.steps
     found, off_plate = list[FoundCause](), False
     for turn, least_gain in enumerate(CAUSE_GAINS):
+        if not descent.point.state.widening and any(cause.name in OF_HOLES for cause in found):
+            state = replace(descent.point.state, widening=True)
+            descent = descent._replace(point=_point(mask, state, whole))
         if off_plate:
             # Where pinholes stand decides how much of their light the aperture's edge cuts.
-            bench = bench.about(found, descent.point.state.own, boards)
+            bench = bench.about(found, descent.point.state, boards)
         elif turn > 1:
             break
         found = _find_causes(mask, descent.point, whole, bench)
@@ -818,6 +837,9 @@ def fit_placement(
     )
     causes = doubt_lone_move(causes, boards)
     moved_um = _astray_um(causes, checks, boards)
+    own_deviation = np.sqrt(np.diag(own_covariance)).reshape(state.own.shape)
+    if any(cause.name == LENS for cause in causes) and not off_plate:
+        own_deviation[[through_pinhole(board) for board in boards], 1:3] = 0.0
     covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement=placement,
@@ -832,10 +854,8 @@ def fit_placement(
         more_boards=more,
         boards=checks,
         causes=tuple(causes),
-        own=_without_aberrations(state.own, causes, boards),
-        own_deviation=_without_aberrations(
-            np.sqrt(np.diag(own_covariance)).reshape(state.own.shape), causes, boards
-        ),
+        own=_without_aberrations(state.own, causes, bench),
+        own_deviation=own_deviation,
         moved_um=moved_um,
         astray2=astray2,
     )
@@ -933,18 +953,19 @@ def _refuse_unexplained(alike: float) -> None:
 
 
 def _without_aberrations(
-    own: NDArray[np.float64], causes: Sequence[FoundCause], boards: Sequence[Board]
+    own: NDArray[np.float64], causes: Sequence[FoundCause], bench: _BenchPrior
 ) -> NDArray[np.float64]:
-    """Return own parameters or their deviations, (board, OWN), 0 for moves that are the views' own.
+    """Return the own parameters, (board, OWN), by what the causes say where the lens has a part.
 
     What aberrations make of a view is part of Psi, and not to be taken out.
     """
-    names = {cause.name for cause in causes}
-    if LENS not in names or HANDS in names:
+    if not any(cause.name == LENS for cause in causes):
         return own
-    kept = own.copy()
-    kept[[through_pinhole(board) for board in boards], 1:] = 0.0
-    return kept
+    explained = np.zeros(own.size)
+    for cause in causes:
+        if cause.name in bench.causes:
+            explained += bench.causes[cause.name].columns @ np.array(cause.size)
+    return explained.reshape(own.shape)
 
 
 def _find_undecided(
@@ -969,8 +990,8 @@ def _astray_um(
 ) -> float:
     """Return how far from the fitted place the mask may stand in a shot, um: 0 where it stays.
 
-    What the stage does by chance, what it creeps by from the middle of the capture to its end, and
-    the largest move that is sure of a whole aperture: the width of all takes an outlier for chance.
+    The largest of three: the stage's moves by chance, its creep from the middle of the capture to
+    the end, and the farthest sure move of a whiteboard, which the width of all takes for chance.
     """
     far_um = [cause.width for cause in causes if cause.name == STAGE]
     far_um += [float(np.hypot(*cause.size)) / 2 for cause in causes if cause.name == CREEP]
@@ -1033,13 +1054,13 @@ def _check_board(point: _Point, sample: Sample, index: int) -> BoardCheck:
     brightness = point.state.brightness(index)
     # Of the shadow itself, as if the whiteboard had the brightness of all.
     rows = np.stack([slope[:, -OWN], *(slope[:, OFFSETS] / brightness).T], axis=1)
-    weight, step, matrix = np.ones(len(residual)), np.zeros(OWN), np.eye(OWN)
+    weight, step, matrix = np.ones(len(residual)), np.zeros(3), np.eye(3)
     for _ in range(8):
         matrix = rows.T @ (rows * weight[:, None])
         step = np.linalg.solve(matrix, rows.T @ (weight * residual))
         left = residual - rows @ step
         weight = tukey_weights(left / _robust_spread([left]))
-    brightness, x_um, y_um = map(float, point.state.own[index] + step)
+    brightness, x_um, y_um = map(float, point.state.own[index, :3] + step)
     spread = _robust_spread([residual])
     inside = tukey_weights(residual / spread) > 0
     brightness_deviation, *moved_deviations = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread

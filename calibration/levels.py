@@ -130,18 +130,23 @@ def check_of(
     dark_dn, channels: (y, x), as `Levels.corrected`'s. turn_deg: of the white board.
     """
     board = f"{'masks in' if masks_in else 'without masks'}, turned by {turn_deg:g}"
-    # Loaded here: scipy.stats takes a second.
-    from scipy.stats import trim_mean
-
     above = (frame.mean_dn - dark_dn).astype(np.float64)
     means = tuple(
-        float(trim_mean(above[channels == c], TRIMMED)) if (channels == c).any() else np.nan
+        _trimmed_mean(above[channels == c]) if (channels == c).any() else np.nan
         for c in range(CHANNELS)
     )
     level = max(float(above.mean()), 1e-9)
     # At most: shot noise at 1 DN per electron.
     deviation = np.sqrt(CHANNELS / above.size / frame.count / level)
     return Check(board, frame.taken_s, frame.exposure_s, means, float(deviation), masks_in)
+
+
+def _trimmed_mean(values: Array) -> float:
+    """Return the mean of values (n,) without TRIMMED of them at either end."""
+    # As scipy.stats.trim_mean, which takes a third of a second to load.
+    left_out = int(TRIMMED * len(values))
+    kept = slice(left_out, len(values) - left_out)
+    return float(np.partition(values, (kept.start, kept.stop - 1))[kept].mean())
 
 
 @dataclass(frozen=True, eq=False)

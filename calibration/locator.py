@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from emmc_rig.calibration.boards import Board, Opening, Sample
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.placement import SCALARS, Placement, Tolerances, designed_placement
-from emmc_rig.calibration.repeats import vertex
+from emmc_rig.calibration.repeats import convolved, vertex
 from emmc_rig.calibration.robust import correlation, deviation_of, tukey_weights
 from emmc_rig.calibration.shadow import SEARCH_UM, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
@@ -201,9 +201,8 @@ def search(
     y, x = np.mgrid[top - margin : top + height + margin, left - margin : left + width + margin]
     pixels = np.stack([y.ravel(), x.ravel()], axis=1)
     shadow = Shadow(mask, start)
-    # Half of what starting most commands takes, for a whiteboard's sake.
-    from scipy.signal import fftconvolve
-
+    # Shifts at which the whole crop lies on what is drawn.
+    within = tuple(slice(side - 1, side + 2 * margin) for side in (height, width))
     usable, channels = board.usable[crop], board.channels[crop]
     reading = np.where(usable, board.reading[crop], 0).astype(np.float64)
     product = energy = np.zeros((2 * margin + 1, 2 * margin + 1))
@@ -218,8 +217,8 @@ def search(
         seen_as = np.full(len(pixels), channel, np.uint8)
         drawn = shadow.readings(pixels, seen_as, *board.opening).reshape(y.shape)
         drawn -= drawn[margin:-margin, margin:-margin].mean()
-        product = product + fftconvolve(drawn, centred[::-1, ::-1], mode="valid")
-        energy = energy + fftconvolve(drawn**2, seen[::-1, ::-1].astype(float), mode="valid")
+        product = product + convolved(drawn, centred[::-1, ::-1])[within]
+        energy = energy + convolved(drawn**2, seen[::-1, ::-1].astype(float))[within]
         of_reading += float((centred**2).sum())
     scores = product / np.sqrt(np.maximum(energy, 1e-12) * max(of_reading, 1e-12))
     peak = np.unravel_index(int(np.argmax(scores)), scores.shape)

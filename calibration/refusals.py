@@ -41,6 +41,8 @@ LARGEST_MISS = 0.08
 """Of a held-out whiteboard's level; a bench of 64 rays, the grainiest that was tried, has 4 %, with
 3x3 views of 32x40 samples 6 %."""
 BRIGHTNESS_DIFFERS = 0.05
+CUT_BRIGHTNESS = 0.6
+"""By which a pinhole off its hole may be darker: half of it lies beyond the aperture."""
 ALIKE_BRIGHTNESS, ALIKE_UM = 0.2, 5.0
 """Differences between whiteboards with the mask in one place: lamps flicker, masks creep."""
 CLEAREST = 1.05
@@ -61,6 +63,8 @@ SURE = 5.0
 """Standard deviations, from which on a difference is no chance."""
 MANY_OUTLIERS = 0.1
 """Share of a whiteboard's pixels: noise has 0.001, dust less than a tenth."""
+UNEXPLAINED = 4.0
+"""Mean squared residual of a whiteboard over the noise, from which on its view is checked."""
 MIRRORED = 0.02
 """By which the views in another order must correlate better with the design's."""
 SAMPLED, SAMPLED_GRADIENT = 3_000, 200_000
@@ -247,7 +251,8 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> None:
     for check, board in zip(fit.boards, boards, strict=True):
         alike = sum(np.allclose(board.stage_um, other.stage_um) for other in boards) > 1
         moved_um = float(np.hypot(*check.moved_um))
-        if abs(check.brightness - 1) > max(ALIKE_BRIGHTNESS, SURE * check.brightness_deviation):
+        alike_to = CUT_BRIGHTNESS if off_plate and through_pinhole(board) else ALIKE_BRIGHTNESS
+        if abs(check.brightness - 1) > max(alike_to, SURE * check.brightness_deviation):
             raise CalibrationError(
                 f"{check.name}: {check.brightness:.2f} times as bright as the others suggest: was "
                 "the aperture where it should be, the mask in the beam, and the lamp the same? "
@@ -274,6 +279,7 @@ def _refuse_wrong_holes(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> 
     quarter_um = mask.aperture_cell_um * mask.distance_um / mask.lens_um / 4
     for check, board in zip(fit.boards, boards, strict=True):
         usual = np.hypot(*check.moved_um) < quarter_um and check.outliers < MANY_OUTLIERS
+        usual = usual and check.chi2 < UNEXPLAINED
         if board.views_open.sum() != 1 or usual:
             continue
         sample = board.sampled(np.inf, SAMPLED, rng)

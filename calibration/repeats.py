@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfftn, next_fast_len, rfftn
 
 Array = NDArray[np.floating]
 ALIKE = 0.9
@@ -57,9 +58,6 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float) -> Repeats:
 
     cells: (row, column, colour), of the colours that the sensor sees.
     """
-    # Half of what starting most commands takes.
-    from scipy.signal import fftconvolve
-
     sides = np.array(cells.shape[:2])
     reach = np.minimum(int(reach_um / cell_um), 3 * sides // 4)
     kept = np.minimum(4 * reach + 1, sides)
@@ -73,7 +71,7 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float) -> Repeats:
 
     def overlapped(first: Array, second: Array) -> Array:
         rows, columns = (slice(n - 1 - r, n + r) for n, r in zip(kept, reach, strict=True))
-        return np.asarray(fftconvolve(first, second[::-1, ::-1])[rows, columns])
+        return convolved(first, second[::-1, ::-1])[rows, columns]
 
     product = sum(overlapped(plane, plane) for plane in np.moveaxis(middle, -1, 0))
     both = overlapped(energy, ones) + overlapped(ones, energy)
@@ -100,6 +98,15 @@ def repeats_of(cells: Array, cell_um: float, reach_um: float) -> Repeats:
         if area > PARALLEL * np.hypot(x, y) * np.hypot(first_x, first_y):
             return Repeats((steps[0], (x, y)))
     return Repeats(tuple(steps[:1]))
+
+
+def convolved(first: Array, second: Array) -> NDArray[np.float64]:
+    """Return the convolution of two arrays (y, x), as large as any of it, by FFT."""
+    # As scipy.signal.fftconvolve, which takes half a second to load.
+    shape = [a + b - 1 for a, b in zip(first.shape, second.shape, strict=True)]
+    fast = [next_fast_len(side, real=True) for side in shape]
+    product = rfftn(first, fast) * rfftn(second, fast)
+    return np.asarray(irfftn(product, fast)[: shape[0], : shape[1]], np.float64)
 
 
 def vertex(scores: Array, peak: tuple[np.intp, ...]) -> float:

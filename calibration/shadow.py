@@ -84,6 +84,8 @@ GLASS_INDEX = 1.52
 """Refractive index of crown glass, as of a sensor's cover."""
 ANY_COLOUR = 3
 """Channel of a pixel that sees all colours."""
+AREA_STEP = 0.02
+"""Relative, of an aperture cell's area, for the derivative by it."""
 OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
 SPARE_UM = 900.0
@@ -865,6 +867,31 @@ class Shadow:
         """Return the readings (n,) and their derivatives (n, parameter)."""
         seen = self._run(pixels, channels, (views_open, stage_um, frame), slopes=True)
         return seen.readings, seen.slopes
+
+    def with_widening(
+        self,
+        pixels: Pixels,
+        channels: NDArray[np.uint8],
+        views_open: NDArray[np.bool_],
+        stage_um: tuple[float, float] = (0.0, 0.0),
+        frame: int = 0,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return `with_slopes`, and derivatives by the area of the aperture's cells, (n,).
+
+        The latter by the relative area, from cells that are AREA_STEP smaller and larger.
+        """
+        how = pixels, channels, views_open, stage_um, frame
+        smaller, larger = (shadow.readings(*how) for shadow in self._resized)
+        return *self.with_slopes(*how), (larger - smaller) / (2 * AREA_STEP)
+
+    @cached_property
+    def _resized(self) -> tuple[Shadow, Shadow]:
+        """The shadows through aperture cells of AREA_STEP less and more area."""
+        less, more = (
+            replace(self.mask, aperture_um=self.mask.aperture_um * (1 + sign * AREA_STEP / 2))
+            for sign in (-1, 1)
+        )
+        return Shadow(less, self.placement), Shadow(more, self.placement)
 
     def slopes_by_view(
         self,

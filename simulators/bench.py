@@ -352,6 +352,8 @@ class Bench:
         lens = camera.lens
         self._at_lens_um = lens_points_um(self._points, lens.aperture_cell_um, lens.aperture_fill)
         lengths_um = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
+        self._optics = optics
+        self._hole_areas = optics.hole_areas(views)
         self._falloff = optics.falloff(size, views, lengths_um)
         self._plates = {
             name: [
@@ -377,7 +379,7 @@ class Bench:
 
     def _lit(self, lamp: tuple[float, ...]) -> Array:
         """Return the readings under a lamp of this level in red, green and blue."""
-        at_um = self.positions_um()
+        at_um = self._optics.moved(self.positions_um(), self._seconds())
         state = (lamp, self.target, self.shot, self.masks_in, self.board_turn_deg, *at_um.values())
         if self._scene_at is not None and self.target == "scene":
             self._scene = self._scene_at(self._began_s)
@@ -385,7 +387,7 @@ class Bench:
         if state not in self._seen:
             if sum(readings.nbytes for readings in self._seen.values()) > KEPT_BYTES:
                 self._seen.clear()
-            self._seen[state] = self._pixels(self._trace(at_um, lamp))
+            self._seen[state] = self._pixels(self._traced(at_um, lamp))
         return self._seen[state]
 
     def _focused(self, offset_um: float) -> NDArray[np.float32]:
@@ -427,13 +429,13 @@ class Bench:
         psi = np.empty((*camera.views, size[0], 3, size[1]), np.float32)
         try:
             self.shot, self.masks_in = shot, False
-            whole = self._pixels(self._trace(at_um, LAMPS["white"], "all"))
+            whole = self._pixels(self._traced(at_um, LAMPS["white"], "all"))
             share = 1 / (k**2 * whole).repeat(k, axis=0).repeat(k, axis=1)
             self.masks_in = True
             for v, u in np.ndindex(camera.views):
                 for colour in range(3):
                     lamp = tuple(np.eye(3)[colour])
-                    psi[v, u, :, colour] = self._trace(at_um, lamp, (v, u)) * share
+                    psi[v, u, :, colour] = self._traced(at_um, lamp, (v, u)) * share
         finally:
             self.shot, self.masks_in = standing
         return psi
@@ -453,6 +455,26 @@ class Bench:
     def light(self, shot: int) -> NDArray[np.float32]:
         """Return how much light each pixel collects in a shot, (pixel_y, pixel_x)."""
         return self._light[shot]
+
+    def _traced(
+        self,
+        at_um: Mapping[str, float],
+        lamp: tuple[float, ...],
+        cell: tuple[int, int] | Literal["all"] | None = None,
+    ) -> Array:
+        """Return `_trace` with the lens's glare, which every colour has of its own light."""
+        optics, response = self._optics, self._response[self.shot]
+        if not (optics.glare or optics.glare_after):
+            return self._trace(at_um, lamp, cell)
+        response = response / np.maximum(response.sum(axis=-1, keepdims=True), 1)
+        colours = [tuple(level * np.eye(3)[c]) for c, level in enumerate(lamp)]
+        return np.sum(
+            [
+                optics.with_glare(self._trace(at_um, colours[c], cell), response[..., c])
+                for c in range(3)
+            ],
+            axis=0,
+        )
 
     def _trace(
         self,
@@ -484,7 +506,7 @@ class Bench:
         scene = (
             np.ones((1, 1, 1, 1, 3), np.float32)
             if board
-            else self._focused(at_um.get("focus", 0.0))
+            else self._focused(at_um.get("focus", 0.0) + at_um.get("lens", 0.0))
         )
         response = self._response[self.shot]
         seen = np.maximum(response.sum(axis=-1, keepdims=True), 1)
@@ -505,7 +527,7 @@ class Bench:
             self._at_lens_um,
             _passes(self._at_lens_um, openings),
             (
-                lens.distance_mm * 1e3,
+                lens.distance_mm * 1e3 + at_um.get("lens", 0.0),
                 sensor.sample_pitch_um,
                 sensor.sample_pitch_um * sensor.pixel_fill,
             ),
@@ -559,5 +581,15 @@ class Bench:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
         cell_um = self.camera.lens.aperture_cell_um
         window_half_um = window_side_um(self.camera.views, cell_um) / 2
-        window_um = (x_um - self.window_um, y_um, window_half_um)
-        return np.array([(x_um, y_um, cell_um / 2), window_um])
+        # The window is beside the pinhole along the plate, which may be turned.
+        turn = np.deg2rad(self._optics.plate_turn_deg)
+        beside_um = self.window_um * np.cos(turn), self.window_um * np.sin(turn)
+        window_um = (x_um - beside_um[0], y_um - beside_um[1], window_half_um)
+        area = 1.0
+        if self._optics.hole_spread:
+            nearest = (
+                int(np.clip(round(at / cell_um + (count - 1) / 2), 0, count - 1))
+                for at, count in zip((y_um, x_um), self.camera.views, strict=True)
+            )
+            area = float(self._hole_areas[tuple(nearest)])
+        return np.array([(x_um, y_um, cell_um / 2 * np.sqrt(area)), window_um])

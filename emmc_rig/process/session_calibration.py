@@ -132,9 +132,7 @@ class SessionCalibration:
 
     def write(self, folder: Path) -> None:
         """Write the same files into an existing folder."""
-        from emmc_rig.report.calibration_page import (
-            write_calibration_report,  # matplotlib: a second
-        )
+        from emmc_rig.report.calibration_page import write_calibration_report  # templates
 
         save_outcome(folder, self.outcome, self.calibration, self.scale)
         if self.inputs is not None:

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emmc_rig.calibration.choice import HeldOut
@@ -17,7 +16,7 @@ from emmc_rig.calibration.routes import Outcome
 from emmc_rig.calibration.sensor import SensorSheet
 from emmc_rig.model.files import write_text
 from emmc_rig.report.display import finite, round_up
-from emmc_rig.report.drawing import ACCENT, INK, drawn_map, sheet, svg_of, titled
+from emmc_rig.report.maps import Map, maps_svg, pixel_ticks
 from emmc_rig.report.page import (
     Card,
     Head,
@@ -237,22 +236,27 @@ def _residuals(judged: HeldOut) -> str:
 
     The kinds are in a table, the worst first.
     """
-    figure, (axes,) = sheet(1, 7.0, 4.6, label="pixel y")
-    height, width = judged.residual.shape
-    drawn_map(
-        axes, _shrunk(judged.residual, MAP_PX), (-RESIDUAL_SCALE, RESIDUAL_SCALE),
-        "validation whiteboard less prediction,\nstandard deviations of the noise", "RdBu_r",
-        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
-    )  # fmt: skip
-    titled(axes, judged.route, "pixel x")
+    (height, width), shown = judged.residual.shape, _shrunk(judged.residual, MAP_PX)
+    drawn = Map(
+        title=judged.route,
+        values=shown,
+        scale=(-RESIDUAL_SCALE, RESIDUAL_SCALE),
+        bar="validation whiteboard less prediction,\nstandard deviations of the noise",
+        colours="blue-red",
+        across="pixel x",
+        down="pixel y",
+        ticks_x=pixel_ticks(width, shown.shape[1]),
+        ticks_y=pixel_ticks(height, shown.shape[0]),
+    )
     order = sorted(judged.groups.items(), key=lambda item: -item[1])
     rows = [(name, f"{value:.2f}") for name, value in order]
     heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
-    return _drawn({"Residual map": figure}) + part("table", heads, rows, numbers=True)
+    return _drawn({"Residual map": maps_svg([drawn])}) + part("table", heads, rows, numbers=True)
 
 
-def _drawn(figures: Mapping[str, Figure]) -> str:
-    addresses = {name: data_address(svg_of(figure), ".svg") for name, figure in figures.items()}
+def _drawn(figures: Mapping[str, bytes]) -> str:
+    """Return SVG files as parts of the page, by name."""
+    addresses = {name: data_address(svg, ".svg") for name, svg in figures.items()}
     return part("drawings", addresses)
 
 
@@ -277,24 +281,28 @@ def _psi(outcome: Outcome) -> tuple[str, float]:
         f"Weights, the middle {slices[1][0].shape[1]} x {slices[1][0].shape[0]} pixels",
         "Their standard deviation, same pixels",
     )
-    figure, panels = sheet(3, 4.9, 4.2, label="view v")
-    for axes, tiles, title in zip(panels, slices, titles, strict=True):
+    panels = []
+    for tiles, title in zip(slices, titles, strict=True):
         height, width = tiles[0].shape
         whole = np.full((views[0] * (height + 2), views[1] * (width + 2)), np.nan, np.float32)
         for tile, (v, u) in zip(tiles, np.ndindex(views), strict=True):
             whole[v * (height + 2) :, u * (width + 2) :][:height, :width] = tile
-        top = round_up(float(np.nanpercentile(whole, 99.9)))
-        label = "share of the open camera's light" if axes is not panels[-1] else "the same unit"
-        drawn_map(axes, whole, (0, top), label, "gray" if axes is not panels[-1] else "magma")
-        axes.set_xticks(
-            [(u + 0.5) * (width + 2) for u in range(views[1])], map(str, range(views[1]))
+        of_weights = tiles is not slices[-1]
+        panels.append(
+            Map(
+                title=title,
+                values=whole,
+                scale=(0, round_up(float(np.nanpercentile(whole, 99.9)))),
+                bar="share of the open camera's light" if of_weights else "the same unit",
+                colours="gray" if of_weights else "magma",
+                across="view u",
+                down="view v",
+                ticks_x={(u + 0.5) * (width + 2): str(u) for u in range(views[1])},
+                ticks_y={(v + 0.5) * (height + 2): str(v) for v in range(views[0])},
+            )
         )
-        axes.set_yticks(
-            [(v + 0.5) * (height + 2) for v in range(views[0])], map(str, range(views[0]))
-        )
-        titled(axes, title, "view u")
     relative_deviation = float(np.sqrt(squares[1] / max(squares[0], 1e-30)))
-    return part("lead", PSI_SHOWN) + _drawn({"Psi": figure}), relative_deviation
+    return part("lead", PSI_SHOWN) + _drawn({"Psi": maps_svg(panels)}), relative_deviation
 
 
 def _centre(view: Array) -> Array:
@@ -312,6 +320,8 @@ def _shrunk(view: Array, longest_px: int) -> Array:
 
 
 def _sensor(sheet_: SensorSheet) -> str:
+    from emmc_rig.report.drawing import ACCENT, INK, sheet, svg_of, titled  # matplotlib: a second
+
     (first, (transfer,)), (second, (linearity,)) = (
         sheet(1, 4.8, label=label)
         for label in ("temporal variance, DN²", "deviation from the line, %")
@@ -331,7 +341,7 @@ def _sensor(sheet_: SensorSheet) -> str:
         for name, value, deviation, unit in sheet_.rows()
     ]
     table = part("table", heads, rows, numbers=True)
-    return table + _drawn({"Photon transfer curve": first, "Linearity": second})
+    return table + _drawn({"Photon transfer curve": svg_of(first), "Linearity": svg_of(second)})
 
 
 def _provenance(metrics: Mapping) -> dict[str, str]:

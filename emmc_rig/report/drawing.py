@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
 INK, FAINT, LINE, ACCENT = "#17202c", "#5b6776", "#dde2e9", "#1d5a9e"
 COLOURS = (
@@ -57,26 +55,6 @@ def titled(axes: Axes, title: str, across: str = "") -> None:
     axes.set_title(title, loc="left", fontsize=10.5, color=INK, weight="bold")
     if across:
         axes.set_xlabel(across, color=FAINT, fontsize=9)
-
-
-def drawn_map(
-    axes: Axes,
-    values: NDArray[np.floating],
-    scale: tuple[float, float],
-    label: str,
-    colours: str,
-    **more: Any,
-) -> None:
-    """Draw a map (y, x) with a colour bar; label: of the bar, with the unit."""
-    axes.grid(False)
-    image = axes.imshow(
-        values, cmap=colours, vmin=scale[0], vmax=scale[1], interpolation="none", **more
-    )
-    assert isinstance(axes.figure, Figure)
-    bar = axes.figure.colorbar(image, ax=axes, fraction=0.05, pad=0.03)
-    bar.outline.set_visible(False)
-    bar.set_label(label, color=FAINT, fontsize=9)
-    bar.ax.tick_params(colors=FAINT, labelsize=9)
 
 
 def plain_log_ticks(axes: Axes) -> None:
