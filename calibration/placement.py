@@ -136,7 +136,7 @@ def designed_placement(camera: Camera) -> Placement:
 
 
 def described_pupil(camera: Camera) -> Pupil | None:
-    """Return the pupil of the camera's lens; None where its description has none."""
+    """Return the pupil of the camera's lens; None for a lens that is described without a pupil."""
     return getattr(camera.lens, "pupil", None)
 
 

@@ -1,9 +1,8 @@
 """Whether the lens's pupil is round, and how large: from the views' light, as whiteboards show it.
 
-Their shares of the light, measured without a belief about them, are l (sum 1, covariance C). A
-pupil that leaves o of them open (shares, sum 1) foretells them but for what a bench may have beside
-(see `placement.Tolerances`): weights of the aperture and a falloff f towards its rim. With P what
-keeps the sum,
+Their shares of the light, measured without a prior, are l (sum 1, covariance C). A pupil predicts
+shares o (sum 1). The bench's tolerances (see `placement.Tolerances`) add to the difference: weights
+of the aperture, and a falloff f towards its rim. With P the projection that keeps the sum,
 
     residual r = l - o,    P = 1 - o (1 ... 1)
     V = C + P (diag(o weight)^2 + f^2 (o far)(o far)^T) P^T + stray^2

@@ -72,8 +72,8 @@ STRIPS_PER_CELL, FEWEST_STRIPS, MOST_STRIPS = 6.0, 4, 12
 of 25 mm behind 5 x 5 views of 5 mm, fitted to whiteboards of every view, is then 0.04 % off; with 4
 and 9 strips a cell 0.06 and 0.03 %, in the same time but for a tenth."""
 PUPIL_STEPS = {"pupil_x_um": 100.0, "pupil_y_um": 100.0, "pupil_share": 8e-3}
-"""Of differences by the pupil's parameters: of the order of the lines by which views are cut (see
-`emmc_rig.model.pupil`), whose steps smaller ones would see: 10 um are 5 % off."""
+"""Of central differences by the pupil's parameters. Smaller differences resolve the lines by which
+`emmc_rig.model.pupil` cuts views: with 16 lines a strip, 10 um made the slopes 5 % wrong."""
 OF_BOX = ("share", "x_um", "y_um", "width", "height")
 """What follows the pupil: width and height as places of their squares among the tables' widths."""
 TAILS = 4.0
