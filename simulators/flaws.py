@@ -15,6 +15,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter
 
 from emmc_rig.model.noise import SensorNoise
+from emmc_rig.model.pupil import Pupil
 
 Array = NDArray[np.floating]
 DUST_GRAIN = 6
@@ -37,7 +38,8 @@ class OpticsFlaws:
     microlens_power: a pixel's response falls as that power of the cosine between the ray and its
     microlens' axis; chief_ray_error: share of the chief ray's slope by which that axis misses it.
     diffraction: at the mask's edges (angular spectrum, from mask to sensor). colour_blur_um:
-    standard deviation of the mask's edges in red, green and blue light.
+    standard deviation of the mask's edges in red, green and blue light. pupil: what the real lens
+    leaves open; None: what the camera describes.
     """
 
     aperture_spread: float = 0.0
@@ -51,6 +53,7 @@ class OpticsFlaws:
     chief_ray_error: float = 0.0
     diffraction: bool = False
     colour_blur_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pupil: Pupil | None = None
     seed: int = 1
 
     def aperture_weights(self, views: tuple[int, int]) -> NDArray[np.float64]:

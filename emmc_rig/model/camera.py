@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -539,17 +539,24 @@ def pixel_light(camera: Camera, size: tuple[int, int]) -> NDArray[np.float32]:
     return colours * k**2
 
 
+class _Box(NamedTuple):
+    """A box of a view's opening: its share of the view's cell, its place on the y and x axis."""
+
+    share: float
+    down: int
+    across: int
+
+
 @dataclass(frozen=True, eq=False)
 class _Field:
     """A part of the picture and the openings that its pixels see: of all samples, or by a knot.
 
-    axes: along y and x; one opening of each for a box. boxes: by view, (share, opening along y,
-    opening along x). open: shares of all views together. rows, columns: of the picture. blend:
-    (y, x), how much the part counts at its samples; 1: wholly.
+    boxes: of the views that are open. open: shares of all views together. rows, columns: of the
+    picture. blend: (y, x), how much the part counts at its samples; 1: wholly.
     """
 
     axes: tuple[_Axis, _Axis]
-    boxes: dict[tuple[int, int], list[tuple[float, int, int]]]
+    boxes: dict[tuple[int, int], list[_Box]]
     open: float
     rows: slice
     columns: slice
@@ -588,7 +595,7 @@ def _fields(camera: Camera, size: tuple[int, int]) -> list[_Field]:
         return found
 
     return [
-        _field(camera, axes, (x_um, y_um), rows, columns, np.float32(np.outer(down, across)))
+        _field(camera, axes, (x_um, y_um), rows, columns, np.outer(down, across).astype(np.float32))
         for y_um, (rows, down) in zip(knots[0], tents(axes[0], knots[0]), strict=True)
         for x_um, (columns, across) in zip(knots[1], tents(axes[1], knots[1]), strict=True)
         if down.size and across.size
@@ -609,20 +616,19 @@ def _field(
     """
     found = camera._openings(pixel_um)
     shares = found.shares(camera.views)
-    boxes: dict[tuple[int, int], list[tuple[float, int, int]]] = {}
+    boxes: dict[tuple[int, int], list[_Box]] = {}
     cut = []
     for v, u in np.argwhere(shares >= LEAST_SHARE):
         parts = found.of_view(v, u)
         if len(parts) == 1:
-            boxes[v, u] = [(float(found.share[parts[0]]), v, u)]
+            boxes[v, u] = [_Box(float(found.share[parts[0]]), v, u)]
             continue
         parts = parts[found.share[parts] > 0]
-        begin = len(cut)
-        cut.extend(parts)
         boxes[v, u] = [
-            (float(found.share[part]), *(count + begin + place for count in camera.views))
-            for place, part in enumerate(parts)
+            _Box(float(found.share[part]), camera.views[0] + place, camera.views[1] + place)
+            for place, part in enumerate(parts, len(cut))
         ]
+        cut.extend(parts)
     chosen = np.array(cut, dtype=np.intp)
     beside = (found.y_um[chosen], found.x_um[chosen])
     wide = (found.height_um[chosen], found.width_um[chosen])
@@ -678,7 +684,7 @@ def _transmittances(
     fields = _fields(camera, size)
     through = [_through_masks(camera, field, plates, shot) for field in fields]
     pupil = camera.lens.pupil
-    scale: NDArray[np.float32] | float = 1.0
+    scale: NDArray[np.floating] | float = 1.0
     if pupil is not None:
         everything = np.zeros(size, dtype=np.float32)
         for field in fields:
@@ -690,9 +696,9 @@ def _transmittances(
             continue
         total = np.zeros((*size, 3), dtype=np.float32)
         for field, passed in zip(fields, through, strict=True):
-            for share, down, across in field.boxes.get((v, u), ()):
-                blend = np.atleast_2d(np.float32(share * field.blend))[..., None]
-                total[field.rows, field.columns] += blend * passed(down, across)
+            for box in field.boxes.get((v, u), ()):
+                blend = np.atleast_2d(np.float32(box.share * field.blend))[..., None]
+                total[field.rows, field.columns] += blend * passed(box.down, box.across)
         yield v, u, total * scale
 
 

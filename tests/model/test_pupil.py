@@ -82,7 +82,7 @@ def psi_of_rays(camera, pupil, size=SIZE):
             lens.aperture_cell_mm * (view - (count - 1) / 2 + lens.aperture_fill * within)
             for view, count, within in zip((u, v), camera.views[::-1], (along, down), strict=True)
         ]
-        inside = is_open(pupil, *on_lens, at)
+        inside = is_open(pupil, on_lens[0], on_lens[1], at)
         passed = np.repeat(inside[..., None], 3, axis=2).astype(float)
         for plate in plates:
             ratio = plate.distance_mm / lens.distance_mm
