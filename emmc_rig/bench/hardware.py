@@ -225,6 +225,12 @@ def default_pupil(camera: Camera) -> Pupil | None:
     return Pupil(diameter_mm=DEFAULT_PUPIL_OF_VIEWS * whole_pupil(camera).diameter_mm)
 
 
+def with_simulated_pupil(camera: Camera) -> Camera:
+    """Return the camera, described with the pupil of the lens that simulates it by default."""
+    lens = camera.lens.model_copy(update={"pupil": default_pupil(camera)})
+    return camera.model_copy(update={"lens": lens})
+
+
 def simulated_rig(
     camera: Camera,
     fine_scene: NDArray[np.float32] | Callable[[float], NDArray[np.float32]],

@@ -189,6 +189,10 @@ class Camera(Settings):
         """Return which views (v, u) lie in the lens's pupil, if only in part."""
         return self.view_shares() >= LEAST_SHARE
 
+    def open_views(self) -> float:
+        """Return how many whole views pass as much light as all of them behind the pupil."""
+        return float(self.view_shares().sum())
+
     def _openings(self, pixel_um: tuple[float, float] = (0.0, 0.0)) -> Openings:
         """Return the boxes of the views' openings that a pixel at (x, y) from the axis sees."""
         lens = self.lens
@@ -322,15 +326,17 @@ class Camera(Settings):
 
     def _narrow_views(self) -> list[str]:
         """Return which views are wholly outside of the lens's pupil, and which open by a part."""
-        shares = self.view_shares()
-        outside = names_of_views(~self.views_measured())
-        narrow = [
-            f"view ({v}, {u}) {100 * shares[v, u]:.0f} % open"
-            for v, u in np.argwhere(self.views_measured() & (shares < NARROW_SHARE))
+        measured, shares = self.views_measured(), self.view_shares()
+        outside = names_of_views(~measured)
+        percent = np.round(100 * shares)
+        narrow = measured & (shares < NARROW_SHARE)
+        parts = [
+            f"{names_of_views(narrow & (percent == each))} {each:.0f} % open"
+            for each in np.unique(percent[narrow])
         ]
         lines = [f"{outside} outside of the lens's pupil: not measured"] if outside else []
-        if narrow:
-            lines.append(f"{', '.join(narrow)} in the lens's pupil: less light, more noise")
+        if parts:
+            lines.append(f"{'; '.join(parts)} in the lens's pupil: less light, more noise")
         return lines
 
 
@@ -369,11 +375,25 @@ def load_camera(path: Path) -> Camera:
     return camera.model_copy(update={"masks": masks})
 
 
-def camera_of(psi: ImagingMatrix) -> Camera:
+def camera_of(psi: PsiLayout) -> Camera:
     """Return the camera that a Psi says it is of; raises SensingError where that is no camera."""
     source = "the imaging matrix's camera"
     described = parse_json(psi.camera_json, source, SensingError)
     return validated(Camera, described, source, SensingError)
+
+
+def measured_views(psi: PsiLayout) -> NDArray[np.bool_]:
+    """Return which views (v, u) a Psi measures: those that its camera's pupil leaves open.
+
+    Of a Psi without camera, those with coefficients other than 0.
+    """
+    if psi.camera_json:
+        return camera_of(psi).views_measured()
+    if isinstance(psi, ImagingMatrix):
+        return np.array(
+            [[psi.weights[:, v, u].any() for u in range(psi.views[1])] for v in range(psi.views[0])]
+        )
+    return np.ones(psi.views, dtype=bool)
 
 
 def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
