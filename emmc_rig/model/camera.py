@@ -35,7 +35,7 @@ from emmc_rig.model.pupil import LEAST_SHARE, Openings, Pupil, cell_openings
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import Settings, validated
-from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxis, grid_name
+from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxis, grid_name, view_names
 
 SHORTEST, LONGEST = 1e-6, 1e9
 """Of lengths (um or mm) and seconds: beyond them a unit was mistaken."""
@@ -327,23 +327,17 @@ class Camera(Settings):
     def _narrow_views(self) -> list[str]:
         """Return which views are wholly outside of the lens's pupil, and which open by a part."""
         measured, shares = self.views_measured(), self.view_shares()
-        outside = names_of_views(~measured)
+        outside = view_names(np.argwhere(~measured))
         percent = np.round(100 * shares)
         narrow = measured & (shares < NARROW_SHARE)
         parts = [
-            f"{names_of_views(narrow & (percent == each))} {each:.0f} % open"
+            f"{view_names(np.argwhere(narrow & (percent == each)))} {each:.0f} % open"
             for each in np.unique(percent[narrow])
         ]
         lines = [f"{outside} outside of the lens's pupil: not measured"] if outside else []
         if parts:
             lines.append(f"{'; '.join(parts)} in the lens's pupil: less light, more noise")
         return lines
-
-
-def names_of_views(chosen: NDArray[np.bool_]) -> str:
-    """Return the chosen views (v, u) by name: "view (0, 0)", "views (0, 0), (0, 4)"; "": none."""
-    names = ", ".join(f"({v}, {u})" for v, u in np.argwhere(chosen))
-    return names and f"view{'s' * bool(chosen.sum() > 1)} {names}"
 
 
 def shipped_camera_files() -> dict[str, Path]:
@@ -383,17 +377,17 @@ def camera_of(psi: PsiLayout) -> Camera:
 
 
 def measured_views(psi: PsiLayout) -> NDArray[np.bool_]:
-    """Return which views (v, u) a Psi measures: those that its camera's pupil leaves open.
-
-    Of a Psi without camera, those with coefficients other than 0.
-    """
+    """Return which views (v, u) a Psi measures: its camera's pupil leaves them open, some light
+    of theirs reaches a pixel."""
+    measured = np.ones(psi.views, dtype=bool)
     if psi.camera_json:
-        return camera_of(psi).views_measured()
+        described = camera_of(psi)
+        if described.views == psi.views:
+            measured &= described.views_measured()
     if isinstance(psi, ImagingMatrix):
-        return np.array(
-            [[psi.weights[:, v, u].any() for u in range(psi.views[1])] for v in range(psi.views[0])]
-        )
-    return np.ones(psi.views, dtype=bool)
+        for v, u in np.argwhere(measured):
+            measured[v, u] = psi.weights[:, v, u].any()
+    return measured
 
 
 def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
