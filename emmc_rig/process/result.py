@@ -398,7 +398,7 @@ class OpenedResult(Result):
 
 
 def _measured(outside: Any, views: tuple[int, ...]) -> NDArray[np.bool_] | None:
-    """Return which views are measured, of those that metrics.json says are not; None: all."""
+    """Return which views are measured; None: all. outside: `views_not_measured` of metrics.json."""
     if not outside:
         return None
     measured = np.ones(views, dtype=bool)

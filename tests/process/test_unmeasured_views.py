@@ -53,7 +53,7 @@ def test_every_method_fills_in_the_views_that_no_light_comes_from(psi, scene, me
     assert np.isfinite(result.light_field).all()
     corners = [result.light_field[v, u] for v, u in CORNERS]
     true = [scene[v, u] for v, u in CORNERS]
-    # They follow from the views beside them, not from nothing.
+    # The neighbouring views determine the corners.
     assert psnr_db(np.array(corners), np.array(true)) > 14
     assert result.metrics()["views_not_measured"] == CORNERS
     inside = measured_views(psi)
