@@ -222,7 +222,8 @@ def default_pupil(camera: Camera) -> Pupil | None:
     apertures = camera.view_axes == ANGLES and camera.lens.aperture_fill > 0
     if described is not None or DEFAULT_PUPIL_OF_VIEWS is None or not apertures:
         return described
-    return Pupil(diameter_mm=DEFAULT_PUPIL_OF_VIEWS * whole_pupil(camera).diameter_mm)
+    side_mm = whole_pupil(camera).diameter_mm
+    return Pupil(diameter_mm=round(DEFAULT_PUPIL_OF_VIEWS * side_mm, 6))
 
 
 def with_simulated_pupil(camera: Camera) -> Camera:

@@ -130,8 +130,10 @@ class SimulatedAxes(AnyRig):
     @field_validator("pupil", mode="before")
     @classmethod
     def _pupil_of_settings(cls, pupil: object) -> object:
-        if not isinstance(pupil, Mapping):
+        if pupil in (None, "round", "none"):
             return pupil
+        if not isinstance(pupil, (Mapping, Pupil)):
+            raise ValueError(f"{pupil}: use round, none, or a lens such as {{diameter_mm: 27.5}}")
         try:
             return Pupil.model_validate(pupil)
         except ValidationError as fault:  # of a union, pydantic would list the faults of each part
