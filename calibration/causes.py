@@ -47,6 +47,8 @@ LONE = 0.9
 """Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
 LAMP, STAGE, CREEP, LENS = "lamp", "stage", "creep", "lens"
 HOLES, HANDS, EXPOSURE, PLATE, TURN = "holes", "hands", "exposure", "plate", "turn"
+OF_PLATE = (HANDS, PLATE, TURN)
+"""Causes by which pinholes stand off their holes."""
 SHIFTING = (STAGE, HANDS, HOLES, PLATE, TURN)
 """Causes that aberrations of the views imitate."""
 
@@ -89,13 +91,62 @@ class OwnInformation(NamedTuple):
     """(own,): gradient of the log likelihood, at all of them 0."""
 
 
-class Geometry(NamedTuple):
-    """Of the camera: what a plate's place makes of the mask's shadow."""
+class Light(NamedTuple):
+    """The light through a pinhole."""
+
+    share: float
+    """Of the light through the hole on its place."""
+    x_um: float
+    """Of its middle, from the middle of the view."""
+    y_um: float
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Of the camera: what a plate's place makes of the mask's shadow.
+
+    ratio: rho = d / D. cell_um: side of a view and of a hole. views: (v, u).
+    """
 
     ratio: float
-    """rho = d / D."""
     cell_um: float
-    """Between the middles of two views."""
+    views: tuple[int, int]
+
+    def light(self, view: tuple[int, int], x_um: float, y_um: float) -> Light:
+        """Return the light through a pinhole that stands (x, y) off its view's hole.
+
+        What lies beyond the outermost views passes none.
+        """
+        lengths, middles = [], []
+        for place, count, off_um in zip(view, self.views, (y_um, x_um), strict=True):
+            middle_um, half_um = (place - (count - 1) / 2) * self.cell_um, count * self.cell_um / 2
+            begin_um = max(middle_um + off_um - self.cell_um / 2, -half_um)
+            end_um = min(middle_um + off_um + self.cell_um / 2, half_um)
+            lengths.append(max(end_um - begin_um, 0.0) / self.cell_um)
+            middles.append((begin_um + end_um) / 2 - middle_um)
+        return Light(lengths[0] * lengths[1], middles[1], middles[0])
+
+    def slopes(self, board: Board, off_um: Array) -> NDArray[np.float64]:
+        """Return the slopes of a whiteboard's own parameters by its pinhole's place, (OWN, 2).
+
+        off_um: (x, y) of the pinhole from its hole, about which the slopes are taken.
+        """
+        if board.views_open.sum() > 1:
+            return np.array([[0.0, 0.0], [-self.ratio, 0.0], [0.0, -self.ratio]])
+        v, u = np.argwhere(board.views_open)[0].tolist()
+        step_um, found = self.cell_um / 1000, np.empty((OWN, 2))
+        for axis in range(2):
+            by = np.eye(2)[axis] * step_um
+            less, more = (self.light((v, u), *(off_um + sign * by)) for sign in (-1, 1))
+            middle = self.light((v, u), *off_um)
+            found[:, axis] = np.array(
+                [
+                    (more.share - less.share) / max(middle.share, 0.1),
+                    -self.ratio * (more.x_um - less.x_um),
+                    -self.ratio * (more.y_um - less.y_um),
+                ]
+            ) / (2 * step_um)
+        return found
 
 
 def through_pinhole(board: Board) -> bool:
@@ -103,11 +154,17 @@ def through_pinhole(board: Board) -> bool:
     return not bool(board.views_open.all())
 
 
-def possible_causes(boards: Sequence[Board], geometry: Geometry) -> list[Cause]:
-    """Return the causes that these whiteboards could tell from a perfect bench."""
+def possible_causes(
+    boards: Sequence[Board], geometry: Geometry, off_um: Array | None = None
+) -> list[Cause]:
+    """Return the causes that these whiteboards could tell from a perfect bench.
+
+    off_um: (board, 2), x and y by which pinholes stand off their holes as far as that is known:
+    one that is pushed beyond the outermost views loses light, and its middle moves half as far.
+    """
     count = len(boards)
+    off_um = np.zeros((count, 2)) if off_um is None else off_um
     few = np.array([through_pinhole(board) for board in boards])
-    loose = np.array([board.loose for board in boards])
     moved = MOVED_STEPS * LEAST_MOVED_UM
     causes = [
         Cause(LAMP, _own_columns(np.eye(count), 0), BRIGHTNESSES),
@@ -119,34 +176,58 @@ def possible_causes(boards: Sequence[Board], geometry: Geometry) -> list[Cause]:
         causes.append(Cause(CREEP, _moves(when[:, None]), 2 * moved))
     if few.sum() == 0:
         return causes
-    ratio, on_plate = geometry.ratio, moved / geometry.ratio
-    each = np.eye(count)[:, few]
-    by_hand = np.eye(count)[:, loose] if loose.any() else each
-    causes.append(Cause(HANDS, -ratio * _moves(by_hand), on_plate))
+    # By the place of every pinhole, x and y: (board, OWN, board of the pinhole, 2).
+    slopes = np.zeros((count, OWN, count, 2))
+    for index in np.flatnonzero(few):
+        slopes[index, :, index] = geometry.slopes(boards[index], off_um[index])
+    by_place = slopes.reshape(count * OWN, count, 2)
+    loose = np.array([board.loose for board in boards])
+    by_hand = few & loose if loose.any() else few
+    on_plate = moved / geometry.ratio
+    causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate))
     if few.sum() > 1:
-        causes.append(Cause(HOLES, _own_columns(each, 0), BRIGHTNESSES))
+        causes.append(Cause(HOLES, _own_columns(np.eye(count)[:, few], 0), BRIGHTNESSES))
     if few.all():
         return causes
     common = few[:, None].astype(np.float64)
     causes.append(Cause(EXPOSURE, _own_columns(common, 0), BRIGHTNESSES))
-    causes.append(Cause(PLATE, -ratio * _moves(common), on_plate))
-    if few.sum() > 1:
-        v_um, u_um = (
-            np.array([_middle(board, axis) for board in boards]) * geometry.cell_um
-            for axis in (0, 1)
-        )
-        far_um = float(np.hypot(v_um, u_um)[few].max())
-        turned = np.zeros((count, OWN))
-        turned[few, 1], turned[few, 2] = ratio * v_um[few], -ratio * u_um[few]
-        if far_um > 0:
-            causes.append(Cause(TURN, turned.reshape(-1, 1), on_plate / far_um))
+    causes.append(Cause(PLATE, by_place.sum(axis=1), on_plate))
+    places_um = plate_places_um(boards, geometry.cell_um)
+    far_um = float(np.hypot(*places_um.T)[few].max())
+    if few.sum() > 1 and far_um > 0:
+        turned = np.einsum("obk,bk->o", by_place, turned_by(places_um))
+        causes.append(Cause(TURN, turned[:, None], on_plate / far_um))
     return causes
 
 
-def _middle(board: Board, axis: int) -> float:
-    """Return where the middle of a whiteboard's open views lies, in views from the axis."""
-    place = np.argwhere(board.views_open)[:, axis].mean()
-    return float(place - (board.views_open.shape[axis] - 1) / 2)
+def turned_by(places_um: Array) -> NDArray[np.float64]:
+    """Return by how much holes move, (board, 2), for each rad that the plate turns from x to y."""
+    return np.stack([-places_um[:, 1], places_um[:, 0]], axis=1)
+
+
+def plate_places_um(boards: Sequence[Board], cell_um: float) -> NDArray[np.float64]:
+    """Return where the middle of every whiteboard's open views lies, x and y: (board, 2)."""
+    middles = np.array([np.argwhere(board.views_open).mean(axis=0) for board in boards])
+    views = np.array(boards[0].views_open.shape)
+    return (middles - (views - 1) / 2)[:, ::-1] * cell_um
+
+
+def pinholes_off_um(
+    found: Sequence[FoundCause], boards: Sequence[Board], cell_um: float
+) -> NDArray[np.float64]:
+    """Return how far pinholes stand off their holes by the causes found, x and y: (board, 2)."""
+    few = np.array([through_pinhole(board) for board in boards])
+    loose = np.array([board.loose for board in boards])
+    by_hand = few & loose if loose.any() else few
+    off_um = np.zeros((len(boards), 2))
+    for cause in found:
+        if cause.name == HANDS:
+            off_um[by_hand] += np.reshape(cause.size, (-1, 2))
+        elif cause.name == PLATE:
+            off_um[few] += cause.size
+        elif cause.name == TURN:
+            off_um += few[:, None] * cause.size[0] * turned_by(plate_places_um(boards, cell_um))
+    return off_um
 
 
 def _own_columns(of_boards: Array, which: int) -> NDArray[np.float64]:
@@ -287,7 +368,7 @@ def doubt_lone_move(found: Sequence[FoundCause], boards: Sequence[Board]) -> lis
     def doubted(cause: FoundCause) -> FoundCause:
         if cause.name != HANDS or STAGE in cause.instead:
             return cause
-        moves2 = np.square(np.reshape(cause.size, (2, -1))).sum(axis=0)
+        moves2 = np.square(np.reshape(cause.size, (-1, 2))).sum(axis=1)
         lone = moves2.max() > LONE * moves2.sum()
         return replace(cause, instead=(*cause.instead, STAGE)) if lone else cause
 

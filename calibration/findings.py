@@ -320,7 +320,7 @@ def _exposure_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: 
 
 
 def _hands_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    off_um = np.hypot(*np.reshape(cause.size, (2, -1)))
+    off_um = np.hypot(*np.reshape(cause.size, (-1, 2)).T)
     if off_um.max(initial=0.0) * mask.distance_um / mask.lens_um < LEAST_MOVE_UM:
         return ""
     return f"pinholes stand up to {off_um.max():.0f} um off their holes: corrected for"

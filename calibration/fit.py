@@ -39,12 +39,16 @@ from scipy.ndimage import correlate1d
 from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadiness2
 from emmc_rig.calibration.causes import (
     CREEP,
+    EXPOSURE,
     HANDS,
+    HOLES,
     LAMP,
     LEAST_MOVED_UM,
     LEAST_OWN,
     LENS,
+    OF_PLATE,
     OWN,
+    PLATE,
     SHIFTING,
     STAGE,
     Cause,
@@ -54,6 +58,7 @@ from emmc_rig.calibration.causes import (
     covariance_of,
     doubt_lone_move,
     find_causes,
+    pinholes_off_um,
     possible_causes,
     through_pinhole,
     with_lens,
@@ -94,8 +99,8 @@ LOOSE_UM = 0.5
 """By which a hand's pinhole seems to move the mask, at first: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
 """Of the width of the prior of glass, which a displaced pinhole imitates."""
-CAUSE_ROUNDS = 2
-"""The causes depend on the fit and the fit on the causes: so many times in turn."""
+CAUSE_ROUNDS = 3
+"""The causes depend on the fit and the fit on the causes: so many times in turn at most."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -197,8 +202,9 @@ class Fit:
         return float(np.sqrt(self.covariance[index, index]))
 
 
-FIRST_WIDTHS = {LAMP: 2e-3, STAGE: 0.2}
-"""Of what whiteboards have of their own, before their causes are known."""
+FIRST_WIDTHS = {LAMP: 2e-3, STAGE: 0.2, HOLES: 0.05, EXPOSURE: 0.05}
+"""Of what whiteboards have of their own, before their causes are known; pinholes beside: LOOSE_UM.
+A narrow width would bend the placement, and bent causes would be found there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,6 +269,18 @@ class _BenchPrior:
     own2: NDArray[np.float64]
     causes: Mapping[str, Cause]
     always: tuple[str, ...]
+    geometry: Geometry
+
+    def about(
+        self, found: Sequence[FoundCause], own: NDArray[np.float64], boards: Sequence[Board]
+    ) -> _BenchPrior:
+        """Return the prior with causes about where pinholes stand by those found."""
+        known = [cause for cause in found if cause.name in self.causes]
+        causes, none = list(self.causes.values()), np.zeros((own.size, own.size))
+        sized = with_sizes(known, causes, own.ravel(), none, self.own2)
+        off_um = pinholes_off_um(sized, boards, self.geometry.cell_um)
+        again = possible_causes(boards, self.geometry, off_um)
+        return replace(self, causes={cause.name: cause for cause in again})
 
     def with_widths(self, widths: Mapping[str, float]) -> _Prior:
         """Return the prior of all parameters; widths: of the causes, by name."""
@@ -275,7 +293,8 @@ class _BenchPrior:
 
     def first_widths(self, ratio: float) -> dict[str, float]:
         """Return the widths before the causes are known."""
-        return FIRST_WIDTHS | dict.fromkeys(self.always, LOOSE_UM / ratio)
+        widths = FIRST_WIDTHS | dict.fromkeys((HANDS, PLATE), LOOSE_UM / ratio)
+        return {name: width for name, width in widths.items() if name in self.causes}
 
 
 def _bench_prior(
@@ -293,9 +312,10 @@ def _bench_prior(
     own2 = np.tile(np.square(LEAST_OWN), (len(boards), 1))
     own2[:, 0] += unsteadiness2(boards) / np.array([board.repeats for board in boards])
     ratio = mask.distance_um / mask.lens_um
-    causes = possible_causes(boards, Geometry(ratio, mask.aperture_cell_um))
-    known = {cause.name: cause for cause in causes}
-    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, (HANDS,) if loose else ())
+    geometry = Geometry(ratio, mask.aperture_cell_um, mask.views)
+    known = {cause.name: cause for cause in possible_causes(boards, geometry)}
+    always = (HANDS,) if loose else ()
+    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry)
 
 
 def _robust_spread(residuals: Sequence[Array]) -> float:
@@ -723,7 +743,14 @@ def fit_placement(
     for samples in _widening_samples(boards, mask, settings):
         descent = _descend(mask, _point(mask, state, samples), samples, prior, settings)
         state, steps = descent.point.state, steps + descent.steps
-    for _ in range(CAUSE_ROUNDS):
+    found: list[FoundCause] = []
+    for turn in range(CAUSE_ROUNDS):
+        off_plate = any(cause.name in OF_PLATE for cause in found)
+        if turn > 1 and not off_plate:
+            break
+        if off_plate:
+            # Where pinholes stand decides how much of their light the aperture's edge cuts.
+            bench = bench.about(found, descent.point.state.own, boards)
         found = _find_causes(mask, descent.point, samples, bench)
         prior = bench.with_widths(_own_widths(found, mask.distance_um / mask.lens_um))
         descent = _descend(mask, descent.point, samples, prior, settings)

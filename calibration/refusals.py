@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.calibration.board_angle import BoardAngle
 from emmc_rig.calibration.boards import Board, BoardSet, Sample
-from emmc_rig.calibration.causes import CREEP, HANDS, PLATE, TURN, through_pinhole
+from emmc_rig.calibration.causes import CREEP, OF_PLATE, through_pinhole
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.fit import Fit
@@ -234,15 +234,15 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> None:
             f"{abs(off[worst]):.1f} times as far from the design as benches are: these whiteboards "
             "are of another camera or mask, or its description is wrong"
         )
+    _refuse_wrong_holes(fit, boards, mask)
     creep = next((cause for cause in fit.causes if cause.name == CREEP), None)
     if creep is not None and np.hypot(*creep.size) > ALIKE_UM:
         raise CalibrationError(
             f"the mask drifts: by ({creep.size[0]:+.1f}, {creep.size[1]:+.1f}) um over the "
             "whiteboards; fasten it, let the bench settle, and capture all again"
         )
-    _refuse_wrong_holes(fit, boards, mask)
     # Where the plate explains what pinholes show, the mask has not moved.
-    off_plate = any(cause.name in (HANDS, PLATE, TURN) for cause in fit.causes)
+    off_plate = any(cause.name in OF_PLATE for cause in fit.causes)
     half_hole_um = mask.aperture_cell_um * mask.distance_um / mask.lens_um / 2
     for check, board in zip(fit.boards, boards, strict=True):
         alike = sum(np.allclose(board.stage_um, other.stage_um) for other in boards) > 1
