@@ -241,8 +241,9 @@ def _calibrated(
     sheet = None
     if sensor:
         watcher.begin("sensor", None)
-        white_dn = camera_of(session).sensor.noise.white_level_dn
-        sheet = characterise(*sensor_pairs(session), white_dn)
+        planned = camera_of(session).sensor
+        white_dn, monochrome = planned.noise.white_level_dn, planned.cfa == "mono"
+        sheet = characterise(*sensor_pairs(session), white_dn, monochrome)
     scale = scale_of(chosen, session, shots)
     inputs = {**psi_inputs(session), "method": method}
     return SessionCalibration(outcome, chosen, scale, metrics, sheet, inputs)
