@@ -32,6 +32,8 @@ QUANTISATION = 1 / 12
 """Variance of rounding to whole steps, in squares of the step."""
 NEIGHBOURING_SHARE = 0.01
 """Of the pixels, that lie beside the gaps between values where noise shows the steps."""
+USUAL_SHARE = 0.9
+"""Of the gaps between values, that are of one width where steps are: the rest lack a value."""
 HOT_DEVIATIONS = 10.0
 """Robust ones of all pixels, from which on a dark pixel is hot: of normal noise none is."""
 
@@ -144,9 +146,9 @@ def average(
 def step_of_values(frames: Iterable[NDArray[np.uint16]]) -> float:
     """Return the step in DN between the values that frames (y, x) of one level use.
 
-    The mean gap between values in use, weighted by the rarer value of each two: wide gaps among
+    The usual gap between values in use, weighted by the rarer value of each two: wide gaps among
     the few values far off do not count. 16 where 12 bits stand left-aligned in 16, whatever the
-    black level; not whole where a digital gain was rounded. Where nearly all pixels read alike,
+    black level. Of gaps of two widths, as a digital gain makes by rounding, their mean. Where nearly all pixels read alike,
     the least gap; NaN where all do. Where noise is so wide that values are left out by chance, the
     step comes out too large, by far less than the noise.
     """
@@ -160,7 +162,10 @@ def step_of_values(frames: Iterable[NDArray[np.uint16]]) -> float:
         return float(gaps.min()) if len(gaps) else np.nan
     order = np.argsort(gaps)
     half = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)
-    near = gaps <= 2 * gaps[order[half]]
+    usual = gaps[order[half]]
+    near = gaps <= 2 * usual
+    if weights[gaps == usual].sum() > USUAL_SHARE * weights[near].sum():
+        return float(usual)
     return float(np.average(gaps[near], weights=weights[near]))
 
 

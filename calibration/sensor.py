@@ -81,6 +81,8 @@ CODED_STEPS, CODED_VARIANCE = 1.5, 0.01
 """Of the dark's step, and of the variance: a flat's larger step and its rounding show a code."""
 NOTABLE_BEND, NOTABLE_LAG = 0.01, 0.001
 """From which on figures are marked; a smaller bend or lag only makes them less sure."""
+LEAST_SURE_LAG = 0.003
+"""Deviation of a lag, up to which it counts: under a lamp that flickers nothing is known of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -591,10 +593,12 @@ def _deviations(
 
     of_mean_dn, of_variance_dn2 = _rounding(points)
     darks, span_s = len(frames.dark.exposure_s), float(np.ptp(frames.dark.exposure_s))
-    for error_dn in (of_mean_dn, effects.drift.size):
+    for error_dn in (of_mean_dn, effects.drift.left_open):
         add("black_level_dn", error_dn)
         add("dark_current_electrons_per_s", error_dn / span_s / gain)
         add("saturation_dn", error_dn)
+    # Drift of one sign adds up till the last flat, even the drift that noise hides.
+    add("saturation_dn", 2 * len(frames.flat.exposure_s) * effects.drift.size)
     add("read_noise_electrons", of_variance_dn2 / (2 * max(read_dn, 1e-9)) / gain)
     saturation_dn, step_dn = points.saturation
     add("saturation_dn", step_dn / np.sqrt(3))
@@ -639,7 +643,7 @@ def _open_of_gain(points: _Points, effects: _Effects, darks: int) -> float:
     lever[below] = line.lever[:-1]
     # A signal that is too large by d is as a variance too small by K d.
     by_level = lever.sum(axis=1)
-    of_drift = effects.drift.size * np.hypot(
+    of_drift = effects.drift.left_open * np.hypot(
         np.sqrt(np.sum(by_level**2) / 2), by_level.sum() / np.sqrt(2 * darks)
     )
     loss = 3 / points.saturation[0] * float(np.sum(lever * points.signal**2))
@@ -647,7 +651,7 @@ def _open_of_gain(points: _Points, effects: _Effects, darks: int) -> float:
     of_shared = shared.deviation if shared.significant else shared.left_open
     # The noise of two frames that share a little of their charge differs by less than K s, by the
     # share of each and their covariance.
-    of_lag = 3 * lag.left_open if lag.significant else 0.0
+    of_lag = 3 * lag.left_open if lag.deviation < LEAST_SURE_LAG else 0.0
     parts = (of_drift, of_shared, of_lag, loss * effects.bend.left_open)
     return float(np.sqrt(np.sum(np.square(parts))))
 
@@ -702,7 +706,8 @@ def _departures(effects: _Effects) -> list[Remark]:
             f"the values' steps grow to {effects.coded:.3g} DN with the light: save the frames "
             "without lossy compression"
         )
-        found.append(Remark((*OF_GAIN, "linearity_error_percent", "saturation_dn"), words))
+        names = "saturation_dn", "linearity_error_percent", "black_level_dn"
+        found.append(Remark((*OF_GAIN, *names), words))
     if effects.shared.significant:
         words = (
             f"corrected for {effects.shared.size:.1%} of the noise that neighbouring pixels share"

@@ -53,17 +53,14 @@ NONE = Effect(0.0, 0.0, 0)
 def black_drift_dn(dark: Levels) -> Effect:
     """Return the standard deviation of the black level from frame to frame, DN.
 
-    Of two frames' means that differ by c: drift^2 = <c^2> / 2. Its own noise is that of the
-    blocks of rows, which differ in their rows' noise as well.
+        drift^2 = <(second mean - first mean)^2> / 2, with the noise of the means in it.
+
+    The noise is that of blocks of rows, by which the rows' own flicker counts.
     """
     blocks = np.nanmean(dark.change, axis=(2, 3))
-    change, noise = blocks.mean(axis=1), blocks.std(axis=1, ddof=1) / np.sqrt(BLOCKS)
-    worst = int(np.argmax(np.abs(change) / np.maximum(noise, 1e-12)))
-    drift2 = float(np.mean(change**2 - noise**2)) / 2
-    size = float(np.sqrt(max(drift2, 0.0)))
-    # As significant as the pair that shows the most.
-    surest = abs(change[worst]) / max(noise[worst], 1e-12)
-    return Effect(size, size / surest if surest else 0.0, BLOCKS - 1)
+    drift2 = np.mean(blocks.mean(axis=1) ** 2) / 2
+    noise2 = np.mean(blocks.var(axis=1, ddof=1)) / BLOCKS / 2
+    return Effect(float(np.sqrt(drift2)), float(np.sqrt(noise2)), BLOCKS - 1)
 
 
 def lag_and_creep(
