@@ -148,9 +148,9 @@ def step_of_values(frames: Iterable[NDArray[np.uint16]]) -> float:
 
     The usual gap between values in use, weighted by the rarer value of each two: wide gaps among
     the few values far off do not count. 16 where 12 bits stand left-aligned in 16, whatever the
-    black level. Of gaps of two widths, as a digital gain makes by rounding, their mean. Where nearly all pixels read alike,
-    the least gap; NaN where all do. Where noise is so wide that values are left out by chance, the
-    step comes out too large, by far less than the noise.
+    black level. Of gaps of two widths, as a digital gain makes by rounding, their mean. Where
+    nearly all pixels read alike, the least gap; NaN where all do. Where noise is so wide that
+    values are left out by chance, the step comes out too large, by far less than the noise.
     """
     counts = np.zeros(2**16, dtype=np.int64)
     for frame in frames:

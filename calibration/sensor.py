@@ -112,6 +112,21 @@ class Nonuniformity:
         return scale * value, scale * float(max(value - low, high - value)) / 3
 
 
+class SheetRow(NamedTuple):
+    """A quantity in its unit; deviation: the standard one, None of counts and bounds."""
+
+    quantity: str
+    value: float
+    deviation: float | None
+    unit: str
+    remark: str
+
+    @property
+    def title(self) -> str:
+        """The quantity with its remark."""
+        return f"{self.quantity}, {self.remark}" if self.remark else self.quantity
+
+
 class Remark(NamedTuple):
     """A limit of some quantities, by their names: a bound, or an effect outside the model."""
 
@@ -163,18 +178,15 @@ class SensorSheet:
             return max(value, LEAST_NOISE * self.step_dn / self.gain_dn_per_electron)
         return value
 
-    def rows(self) -> list[tuple[str, float, float | None, str]]:
-        """Return (quantity, value, standard deviation or None, unit) for a table."""
+    def rows(self) -> list[SheetRow]:
+        """Return the quantities as rows of a table."""
         found = []
-        for name, (words, unit) in QUANTITIES.items():
+        for name, (quantity, unit) in QUANTITIES.items():
             value = self.between_pixels(name) if name in PATTERNS else float(getattr(self, name))
-            scale, deviation = (
-                100 if unit == "%" and name in PATTERNS else 1,
-                self.deviations.get(name),
-            )
-            remark = self.remark(name)
-            title = f"{words}, {remark}" if remark else words
-            found.append((title, scale * value, scale * deviation if deviation else None, unit))
+            deviation = self.deviations.get(name) or None
+            if name == "prnu":
+                value, deviation = 100 * value, deviation and 100 * deviation
+            found.append(SheetRow(quantity, value, deviation, unit, self.remark(name)))
         return found
 
 

@@ -110,7 +110,7 @@ def test_read_noise_below_the_steps_of_the_converter_is_an_upper_bound():
 
     found = characterise(pairs(DARKS_S, False), pairs(FLATS_S, True), 4095)
     assert found.read_noise_electrons == pytest.approx(0.40 / 0.05, rel=0.05)
-    assert any(row[0].startswith("Temporal dark noise, at most (below") for row in found.rows())
+    assert any(row.title.startswith("Temporal dark noise, at most (below") for row in found.rows())
 
 
 def test_hot_and_dead_pixels_are_those_that_are(sheet):

@@ -137,10 +137,10 @@ def test_bounds_hold_and_are_named_in_the_table():
     ]
     for changes, words in bounds:
         chip = Chip(**changes)
-        rows = {row[0].split(",")[0]: row for row in sheet_of(chip).rows()}
+        rows = {row.quantity: row for row in sheet_of(chip).rows()}
         for name, truth in (("Temporal dark noise", chip.read_noise), ("DSNU", chip.dsnu)):
-            assert words in rows[name][0]
-            value = rows[name][1]
+            assert words in rows[name].remark
+            value = rows[name].value
             assert value < truth if "at least" in words else value > truth
 
 
