@@ -1,4 +1,4 @@
-"""Which Psi to trust: the surest one that predicts every kind of whiteboard to the noise."""
+"""Which Psi to trust: of those that predict every kind of whiteboard to the noise the surest."""
 
 from __future__ import annotations
 
@@ -15,10 +15,14 @@ from emmc_rig.calibration.shadow import Shadow
 from emmc_rig.model.sensing import ImagingMatrix
 
 Array = NDArray[np.floating]
+OPEN = "open aperture"
+"""The kind of held-out whiteboards that judges every route."""
 LARGEST_CHI2 = 1.5
 """Mean squared residual over the variance: what is left is less than the noise."""
-ROUTES = ("combined", "parametric", "mixed", "free")
-"""The surest first, then from the simplest to the freest."""
+ROUTES = ("parametric", "mixed", "combined", "free")
+"""From the simplest to the freest."""
+SURE, LEAST_EXCESS = 5.0, 0.05
+"""Deviations, and share of the noise's variance, by which residuals exceed it by chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,20 +144,29 @@ def _likeliest_excess(board: Board, predicted: Array, spread: Array, unsteady: f
     return light / (light2 + unsteady**-2)
 
 
-def choose(judged: Sequence[HeldOut]) -> tuple[HeldOut, str]:
+def choose(judged: Sequence[HeldOut], stated: Mapping[str, float]) -> tuple[HeldOut, str]:
     """Return the description to use, and why in words.
 
-    Raises CalibrationError with none to choose from.
+    Of those that predict the open whiteboard, which none has fitted, to the noise and what they
+    state, the one that states the least error. stated: relative error that each states of its Psi,
+    by route. Raises CalibrationError with none to choose from.
     """
     if not judged:
         raise CalibrationError("no calibration method gave a Psi: capture whiteboards")
-    known = sorted(judged, key=lambda held: ROUTES.index(held.route))
-    for held in known:
-        if held.chi2 <= LARGEST_CHI2:
-            return held, f"calibration good: {_state_residual(held)}"
-    best = min(known, key=lambda held: held.chi2)
-    return best, (
-        f"calibration doubtful: {_state_residual(best)}; the deviation of Psi includes the residual"
+    known = sorted(judged, key=lambda held: (stated[held.route], ROUTES.index(held.route)))
+    good = [held for held in known if held.chi2 <= LARGEST_CHI2]
+    if not good:
+        best = min(known, key=lambda held: held.chi2)
+        return best, (
+            f"calibration doubtful: {_state_residual(best)}; the deviation of Psi includes the "
+            "residual"
+        )
+    # Of n normal residuals the mean square is 1 to a deviation of sqrt(2 / n).
+    chance = SURE * np.sqrt(2 / max(int(np.count_nonzero(good[0].residual)), 1))
+    sure = [held for held in good if held.groups.get(OPEN, held.chi2) < 1 + chance + LEAST_EXCESS]
+    held = (sure or good)[0]
+    return held, (
+        f"calibration good: {_state_residual(held)}, error stated {stated[held.route]:.2%}"
     )
 
 

@@ -16,8 +16,9 @@ or brighter, by the same share in every whiteboard, whatever the mask casts ther
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -81,28 +82,80 @@ def _grained(mask: ShadowMask) -> ShadowMask:
     return replace(mask, cells=np.ascontiguousarray(cells), cell_um=mask.cell_um / SPLITS)
 
 
+@njit(forceinline=True)
+def _add_influences(window, corners, shares_y, shares_x, weights, start, through, channel):
+    """Add to window (row, column) how much each grain there adds to one pixel's reading.
+
+    corners: (view, 2), first grain of each view; shares: (view, k); weights: (view,). start: (2,),
+    of the window. through: (row, column, 4), what a grain passes.
+    """
+    for view in range(corners.shape[0]):
+        top, left = corners[view]
+        for a in range(shares_y.shape[1]):
+            row, down = top + a, weights[view] * shares_y[view, a]
+            if not 0 <= row < through.shape[0]:
+                continue
+            for b in range(shares_x.shape[1]):
+                column = left + b
+                if 0 <= column < through.shape[1]:
+                    seen = down * shares_x[view, b] * through[row, column, channel]
+                    window[row - start[0], column - start[1]] += seen
+
+
 @njit(cache=True, parallel=True)
 def _influence(corners, shares_y, shares_x, weights, starts, through, channels, out):
     """Set out (n, rows, columns) to how much each grain of a pixel's window adds to its reading.
 
-    corners: (n, view, 2), first grain of each view; shares: (n, view, k); weights: (n, view);
-    starts: (n, 2), of the window; through: (row, column, 4), what a grain passes.
+    starts: (n, 2), of the windows. Others are those of `_add_influences`, (n, ...).
     """
     for n in prange(out.shape[0]):
         out[n] = 0
-        for view in range(corners.shape[1]):
-            top, left = corners[n, view]
-            for a in range(shares_y.shape[2]):
-                for b in range(shares_x.shape[2]):
-                    i, j = top + a - starts[n, 0], left + b - starts[n, 1]
-                    row, column = top + a, left + b
-                    if 0 <= row < through.shape[0] and 0 <= column < through.shape[1]:
-                        out[n, i, j] += (
-                            weights[n, view]
-                            * shares_y[n, view, a]
-                            * shares_x[n, view, b]
-                            * through[row, column, channels[n]]
-                        )
+        _add_influences(
+            out[n],
+            corners[n],
+            shares_y[n],
+            shares_x[n],
+            weights[n],
+            starts[n],
+            through,
+            channels[n],
+        )
+
+
+@njit(cache=True)
+def _add_evidence(footprints, starts, window, through, channels, deviations, residuals, out):
+    """Add to out, gradient and curvature of each grain (row, column), those of n pixels.
+
+    footprints: (corners, shares_y, shares_x, weights), (n, ...), see `_add_influences`. window:
+    scratch, of the size of each. deviations, residuals: (n,). Pixels in turn: they share grains.
+    """
+    corners, shares_y, shares_x, weights = footprints
+    gradient, curvature = out
+    for n in range(len(residuals)):
+        window[:] = 0
+        start = starts[n]
+        _add_influences(
+            window,
+            corners[n],
+            shares_y[n],
+            shares_x[n],
+            weights[n],
+            start,
+            through,
+            channels[n],
+        )
+        for i in range(max(-start[0], 0), min(window.shape[0], through.shape[0] - start[0])):
+            for j in range(max(-start[1], 0), min(window.shape[1], through.shape[1] - start[1])):
+                influence = window[i, j] / deviations[n]
+                gradient[start[0] + i, start[1] + j] -= influence * residuals[n]
+                curvature[start[0] + i, start[1] + j] += influence * influence
+
+
+def _through(shadow: Shadow, shot: int) -> NDArray[np.float64]:
+    """Return what each grain of the mask passes, (row, column, 4)."""
+    placement, cells = shadow.placement, shadow.mask.cells
+    passing = placement.clear - placement.leak
+    return placement.leak + passing * cells[shot % len(cells)].astype(np.float64)
 
 
 def _entries(
@@ -111,17 +164,13 @@ def _entries(
     """Return (pixel, grain) indices into the flat mask and their influences."""
     views_open, stage_um, shot = opening
     corners, shares_y, shares_x, weights = shadow.footprints(pixels, views_open, stage_um)
-    count = shares_x.shape[2]
-    starts = corners.min(axis=1)
-    spans = (corners.max(axis=1) - starts).max(axis=0) + count
-    placement = shadow.placement
-    cells = shadow.mask.cells[shot % len(shadow.mask.cells)]
-    through = placement.leak + (placement.clear - placement.leak) * cells.astype(np.float64)
+    starts, spans = _windows(corners, shares_x.shape[2])
+    through = _through(shadow, shot)
     out = np.empty((len(pixels), *spans))
     _influence(corners, shares_y, shares_x, weights, starts, through, channels, out)
     rows = starts[:, :1] + np.arange(spans[0])
     columns = starts[:, 1:] + np.arange(spans[1])
-    height, width = cells.shape[:2]
+    height, width = through.shape[:2]
     index = (
         np.clip(rows, 0, height - 1)[:, :, None] * width
         + np.clip(columns, 0, width - 1)[:, None, :]
@@ -129,29 +178,98 @@ def _entries(
     return index.reshape(len(pixels), -1), out.reshape(len(pixels), -1)
 
 
+def _windows(corners: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where the grains that pixels see begin, (n, 2), and over how many they span, (2,).
+
+    corners: (n, view, 2), the first of each view's `count` rows and columns.
+    """
+    starts = corners.min(axis=1)
+    return starts, (corners.max(axis=1) - starts).max(axis=0) + count
+
+
+class _Part(NamedTuple):
+    """Usable pixels of a whiteboard, CHUNK at most."""
+
+    board: Board
+    pixels: NDArray[np.int64]
+    channels: NDArray[np.uint8]
+    deviations: Array
+    """(n,), of the readings."""
+    place: slice
+    """Among all usable pixels of all whiteboards."""
+
+
+def _parts(boards: Sequence[Board]) -> Iterator[_Part]:
+    """Yield the usable pixels of all whiteboards."""
+    before = 0
+    for board in boards:
+        pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
+        deviations = np.sqrt(board.variance[board.usable].astype(np.float64))
+        for first in range(0, len(pixels), CHUNK):
+            part = slice(first, first + CHUNK)
+            place = slice(before, before + len(pixels[part]))
+            yield _Part(board, pixels[part], channels[part], deviations[part], place)
+            before = place.stop
+
+
+class _Evidence(NamedTuple):
+    """Gradient and curvature of each grain, (row, column), see the module; for a spread of 1."""
+
+    gradient: NDArray[np.float64]
+    curvature: NDArray[np.float64]
+
+    def add(self, shadow: Shadow, parts: Iterable[_Part], residuals: Array) -> None:
+        """Add those of pixels whose residuals, in deviations, are not 0."""
+        for part in parts:
+            there = residuals[part.place] != 0
+            if not there.any():
+                continue
+            views_open, stage_um, shot = part.board.opening
+            footprints = shadow.footprints(part.pixels[there], views_open, stage_um)
+            starts, spans = _windows(footprints[0], footprints[2].shape[2])
+            _add_evidence(
+                footprints,
+                starts,
+                np.empty(spans),
+                _through(shadow, shot),
+                part.channels[there],
+                part.deviations[there],
+                residuals[part.place][there],
+                self,
+            )
+
+
 def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement) -> Defects:
-    """Return the defects that these whiteboards support, under the placement fitted to them."""
+    """Return the defects that these whiteboards support, under the placement fitted to them.
+
+    With S the influences of the grains taken up, over the deviations, (pixel, grain), losses change
+    the residuals by S losses: of the few pixels that see these grains.
+    """
     fine = _grained(mask)
     shadow, size = Shadow(fine, placement), fine.cells.shape[1:3]
-    lost, count = np.zeros(size), int(np.prod(size))
-    covariance = sparse.csr_array((count, count))
+    clean = np.concatenate([_residual(shadow, board) for board in boards])
+    evidence = _Evidence(np.zeros(size), np.zeros(size))
+    evidence.add(shadow, _parts(boards), clean)
+    chosen, seen, losses = np.zeros(size, bool), sparse.csr_array((len(clean), 0)), np.zeros(0)
+    covariance = sparse.csr_array((chosen.size, chosen.size))
     for _ in range(ROUNDS):
-        current = Shadow(_with_losses(fine, placement, lost), placement)
-        residuals = [_residual(current, board) for board in boards]
-        spread = max(1.0, deviation_of(np.concatenate(residuals)))
-        gradient, curvature = np.zeros(count), np.zeros(count)
-        for index, influence, deviations, residual in _influences(shadow, boards, residuals):
-            scaled = influence / (deviations * spread)[:, None]
-            pull = -scaled * (residual / spread)[:, None]
-            gradient += np.bincount(index.ravel(), pull.ravel(), count)
-            curvature += np.bincount(index.ravel(), (scaled**2).ravel(), count)
-        evidence = gradient / np.sqrt(np.maximum(curvature, 1e-12))
-        chosen = (np.abs(evidence) > SUPPORT) & (curvature > 1 / SIZE**2)
-        chosen |= lost.ravel() != 0
-        if not chosen.any() or chosen.mean() > LARGEST_SHARE:
+        changes = seen @ losses
+        spread = max(1.0, deviation_of(clean + changes))
+        changed = _Evidence(evidence.gradient.copy(), np.zeros(size))
+        changed.add(shadow, _parts(boards), changes)
+        curvature = evidence.curvature / spread**2
+        deviations = np.abs(changed.gradient) / (spread * np.sqrt(evidence.curvature + 1e-300))
+        more = (deviations > SUPPORT) & (curvature > 1 / SIZE**2) & ~chosen
+        if not (chosen | more).any() or (chosen | more).mean() > LARGEST_SHARE:
             break
-        losses, covariance = _solve_losses(boards, shadow, np.flatnonzero(chosen), spread)
-        lost = losses.reshape(size)
+        if more.any():
+            chosen |= more
+            rows = [_seen_grains(shadow, part, chosen) for part in _parts(boards)]
+            seen = sparse.csr_array(sparse.vstack(rows))
+        where = np.flatnonzero(chosen)
+        losses, covariance = _solve_losses(seen, clean, where, chosen.size, spread)
+    lost = np.zeros(size)
+    lost[chosen] = losses
     return Defects(lost.astype(np.float32), covariance, _with_losses(fine, placement, lost))
 
 
@@ -167,39 +285,48 @@ def _residual(shadow: Shadow, board: Board) -> Array:
     return (board.reading[board.usable] - predicted) / scale
 
 
-def _influences(
-    shadow: Shadow, boards: Sequence[Board], residuals: Sequence[Array]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], Array, Array]]:
-    """Yield `_entries` of CHUNK usable pixels, their deviations and residuals, board by board."""
-    for board, residual in zip(boards, residuals, strict=True):
-        pixels, channels = np.argwhere(board.usable), board.channels[board.usable]
-        deviations = np.sqrt(board.variance[board.usable].astype(np.float64))
-        for first in range(0, len(pixels), CHUNK):
-            part = slice(first, first + CHUNK)
-            entries = _entries(shadow, board.opening, pixels[part], channels[part])
-            yield *entries, deviations[part], residual[part]
+def _seen_grains(shadow: Shadow, part: _Part, chosen: NDArray[np.bool_]) -> sparse.csr_array:
+    """Return the influences of the grains chosen, (row, column), over the pixels' deviations.
+
+    Shaped (pixel, grain), the grains in the order of the flat mask.
+    """
+    views_open, stage_um, _ = part.board.opening
+    corners, _, shares_x, _ = shadow.footprints(part.pixels, views_open, stage_um)
+    # Chosen grains above and to the left: four of these sums count those in a footprint.
+    sums = np.pad(chosen.cumsum(axis=0).cumsum(axis=1), (1, 0))
+    ends = corners + shares_x.shape[2]
+    top, left, bottom, right = (
+        np.clip(edges[:, :, axis], 0, chosen.shape[axis])
+        for edges in (corners, ends)
+        for axis in range(2)
+    )
+    within = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    touched = np.flatnonzero(within.any(axis=1))
+    place = np.full(chosen.size, -1)
+    place[chosen.ravel()] = np.arange(chosen.sum())
+    shape = (len(part.pixels), int(chosen.sum()))
+    if len(touched) == 0:
+        return sparse.csr_array(shape)
+    how = part.board.opening, part.pixels[touched], part.channels[touched]
+    index, influence = _entries(shadow, *how)
+    column = place[index]
+    rows, entries = np.nonzero((column >= 0) & (influence > 0))
+    values = influence[rows, entries] / part.deviations[touched[rows]]
+    return sparse.csr_array((values, (touched[rows], column[rows, entries])), shape=shape)
 
 
 def _solve_losses(
-    boards: Sequence[Board], shadow: Shadow, chosen: NDArray[np.intp], spread: float
+    seen: sparse.csr_array, residual: Array, chosen: NDArray[np.intp], size: int, spread: float
 ) -> tuple[NDArray[np.float64], sparse.csr_array]:
-    """Return the losses of the chosen grains and their covariance, on the flat mask."""
-    place = np.full(shadow.mask.cells[0, :, :, 0].size, -1)
-    place[chosen] = np.arange(len(chosen))
-    matrix = sparse.csc_array(sparse.diags_array(np.full(len(chosen), 1 / SIZE**2)))
-    right = np.zeros(len(chosen))
-    residuals = [_residual(shadow, board) for board in boards]
-    for index, influence, deviations, residual in _influences(shadow, boards, residuals):
-        column = place[index]
-        rows, entries = np.nonzero((column >= 0) & (influence > 0))
-        values = influence[rows, entries] / (deviations * spread)[rows]
-        shape = (len(index), len(chosen))
-        slopes = sparse.csc_array((-values, (rows, column[rows, entries])), shape=shape)
-        matrix = matrix + slopes.T @ slopes
-        right += slopes.T @ (residual / spread)
-    matrix = sparse.csc_array(matrix)
-    lost = np.zeros(len(place))
-    lost[chosen] = np.clip(np.ravel(np.asarray(spsolve(matrix, right))), -1, 1)
+    """Return the losses of the chosen grains, and their covariance on the flat mask.
+
+        (S^T S / spread^2 + 1 / SIZE^2) losses = - S^T residual / spread^2
+
+    seen: S. chosen: indices into the flat mask of `size` grains. residual: without losses.
+    """
+    prior = sparse.diags_array(np.full(len(chosen), 1 / SIZE**2))
+    matrix = sparse.csc_array(seen.T @ seen / spread**2 + prior)
+    solved = np.ravel(np.asarray(spsolve(matrix, -(seen.T @ residual) / spread**2)))
     blocks, rows, columns = [], [], []
     count, part_of = connected_components(matrix, directed=False)
     for part in range(count):
@@ -208,7 +335,7 @@ def _solve_losses(
         rows.append(chosen[grains].repeat(len(grains)))
         columns.append(np.tile(chosen[grains], len(grains)))
     entries = np.concatenate(blocks), (np.concatenate(rows), np.concatenate(columns))
-    return lost, sparse.csr_array(entries, shape=(len(place), len(place)))
+    return np.clip(solved, -1, 1), sparse.csr_array(entries, shape=(size, size))
 
 
 def loss_variance(

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.calibration.board_angle import BoardAngle, Leaning
 from emmc_rig.calibration.boards import Board
+from emmc_rig.calibration.causes import (
+    CREEP,
+    EXPOSURE,
+    HANDS,
+    HOLES,
+    LAMP,
+    LENS,
+    PLATE,
+    STAGE,
+    TURN,
+    FoundCause,
+)
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.colours import Crosstalk
 from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
@@ -21,8 +34,8 @@ LARGEST_FLICKER = 0.01
 """Of a whiteboard's brightness against the others: more is named."""
 LARGEST_MOVE_UM = 1.0
 """Of the mask from its place: more is named."""
-FEWEST_FOR_DRIFT, DRIFT_LEAVES = 5, 0.2
-"""Whiteboards, and the share of their squared moves that a drift at an even rate leaves."""
+LEAST_HOLES, LEAST_EXPOSURE, LEAST_TURN_DEG = 0.01, 3e-3, 0.2
+"""Relative light through a hole, and of all; degrees of the plate: more is named."""
 SIGNIFICANT = 5.0
 """Standard deviations, from which on a parameter is named: by chance once in two million."""
 LEAST_MOVE_UM = 0.2
@@ -203,16 +216,6 @@ def dust_finding(dusty: NDArray[np.bool_]) -> str:
     )
 
 
-def hands_findings(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[str]:
-    """Return how far hands put pinholes off their holes; nothing where no hand did."""
-    lever = mask.lens_um / mask.distance_um
-    pairs = zip(fit.boards, boards, strict=True)
-    off_um = [float(np.hypot(*check.moved_um)) * lever for check, board in pairs if board.loose]
-    if not off_um:
-        return []
-    return [f"hands put pinholes up to {max(off_um):.0f} um off their holes: corrected for"]
-
-
 def residual_advice(held: HeldOut) -> str:
     """Return by how much held-out whiteboards differ from Psi, the worst kinds first."""
     order = sorted(held.groups, key=lambda name: -held.groups[name])
@@ -225,57 +228,171 @@ def residual_advice(held: HeldOut) -> str:
 
 
 def fit_advice(fit: Fit) -> list[str]:
-    """Return what the fit says to measure again: flicker, moved stage, too few frames."""
-    found = []
+    """Return what the fit says to measure again: too few whiteboards."""
+    if not fit.undecided:
+        return []
+    shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
+    more = f"capture {fit.more_boards} more of the same kinds, or a few through a pinhole"
+    if fit.more_boards >= MOST_MORE_BOARDS:
+        more = "capture some through a pinhole"
+    return [
+        f"too few whiteboards to measure {shown}: Psi takes the value of the camera's file "
+        f"instead; {more}"
+    ]
+
+
+class CauseLines(NamedTuple):
+    """Why whiteboards differ, in words, the likeliest first."""
+
+    findings: list[str]
+    """What Psi is corrected for."""
+    advice: list[str]
+    """What to mend, and to capture again."""
+
+
+def cause_lines(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> CauseLines:
+    """Return the causes for which whiteboards differ, with their size, where it matters.
+
+    boards: those fitted. Causes that fit nearly as well as a named cause are named beside it.
+    """
+    lines = CauseLines([], [])
+    for cause in fit.causes:
+        words = _WORDS[cause.name](cause, fit, boards, mask)
+        if not words:
+            continue
+        if cause.instead:
+            words += "; fits nearly as well: " + ", ".join(SHORT[name] for name in cause.instead)
+        (lines.advice if cause.name in (LAMP, STAGE, CREEP) else lines.findings).append(words)
+    return lines
+
+
+SHORT = {
+    LAMP: "a lamp that is not steady",
+    STAGE: "a mask that is not where the stage reports it",
+    CREEP: "a mask that drifts",
+    HOLES: "holes of unequal size",
+    HANDS: "pinholes off their holes",
+    EXPOSURE: "other exposures of the pinhole than noted",
+    PLATE: "a plate that stands off its place",
+    TURN: "a plate that is turned",
+    LENS: "aberrations of the lens",
+}
+"""Causes as alternatives are named."""
+
+
+def _lamp_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
     flickering = [
         check
         for check in fit.boards
         if abs(check.brightness - 1) > max(LARGEST_FLICKER, 5 * check.brightness_deviation)
     ]
-    if flickering:
-        worst = max(flickering, key=lambda check: abs(check.brightness - 1))
-        others = f" ({len(flickering)} of {len(fit.boards)} whiteboards differ)"
-        found.append(
-            f"{worst.name}: {worst.brightness - 1:+.1%} in brightness against the other "
-            f"whiteboards{others if len(flickering) > 1 else ''}; the lamp is not steady: let it "
-            "warm up, and capture it again"
-        )
-    found += _moves(fit)
-    if fit.undecided:
-        shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
-        more = f"capture {fit.more_boards} more of the same kinds, or a few through a pinhole"
-        if fit.more_boards >= MOST_MORE_BOARDS:
-            more = "capture some through a pinhole"
-        found.append(
-            f"too few whiteboards to measure {shown}: Psi takes the value of the camera's file "
-            f"instead; {more}"
-        )
-    return found
+    if not flickering:
+        return ""
+    worst = max(flickering, key=lambda check: abs(check.brightness - 1))
+    others = f" ({len(flickering)} of {len(fit.boards)} whiteboards differ)"
+    return (
+        f"{worst.name}: {worst.brightness - 1:+.1%} in brightness against the other "
+        f"whiteboards{others if len(flickering) > 1 else ''}; the lamp is not steady: let it "
+        "warm up, and capture it again"
+    )
 
 
-def _moves(fit: Fit) -> list[str]:
-    """Return in words that the mask stands elsewhere than the stage says, if that matters."""
+def _holes_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    excess = np.array([0.0 if board.views_open.all() else 1.0 for board in boards]) * fit.own[:, 0]
+    worst = int(np.argmax(np.abs(excess)))
+    if abs(excess[worst]) < LEAST_HOLES:
+        return ""
+    return (
+        f"the plate's holes are unequal: the light through them differs by {cause.width:.1%}, most "
+        f"in {boards[worst].name} ({excess[worst]:+.1%}): corrected for"
+    )
+
+
+def _exposure_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    more, deviation = cause.size[0], cause.deviation[0]
+    if abs(more) < max(LEAST_EXPOSURE, SIGNIFICANT * deviation):
+        return ""
+    return (
+        f"the exposures through the pinhole were {abs(more):.1%} +- {deviation:.1%} "
+        f"{'longer' if more > 0 else 'shorter'} than noted, or all its holes are so much "
+        f"{'larger' if more > 0 else 'smaller'} than a view: corrected for"
+    )
+
+
+def _hands_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    off_um = np.hypot(*np.reshape(cause.size, (-1, 2)).T)
+    if off_um.max(initial=0.0) * mask.distance_um / mask.lens_um < LEAST_MOVE_UM:
+        return ""
+    return f"pinholes stand up to {off_um.max():.0f} um off their holes: corrected for"
+
+
+def _plate_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    x_um, y_um = cause.size
+    if np.hypot(x_um, y_um) * mask.distance_um / mask.lens_um < LEAST_MOVE_UM:
+        return ""
+    return (
+        f"the plate stands ({x_um:+.0f}, {y_um:+.0f}) +- {max(cause.deviation):.0f} um off its "
+        "place: corrected for"
+    )
+
+
+def _turn_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    turn_deg, deviation_deg = np.degrees(cause.size[0]), np.degrees(cause.deviation[0])
+    if abs(turn_deg) < max(LEAST_TURN_DEG, SIGNIFICANT * deviation_deg):
+        return ""
+    return (
+        f"the plate is turned by {turn_deg:+.2f} +- {deviation_deg:.2f} degrees against the views: "
+        "corrected for"
+    )
+
+
+def _creep_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    far_um = float(np.hypot(*cause.size))
+    if far_um < max(LARGEST_MOVE_UM, SIGNIFICANT * max(cause.deviation)):
+        return ""
+    minutes = float(np.ptp([check.taken_s for check in fit.boards])) / 60
+    return (
+        f"the mask is not where the stage reports it: it drifts by {far_um / minutes:.2g} um/min, "
+        f"({cause.size[0]:+.1f}, {cause.size[1]:+.1f}) um over the whiteboards; Psi's deviation "
+        "includes it: fasten it, let the bench settle, and capture again"
+    )
+
+
+def _stage_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
     moved = [
         check
         for check in fit.boards
         if np.hypot(*check.moved_um) > max(LARGEST_MOVE_UM, 5 * check.moved_deviation_um)
     ]
     if not moved:
-        return []
+        return ""
     worst = max(moved, key=lambda check: float(np.hypot(*check.moved_um)))
-    words = (
+    return (
         f"the mask is not where the stage reports it in {len(moved)} of {len(fit.boards)} "
         f"whiteboards, by up to ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
-        f"{worst.name}; Psi's deviation includes it: "
+        f"{worst.name}; Psi's deviation includes it: let the stage approach every place from the "
+        "same side, and settle, and capture again"
     )
-    times_s = np.array([check.taken_s for check in fit.boards])
-    places_um = np.array([check.moved_um for check in fit.boards])
-    times_s, places_um = times_s - times_s.mean(), places_um - places_um.mean(axis=0)
-    rate = times_s @ places_um / max(float(times_s @ times_s), 1e-12)
-    left = np.square(places_um - times_s[:, None] * rate).sum() / np.square(places_um).sum()
-    if len(fit.boards) >= FEWEST_FOR_DRIFT and left < DRIFT_LEAVES:
-        per_minute = 60 * float(np.hypot(*rate))
-        words += f"it drifts by {per_minute:.2g} um/min; fasten it, let the bench settle"
-    else:
-        words += "let the stage approach every place from the same side, and settle"
-    return [words + ", and capture again"]
+
+
+def _lens_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    if cause.width < LEAST_MOVE_UM:
+        return ""
+    return (
+        f"aberrations of the lens displace the shadows of the views by {cause.width:.1f} um (root "
+        "mean square): the deviation of the fitted Psi includes them, and whiteboards through the "
+        "pinhole before every view measure them"
+    )
+
+
+_WORDS = {
+    LAMP: _lamp_words,
+    HOLES: _holes_words,
+    EXPOSURE: _exposure_words,
+    HANDS: _hands_words,
+    PLATE: _plate_words,
+    TURN: _turn_words,
+    CREEP: _creep_words,
+    STAGE: _stage_words,
+    LENS: _lens_words,
+}

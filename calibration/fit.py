@@ -1,10 +1,10 @@
 """The parametric route: the placement of a known mask from a few whiteboards, robust and weighted.
 
 Levenberg-Marquardt on the posterior of readings weighed by the noise, Tukey's biweight (dust, bad
-pixels) and a wide prior (the bench's tolerances). The normal equations are summed over chunks of
-pixels: time is linear in the pixels, memory is that of one chunk. The fit begins on the middle of
-the picture, registered by correlation, and widens: a small turn or stretch that moves the corner
-by pixels moves the middle by little.
+pixels) and a wide prior (the bench's tolerances). Time and memory are linear in the pixels drawn:
+the slopes of 100 000 pixels by 44 parameters are 35 MB. The fit begins on the middle of the
+picture, registered by correlation, and widens: a small turn or stretch that moves the corner by
+pixels moves the middle by little.
 
 Through a real lens every view sees the mask a little displaced and a little softer than the
 placement has it (aberrations). Neighbouring views are coded nearly alike, so that a displacement of
@@ -16,27 +16,54 @@ C N diag(tau^2) N^T C, N the information between its parameters and the views' o
 
 What all pixels of one whiteboard share is no noise of single pixels: shutter and lamp change its
 brightness, and the mask stands a little elsewhere. Each whiteboard has these three of its own,
-normal about 0, of the widths that make the readings likeliest; brightness in addition by what
-repeats of a whiteboard differ among themselves, over their number.
+normal about 0, of the covariance that the causes have which the readings show (see `causes`);
+brightness in addition by what repeats of a whiteboard differ among themselves, over their number.
 
-Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963; of the widths (evidence):
-MacKay 1992.
+Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.linalg import solve_triangular
 from scipy.ndimage import correlate1d
 
 from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadiness2
+from emmc_rig.calibration.causes import (
+    CREEP,
+    EXPOSURE,
+    HANDS,
+    HOLES,
+    LAMP,
+    LEAST_MOVED_UM,
+    LEAST_OWN,
+    LENS,
+    OF_PLATE,
+    OWN,
+    PLATE,
+    SHIFTING,
+    STAGE,
+    Cause,
+    FoundCause,
+    Geometry,
+    OwnInformation,
+    covariance_of,
+    doubt_lone_move,
+    find_causes,
+    pinholes_off_um,
+    possible_causes,
+    through_pinhole,
+    with_lens,
+    with_sizes,
+)
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import register, starting_placement
 from emmc_rig.calibration.placement import (
@@ -54,7 +81,7 @@ from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
 CHUNK = 4096
-"""Pixels whose slopes are held at once: by 41 parameters 1.3 MB, about a core's cache."""
+"""Pixels whose slopes by view are held at once: by 25 views 4 MB."""
 FIRST_WINDOW_PX = 64
 """Half a side: a turn of half a degree moves the window's corner by less than a pixel."""
 FEWEST_PIXELS = 400
@@ -68,22 +95,12 @@ LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
-OWN = 3
-"""Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
-BRIGHTNESSES = np.geomspace(2e-5, 0.05, 12)
-MOVES_UM = np.geomspace(0.002, 10.0, 12)
-"""Widths of the whiteboards' own that are tried: the least are far below what noise shows."""
 LOOSE_UM = 0.5
-"""Width of where a hand puts a pinhole, as a move of the mask: 0.2 mm of 50 mm at 0.12 mm."""
+"""By which a hand's pinhole seems to move the mask, at first: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
 """Of the width of the prior of glass, which a displaced pinhole imitates."""
-LEAST_MOVED_UM = 0.25
-"""Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
-rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
-CLEARLY_LIKELIER = 0.5
-"""Difference of log evidence: less than this tells nothing."""
-WIDTH_ROUNDS = 2
-"""The widths depend on the fit and the fit on the widths: so many times in turn."""
+CAUSE_ROUNDS = 3
+"""The causes depend on the fit and the fit on the causes: so many times in turn at most."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -144,8 +161,10 @@ class Fit:
     chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
     undecided: names of parameters that the prior decides more than the whiteboards.
     more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
-    brightness_spread: relative standard deviation of the whiteboards' brightness, beyond what their
-        repeats show; references vary likewise, which the covariance does not count.
+    own, own_deviation: (board, OWN), brightness over 1 and place of the mask by which whiteboards
+        differ, um, as the causes let them.
+    causes: why whiteboards differ, the strongest first. A lamp that is not steady makes references
+        differ likewise, which the covariance does not count.
     moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
         covariance counts.
     astray2: (OF_VIEW,), variances of the views' own displacements and softenings, um^2.
@@ -162,9 +181,20 @@ class Fit:
     undecided: tuple[str, ...]
     more_boards: int
     boards: tuple[BoardCheck, ...]
-    brightness_spread: float = 0.0
+    own: NDArray[np.float64]
+    own_deviation: NDArray[np.float64]
+    causes: tuple[FoundCause, ...] = ()
     moved_um: float = 0.0
     astray2: tuple[float, ...] = ()
+
+    @property
+    def brightness_spread(self) -> float:
+        """Standard deviation of all whiteboards' brightness, relative; 0: a steady lamp."""
+        return self.width(LAMP)
+
+    def width(self, cause: str) -> float:
+        """Return the width of a cause by name, 0 of those that were not found."""
+        return next((found.width for found in self.causes if found.name == cause), 0.0)
 
     def deviation(self, name: str) -> float:
         """Return the standard deviation of a parameter by name."""
@@ -172,16 +202,9 @@ class Fit:
         return float(np.sqrt(self.covariance[index, index]))
 
 
-class _Widths(NamedTuple):
-    """Standard deviations of what whiteboards have of their own, about 0."""
-
-    brightness: float
-    """Relative."""
-    moved_um: float
-    """Of the mask, along either axis."""
-
-
-FIRST_WIDTHS = _Widths(brightness=2e-3, moved_um=0.2)
+FIRST_WIDTHS = {LAMP: 2e-3, STAGE: 0.2, HOLES: 0.05, EXPOSURE: 0.05}
+"""Of what whiteboards have of their own, before their causes are known; pinholes beside: LOOSE_UM.
+A narrow width would bend the placement, and bent causes would be found there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,35 +241,60 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """Precisions and centres of all parameters, in the order of `_State.vector`."""
+    """Precision (all, all) and centre (all,) of all parameters, in the order of `_State.vector`."""
 
     precision: NDArray[np.float64]
     centre: NDArray[np.float64]
 
     def loss(self, state: _State) -> float:
         """Return what the prior adds to the loss."""
-        return 0.5 * float(np.sum(self.precision * (state.vector() - self.centre) ** 2))
+        off = state.vector() - self.centre
+        return 0.5 * float(off @ self.precision @ off)
+
+    def pull(self, state: _State) -> NDArray[np.float64]:
+        """Return the gradient by which the prior draws the parameters to their centre, (all,)."""
+        return np.asarray(self.precision @ (self.centre - state.vector()), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class _BenchPrior:
-    """What is known before the fit, apart from the widths of the whiteboards' own.
+    """What is known before the fit.
 
-    precision, centre: of the placement, (parameter,). own2: (board, OWN), variances beside those of
-    the widths: brightness as repeats show it, and places of pinholes that hands put.
+    precision, centre: of the placement, (parameter,). own2: (own,), variances beside those of the
+    causes: brightness as repeats show it. causes: those possible; always: those that act.
     """
 
     precision: NDArray[np.float64]
     centre: NDArray[np.float64]
     own2: NDArray[np.float64]
+    causes: Mapping[str, Cause]
+    always: tuple[str, ...]
+    geometry: Geometry
 
-    def with_widths(self, widths: _Widths) -> _Prior:
-        """Return the prior of all parameters."""
-        own2 = self.own2 + np.square([widths.brightness, widths.moved_um, widths.moved_um])
-        return _Prior(
-            np.concatenate([self.precision, 1 / own2.ravel()]),
-            np.concatenate([self.centre, np.zeros(own2.size)]),
-        )
+    def about(
+        self, found: Sequence[FoundCause], own: NDArray[np.float64], boards: Sequence[Board]
+    ) -> _BenchPrior:
+        """Return the prior with causes about where pinholes stand by those found."""
+        known = [cause for cause in found if cause.name in self.causes]
+        causes, none = list(self.causes.values()), np.zeros((own.size, own.size))
+        sized = with_sizes(known, causes, own.ravel(), none, self.own2)
+        off_um = pinholes_off_um(sized, boards, self.geometry.cell_um)
+        again = possible_causes(boards, self.geometry, off_um)
+        return replace(self, causes={cause.name: cause for cause in again})
+
+    def with_widths(self, widths: Mapping[str, float]) -> _Prior:
+        """Return the prior of all parameters; widths: of the causes, by name."""
+        own = np.linalg.inv(covariance_of(self.causes, widths, self.own2))
+        size = len(self.centre)
+        precision = np.zeros((size + len(own), size + len(own)))
+        precision[:size, :size] = np.diag(self.precision)
+        precision[size:, size:] = own
+        return _Prior(precision, np.concatenate([self.centre, np.zeros(len(own))]))
+
+    def first_widths(self, ratio: float) -> dict[str, float]:
+        """Return the widths before the causes are known."""
+        widths = FIRST_WIDTHS | dict.fromkeys((HANDS, PLATE), LOOSE_UM / ratio)
+        return {name: width for name, width in widths.items() if name in self.causes}
 
 
 def _bench_prior(
@@ -257,23 +305,17 @@ def _bench_prior(
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     deviations = Tolerances().deviations(camera.views)
-    if any(board.loose for board in boards):
+    loose = any(board.loose for board in boards)
+    if loose:
         # Pinholes a little off their holes look like glass before the mask.
         deviations[SCALARS.index("glass_um")] *= OF_LOOSE
-    own2 = np.zeros((len(boards), OWN))
-    own2[:, 0] = unsteadiness2(boards) / np.array([board.repeats for board in boards])
-    own2[[board.loose for board in boards], 1:] = LOOSE_UM**2
-    return _BenchPrior(1 / deviations**2, centre, own2)
-
-
-def _all_residuals(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> list[Array]:
-    """Return the residuals of every whiteboard's sample, in deviations."""
-    shadow, residuals = Shadow(mask, state.placement), []
-    for index, sample in enumerate(samples):
-        opening = state.opening(sample.board, index)
-        predicted = shadow.readings(sample.pixels, sample.channels, *opening)
-        residuals.append((sample.reading - state.brightness(index) * predicted) / sample.deviation)
-    return residuals
+    own2 = np.tile(np.square(LEAST_OWN), (len(boards), 1))
+    own2[:, 0] += unsteadiness2(boards) / np.array([board.repeats for board in boards])
+    ratio = mask.distance_um / mask.lens_um
+    geometry = Geometry(ratio, mask.aperture_cell_um, mask.views)
+    known = {cause.name: cause for cause in possible_causes(boards, geometry)}
+    always = (HANDS,) if loose else ()
+    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry)
 
 
 def _robust_spread(residuals: Sequence[Array]) -> float:
@@ -281,45 +323,41 @@ def _robust_spread(residuals: Sequence[Array]) -> float:
     return max(1.0, deviation_of(np.concatenate(residuals)))
 
 
-class _Chunk(NamedTuple):
-    """Some pixels of one whiteboard's sample."""
+def _with_own_slopes(read: Array, slope: Array, brightness: float) -> NDArray[np.float64]:
+    """Return slopes of a whiteboard's readings, (n, parameter + OWN), from those of the shadow.
 
-    pixels: NDArray[np.int64]
-    """(n, 2), row and column."""
-    channels: NDArray[np.uint8]
-    """(n,), the colour that each pixel sees."""
-    opening: Opening
+    By the placement, the whiteboard's brightness, and the mask's move in x and y. read: (n,),
+    readings of the shadow.
+    """
+    rows = [brightness * slope, read[:, None], brightness * slope[:, OFFSETS]]
+    return np.concatenate(rows, axis=1)
+
+
+class _Linear(NamedTuple):
+    """Readings of a whiteboard's sample, linear in the parameters around a state."""
+
     residual: Array
     """(n,), in deviations."""
-    deviation: Array
-    """(n, 1), of a reading."""
+    slope: Array
+    """(n, parameter + OWN), of the reading, over its deviation."""
 
-    def slopes(self, shadow: Shadow, brightness: float) -> tuple[Array, Array]:
-        """Return the shadow's readings (n,), and slopes of the whiteboard's, (n, parameter + OWN).
-
-        By the placement, the whiteboard's brightness, and the mask's move in x and y.
-        """
-        read, slope = shadow.with_slopes(self.pixels, self.channels, *self.opening)
-        return read, _with_own_slopes(read, slope, brightness)
+    def read(self, sample: Sample) -> Array:
+        """Return the readings of the shadow, (n,): the slope by the whiteboard's brightness."""
+        return self.slope[:, -OWN] * sample.deviation
 
 
-def _with_own_slopes(read: Array, slope: Array, brightness: float) -> NDArray[np.float64]:
-    rows = [brightness * slope, read, brightness * slope[:, OFFSETS]]
-    return np.column_stack(rows).astype(np.float64, copy=False)
-
-
-def _pixel_chunks(state: _State, sample: Sample, index: int, residual: Array) -> Iterator[_Chunk]:
-    """Yield the pixels of a sample, CHUNK at a time."""
-    opening = state.opening(sample.board, index)
-    for first in range(0, len(residual), CHUNK):
-        part = slice(first, first + CHUNK)
-        yield _Chunk(
-            sample.pixels[part],
-            sample.channels[part],
-            opening,
-            residual[part],
-            sample.deviation[part, None],
-        )
+def _linear_readings(
+    mask: ShadowMask, state: _State, samples: Sequence[Sample]
+) -> tuple[_Linear, ...]:
+    """Return every whiteboard's readings and slopes at a state."""
+    shadow, found = Shadow(mask, state.placement), []
+    for index, sample in enumerate(samples):
+        opening, brightness = state.opening(sample.board, index), state.brightness(index)
+        read, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
+        slope = _with_own_slopes(read, slope, brightness)
+        slope /= sample.deviation[:, None]
+        found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slope))
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,57 +376,65 @@ class _NormalEquations:
     count: int
 
 
-def _normal_equations(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample]
-) -> _NormalEquations:
-    """Return the normal equations of all samples, chunk by chunk.
+def _normal_equations(state: _State, linear: Sequence[_Linear]) -> _NormalEquations:
+    """Return the normal equations of all whiteboards.
 
-    r = (reading - (1 + brightness) shadow) / deviation       of a pixel
-    spread = max(1, 1.4826 median |r|)
-    w = (1 - (r / (4.685 spread))^2)^2, 0 beyond                Tukey's weight
-    J = d((1 + brightness) shadow) / d(parameters) / (deviation spread)
-    matrix = sum w J^T J,    gradient = sum w J^T r / spread
+    With r residuals over the spread, J their slopes, and w Tukey's weights of r,
+
+        matrix = J^T diag(w) J,    gradient = J^T (w r)
     """
-    shadow = Shadow(mask, state.placement)
-    residuals = _all_residuals(mask, state, samples)
-    spread = _robust_spread(residuals)
+    spread = _robust_spread([each.residual for each in linear])
     size = len(state.vector())
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
     squares, kept = 0.0, 0
-    for index, sample in enumerate(samples):
+    for index, (residual, slope) in enumerate(linear):
         places = state.places(index)
-        for chunk in _pixel_chunks(state, sample, index, residuals[index]):
-            _, slope = chunk.slopes(shadow, state.brightness(index))
-            slope = slope / (chunk.deviation * spread)
-            scaled = chunk.residual / spread
-            weight = tukey_weights(scaled)
-            matrix[np.ix_(places, places)] += slope.T @ (slope * weight[:, None])
-            gradient[places] += slope.T @ (weight * scaled)
-            inside = weight > 0
-            squares += float((chunk.residual[inside] ** 2).sum())
-            kept += int(inside.sum())
-    count = sum(map(len, residuals))
+        weight = tukey_weights(residual / spread)
+        rooted = slope * (np.sqrt(weight) / spread)[:, None]
+        matrix[np.ix_(places, places)] += rooted.T @ rooted
+        gradient[places] += slope.T @ (weight * residual) / spread**2
+        inside = weight > 0
+        squares += float((residual[inside] ** 2).sum())
+        kept += int(inside.sum())
+    count = sum(len(each.residual) for each in linear)
     return _NormalEquations(matrix, gradient, spread, squares, kept, count)
+
+
+class _Point(NamedTuple):
+    """A state, and the readings around it."""
+
+    state: _State
+    linear: tuple[_Linear, ...]
+    """Of each whiteboard."""
+    normal: _NormalEquations
+
+    def loss(self, spread: float, prior: _Prior) -> float:
+        """Return the loss of the residuals, at a spread, and of the prior."""
+        of_readings = sum(tukey_loss(each.residual / spread) for each in self.linear)
+        return of_readings + prior.loss(self.state)
+
+
+def _point(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> _Point:
+    linear = _linear_readings(mask, state, samples)
+    return _Point(state, linear, _normal_equations(state, linear))
 
 
 class _Descent(NamedTuple):
     """The end of Levenberg-Marquardt steps."""
 
-    state: _State
+    point: _Point
     steps: int
     converged: bool
-    normal: _NormalEquations
-    """At the state."""
 
 
 def _descend(
     mask: ShadowMask,
-    state: _State,
+    point: _Point,
     samples: Sequence[Sample],
     prior: _Prior,
     settings: FitSettings,
 ) -> _Descent:
-    """Return the state after Levenberg-Marquardt steps on these samples.
+    """Return the point after Levenberg-Marquardt steps on these samples.
 
         loss(p) = sum rho(r(p) / spread) + 1/2 (p - centre)^T P (p - centre)
         H = matrix + P,    (H + damping diag H) step = gradient + P (centre - p)
@@ -397,34 +443,28 @@ def _descend(
     grows until the loss falls. The last step is small in standard deviations, or gains little.
     """
     damping = 1e-3
-    normal = _normal_equations(mask, state, samples)
     for step in range(settings.max_steps):
-        pull = prior.precision * (prior.centre - state.vector())
-        loss = _loss(mask, state, samples, normal.spread, prior)
+        state, normal = point.state, point.normal
+        pull = prior.pull(state)
+        loss = point.loss(normal.spread, prior)
         while True:
-            matrix = normal.matrix + np.diag(prior.precision)
+            matrix = normal.matrix + prior.precision
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
-            trial = _step_within_limits(state, matrix, normal.gradient + pull)
-            trial_loss = _loss(mask, trial, samples, normal.spread, prior)
+            moved = _step_within_limits(state, matrix, normal.gradient + pull)
+            # With its slopes: nearly every trial is the next point.
+            trial = _point(mask, moved, samples)
+            trial_loss = trial.loss(normal.spread, prior)
             if trial_loss <= loss or damping > 1e6:
                 break
             damping *= 8
         damping = max(damping / 5, 1e-7)
-        deviations = 1 / np.sqrt(np.diag(normal.matrix) + prior.precision)
-        size = float(np.max(np.abs(trial.vector() - state.vector()) / deviations))
+        deviations = 1 / np.sqrt(np.diag(normal.matrix + prior.precision))
+        size = float(np.max(np.abs(moved.vector() - state.vector()) / deviations))
         if trial_loss <= loss:
-            state = trial
-        normal = _normal_equations(mask, state, samples)
+            point = trial
         if size < settings.tolerance or loss - trial_loss < LEAST_GAIN:
-            return _Descent(state, step + 1, True, normal)
-    return _Descent(state, settings.max_steps, False, normal)
-
-
-def _loss(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float, prior: _Prior
-) -> float:
-    residuals = _all_residuals(mask, state, samples)
-    return sum(tukey_loss(residual / spread) for residual in residuals) + prior.loss(state)
+            return _Descent(point, step + 1, True)
+    return _Descent(point, settings.max_steps, False)
 
 
 def _step_within_limits(state: _State, matrix: Array, gradient: Array) -> _State:
@@ -442,41 +482,6 @@ def _step_within_limits(state: _State, matrix: Array, gradient: Array) -> _State
     return state.moved(move)
 
 
-def _likeliest_widths(descent: _Descent, bench: _BenchPrior) -> _Widths:
-    """Return the widths of brightness and place that make the readings likeliest, at a fit.
-
-    With the readings linear in the parameters, x of them from the prior's centre, the log evidence
-    of widths is, but for a constant,
-
-        1/2 g^T H^-1 g - 1/2 log|H| + 1/2 log|P_own|,
-        H = matrix + P,    g = gradient + matrix x
-
-    P the prior's precision at these widths, P_own of the whiteboards' own.
-    """
-    normal, state = descent.normal, descent.state
-    away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
-    pull = normal.gradient + normal.matrix @ away
-
-    def evidence(widths: _Widths) -> float:
-        precision = bench.with_widths(widths).precision
-        factor = np.linalg.cholesky(normal.matrix + np.diag(precision))
-        seen = np.linalg.solve(factor, pull)
-        own = precision[len(bench.precision) :]
-        return float(0.5 * seen @ seen - np.log(np.diag(factor)).sum() + 0.5 * np.log(own).sum())
-
-    tried = {_Widths(*pair): evidence(_Widths(*pair)) for pair in product(BRIGHTNESSES, MOVES_UM)}
-    best = max(tried, key=lambda widths: tried[widths])
-    least = _Widths(BRIGHTNESSES[0], MOVES_UM[0])
-    # A width that is hardly likelier than the smallest counts as 0.
-    likely = tried[best] - CLEARLY_LIKELIER
-    steady = tried[best._replace(brightness=least.brightness)] > likely
-    still = tried[best._replace(moved_um=least.moved_um)] > likely or best.moved_um < LEAST_MOVED_UM
-    return _Widths(
-        least.brightness if steady else best.brightness,
-        least.moved_um if still else best.moved_um,
-    )
-
-
 class _ViewTerms(NamedTuple):
     """Normal equations of the views' own displacements and softenings, see `Shadow.slopes_by_view`.
 
@@ -491,27 +496,26 @@ class _ViewTerms(NamedTuple):
     """(view x OF_VIEW,): gradient of the log likelihood by the views' own."""
 
 
-def _view_terms(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float
-) -> _ViewTerms:
+def _view_terms(mask: ShadowMask, point: _Point, samples: Sequence[Sample]) -> _ViewTerms:
     """Return the normal equations of the views' own, at a fit; weights as in the placement's."""
-    shadow = Shadow(mask, state.placement)
+    shadow, state, spread = Shadow(mask, point.state.placement), point.state, point.normal.spread
     size, own_size = len(state.vector()), OF_VIEW * mask.views[0] * mask.views[1]
     terms = _ViewTerms(
         np.zeros((size, own_size)), np.zeros((own_size, own_size)), np.zeros(own_size)
     )
-    residuals = _all_residuals(mask, state, samples)
-    for index, sample in enumerate(samples):
-        for chunk in _pixel_chunks(state, sample, index, residuals[index]):
-            where = chunk.pixels, chunk.channels, *chunk.opening
-            slope, by_view = shadow.slopes_by_view(*where)
-            slope = _with_own_slopes(shadow.readings(*where), slope, state.brightness(index))
-            scaled, scale = chunk.residual / spread, 1 / (chunk.deviation * spread)
-            slope, by_view = slope * scale, by_view * scale
-            weighted = by_view * tukey_weights(scaled)[:, None]
-            terms.mixed[state.places(index)] += slope.T @ weighted
-            terms.own[...] += by_view.T @ weighted
-            terms.pull[...] += weighted.T @ scaled
+    for index, (sample, (residual, slope)) in enumerate(zip(samples, point.linear, strict=True)):
+        opening, places = state.opening(sample.board, index), state.places(index)
+        weight = tukey_weights(residual / spread) / spread**2
+        # Views that are closed have no part in the readings.
+        parts = np.flatnonzero(np.repeat(sample.board.views_open.ravel(), OF_VIEW))
+        for first in range(0, len(residual), CHUNK):
+            part = slice(first, first + CHUNK)
+            _, by_view = shadow.slopes_by_view(sample.pixels[part], sample.channels[part], *opening)
+            by_view = by_view[:, parts] / sample.deviation[part, None]
+            weighted = by_view * weight[part, None]
+            terms.mixed[np.ix_(places, parts)] += slope[part].T @ weighted
+            terms.own[np.ix_(parts, parts)] += by_view.T @ weighted
+            terms.pull[parts] += weighted.T @ residual[part]
     return terms
 
 
@@ -536,10 +540,9 @@ def _bias_covariance(
     evidence, squares = [], []
     for taus in product(TAUS_UM, repeat=max(KINDS) + 1):
         tau = np.array(taus)[kind]
-        values, vectors = np.linalg.eigh(tau[:, None] * left * tau)
-        values = 1 + np.maximum(values, 0)
-        seen = vectors.T @ (tau * pull)
-        likelihood = 0.5 * float(np.sum(seen**2 / values - np.log(values)))
+        factor = np.linalg.cholesky(np.eye(len(pull)) + tau[:, None] * left * tau)
+        seen = solve_triangular(factor, tau * pull, lower=True, check_finite=False)
+        likelihood = 0.5 * float(seen @ seen) - float(np.log(np.diag(factor)).sum())
         # Steps of the grid grow with tau.
         beforehand = np.log(taus) - 2 * np.log1p(np.square(taus) / TAU_UM**2 / 3)
         evidence.append(likelihood + float(beforehand.sum()))
@@ -549,6 +552,72 @@ def _bias_covariance(
     moved = covariance @ mixed
     added = np.asarray((moved * expected[kind]) @ moved.T, np.float64)
     return added, tuple(float(expected[place]) for place in KINDS)
+
+
+def _find_causes(
+    mask: ShadowMask, point: _Point, samples: Sequence[Sample], bench: _BenchPrior
+) -> list[FoundCause]:
+    """Return why whiteboards differ, at a fit.
+
+    Aberrations displace the shadows of the views as pinholes do that stand off their holes, and
+    are tried where something does.
+    """
+    causes = list(bench.causes.values())
+    own = _own_information(point, bench)
+    found = find_causes(own, causes, bench.own2, bench.always)
+    if not any(cause.name in SHIFTING for cause in found) or bench.always:
+        return found
+    terms = _view_terms(mask, point, samples)
+    displaced = np.flatnonzero(np.resize(KINDS, len(terms.pull)) == KINDS[0])
+    own = _own_information(point, bench, terms, displaced)
+    own2 = np.concatenate([bench.own2, np.full(len(displaced), LEAST_OWN[1] ** 2)])
+    return find_causes(own, with_lens(causes, len(displaced)), own2)
+
+
+def _own_widths(found: Sequence[FoundCause], ratio: float) -> dict[str, float]:
+    """Return the widths of the causes that act on whiteboards' own parameters, by name.
+
+    Aberrations displace what a single view shows: each whiteboard through the pinhole has the place
+    of its view, as if hands had put the pinhole there, and the placement is not bent to follow.
+    """
+    widths = {cause.name: cause.width for cause in found}
+    displaced = widths.pop(LENS, 0.0)
+    if displaced:
+        widths[HANDS] = float(np.hypot(widths.get(HANDS, 0.0), displaced / ratio))
+    return widths
+
+
+def _own_information(
+    point: _Point,
+    bench: _BenchPrior,
+    terms: _ViewTerms | None = None,
+    displaced: Sequence[int] | NDArray[np.intp] = (),
+) -> OwnInformation:
+    """Return what the readings say of the whiteboards' own parameters, the placement's taken out.
+
+    With x the parameters from the prior's centre, p those of the placement, o the own ones, and P
+    the placement's prior precision,
+
+        g = gradient + matrix x
+        S = matrix_oo - matrix_op (matrix_pp + P)^-1 matrix_po
+        h = g_o - matrix_op (matrix_pp + P)^-1 g_p
+
+    terms, displaced: of the views, and which of theirs count as own as well.
+    """
+    normal, state = point.normal, point.state
+    away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
+    matrix, pull = normal.matrix, normal.gradient + normal.matrix @ away
+    if terms is not None:
+        chosen = np.asarray(displaced)
+        mixed, of_views = terms.mixed[:, chosen], terms.own[np.ix_(chosen, chosen)]
+        matrix = np.block([[matrix, mixed], [mixed.T, of_views]])
+        pull = np.concatenate([pull, terms.pull[chosen] + mixed.T @ away])
+    size = len(bench.centre)
+    of_placement = matrix[:size, :size] + np.diag(bench.precision)
+    across = np.linalg.solve(of_placement, matrix[:size, size:]).T
+    return OwnInformation(
+        matrix[size:, size:] - across @ matrix[:size, size:], pull[size:] - across @ pull[:size]
+    )
 
 
 class _RowErrors(NamedTuple):
@@ -576,7 +645,7 @@ def _row_errors(known: Sequence[Rows], height: int) -> _RowErrors | None:
 
 
 def _rows_covariance(
-    mask: ShadowMask, state: _State, samples: Sequence[Sample], spread: float, covariance: Array
+    point: _Point, samples: Sequence[Sample], covariance: Array
 ) -> NDArray[np.float64]:
     """Return what rows that err alike add to the covariance C.
 
@@ -603,20 +672,17 @@ def _rows_covariance(
     def apart(by_row: Array) -> Array:
         return by_row - by_row.mean(axis=0)
 
-    shadow = Shadow(mask, state.placement)
+    state, spread = point.state, point.normal.spread
     added, of_references = np.zeros((size, size)), np.zeros((height, size))
     of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
-    for index, residual in enumerate(_all_residuals(mask, state, samples)):
+    for index, (residual, slope) in enumerate(point.linear):
         sample, rows = samples[index], known[index]
         # By an error of the whiteboard, and of its reference: a reading is their ratio.
         by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
-        for chunk in _pixel_chunks(state, sample, index, residual):
-            read, slope = chunk.slopes(shadow, state.brightness(index))
-            weight = tukey_weights(chunk.residual / spread)[:, None]
-            pull = slope * (weight / np.square(chunk.deviation * spread))
-            where = chunk.pixels[:, :1], state.places(index)
-            np.add.at(by_row, where, pull)
-            np.add.at(read_by_row, where, pull * read[:, None])
+        weight = tukey_weights(residual / spread) / (sample.deviation * spread**2)
+        pull, where = slope * weight[:, None], (sample.pixels[:, :1], state.places(index))
+        np.add.at(by_row, where, pull)
+        np.add.at(read_by_row, where, pull * point.linear[index].read(sample)[:, None])
         white_dn, reference_dn = rows.white_dn
         by_row, read_by_row = by_row / white_dn, read_by_row / reference_dn
         added += squared(apart(by_row)) / sample.board.repeats
@@ -628,6 +694,27 @@ def _rows_covariance(
     for by_row in of_darks.values():
         added += squared(by_row) / errors.darks
     return np.asarray(errors.own_dn2 * covariance @ added @ covariance, np.float64)
+
+
+def settled(fit: Fit, boards: Sequence[Board]) -> list[Board]:
+    """Return whiteboards as they would be without what the causes made of them.
+
+    boards: those of the fit, in order. Each has the mask's place as fitted, and the brightness of
+    the others; hands no longer count.
+    """
+    found = []
+    for board, (brighter, x_um, y_um) in zip(boards, fit.own.tolist(), strict=True):
+        level = np.float32(1 + brighter)
+        found.append(
+            replace(
+                board,
+                reading=board.reading / level,
+                variance=board.variance / level**2,
+                stage_um=(board.stage_um[0] + x_um, board.stage_um[1] + y_um),
+                loose=False,
+            )
+        )
+    return found
 
 
 @one_blas_thread()
@@ -650,23 +737,37 @@ def fit_placement(
     if start is None:
         soft = starting_placement(camera, mask)
         start = register(max(boards, key=_contrast), mask, soft).placement
-    bench, widths = _bench_prior(boards, camera, mask, start), FIRST_WIDTHS
+    bench = _bench_prior(boards, camera, mask, start)
+    prior = bench.with_widths(bench.first_widths(mask.distance_um / mask.lens_um))
     state, steps = _State(start, np.zeros((len(boards), OWN))), 0
     for samples in _widening_samples(boards, mask, settings):
-        descent = _descend(mask, state, samples, bench.with_widths(widths), settings)
-        state, steps = descent.state, steps + descent.steps
-    for _ in range(WIDTH_ROUNDS):
-        widths = _likeliest_widths(descent, bench)
-        descent = _descend(mask, state, samples, bench.with_widths(widths), settings)
-        state, steps = descent.state, steps + descent.steps
-    checks = tuple(_check_board(mask, state, sample, index) for index, sample in enumerate(samples))
-    _refuse_unexplained(alike := _fitted_correlation(mask, state, samples))
-    normal, placement = descent.normal, with_aperture_mean_one(state.placement)
-    covariance, astray2 = _covariance(mask, descent, samples, bench.with_widths(widths))
+        descent = _descend(mask, _point(mask, state, samples), samples, prior, settings)
+        state, steps = descent.point.state, steps + descent.steps
+    found: list[FoundCause] = []
+    for turn in range(CAUSE_ROUNDS):
+        off_plate = any(cause.name in OF_PLATE for cause in found)
+        if turn > 1 and not off_plate:
+            break
+        if off_plate:
+            # Where pinholes stand decides how much of their light the aperture's edge cuts.
+            bench = bench.about(found, descent.point.state.own, boards)
+        found = _find_causes(mask, descent.point, samples, bench)
+        prior = bench.with_widths(_own_widths(found, mask.distance_um / mask.lens_um))
+        descent = _descend(mask, descent.point, samples, prior, settings)
+        steps += descent.steps
+    point, state = descent.point, descent.point.state
+    checks = tuple(_check_board(point, sample, index) for index, sample in enumerate(samples))
+    _refuse_unexplained(alike := _fitted_correlation(point, samples))
+    normal, placement = point.normal, with_aperture_mean_one(state.placement)
+    everything, astray2 = _covariance(mask, point, samples, prior)
+    size = len(placement.vector())
+    covariance, own_covariance = everything[:size, :size], everything[size:, size:]
     undecided, more = _find_undecided(placement, covariance, len(boards))
-    # A pinhole that a hand put a little off looks like a mask that moved, and is none.
-    firm = [check for check, board in zip(checks, boards, strict=True) if not board.loose]
-    moved_um = _farthest_um(widths.moved_um if len(firm) == len(checks) else 0.0, firm)
+    causes = with_sizes(
+        found, list(bench.causes.values()), state.own.ravel(), own_covariance, bench.own2
+    )
+    causes = doubt_lone_move(causes, boards)
+    moved_um = _astray_um(causes, checks, boards)
     covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement=placement,
@@ -680,7 +781,11 @@ def fit_placement(
         undecided=undecided,
         more_boards=more,
         boards=checks,
-        brightness_spread=float(widths.brightness),
+        causes=tuple(causes),
+        own=_without_aberrations(state.own, causes, boards),
+        own_deviation=_without_aberrations(
+            np.sqrt(np.diag(own_covariance)).reshape(state.own.shape), causes, boards
+        ),
         moved_um=moved_um,
         astray2=astray2,
     )
@@ -714,19 +819,17 @@ def _widening_samples(
 
 
 def _covariance(
-    mask: ShadowMask, descent: _Descent, samples: Sequence[Sample], prior: _Prior
+    mask: ShadowMask, point: _Point, samples: Sequence[Sample], prior: _Prior
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
-    """Return the placement's covariance, and the variances of the views' own, see `Fit`.
+    """Return the covariance of all parameters, and the variances of the views' own, see `Fit`.
 
     C = (matrix + P)^-1 of all parameters, and what the views' own and rows that err alike add.
     """
-    state, normal = descent.state, descent.normal
-    covariance = np.asarray(np.linalg.inv(normal.matrix + np.diag(prior.precision)), np.float64)
-    terms = _view_terms(mask, state, samples, normal.spread)
-    of_views, astray2 = _bias_covariance(covariance, terms)
-    of_rows = _rows_covariance(mask, state, samples, normal.spread, covariance)
-    size = len(state.placement.vector())
-    return (covariance + of_views + of_rows)[:size, :size], astray2
+    information = point.normal.matrix + prior.precision
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    of_views, astray2 = _bias_covariance(covariance, _view_terms(mask, point, samples))
+    of_rows = _rows_covariance(point, samples, covariance)
+    return covariance + of_views + of_rows, astray2
 
 
 def _refuse_unexplained(alike: float) -> None:
@@ -737,6 +840,21 @@ def _refuse_unexplained(alike: float) -> None:
             f"design is {alike:.2f} after the fit, at least {LEAST_FIT_CORRELATION} is "
             "needed; check the mask and the camera's description, or use calibration method free"
         )
+
+
+def _without_aberrations(
+    own: NDArray[np.float64], causes: Sequence[FoundCause], boards: Sequence[Board]
+) -> NDArray[np.float64]:
+    """Return own parameters or their deviations, (board, OWN), 0 for moves that are the views' own.
+
+    What aberrations make of a view is part of Psi, and not to be taken out.
+    """
+    names = {cause.name for cause in causes}
+    if LENS not in names or HANDS in names:
+        return own
+    kept = own.copy()
+    kept[[through_pinhole(board) for board in boards], 1:] = 0.0
+    return kept
 
 
 def _find_undecided(
@@ -756,17 +874,26 @@ def _find_undecided(
     return tuple(name for name, share in names if share > MOST_OF_PRIOR), more
 
 
-def _farthest_um(width_um: float, checks: Sequence[BoardCheck]) -> float:
-    """Return how far from the fitted place the mask may stand, um: 0 where it seems to stand still.
+def _astray_um(
+    causes: Sequence[FoundCause], checks: Sequence[BoardCheck], boards: Sequence[Board]
+) -> float:
+    """Return how far from the fitted place the mask may stand in a shot, um: 0 where it stays.
 
-    The largest significant move: the width of all moves takes a single outlier for chance.
+    What the stage does by chance, what it creeps by from the middle of the capture to its end, and
+    the largest move that is sure of a whole aperture: the width of all takes an outlier for chance.
     """
-    sure = [
-        float(np.hypot(*check.moved_um))
-        for check in checks
-        if np.hypot(*check.moved_um) > max(LEAST_MOVED_UM, SURE_MOVE * check.moved_deviation_um)
-    ]
-    return max([width_um if width_um > MOVES_UM[0] else 0.0, *sure])
+    far_um = [cause.width for cause in causes if cause.name == STAGE]
+    far_um += [float(np.hypot(*cause.size)) / 2 for cause in causes if cause.name == CREEP]
+    if not any(cause.name == CREEP for cause in causes):
+        perhaps = any(cause.name == HANDS and STAGE in cause.instead for cause in causes)
+        far_um += [
+            float(np.hypot(*check.moved_um))
+            for check, board in zip(checks, boards, strict=True)
+            if (perhaps or not through_pinhole(board))
+            and np.hypot(*check.moved_um)
+            > max(LEAST_MOVED_UM, SURE_MOVE * check.moved_deviation_um)
+        ]
+    return max([0.0, *far_um])
 
 
 def shares_of_prior(
@@ -795,9 +922,9 @@ def shares_of_prior(
     return share
 
 
-def _fitted_correlation(mask: ShadowMask, state: _State, samples: Sequence[Sample]) -> float:
+def _fitted_correlation(point: _Point, samples: Sequence[Sample]) -> float:
     """Return the correlation of readings and fit, every colour of a whiteboard with its level."""
-    residuals = np.concatenate(_all_residuals(mask, state, samples))
+    residuals = np.concatenate([each.residual for each in point.linear])
     reading, deviation = (
         np.concatenate([getattr(sample, name) for sample in samples])
         for name in ("reading", "deviation")
@@ -809,35 +936,33 @@ def _fitted_correlation(mask: ShadowMask, state: _State, samples: Sequence[Sampl
     return correlation(reading, reading - residuals * deviation, np.concatenate(channels))
 
 
-def _check_board(mask: ShadowMask, state: _State, sample: Sample, index: int) -> BoardCheck:
+def _check_board(point: _Point, sample: Sample, index: int) -> BoardCheck:
     """Return how far one board's brightness and mask are off, the placement as fitted.
 
     Robust least squares of the board alone, without the prior of its own: the fit's values, of
     which the prior has held back a part, and the steps (brightness, x, y) that are left.
     """
-    shadow = Shadow(mask, state.placement)
-    board = sample.board
-    opening = state.opening(board, index)
-    fitted, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
-    rows = np.stack([fitted, slope[:, 0], slope[:, 1]], axis=1) / sample.deviation[:, None]
-    residual = (sample.reading - state.brightness(index) * fitted) / sample.deviation
+    residual, slope = point.linear[index]
+    brightness = point.state.brightness(index)
+    # Of the shadow itself, as if the whiteboard had the brightness of all.
+    rows = np.stack([slope[:, -OWN], *(slope[:, OFFSETS] / brightness).T], axis=1)
     weight, step, matrix = np.ones(len(residual)), np.zeros(OWN), np.eye(OWN)
     for _ in range(8):
         matrix = rows.T @ (rows * weight[:, None])
         step = np.linalg.solve(matrix, rows.T @ (weight * residual))
         left = residual - rows @ step
         weight = tukey_weights(left / _robust_spread([left]))
-    brightness, x_um, y_um = map(float, state.own[index] + step)
+    brightness, x_um, y_um = map(float, point.state.own[index] + step)
     spread = _robust_spread([residual])
     inside = tukey_weights(residual / spread) > 0
     brightness_deviation, *moved_deviations = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread
     return BoardCheck(
-        name=board.name,
+        name=sample.board.name,
         brightness=1 + brightness,
         brightness_deviation=float(brightness_deviation),
         moved_um=(x_um, y_um),
         moved_deviation_um=float(max(moved_deviations)),
-        taken_s=board.taken_s,
+        taken_s=sample.board.taken_s,
         chi2=float(np.mean(residual[inside] ** 2)),
         outliers=float(1 - inside.mean()),
     )

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from emmc_rig.calibration.board_angle import BoardAngle
 from emmc_rig.calibration.boards import Board, BoardSet, Sample
+from emmc_rig.calibration.causes import CREEP, OF_PLATE, through_pinhole
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.fit import Fit
 from emmc_rig.calibration.frames import MeanFrame
 from emmc_rig.calibration.locator import register
+from emmc_rig.calibration.openings import views_open
 from emmc_rig.calibration.placement import SCALARS, Placement, Tolerances, designed_placement
 from emmc_rig.calibration.robust import correlation, deviation_of
 from emmc_rig.calibration.shadow import Shadow, ShadowMask
@@ -57,6 +59,8 @@ LARGEST_UNEVENNESS = 0.25
 LARGEST_DISAGREEMENT = 0.005
 SURE = 5.0
 """Standard deviations, from which on a difference is no chance."""
+MANY_OUTLIERS = 0.1
+"""Share of a whiteboard's pixels: noise has 0.001, dust less than a tenth."""
 MIRRORED = 0.02
 """By which the views in another order must correlate better with the design's."""
 SAMPLED, SAMPLED_GRADIENT = 3_000, 200_000
@@ -203,8 +207,8 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
     return shadow.placement
 
 
-def _correlation(sample: Sample, shadow: Shadow, views_open: NDArray[np.bool_]) -> float:
-    how = sample.pixels, sample.channels, views_open, sample.board.stage_um, sample.board.shot
+def _correlation(sample: Sample, shadow: Shadow, opened: NDArray[np.bool_]) -> float:
+    how = sample.pixels, sample.channels, opened, sample.board.stage_um, sample.board.shot
     return correlation(sample.reading, shadow.readings(*how), sample.channels)
 
 
@@ -216,7 +220,7 @@ def _raise_dim_references(clear: float) -> None:
     )
 
 
-def refuse_odd_fit(fit: Fit, boards: Sequence[Board]) -> None:
+def refuse_odd_fit(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> None:
     """Raise CalibrationError for a fit that no bench has, and for whiteboards unlike the others."""
     at = fit.placement
     if at.clear > max(CLEAREST, 1 + SURE * fit.deviation("clear")):
@@ -230,6 +234,16 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board]) -> None:
             f"{abs(off[worst]):.1f} times as far from the design as benches are: these whiteboards "
             "are of another camera or mask, or its description is wrong"
         )
+    _refuse_wrong_holes(fit, boards, mask)
+    creep = next((cause for cause in fit.causes if cause.name == CREEP), None)
+    if creep is not None and np.hypot(*creep.size) > ALIKE_UM:
+        raise CalibrationError(
+            f"the mask drifts: by ({creep.size[0]:+.1f}, {creep.size[1]:+.1f}) um over the "
+            "whiteboards; fasten it, let the bench settle, and capture all again"
+        )
+    # Where the plate explains what pinholes show, the mask has not moved.
+    off_plate = any(cause.name in OF_PLATE for cause in fit.causes)
+    half_hole_um = mask.aperture_cell_um * mask.distance_um / mask.lens_um / 2
     for check, board in zip(fit.boards, boards, strict=True):
         alike = sum(np.allclose(board.stage_um, other.stage_um) for other in boards) > 1
         moved_um = float(np.hypot(*check.moved_um))
@@ -239,10 +253,40 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board]) -> None:
                 "the aperture where it should be, the mask in the beam, and the lamp the same? "
                 "Capture it again"
             )
-        if alike and moved_um > max(ALIKE_UM, SURE * check.moved_deviation_um):
+        if off_plate and through_pinhole(board):
+            if moved_um > max(half_hole_um, ALIKE_UM):
+                off_um = moved_um / mask.distance_um * mask.lens_um
+                raise CalibrationError(
+                    f"{check.name}: the pinhole stands {off_um:.0f} um off its hole, half a hole "
+                    "or more: put it on its hole and capture this whiteboard again; if the mask "
+                    "moved instead, capture all again"
+                )
+        elif alike and moved_um > max(ALIKE_UM, SURE * check.moved_deviation_um):
             raise CalibrationError(
                 f"{check.name}: the mask stands {moved_um:.1f} um from where the others have it: "
                 "it moved between them, or this one is of another day; capture all again, in one go"
+            )
+
+
+def _refuse_wrong_holes(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> None:
+    """Raise CalibrationError for a whiteboard that shows the shadow through another hole."""
+    shadow, rng = Shadow(mask, fit.placement), np.random.default_rng(0)
+    quarter_um = mask.aperture_cell_um * mask.distance_um / mask.lens_um / 4
+    for check, board in zip(fit.boards, boards, strict=True):
+        usual = np.hypot(*check.moved_um) < quarter_um and check.outliers < MANY_OUTLIERS
+        if board.views_open.sum() != 1 or usual:
+            continue
+        sample = board.sampled(np.inf, SAMPLED, rng)
+        alike = {
+            view: _correlation(sample, shadow, views_open(mask.views, view))
+            for view in np.ndindex(*mask.views)
+        }
+        named, shown = np.argwhere(board.views_open)[0].tolist(), max(alike, key=lambda v: alike[v])
+        if alike[shown] > alike[tuple(named)] + MIRRORED:
+            raise CalibrationError(
+                f"{check.name}: it shows the shadow through the hole of view {shown}: the pinhole "
+                "was in the wrong hole, or the whiteboard is named for the wrong view; capture it "
+                "again, or correct its name"
             )
 
 

@@ -24,6 +24,7 @@ from emmc_rig.calibration.boards import (
 )
 from emmc_rig.calibration.choice import (
     LARGEST_CHI2,
+    OPEN,
     HeldOut,
     choose,
     judge,
@@ -41,7 +42,7 @@ from emmc_rig.calibration.colours import (
 )
 from emmc_rig.calibration.defects import find_defects, loss_variance, moved_dust
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.fit import OFFSETS, fit_placement
+from emmc_rig.calibration.fit import OFFSETS, fit_placement, settled
 from emmc_rig.calibration.frames import MeanFrame
 from emmc_rig.calibration.levels import Levels, fit_levels
 from emmc_rig.calibration.locator import SOFT_EDGES
@@ -156,7 +157,8 @@ def calibrate(
         psis |= _measure_views(task, modelled, empty, on_plane)
     _count_common_errors(task, modelled, psis)
     judged = {name: psi.judged for name, psi in psis.items() if name in routes}
-    chosen, why = choose(list(judged.values()))
+    stated = {name: psi.calibration.stated_error for name, psi in psis.items()}
+    chosen, why = choose(list(judged.values()), stated)
     refusals.refuse_another_bench(chosen)
     advice += _count_residual(chosen, psis[chosen.route].calibration)
     calibrations = {name: psi.calibration for name, psi in psis.items()}
@@ -335,7 +337,7 @@ def _compare_with_design(task: _Task, readings: _Readings) -> tuple[Shadow | Non
     seen = [*seen, *readings.judges]
     start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
     fit = fit_placement(seen, task.camera, mask, start=start)
-    refusals.refuse_odd_fit(fit, seen)
+    refusals.refuse_odd_fit(fit, seen, mask)
     shadow = Shadow(mask, fit.placement)
     refusals.refuse_tilted_board(shadow, seen, limits=refusals.FREE_GRADIENT)
     # Smaller differences are left to the measured Psi: few whiteboards do not determine them.
@@ -354,32 +356,34 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
     plain = shadow_mask(task.camera, task.design.size)
     mask = task.as_filtered(plain)
     fit = fit_placement(readings.seen, task.camera, mask)
+    refusals.refuse_odd_fit(fit, readings.seen, mask)
     advice, findings = words.fit_advice(fit), list[str]()
-    refusals.refuse_odd_fit(fit, readings.seen)
-    dusty = moved_dust(Shadow(mask, fit.placement), readings.seen)
+    dusty = moved_dust(Shadow(mask, fit.placement), settled(fit, readings.seen))
     if dusty.any():
         findings.append(words.dust_finding(dusty))
         readings = readings.without(dusty)
         fit = fit_placement(readings.seen, task.camera, mask, start=fit.placement)
-    findings += words.hands_findings(fit, readings.seen, mask)
-    models = {"parametric": with_misfit(Parametric(fit, mask), readings.seen)}
+    of_causes = words.cause_lines(fit, readings.seen, mask)
+    findings, advice = [*of_causes.findings, *findings], [*of_causes.advice, *advice]
+    seen = settled(fit, readings.seen)
+    models = {"parametric": with_misfit(Parametric(fit, mask), seen)}
     if {"mixed", "combined"} & task.routes and task.design.binning == 1:
         task.on_stage("defects of the mask")
         mixed = _fit_with_defects(readings.seen, task.camera, models["parametric"])
-        models["mixed"] = with_misfit(mixed, readings.seen)
+        models["mixed"] = with_misfit(mixed, seen)
     bare, psis = {}, {}
     for name, fitted in models.items():
-        missed = _missed_at_defects(fitted, [*readings.seen, *readings.judges])
+        missed = _missed_at_defects(fitted, [*seen, *readings.judges])
         model = replace(fitted, of_defects=missed)
         task.on_stage(f"Psi, {name}")
         bare[name] = _calibration_by(model, task, few, readings.good)
         psis[name] = _RoutePsi(
             _with_misfit_variance(bare[name], model),
-            _judged_model(name, model, readings.judges, readings.seen),
+            _judged_model(name, model, readings.judges, seen),
             few.exposures,
         )
     best = models.get("mixed", models["parametric"])
-    refusals.refuse_tilted_board(best.shadow, [*readings.judges, *readings.seen])
+    refusals.refuse_tilted_board(best.shadow, [*readings.judges, *seen])
     findings += words.mask_findings(best.fit)
     findings += filter(None, [best.mask.repeats.words])
     return _Modelled(readings, plain, models, bare, psis, advice, findings)
@@ -413,8 +417,8 @@ def _measure_views(
         raise CalibrationError("the calibration method free was given no whiteboards")
     task.on_stage("Psi, free")
     free = replace(measure_psi(pinholes, task.design, empty, on_plane), good=readings.good)
-    if modelled.best is not None:
-        _correct_pinhole_places(free, modelled.best, readings.seen, task.design)
+    if modelled.best is not None and modelled.best.fit.causes:
+        _correct_pinholes(free, modelled.best, readings.seen, task.design)
     at_first = (board for board in readings.judges if board.shot == 0)
     still = next((b for b in at_first if np.allclose(b.stage_um, task.stages[0])), None)
     if still is None:
@@ -426,7 +430,7 @@ def _measure_views(
     def judged(name: str, known: Calibration, boards: BoardSet) -> _RoutePsi:
         predicted = predicted_by_psi(known.psi, still)
         variance = prediction_variance(known.deviation, still, task.design.binning)
-        held = worst({"open aperture": judge(name, still, predicted, variance)})
+        held = worst({OPEN: judge(name, still, predicted, variance)})
         return _RoutePsi(known, held, boards.exposures)
 
     psis = {"free": judged("free", free, pinholes)}
@@ -466,7 +470,8 @@ def _unsteady(task: _Task, modelled: _Modelled, route: str) -> float:
     if "parametric" in modelled.models:
         slow2 = modelled.models["parametric"].fit.brightness_spread ** 2
     spread2 = slow2 + fast2 * float(np.mean([1 / reference.count for reference in references]))
-    if route == "free":
+    corrected = modelled.best is not None and modelled.best.fit.causes
+    if route == "free" and not corrected:
         frames = [frame for boards in sets for frame in boards.frames if frame.pinhole]
         spread2 += slow2 + fast2 * float(np.mean([1 / frame.count for frame in frames]))
     return float(np.sqrt(spread2))
@@ -548,11 +553,12 @@ def _list_unwatched(
 def _fit_with_defects(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
     """Return the fit with defects: found, and the placement refined with them in the mask."""
     start = parametric.fit.placement
-    defects = find_defects(seen, parametric.mask, start)
+    defects = find_defects(settled(parametric.fit, seen), parametric.mask, start)
     if defects.count == 0:
         return Parametric(parametric.fit, parametric.mask, defects)
     fit = fit_placement(seen, camera, defects.mask, start=start)
-    return Parametric(fit, parametric.mask, find_defects(seen, parametric.mask, fit.placement))
+    again = find_defects(settled(fit, seen), parametric.mask, fit.placement)
+    return Parametric(fit, parametric.mask, again)
 
 
 def with_misfit(model: Parametric, seen: Sequence[Board]) -> Parametric:
@@ -625,10 +631,7 @@ def _judged_model(
         unsteady2 = slow2 + fast2 / board.repeats
         return judge(name, board, predicted, unsteady=float(np.sqrt(unsteady2)))
 
-    groups = {
-        ("open aperture" if i == 0 else "mask moved"): judged(board)
-        for i, board in enumerate(judges)
-    }
+    groups = {(OPEN if i == 0 else "mask moved"): judged(board) for i, board in enumerate(judges)}
     for board in seen:
         if not board.views_open.all():
             v, u = np.argwhere(board.views_open)[[0, -1]].T
@@ -656,22 +659,24 @@ def _lost_at_aperture_edge(moved_um: tuple[float, float], board: Board, mask: Sh
     return 1 - left
 
 
-def _correct_pinhole_places(
+def _correct_pinholes(
     known: Calibration, model: Parametric, seen: Sequence[Board], layout: PsiLayout
 ) -> None:
-    """Take out of a measured Psi that hands put the pinhole a little off.
+    """Take out of a measured Psi what the causes made of the whiteboards through the pinhole.
 
-    Each view changes by what the fitted mask says that the way to its hole changes.
+    Each view is divided by the brightness of its whiteboard, and changes by what the fitted mask
+    says that the way to its hole changes.
     """
     weights, deviation = known.psi.weights, known.deviation
     shadow = of_samples(model.shadow)
-    for check, board in zip(model.fit.boards, seen, strict=True):
-        if not (board.loose and board.views_open.sum() == 1):
-            continue
+    pinholes = (
+        (board, own, unsure)
+        for board, own, unsure in zip(seen, model.fit.own, model.fit.own_deviation, strict=True)
+        if board.views_open.sum() == 1
+    )
+    for board, (brighter, off_x, off_y), (unsure, unsure_x, unsure_y) in pinholes:
         (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
-        off_x, off_y = check.moved_um
-        unsure_um = check.moved_deviation_um
-        lost = _lost_at_aperture_edge(check.moved_um, board, model.mask)
+        lost = _lost_at_aperture_edge((off_x, off_y), board, model.mask)
         for stored in range(layout.weights_shape[4]):
             place = board.shot, v, u, stored
 
@@ -680,12 +685,13 @@ def _correct_pinhole_places(
 
             right = at(x_um, y_um)
             index = board.shot, v, u, slice(None), stored
-            weights[index] = weights[index] + right - at(x_um + off_x, y_um + off_y)
+            moved = right - at(x_um + off_x, y_um + off_y)
+            weights[index] = weights[index] / (1 + brighter) + moved
             variance = sum(
                 np.square(at(x_um + by_x, y_um + by_y) - right)
-                for by_x, by_y in ((unsure_um, 0.0), (0.0, unsure_um))
+                for by_x, by_y in ((unsure_x, 0.0), (0.0, unsure_y))
             )
-            variance += np.square(lost * right)
+            variance += np.square(np.hypot(lost, unsure) * right)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
 
 

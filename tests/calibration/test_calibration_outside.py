@@ -51,8 +51,8 @@ def is_true(agreement, once=(0.45, 0.95), twice=(0.88, 1.0)):
 
 
 FLAWS = {
-    "tilt, glare, hot pixels, and cells of 0.03 and 0.93": {
-        "optics": {"tilt": (0.004, -0.002), "glare": 0.01, "open": 0.93, "closed": 0.03},
+    "tilt, hot pixels, and cells of 0.03 and 0.93": {
+        "optics": {"tilt": (0.004, -0.002), "open": 0.93, "closed": 0.03},
         "sensor": {"hot": 0.002},
     },
     "exposures that differ": {"course": {"shutter": 0.003}},

@@ -1,5 +1,6 @@
 """The parametric and mixed methods on a bench that is wrong in every way they do not know."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from emmc_rig.calibration.boards import Board, BoardFrame, BoardSet, as_readings
 from emmc_rig.calibration.choice import HeldOut, choose, judge, predicted_by_shadow
 from emmc_rig.calibration.defects import find_defects, loss_variance, mask_with_losses
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.findings import fit_advice
+from emmc_rig.calibration.findings import cause_lines, fit_advice
 from emmc_rig.calibration.fit import FitSettings, fit_placement, shares_of_prior
 from emmc_rig.calibration.locator import register
 from emmc_rig.calibration.openings import CENTRED, parts, views_open
@@ -247,11 +248,14 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     )
     seen = [boards[0], replace(flickered, name="second"), moved, *boards[3:]]
     fit = fit_placement(seen, CAMERA, MASK)
-    advice = " ".join(fit_advice(fit))
-    assert "second" in advice
-    assert "in brightness against the other whiteboards" in advice
-    assert "in 1 of" in advice
-    assert "um in third" in advice
+    lines = cause_lines(fit, seen, MASK)
+    assert "second" in lines.advice[0]
+    assert "in brightness against the other whiteboards" in lines.advice[0]
+    # 3 um of the mask's shadow; one pinhole alone may be a mask that moved as well.
+    far_um = 3.0 / MASK.distance_um * MASK.lens_um
+    off_um = float(re.search(r"pinholes stand up to (\d+) um", lines.findings[0])[1])
+    assert off_um == pytest.approx(far_um, rel=0.1)
+    assert "a mask that is not where the stage reports it" in lines.findings[0]
     assert fit.moved_um == pytest.approx(3.0, rel=0.2)
 
 
@@ -366,20 +370,25 @@ def test_a_dark_whiteboard_and_missing_references_are_refused(few, design):
         fit_placement([], CAMERA, MASK)
 
 
-def test_the_simplest_method_at_the_noise_is_chosen():
+def test_the_surest_method_that_predicts_to_the_noise_is_chosen():
     def judged(route, chi2):
-        return HeldOut(route, chi2, 0.0, np.zeros((2, 2), np.float32))
+        return HeldOut(route, chi2, 0.0, np.ones((64, 64), np.float32))
 
-    def pick(*pairs):
-        return choose([judged(*pair) for pair in pairs])[0].route
+    def pick(**routes):
+        held = [judged(route, chi2) for route, (chi2, _) in routes.items()]
+        return choose(held, {route: stated for route, (_, stated) in routes.items()})
 
-    assert pick(("free", 1.0), ("mixed", 1.1), ("parametric", 1.2)) == "parametric"
-    assert pick(("parametric", 3.0), ("mixed", 1.2), ("free", 1.0)) == "mixed"
-    assert pick(("parametric", 9.0), ("mixed", 5.0), ("free", 2.5)) == "free"
-    assert choose([judged("mixed", 1.24)])[1].startswith(
+    # 5 sqrt(2 / 4096) = 0.11 is chance.
+    assert pick(free=(1.0, 0.005), parametric=(1.1, 0.001))[0].route == "parametric"
+    assert pick(free=(1.0, 0.005), combined=(1.02, 0.004))[0].route == "combined"
+    assert pick(free=(1.0, 0.005), parametric=(1.3, 0.001))[0].route == "free"
+    assert pick(mixed=(1.4, 0.002), parametric=(1.3, 0.003))[0].route == "mixed"
+    assert pick(mixed=(9.0, 0.002), free=(2.5, 0.003))[0].route == "free"
+    assert pick(mixed=(1.24, 0.002))[1].startswith(
         "calibration good: residual 1.24 x noise variance (limit 1.5)"
     )
-    assert choose([judged("mixed", 8.0)])[1].startswith("calibration doubtful: residual 8.00 x")
+    doubtful = pick(mixed=(8.0, 0.002))[1]
+    assert doubtful.startswith("calibration doubtful: residual 8.00 x")
 
 
 def test_dark_current_is_drawn_as_a_line_between_two_dark_exposures(few):

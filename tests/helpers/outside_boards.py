@@ -11,6 +11,7 @@ from outside_bench import Bench, Optics
 from emmc_rig.calibration.boards import BoardFrame, BoardSet
 from emmc_rig.calibration.frames import average
 from emmc_rig.calibration.shadow import shadow_mask
+from emmc_rig.calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.model.camera import Camera
 
 REPEATS = 4
@@ -63,15 +64,22 @@ class Photographer:
         held_um: Sequence[tuple[float, float]] = ((0, 0), (15, -21)),
         pinholes: Sequence[tuple[int, int]] = (),
         turns: Sequence[float] = (),
+        colours: bool = False,
+        loose: bool = False,
     ) -> dict[str, Any]:
-        """Return held_out, few, pinholes and turned, as `calibrate` takes them."""
+        """Return held_out, few, pinholes and turned, as `calibrate` takes them.
+
+        colours: whether the references are taken under coloured lamps as well. loose: whether the
+        table says that hands put the pinhole.
+        """
         views = self.bench.optics.views[0] * self.bench.optics.views[1]
         dark = [self.mean(OPEN_S, lit=False), self.mean(OPEN_S * views, lit=False)]
-        white = {(0, "white"): self.mean(OPEN_S, mask=None)}
+        lamps = ("white", "red", "green", "blue") if colours else ("white",)
+        white = {(0, lamp): self.mean(OPEN_S, mask=None, lamp=lamp) for lamp in lamps}
         boards = BoardSet(tuple(dark), white, ())
         few = [BoardFrame.held(self.mean(OPEN_S, mask=at), at) for at in open_um]
         free = [
-            BoardFrame.held(self.mean(OPEN_S * views, view=view), (0.0, 0.0), 0, view)
+            BoardFrame.held(self.mean(OPEN_S * views, view=view), (0.0, 0.0), 0, view, loose=loose)
             for view in pinholes
         ]
         held = [BoardFrame.held(self.mean(OPEN_S, mask=at), at) for at in held_um]
@@ -89,16 +97,27 @@ class Photographer:
 
 
 def agreement(
-    bench: Bench, weights: np.ndarray, deviation: np.ndarray, good: Any
+    bench: Bench,
+    weights: np.ndarray,
+    deviation: np.ndarray,
+    good: Any,
+    mask: tuple[float, float] = (0.0, 0.0),
 ) -> dict[str, float]:
     """Return true and stated error of Psi, relative, and shares within one and two deviations.
 
-    weights, deviation: (shot, v, u, y, stored colour, x), the first shot counts.
+    weights, deviation: (shot, v, u, y, stored colour, x), the first shot counts. mask: its true
+    place. Of a Psi in three colours of a bench without crosstalk the sum counts.
     """
-    truth = bench.psi()
+    if weights.shape[4] == 3 and bench.sensor.crosstalk:
+        truth = np.stack([bench.psi_of(*mask, lamp) for lamp in LAMP_COLOURS], 3)
+        off, stated = weights[0] - truth, deviation[0]
+        good = np.asarray(good)[:, None]
+    else:
+        truth = bench.psi(*mask)
+        off = weights[0].sum(3) - truth
+        stated = np.sqrt(np.square(deviation[0]).sum(3))
     use = np.broadcast_to(good, truth.shape)
-    off = (weights[0, :, :, :, 0] - truth)[use]
-    stated = deviation[0, :, :, :, 0][use]
+    off, stated = off[use], stated[use]
     scale = float(np.sqrt(np.mean(truth[use] ** 2)))
     return {
         "true": float(np.sqrt(np.mean(off**2))) / scale,

@@ -1,0 +1,407 @@
+"""Why whiteboards differ among themselves: single causes, compared by the evidence of the readings.
+
+Every whiteboard has three parameters of its own beside the placement: its brightness b, and by how
+much the mask seems to have moved, x and y. A cause gives these a pattern over the whiteboards: a
+lamp that is not steady changes every b by chance, holes of unequal size only those of whiteboards
+through the pinhole, a plate that is turned moves the shadow of every hole by its distance from the
+axis. A pinhole moved by du on the plate shows the shadow of a mask moved by -rho du, rho = d / D.
+
+With the readings linear in the parameters, what the whiteboards say of their own parameters p, the
+placement's taken out, is an information S and a pull h. A cause of pattern A and width tau makes p
+normal about 0 with covariance Sigma = tau^2 A A^T, several causes sum, and with Sigma = F F^T
+
+    log evidence = 1/2 (F^T h)^T (1 + F^T S F)^-1 F^T h - 1/2 log|1 + F^T S F|
+
+A cause is taken in after another where it raises the evidence most. What raises it nearly as much
+is named beside it: the whiteboards do not tell these apart.
+
+Source of the evidence: MacKay 1992.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emmc_rig.calibration.boards import Board
+
+Array = NDArray[np.floating]
+OWN = 3
+"""Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
+LEAST_OWN = (2e-5, 0.002, 0.002)
+"""Standard deviations of these without any cause: far below what noise shows."""
+LEAST_MOVED_UM = 0.25
+"""Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
+rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
+MOVED_STEPS, BRIGHTNESSES = np.geomspace(1.0, 64.0, 9), np.geomspace(5e-5, 0.1, 12)
+"""Widths that are tried: of moves in units of LEAST_MOVED_UM; of brightness relative."""
+LEAST_GAIN = 1.0
+"""Of the log evidence by a cause: less tells nothing."""
+NEARLY = 3.0
+"""Difference of the log evidence of causes that fit nearly alike: a factor of 20."""
+LONE = 0.9
+"""Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
+LAMP, STAGE, CREEP, LENS = "lamp", "stage", "creep", "lens"
+HOLES, HANDS, EXPOSURE, PLATE, TURN = "holes", "hands", "exposure", "plate", "turn"
+OF_PLATE = (HANDS, PLATE, TURN)
+"""Causes by which pinholes stand off their holes."""
+SHIFTING = (STAGE, HANDS, HOLES, PLATE, TURN)
+"""Causes that aberrations of the views imitate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """A possible cause. columns: (own parameter of all whiteboards, coefficient), for a coefficient
+    of 1. widths: standard deviations of the coefficients that are tried, in the cause's unit:
+    LAMP, HOLES, EXPOSURE relative; STAGE, CREEP (over the whole capture) and LENS (aberrations that
+    displace every view's shadow) um of the mask; HANDS, PLATE um of the plate; TURN rad.
+    """
+
+    name: str
+    columns: NDArray[np.float64]
+    widths: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCause:
+    """A cause that the whiteboards show.
+
+    width: standard deviation of its coefficients. size, deviation: every coefficient as found.
+    gain: of the log evidence. instead: other causes that fit nearly as well.
+    """
+
+    name: str
+    width: float
+    gain: float
+    instead: tuple[str, ...] = ()
+    size: tuple[float, ...] = ()
+    deviation: tuple[float, ...] = ()
+
+
+class OwnInformation(NamedTuple):
+    """What readings say of the whiteboards' own parameters, the placement's taken out."""
+
+    information: NDArray[np.float64]
+    """(own, own)."""
+    pull: NDArray[np.float64]
+    """(own,): gradient of the log likelihood, at all of them 0."""
+
+
+class Light(NamedTuple):
+    """The light through a pinhole."""
+
+    share: float
+    """Of the light through the hole on its place."""
+    x_um: float
+    """Of its middle, from the middle of the view."""
+    y_um: float
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Of the camera: what a plate's place makes of the mask's shadow.
+
+    ratio: rho = d / D. cell_um: side of a view and of a hole. views: (v, u).
+    """
+
+    ratio: float
+    cell_um: float
+    views: tuple[int, int]
+
+    def light(self, view: tuple[int, int], x_um: float, y_um: float) -> Light:
+        """Return the light through a pinhole that stands (x, y) off its view's hole.
+
+        What lies beyond the outermost views passes none.
+        """
+        lengths, middles = [], []
+        for place, count, off_um in zip(view, self.views, (y_um, x_um), strict=True):
+            middle_um, half_um = (place - (count - 1) / 2) * self.cell_um, count * self.cell_um / 2
+            begin_um = max(middle_um + off_um - self.cell_um / 2, -half_um)
+            end_um = min(middle_um + off_um + self.cell_um / 2, half_um)
+            lengths.append(max(end_um - begin_um, 0.0) / self.cell_um)
+            middles.append((begin_um + end_um) / 2 - middle_um)
+        return Light(lengths[0] * lengths[1], middles[1], middles[0])
+
+    def slopes(self, board: Board, off_um: Array) -> NDArray[np.float64]:
+        """Return the slopes of a whiteboard's own parameters by its pinhole's place, (OWN, 2).
+
+        off_um: (x, y) of the pinhole from its hole, about which the slopes are taken.
+        """
+        if board.views_open.sum() > 1:
+            return np.array([[0.0, 0.0], [-self.ratio, 0.0], [0.0, -self.ratio]])
+        v, u = np.argwhere(board.views_open)[0].tolist()
+        step_um, found = self.cell_um / 1000, np.empty((OWN, 2))
+        for axis in range(2):
+            by = np.eye(2)[axis] * step_um
+            less, more = (self.light((v, u), *(off_um + sign * by)) for sign in (-1, 1))
+            middle = self.light((v, u), *off_um)
+            found[:, axis] = np.array(
+                [
+                    (more.share - less.share) / max(middle.share, 0.1),
+                    -self.ratio * (more.x_um - less.x_um),
+                    -self.ratio * (more.y_um - less.y_um),
+                ]
+            ) / (2 * step_um)
+        return found
+
+
+def through_pinhole(board: Board) -> bool:
+    """Return whether a whiteboard opens one view, or some."""
+    return not bool(board.views_open.all())
+
+
+def possible_causes(
+    boards: Sequence[Board], geometry: Geometry, off_um: Array | None = None
+) -> list[Cause]:
+    """Return the causes that these whiteboards could tell from a perfect bench.
+
+    off_um: (board, 2), x and y by which pinholes stand off their holes as far as that is known:
+    one that is pushed beyond the outermost views loses light, and its middle moves half as far.
+    """
+    count = len(boards)
+    off_um = np.zeros((count, 2)) if off_um is None else off_um
+    few = np.array([through_pinhole(board) for board in boards])
+    moved = MOVED_STEPS * LEAST_MOVED_UM
+    causes = [
+        Cause(LAMP, _own_columns(np.eye(count), 0), BRIGHTNESSES),
+        Cause(STAGE, _moves(np.eye(count)), moved),
+    ]
+    times = np.array([board.taken_s for board in boards])
+    if np.ptp(times) > 0 and count > 2:
+        when = (times - times.mean()) / np.ptp(times)
+        causes.append(Cause(CREEP, _moves(when[:, None]), 2 * moved))
+    if few.sum() == 0:
+        return causes
+    # By the place of every pinhole, x and y: (board, OWN, board of the pinhole, 2).
+    slopes = np.zeros((count, OWN, count, 2))
+    for index in np.flatnonzero(few):
+        slopes[index, :, index] = geometry.slopes(boards[index], off_um[index])
+    by_place = slopes.reshape(count * OWN, count, 2)
+    loose = np.array([board.loose for board in boards])
+    by_hand = few & loose if loose.any() else few
+    on_plate = moved / geometry.ratio
+    causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate))
+    if few.sum() > 1:
+        causes.append(Cause(HOLES, _own_columns(np.eye(count)[:, few], 0), BRIGHTNESSES))
+    if few.all():
+        return causes
+    common = few[:, None].astype(np.float64)
+    causes.append(Cause(EXPOSURE, _own_columns(common, 0), BRIGHTNESSES))
+    causes.append(Cause(PLATE, by_place.sum(axis=1), on_plate))
+    places_um = plate_places_um(boards, geometry.cell_um)
+    far_um = float(np.hypot(*places_um.T)[few].max())
+    if few.sum() > 1 and far_um > 0:
+        turned = np.einsum("obk,bk->o", by_place, turned_by(places_um))
+        causes.append(Cause(TURN, turned[:, None], on_plate / far_um))
+    return causes
+
+
+def turned_by(places_um: Array) -> NDArray[np.float64]:
+    """Return by how much holes move, (board, 2), for each rad that the plate turns from x to y."""
+    return np.stack([-places_um[:, 1], places_um[:, 0]], axis=1)
+
+
+def plate_places_um(boards: Sequence[Board], cell_um: float) -> NDArray[np.float64]:
+    """Return where the middle of every whiteboard's open views lies, x and y: (board, 2)."""
+    middles = np.array([np.argwhere(board.views_open).mean(axis=0) for board in boards])
+    views = np.array(boards[0].views_open.shape)
+    return (middles - (views - 1) / 2)[:, ::-1] * cell_um
+
+
+def pinholes_off_um(
+    found: Sequence[FoundCause], boards: Sequence[Board], cell_um: float
+) -> NDArray[np.float64]:
+    """Return how far pinholes stand off their holes by the causes found, x and y: (board, 2)."""
+    few = np.array([through_pinhole(board) for board in boards])
+    loose = np.array([board.loose for board in boards])
+    by_hand = few & loose if loose.any() else few
+    off_um = np.zeros((len(boards), 2))
+    for cause in found:
+        if cause.name == HANDS:
+            off_um[by_hand] += np.reshape(cause.size, (-1, 2))
+        elif cause.name == PLATE:
+            off_um[few] += cause.size
+        elif cause.name == TURN:
+            off_um += few[:, None] * cause.size[0] * turned_by(plate_places_um(boards, cell_um))
+    return off_um
+
+
+def _own_columns(of_boards: Array, which: int) -> NDArray[np.float64]:
+    """Return columns (own, k) of one own parameter from those of the whiteboards, (board, k)."""
+    columns = np.zeros((len(of_boards), OWN, of_boards.shape[1]))
+    columns[:, which] = of_boards
+    return columns.reshape(len(of_boards) * OWN, -1)
+
+
+def _moves(of_boards: Array) -> NDArray[np.float64]:
+    """Return the same for moves along x, then along y."""
+    return np.hstack([_own_columns(of_boards, 1), _own_columns(of_boards, 2)])
+
+
+def with_lens(causes: Sequence[Cause], displacements: int) -> list[Cause]:
+    """Return the causes with LENS, over the own parameters and then the views' displacements.
+
+    displacements: number of the latter, um, by x and y of every view.
+    """
+    more = [
+        replace(cause, columns=np.pad(cause.columns, ((0, displacements), (0, 0))))
+        for cause in causes
+    ]
+    own = len(causes[0].columns)
+    of_views = np.vstack([np.zeros((own, displacements)), np.eye(displacements)])
+    return [*more, Cause(LENS, of_views, MOVED_STEPS * LEAST_MOVED_UM / 5)]
+
+
+def covariance_of(
+    causes: Mapping[str, Cause], widths: Mapping[str, float], own2: Array
+) -> NDArray[np.float64]:
+    """Return the covariance of the own parameters, (own, own), beforehand.
+
+    own2: (own,), variances known beside the causes.
+    """
+    total = np.diag(own2)
+    for name, width in widths.items():
+        total += width**2 * causes[name].columns @ causes[name].columns.T
+    return total
+
+
+def log_evidence(own: OwnInformation, covariance: Array) -> float:
+    """Return the log evidence of a covariance of the own parameters, but for a constant."""
+    factor = np.linalg.cholesky(covariance)
+    seen = factor.T @ own.pull
+    root = np.linalg.cholesky(np.eye(len(seen)) + factor.T @ own.information @ factor)
+    whitened = np.linalg.solve(root, seen)
+    return float(0.5 * whitened @ whitened - np.log(np.diag(root)).sum())
+
+
+def find_causes(
+    own: OwnInformation, causes: Sequence[Cause], own2: Array, always: Sequence[str] = ()
+) -> list[FoundCause]:
+    """Return the causes that the whiteboards show, the one that explains most first.
+
+    always: names of causes that are known to act, whatever the evidence.
+    """
+    known = {cause.name: cause for cause in causes}
+    widths = {name: float(known[name].widths[0]) for name in always if name in known}
+    gains = dict.fromkeys(widths, 0.0)
+    instead: dict[str, tuple[str, ...]] = {}
+    reached = _fit_widths(own, known, widths, own2)
+    while len(widths) < len(known):
+        tried = {}
+        for name in known.keys() - widths.keys():
+            more = widths | {name: 0.0}
+            tried[name] = _best_width(own, known, more, name, own2)
+        best = max(tried, key=lambda name: tried[name][0])
+        gain = tried[best][0] - reached
+        if gain < LEAST_GAIN:
+            break
+        instead[best] = tuple(
+            name
+            for name in sorted(tried, key=lambda name: -tried[name][0])
+            if name != best and tried[name][0] > max(tried[best][0] - NEARLY, reached + LEAST_GAIN)
+        )
+        widths[best], gains[best] = tried[best][1], gain
+        reached = _fit_widths(own, known, widths, own2)
+        reached = _drop_idle(own, known, widths, own2, always, reached)
+    order = sorted(widths, key=lambda name: -gains[name])
+    return [FoundCause(name, widths[name], gains[name], instead.get(name, ())) for name in order]
+
+
+def _best_width(
+    own: OwnInformation,
+    known: Mapping[str, Cause],
+    widths: Mapping[str, float],
+    name: str,
+    own2: Array,
+) -> tuple[float, float]:
+    """Return the largest evidence over the widths of one cause, and the width."""
+    rest = {other: width for other, width in widths.items() if other != name}
+    without = covariance_of(known, rest, own2)
+    pattern = known[name].columns @ known[name].columns.T
+    found = [
+        (log_evidence(own, without + width**2 * pattern), float(width))
+        for width in known[name].widths
+    ]
+    return max(found)
+
+
+def _fit_widths(
+    own: OwnInformation, known: Mapping[str, Cause], widths: dict[str, float], own2: Array
+) -> float:
+    """Set every width to its likeliest in turn, twice; return the evidence reached."""
+    reached = log_evidence(own, covariance_of(known, widths, own2))
+    if not widths:
+        return reached
+    for _ in range(1 if len(widths) == 1 else 2):
+        for name in widths:
+            reached, widths[name] = _best_width(own, known, widths, name, own2)
+    return reached
+
+
+def _drop_idle(
+    own: OwnInformation,
+    known: Mapping[str, Cause],
+    widths: dict[str, float],
+    own2: Array,
+    always: Sequence[str],
+    reached: float,
+) -> float:
+    """Take out causes that others explain by now; return the evidence."""
+    for name in [name for name in widths if name not in always]:
+        rest = {other: width for other, width in widths.items() if other != name}
+        without = log_evidence(own, covariance_of(known, rest, own2))
+        if reached - without < LEAST_GAIN:
+            del widths[name]
+            reached = without
+    return reached
+
+
+def doubt_lone_move(found: Sequence[FoundCause], boards: Sequence[Board]) -> list[FoundCause]:
+    """Return the causes; a single pinhole that is off may be a mask that moved once as well."""
+    if any(board.loose for board in boards) or any(cause.name == STAGE for cause in found):
+        return list(found)
+
+    def doubted(cause: FoundCause) -> FoundCause:
+        if cause.name != HANDS or STAGE in cause.instead:
+            return cause
+        moves2 = np.square(np.reshape(cause.size, (-1, 2))).sum(axis=1)
+        lone = moves2.max() > LONE * moves2.sum()
+        return replace(cause, instead=(*cause.instead, STAGE)) if lone else cause
+
+    return [doubted(cause) for cause in found]
+
+
+def with_sizes(
+    found: Sequence[FoundCause],
+    causes: Sequence[Cause],
+    own: Array,
+    own_covariance: Array,
+    own2: Array,
+) -> tuple[FoundCause, ...]:
+    """Return the causes with their coefficients, from the own parameters as fitted.
+
+    Of normal c and p = A c + rest, with what is known of p afterwards (mean, covariance C):
+
+        gain = tau^2 A^T Sigma^-1,    c = gain p,    cov c = tau^2 - gain A tau^2 + gain C gain^T
+
+    own: (own,). own_covariance: (own, own). Causes in views are left as they are.
+    """
+    known = {cause.name: cause for cause in causes}
+    widths = {cause.name: cause.width for cause in found if cause.name in known}
+    inverse = np.linalg.inv(covariance_of(known, widths, own2))
+    sized = []
+    for cause in found:
+        if cause.name not in known:
+            sized.append(cause)
+            continue
+        columns, tau2 = known[cause.name].columns, cause.width**2
+        gain = tau2 * columns.T @ inverse
+        spread = tau2 * (np.eye(len(gain)) - gain @ columns) + gain @ own_covariance @ gain.T
+        deviation = np.sqrt(np.maximum(np.diag(spread), 0.0))
+        size = tuple(map(float, gain @ own))
+        sized.append(replace(cause, size=size, deviation=tuple(map(float, deviation))))
+    return tuple(sized)
