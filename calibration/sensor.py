@@ -33,6 +33,8 @@ from emmc_rig.calibration.sensor_effects import (
     bend_of_curve,
     bend_of_response,
     black_drift_dn,
+    by_blocks,
+    carried_charge,
     combined,
     lag_and_creep,
     shared_charge,
@@ -81,8 +83,8 @@ CODED_STEPS, CODED_VARIANCE = 1.5, 0.01
 """Of the dark's step, and of the variance: a flat's larger step and its rounding show a code."""
 NOTABLE_BEND, NOTABLE_LAG = 0.01, 0.001
 """From which on figures are marked; a smaller bend or lag only makes them less sure."""
-LEAST_SURE_LAG = 0.003
-"""Deviation of a lag, up to which it counts: under a lamp that flickers nothing is known of it."""
+LEAST_SURE_LAG = 0.005
+"""Deviation of a lag, up to which it counts: a flickering lamp and few pixels show none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +242,7 @@ def characterise(
 
     darks: at two exposures or more, for the dark current. flats: from dim to saturated, in the
     order taken, at least four below saturation; few pairs are held at a time. monochrome: no
-    colour filters, so that columns and rows that differ are pixels that differ. Raises
+    colour filters: PRNU includes even and odd columns and rows. Raises
     CalibrationError for too few exposures, flats no brighter than the dark, noise below the steps
     of the converter in the light too, and sizes that differ.
     """
@@ -255,7 +257,7 @@ def characterise(
     # Those dead already in the dimmest flat do not count in any level.
     good = ~hot & ~(_dead_pixels(dimmest[0], darks[0]) if dimmest else hot)
     dark = stacked(measure_pair(pair, good, white_level_dn, lit=False) for pair in darks)
-    flat, unsaturated = _read_flats(chain(dimmest, flats), good, white_level_dn)
+    flat, unsaturated, carried = _read_flats(chain(dimmest, flats), good, white_level_dn, darks[0])
     flat = flat._replace(step_dn=np.where(np.isnan(flat.step_dn), step_dn, flat.step_dn))
     brightest_dn, light, brightest = unsaturated[-1]
     dead = _dead_pixels(brightest, darks[0])
@@ -265,7 +267,7 @@ def characterise(
     frames = _Frames(dark, flat, share >= BRIGHTEST_SHARE * np.nanmax(share), step_dn, good)
     points = frames.points(EVERY)
     points.figures(0.0)  # refuses flats that show no light
-    effects = _effects(frames, points)
+    effects = _effects(frames, points, carried)
     half_dn = points.black_dn + PRNU_SHARE * (brightest_dn - points.black_dn)
     lit = min(unsaturated, key=lambda held: abs(held[0] - half_dn))[2]
     dsnu = _nonuniformity(darks[0], None, good, phases_alike=True)
@@ -296,9 +298,15 @@ def _step_dn(pairs: Iterable[Pair]) -> float:
 
 
 def _read_flats(
-    flats: Iterable[Pair], good: Flags, white_level_dn: int
-) -> tuple[Levels, list[tuple[float, Array, Pair]]]:
-    """Return the flats' levels, and (mean in DN, by tile, pair) of those bright and unsaturated."""
+    flats: Iterable[Pair], good: Flags, white_level_dn: int, dark: Pair
+) -> tuple[Levels, list[tuple[float, Array, Pair]], dict[int, Array]]:
+    """Return the flats' levels, those bright and unsaturated, and what their noise carries over.
+
+    The second as (mean in DN, by tile, pair); the last of every two pairs, by the brighter one's
+    number, see `carried_charge`.
+    """
+    carried: dict[int, Array] = {}
+    single: Pair | None = None
     levels: list[Levels] = []
     unsaturated: list[tuple[float, Array, Pair]] = []
     loudest = 0.0
@@ -311,12 +319,15 @@ def _read_flats(
             mean, loudest = float(np.nanmean(level.mean, axis=(0, 1)).mean()), quietest
             unsaturated = [held for held in unsaturated if held[0] > HELD_SHARE * mean]
             unsaturated.append((mean, level.mean, pair))
+            if single is not None:
+                carried[len(levels) - 1] = carried_charge(single, pair, dark, good)
+            single = pair if single is None else None
     if len(levels) < 4 or not unsaturated:
         raise CalibrationError(
             f"{len(levels)} flat exposures: the photon transfer curve needs four at least, and "
             "some below saturation"
         )
-    return stacked(levels), unsaturated
+    return stacked(levels), unsaturated, carried
 
 
 @dataclass(frozen=True, eq=False)
@@ -524,7 +535,7 @@ class _Points:
 
 
 class _Effects(NamedTuple):
-    """What departs from the linear model, and what a file's code does to it.
+    """Effects outside the linear model, and the steps of a file's lossy code.
 
     drift: DN, from frame to frame. creep: DN per frame. bend: relative, at saturation, by response
     and noise. scatter: percent, of the linearity's points about a smooth curve. coded: the steps
@@ -541,41 +552,58 @@ class _Effects(NamedTuple):
     coded: float
 
 
-def _effects(frames: _Frames, points: _Points) -> _Effects:
+def _effects(frames: _Frames, points: _Points, carried: dict[int, Array]) -> _Effects:
     flat = frames.flat
     clear = (points.clipped < CLIPPED_SHARE).all(axis=1)
     clear &= (points.bright_signal <= LINEAR_RANGE[1] * points.saturation[0]).all(axis=1)
     lag, creep = lag_and_creep(flat, points.signal.mean(axis=1), clear)
+    of_noise = by_blocks([shares for number, shares in carried.items() if clear[number]])
     in_light = points.fitted.all(axis=1) & (
         points.variance.min(axis=1) > BRIGHTER_DEVIATIONS * points.dark_noise_dn2
     )
     shared = shared_charge(flat, frames.dark, in_light)
+    of_response, scatter = _bend_of_response(points)
+    of_variance = points.bend_of_variance()
+    return _Effects(
+        drift=black_drift_dn(frames.dark),
+        lag=combined([lag, of_noise]),
+        creep=creep,
+        shared=shared,
+        bend=combined([of_response, of_variance]),
+        bends=of_response.significant or of_variance.significant,
+        scatter=scatter,
+        coded=_coded_step_dn(frames, points, clear),
+    )
+
+
+def _bend_of_response(points: _Points) -> tuple[Effect, float]:
+    """Return the bend of the response, and in percent the scatter of the signals about it.
+
+    About a straight response where the bend is not significant.
+    """
     bends, scatters = [], []
     for phase, inside in enumerate(points.linear.T):
         y, t = points.signal[inside, phase], points.exposure_s[inside, phase]
         bend, scatter = bend_of_response(t, y, points.saturation[0])
+        if not bend.significant and len(t) > 2:
+            squares = np.nansum(np.square(points.linearity()[:, phase]))
+            scatter = np.sqrt(squares / (len(t) - 2)) / 100
         bends.append(bend)
-        scatters.append(100 * scatter)
-    # The phases share the lamp's flicker: together they are as sure as each.
-    of_response = Effect(
-        float(np.mean([bend.size for bend in bends])),
-        float(np.mean([bend.deviation for bend in bends])),
-        min(bend.freedom for bend in bends),
+        scatters.append(100 * float(scatter))
+    # The phases share the lamp's flicker: their mean is no surer than each phase.
+    size, deviation = (
+        float(np.mean([getattr(bend, name) for bend in bends])) for name in ("size", "deviation")
     )
-    of_variance = points.bend_of_variance()
-    steps, variance = flat.step_dn[:, None], np.maximum(flat.over(EVERY, "variance"), 1e-9)
-    coarse = (steps > CODED_STEPS * points.step_dn) & clear[:, None]
-    coarse = coarse & (QUANTISATION * steps**2 > CODED_VARIANCE * variance)
-    return _Effects(
-        black_drift_dn(frames.dark),
-        lag,
-        creep,
-        shared,
-        combined([of_response, of_variance]),
-        of_response.significant or of_variance.significant,
-        max(scatters),
-        float(flat.step_dn[coarse.any(axis=1)].max(initial=0.0)),
-    )
+    return Effect(size, deviation, min(bend.freedom for bend in bends)), max(scatters)
+
+
+def _coded_step_dn(frames: _Frames, points: _Points, clear: Flags) -> float:
+    """Return the largest step of flats whose values a code made coarser than the dark's; or 0."""
+    steps = frames.flat.step_dn
+    variance = np.maximum(frames.flat.over(EVERY, "variance").min(axis=1), 1e-9)
+    coarse = clear & (steps > CODED_STEPS * points.step_dn)
+    coarse &= QUANTISATION * steps**2 > CODED_VARIANCE * variance
+    return float(steps[coarse].max(initial=0.0))
 
 
 def _deviations(
@@ -619,7 +647,7 @@ def _deviations(
     for name in ("gain_dn_per_electron", "read_noise_electrons", "dark_current_electrons_per_s"):
         add(name, relative * figures[name])
     of_gain = found["gain_dn_per_electron"] / gain
-    # A pixel that shares its charge, and one of a bent response, differs less from the others.
+    # Shared charge and a bent response make the pixels' differences smaller.
     of_response = np.hypot(effects.shared.left_open / 2, PRNU_SHARE * effects.bend.left_open)
     for name, pattern, scale, open_part in (
         ("dsnu", dsnu, 1 / gain, of_gain), ("prnu", prnu, 1.0, of_response)
@@ -730,7 +758,7 @@ def _departures(effects: _Effects) -> list[Remark]:
 
 def _dead_pixels(flat: Pair, dark: Pair) -> Flags:
     """Return pixels that see less than half of what their colour's do, and more than noise does."""
-    if flat.first.shape != dark.first.shape:
+    if flat.first.shape != dark.first.shape:  # refused where its levels are measured
         return np.zeros(dark.first.shape, dtype=bool)
     signal = (flat.first.astype(np.float64) + flat.second - dark.first - dark.second) / 2
     dead = np.zeros(signal.shape, dtype=bool)

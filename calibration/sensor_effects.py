@@ -1,8 +1,8 @@
 """Effects that the linear model of EMVA 1288 excludes, measured from the levels of sensor frames.
 
 The standard demands a stable black level, frames independent of each other, a linear response, and
-noise that is independent from pixel to pixel. Each effect has a size with its deviation: where it
-is significant it is named, where it is not, the figures that it would change are less sure.
+noise that is independent from pixel to pixel. Each effect has a size with its deviation. A
+significant effect is named; an effect that noise could hide adds to the deviations of the figures.
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from emmc_rig.calibration.sensor_levels import BLOCKS, Levels
+from emmc_rig.calibration.sensor_levels import (
+    BLOCKS,
+    Flags,
+    Levels,
+    Pair,
+    phases_of,
+    tiles_of,
+)
 
 Array = NDArray[np.floating]
 CHANCE = 1e-4
@@ -41,7 +48,7 @@ class Effect:
 
     @property
     def left_open(self) -> float:
-        """How large the effect may be: its size, and of what is no more than noise, that beyond."""
+        """How large the effect may be: its size; without significance, beyond the deviation."""
         if self.significant:
             return abs(self.size)
         return float(np.sqrt(max(self.size**2 - self.deviation**2, 0.0)))
@@ -55,7 +62,7 @@ def black_drift_dn(dark: Levels) -> Effect:
 
         drift^2 = <(second mean - first mean)^2> / 2, with the noise of the means in it.
 
-    The noise is that of blocks of rows, by which the rows' own flicker counts.
+    The noise is estimated from blocks of rows, so that flicker of whole rows counts.
     """
     blocks = np.nanmean(dark.change, axis=(2, 3))
     drift2 = np.mean(blocks.mean(axis=1) ** 2) / 2
@@ -63,9 +70,7 @@ def black_drift_dn(dark: Levels) -> Effect:
     return Effect(float(np.sqrt(drift2)), float(np.sqrt(noise2)), BLOCKS - 1)
 
 
-def lag_and_creep(
-    flat: Levels, signal_dn: Array, clear: NDArray[np.bool_]
-) -> tuple[Effect, Effect]:
+def lag_and_creep(flat: Levels, signal_dn: Array, clear: Flags) -> tuple[Effect, Effect]:
     """Return lag, the share of a frame that the next one shows, and creep, DN per frame.
 
     The second frame of a pair follows one as bright, the first that of the pair before, darker as
@@ -100,7 +105,48 @@ def lag_and_creep(
     return lag, creep
 
 
-def shared_charge(flat: Levels, dark: Levels, clear: NDArray[np.bool_]) -> Effect:
+def carried_charge(dim: Pair, bright: Pair, dark: Pair, good: Flags) -> Array:
+    """Return by which share of its variance the noise of second frames follows the first, (block,).
+
+    With r the ratio of the two pairs' signals, pixels' own response cancels in d = r bright - dim:
+
+        lag = <d_first d_second> / (<d_first^2> + <d_second^2>) * 2,
+
+    of pixels less their tile's mean; from the first frames the first dark is subtracted, whose
+    noise is not the second's. This needs no steady lamp, and many pixels.
+    """
+    products, squares = np.zeros(BLOCKS), np.zeros(BLOCKS)
+    both = [
+        [frame - black.astype(np.float64) for frame in frames]
+        for *frames, black in (
+            (dim.first, bright.first, dark.first), (dim.second, bright.second, dark.second)
+        )
+    ]  # fmt: skip
+    planes = map(phases_of, (*both[0], *both[1], good))
+    for *frames, use in zip(*planes, strict=True):
+        for block, _, part in tiles_of(use.shape):
+            values = [frame[part][use[part]] for frame in frames]
+            if len(values[0]) < 2 or min(values[1].mean(), values[3].mean()) <= 0:
+                continue
+            # Each frame's own level: the lamp may flicker.
+            first, second = (
+                bright_dn * (dim_dn.mean() / bright_dn.mean()) - dim_dn
+                for dim_dn, bright_dn in (values[:2], values[2:])
+            )
+            products[block] += 2 * float(first @ second)
+            squares[block] += float(first @ first + second @ second)
+    return products / np.maximum(squares, 1e-12)
+
+
+def by_blocks(shares: list[Array]) -> Effect:
+    """Return the mean of shares (block,) of independent pairs, by the scatter of the blocks."""
+    if not shares:
+        return NONE
+    mean = np.mean(shares, axis=0)
+    return Effect(float(mean.mean()), float(mean.std(ddof=1)) / np.sqrt(BLOCKS), BLOCKS - 1)
+
+
+def shared_charge(flat: Levels, dark: Levels, clear: Flags) -> Effect:
     """Return by how much of its variance a pixel's noise varies with its neighbours' noise.
 
     Where y = k * electrons, with sum k = 1, the variance is gain signal sum k^2, too small, and the
@@ -117,9 +163,7 @@ def shared_charge(flat: Levels, dark: Levels, clear: NDArray[np.bool_]) -> Effec
         of_light, variance = (
             (of_flat - of_dark.mean(axis=0))[clear] for of_flat, of_dark in (shared, variances)
         )
-        by_block = (of_light / np.maximum(variance, 1e-12)).mean(axis=0)
-        size, deviation = by_block.mean(), by_block.std(ddof=1) / np.sqrt(BLOCKS)
-        ratios.append(Effect(float(size), float(deviation), BLOCKS - 1))
+        ratios.append(by_blocks(list(of_light / np.maximum(variance, 1e-12))))
     return ratios[1] if ratios[0].significant else ratios[0]
 
 
@@ -169,5 +213,6 @@ def combined(effects: list[Effect]) -> Effect:
         return NONE
     weights = np.array([1 / effect.deviation**2 for effect in known])
     size = float(np.average([effect.size for effect in known], weights=weights))
-    freedom = sum(effect.freedom for effect in known)
-    return Effect(size, float(1 / np.sqrt(weights.sum())), freedom)
+    # Of the surest alone where it decides (Welch and Satterthwaite).
+    freedom = weights.sum() ** 2 / np.sum(weights**2 / [effect.freedom for effect in known])
+    return Effect(size, float(1 / np.sqrt(weights.sum())), int(freedom))

@@ -91,7 +91,7 @@ def measure_pair(pair: Pair, good: Flags, white_level_dn: int, lit: bool) -> Lev
     planes = zip(*map(phases_of, (pair.first, pair.second, good, noise)), strict=True)
     for phase, (first, second, use, centred) in enumerate(planes):
         whole = (second[use].astype(np.float64) - first[use]).mean() if use.any() else 0.0
-        for block, tile, part in _tiles(first.shape):
+        for block, tile, part in tiles_of(first.shape):
             x, y = (plane[part][use[part]].astype(np.float64) for plane in (first, second))
             if len(x) < 2:
                 continue
@@ -108,7 +108,7 @@ def measure_pair(pair: Pair, good: Flags, white_level_dn: int, lit: bool) -> Lev
     return Levels(exposure_s, step, mean, variance, clipped, change, wide, *_shared(noise, good))
 
 
-def _tiles(shape: tuple[int, int]) -> Iterable[tuple[int, int, tuple[slice, slice]]]:
+def tiles_of(shape: tuple[int, int]) -> Iterable[tuple[int, int, tuple[slice, slice]]]:
     """Yield block, tile and their part of a phase's plane."""
     rows, columns = (
         np.linspace(0, length, count + 1).astype(int)

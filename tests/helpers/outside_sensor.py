@@ -73,7 +73,7 @@ class Chip:
         rows, columns = (np.linspace(-1, 1, count) for count in self.size)
         self.lens = 1 - self.falls_off * (rows[:, None] ** 2 + columns**2) / 2
         self.left_behind = np.zeros(self.size)
-        # Neighbours of a hot pixel that it shares its charge with are hot too.
+        # A hot pixel that shares its charge makes its neighbours hot.
         spilt = self._shared(HOT_ELECTRONS_PER_S * self.is_hot)
         self.is_hot_in_frames = spilt > LEAST_HOT_ELECTRONS_PER_S
 

@@ -21,6 +21,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "clean": {},
     "flicker 1 %": {"flicker": 0.01},
     "steps of 16 DN": COARSE,
+    "steps of 16 DN, read noise 1 e": COARSE | {"read_noise": 1.0, "black_dn": 2003.0},
     "steps of 16 DN, read noise 8 e": COARSE | {"read_noise": 8.0},
     "steps of 16 DN, read noise 20 e": COARSE | {"read_noise": 20.0},
     "black drifts by 4 DN": {"black_drift_dn": 4.0},
