@@ -553,15 +553,14 @@ class _Effects(NamedTuple):
 
 
 def _effects(frames: _Frames, points: _Points, carried: dict[int, Array]) -> _Effects:
-    flat = frames.flat
-    clear = (points.clipped < CLIPPED_SHARE).all(axis=1)
-    clear &= (points.bright_signal <= LINEAR_RANGE[1] * points.saturation[0]).all(axis=1)
-    lag, creep = lag_and_creep(flat, points.signal.mean(axis=1), clear)
+    dim = points.bright_signal <= LINEAR_RANGE[1] * points.saturation[0]
+    clear: Flags = np.logical_and.reduce((points.clipped < CLIPPED_SHARE) & dim, axis=1)
+    lag, creep = lag_and_creep(frames.flat, points.signal.mean(axis=1), clear)
     of_noise = by_blocks([shares for number, shares in carried.items() if clear[number]])
     in_light = points.fitted.all(axis=1) & (
         points.variance.min(axis=1) > BRIGHTER_DEVIATIONS * points.dark_noise_dn2
     )
-    shared = shared_charge(flat, frames.dark, in_light)
+    shared = shared_charge(frames.flat, frames.dark, in_light)
     of_response, scatter = _bend_of_response(points)
     of_variance = points.bend_of_variance()
     return _Effects(

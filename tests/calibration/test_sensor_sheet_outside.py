@@ -46,7 +46,7 @@ def worst(chip, sheet, flats_s=FLATS_S):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_value_is_right_within_its_deviation_or_marked(kind):
-    chip = Chip(**{"seed": 4} | KINDS[kind])
+    chip = Chip(seed=4, **KINDS[kind])
     sheet = sheet_of(chip)
     assert worst(chip, sheet) < (3.5, "")
     assert marks(chip, sheet) == set(MARKED.get(kind, "").split())
@@ -67,7 +67,7 @@ def test_every_value_is_right_within_its_deviation_or_marked(kind):
     ],
 )  # fmt: skip
 def test_lamp_lens_and_converter_are_told_from_the_sensor(changes, flats_s, marked):
-    chip = Chip(**{"seed": 3} | changes)
+    chip = Chip(seed=3, **changes)
     sheet = sheet_of(chip, flats_s)
     assert marks(chip, sheet) == set(marked.split())
     assert worst(chip, sheet, flats_s) < (3.5, "")
@@ -75,7 +75,7 @@ def test_lamp_lens_and_converter_are_told_from_the_sensor(changes, flats_s, mark
 
 @pytest.mark.parametrize("kind", clean_kinds())
 def test_a_clean_sensor_of_any_gain_and_bits_is_marked_for_its_steps_alone(kind):
-    chip = Chip(**{"seed": 8} | clean_kinds()[kind])
+    chip = Chip(seed=8, **clean_kinds()[kind])
     sheet = sheet_of(chip)
     steps = chip.gain * chip.read_noise < 0.4
     assert marks(chip, sheet) == set(OF_STEPS.split() if steps else ())

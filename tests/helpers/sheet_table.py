@@ -97,7 +97,7 @@ def main(kinds: dict[str, dict[str, Any]], seeds: int) -> None:
         rows, marked = [], []
         try:
             for seed in range(seeds):
-                chip = Chip(**{"seed": seed} | changes)
+                chip = Chip(seed=seed, **changes)
                 sheet = sheet_of(chip)
                 missed = misses(chip, sheet)
                 rows.append([missed[name] for name in SHORT])
