@@ -723,7 +723,7 @@ def _departures(effects: _Effects) -> list[Remark]:
     """Return the effects that the standard excludes, and the quantities that each changes."""
     found = []
     drift, lag, creep, bend = effects.drift, effects.lag, effects.creep, effects.bend
-    unsteady = "let the camera warm up, and switch its automatic black level off"
+    unsteady = "let the camera warm up, wait after bright frames, no automatic black level"
     if drift.significant:
         words = f"the black level moves by {drift.size:.2g} DN between frames: {unsteady}"
         found.append(Remark(("black_level_dn", "dark_current_electrons_per_s"), words))

@@ -47,6 +47,10 @@ def test_the_gain_is_the_slope_of_the_photon_transfer_curve(sheet):
     assert sheet.deviations["gain_dn_per_electron"] < 0.02
 
 
+def test_a_sensor_behind_colour_filters_needs_no_remark(sheet):
+    assert sheet.remarks == ()
+
+
 def test_read_noise_black_level_and_dark_current_come_out(sheet):
     within(sheet, "read_noise_electrons", 2.5)
     assert sheet.read_noise_electrons == pytest.approx(2.5, rel=0.05)

@@ -9,7 +9,7 @@ from sheet_table import FLATS_S, KINDS, PATTERNS, clean_kinds, misses, sheet_of
 
 from emmc_rig.calibration.boards import BoardSet, sensor_blemishes
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.frames import average, photon_transfer
+from emmc_rig.calibration.frames import average, photon_transfer, step_of_values
 from emmc_rig.calibration.sensor import Pair, characterise
 
 OF_CLIPPED = (
@@ -110,6 +110,32 @@ def test_values_times_sixteen_have_the_same_sheet_in_electrons():
             assert same == pytest.approx(value, rel=1e-6)
             assert coarse.deviations[name] == pytest.approx(deviation, rel=1e-6)
     np.testing.assert_array_equal(plain.good, coarse.good)
+
+
+@pytest.mark.parametrize(
+    ("coded", "step"),
+    [
+        (lambda twelve_bits: twelve_bits << 4, 16),
+        (lambda twelve_bits: (twelve_bits << 4) + 7, 16),
+        (lambda twelve_bits: twelve_bits << 4 | twelve_bits >> 8, 16),
+        (lambda twelve_bits: twelve_bits, 1),
+    ],
+)
+@pytest.mark.parametrize("noise_dn", [0.3, 1.0, 5.0])
+def test_the_step_of_values_is_that_of_the_converter_behind_any_packing(coded, step, noise_dn):
+    noise = np.random.default_rng(1).normal(300.3, noise_dn, (100, 100))
+    noise[::40, ::40] = 3000
+    frame = coded(np.rint(noise).astype(np.uint16)).astype(np.uint16)
+    assert step_of_values([frame]) == step
+
+
+def test_a_digital_gain_that_rounds_has_a_mean_step():
+    read = np.rint(np.random.default_rng(1).normal(300, 10, (100, 100)))
+    assert step_of_values([np.rint(1.37 * read).astype(np.uint16)]) == pytest.approx(1.37, rel=0.05)
+
+
+def test_frames_that_read_one_value_show_no_step():
+    assert np.isnan(step_of_values([np.full((10, 10), 64, np.uint16)]))
 
 
 def test_noise_below_the_steps_in_the_light_too_is_refused():
