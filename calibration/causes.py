@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from emmc_rig.calibration.boards import Board
 
@@ -271,11 +272,30 @@ def covariance_of(
 
 def log_evidence(own: OwnInformation, covariance: Array) -> float:
     """Return the log evidence of a covariance of the own parameters, but for a constant."""
+    return _factors(own, covariance).evidence
+
+
+class _Factors(NamedTuple):
+    """Of a covariance Sigma of the own parameters, and what the readings say of these."""
+
+    factor: NDArray[np.float64]
+    """F, with Sigma = F F^T."""
+    root: NDArray[np.float64]
+    """R, with 1 + F^T S F = R R^T."""
+    whitened: NDArray[np.float64]
+    """R^-1 F^T h."""
+
+    @property
+    def evidence(self) -> float:
+        """Log evidence of the covariance."""
+        return float(0.5 * self.whitened @ self.whitened - np.log(np.diag(self.root)).sum())
+
+
+def _factors(own: OwnInformation, covariance: Array) -> _Factors:
     factor = np.linalg.cholesky(covariance)
-    seen = factor.T @ own.pull
-    root = np.linalg.cholesky(np.eye(len(seen)) + factor.T @ own.information @ factor)
-    whitened = np.linalg.solve(root, seen)
-    return float(0.5 * whitened @ whitened - np.log(np.diag(root)).sum())
+    root = np.linalg.cholesky(np.eye(len(factor)) + factor.T @ own.information @ factor)
+    whitened = solve_triangular(root, factor.T @ own.pull, lower=True, check_finite=False)
+    return _Factors(factor, root, whitened)
 
 
 def find_causes(
@@ -318,15 +338,27 @@ def _best_width(
     name: str,
     own2: Array,
 ) -> tuple[float, float]:
-    """Return the largest evidence over the widths of one cause, and the width."""
+    """Return the largest evidence over the widths of one cause, and the width.
+
+    Of the others' covariance Sigma, a cause of pattern A and width tau adds to the log evidence
+
+        1/2 sum_i (tau^2 q_i^2 / (1 + tau^2 g_i) - log(1 + tau^2 g_i))
+
+    with g_i the eigenvalues of G = B^T B - W^T W, B = F^-1 A, W = R^-1 B, and q the pull
+    W^T R^-1 F^T h along the eigenvectors.
+    """
     rest = {other: width for other, width in widths.items() if other != name}
-    without = covariance_of(known, rest, own2)
-    pattern = known[name].columns @ known[name].columns.T
-    found = [
-        (log_evidence(own, without + width**2 * pattern), float(width))
-        for width in known[name].widths
-    ]
-    return max(found)
+    without = _factors(own, covariance_of(known, rest, own2))
+    columns = known[name].columns
+    pattern = solve_triangular(without.factor, columns, lower=True, check_finite=False)
+    seen = solve_triangular(without.root, pattern, lower=True, check_finite=False)
+    values, vectors = np.linalg.eigh(pattern.T @ pattern - seen.T @ seen)
+    pull2 = np.square(vectors.T @ (seen.T @ without.whitened))
+    widths2 = np.square(known[name].widths)[:, None]
+    grown = 1 + widths2 * np.maximum(values, 0.0)
+    found = without.evidence + 0.5 * (widths2 * pull2 / grown - np.log(grown)).sum(axis=1)
+    best = int(np.argmax(found))
+    return float(found[best]), float(known[name].widths[best])
 
 
 def _fit_widths(

@@ -67,13 +67,22 @@ from emmc_rig.calibration.causes import (
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import register, starting_placement
 from emmc_rig.calibration.placement import (
+    PUPIL_SHARE,
+    PUPIL_X,
     SCALARS,
     Placement,
     Tolerances,
     labels,
     with_aperture_mean_one,
 )
-from emmc_rig.calibration.robust import correlation, deviation_of, tukey_loss, tukey_weights
+from emmc_rig.calibration.pupil_shape import CLEARLY_ROUND, likeliest_pupil, measured_light
+from emmc_rig.calibration.robust import (
+    correlation,
+    deviation_of,
+    tukey_curvatures,
+    tukey_loss,
+    tukey_weights,
+)
 from emmc_rig.calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, ShadowMask
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
@@ -90,17 +99,28 @@ MOST_OF_PRIOR = 0.7
 """Of the prior's deviation: a parameter known no better stays at the design."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
+FIRST_GAIN = 0.5
+"""The same, before the last fit: of a move by a standard deviation, which later steps make."""
+LEAST_CURVATURE = 0.3
+"""Of the loss, over that of its weights: below it most pixels are outliers, and steps too long."""
 MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
+PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
+"""Where the pupil's parameters lie there."""
+STEPS_TO_PUPIL = 4
+"""Of the fit, before the views' light is looked at: the mask is then about where it stands."""
+HELD = 1e-6
+"""Of the tolerance of parameters that nothing depends on."""
 LOOSE_UM = 0.5
 """By which a hand's pinhole seems to move the mask, at first: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
 """Of the width of the prior of glass, which a displaced pinhole imitates."""
-CAUSE_ROUNDS = 3
-"""The causes depend on the fit and the fit on the causes: so many times in turn at most."""
+CAUSE_GAINS = (FIRST_GAIN, LEAST_GAIN, LEAST_GAIN)
+"""The causes depend on the fit and the fit on the causes: in turn, to these last gains; the third
+time where pinholes stand off their holes."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -305,6 +325,8 @@ def _bench_prior(
     # A stage sits where it was found; the prior is for what whiteboards do not determine.
     centre[OFFSETS] = placement.vector()[OFFSETS]
     deviations = Tolerances().deviations(camera.views)
+    if placement.pupil is None:
+        deviations[PUPIL] *= HELD
     loose = any(board.loose for board in boards)
     if loose:
         # Pinholes a little off their holes look like glass before the mask.
@@ -364,13 +386,15 @@ def _linear_readings(
 class _NormalEquations:
     """Gauss-Newton normal equations, and what the residuals are like.
 
-    spread: robust deviation of the residuals, in deviations. squares: sum of squared residuals of
-    the `kept` pixels that are no outliers, of `count`.
+    spread: robust deviation of the residuals, in deviations. curvature: of Tukey's loss, over
+    that of the weighted squares, mean of all pixels. squares: sum of squared residuals of the
+    `kept` pixels that are no outliers, of `count`.
     """
 
     matrix: NDArray[np.float64]
     gradient: NDArray[np.float64]
     spread: float
+    curvature: float
     squares: float
     kept: int
     count: int
@@ -386,7 +410,7 @@ def _normal_equations(state: _State, linear: Sequence[_Linear]) -> _NormalEquati
     spread = _robust_spread([each.residual for each in linear])
     size = len(state.vector())
     matrix, gradient = np.zeros((size, size)), np.zeros(size)
-    squares, kept = 0.0, 0
+    squares, kept, weights, curvatures = 0.0, 0, 0.0, 0.0
     for index, (residual, slope) in enumerate(linear):
         places = state.places(index)
         weight = tukey_weights(residual / spread)
@@ -396,8 +420,11 @@ def _normal_equations(state: _State, linear: Sequence[_Linear]) -> _NormalEquati
         inside = weight > 0
         squares += float((residual[inside] ** 2).sum())
         kept += int(inside.sum())
+        weights += float(weight.sum())
+        curvatures += float(tukey_curvatures(residual / spread).sum())
     count = sum(len(each.residual) for each in linear)
-    return _NormalEquations(matrix, gradient, spread, squares, kept, count)
+    curvature = curvatures / max(weights, 1e-300)
+    return _NormalEquations(matrix, gradient, spread, curvature, squares, kept, count)
 
 
 class _Point(NamedTuple):
@@ -433,14 +460,17 @@ def _descend(
     samples: Sequence[Sample],
     prior: _Prior,
     settings: FitSettings,
+    least_gain: float = LEAST_GAIN,
 ) -> _Descent:
     """Return the point after Levenberg-Marquardt steps on these samples.
 
         loss(p) = sum rho(r(p) / spread) + 1/2 (p - centre)^T P (p - centre)
-        H = matrix + P,    (H + damping diag H) step = gradient + P (centre - p)
+        H = curvature matrix + P,    (H + damping diag H) step = gradient + P (centre - p)
 
-    rho is Tukey's loss, P the prior's precision, the others as in `_normal_equations`. The damping
-    grows until the loss falls. The last step is small in standard deviations, or gains little.
+    rho is Tukey's loss, P the prior's precision, the others as in `_normal_equations`: rho'' is
+    less than the weights, and taken as the same share of them for all pixels. The damping grows
+    until the loss falls. The last step is small in standard deviations, or gains less than
+    least_gain.
     """
     damping = 1e-3
     for step in range(settings.max_steps):
@@ -448,7 +478,7 @@ def _descend(
         pull = prior.pull(state)
         loss = point.loss(normal.spread, prior)
         while True:
-            matrix = normal.matrix + prior.precision
+            matrix = max(normal.curvature, LEAST_CURVATURE) * normal.matrix + prior.precision
             matrix[np.diag_indices_from(matrix)] *= 1 + damping
             moved = _step_within_limits(state, matrix, normal.gradient + pull)
             # With its slopes: nearly every trial is the next point.
@@ -462,7 +492,7 @@ def _descend(
         size = float(np.max(np.abs(moved.vector() - state.vector()) / deviations))
         if trial_loss <= loss:
             point = trial
-        if size < settings.tolerance or loss - trial_loss < LEAST_GAIN:
+        if size < settings.tolerance or loss - trial_loss < least_gain:
             return _Descent(point, step + 1, True)
     return _Descent(point, settings.max_steps, False)
 
@@ -723,43 +753,56 @@ def fit_placement(
     camera: Camera,
     mask: ShadowMask,
     settings: FitSettings | None = None,
-    start: Placement | None = None,
+    start: Placement | Fit | None = None,
 ) -> Fit:
     """Return the placement that explains the whiteboards.
 
-    start: from an earlier fit, to begin there without registering. Raises CalibrationError
-    without whiteboards, for a mask that is not the design's (with the correlation found), and
-    where the fit does not explain what it was given. Not converging is a status.
+    start: a placement, to begin there without registering; or an earlier fit of these whiteboards,
+    to begin where it ended, with the whole picture. Raises CalibrationError without whiteboards,
+    for a mask that is not the design's (with the correlation found), and where the fit does not
+    explain what it was given. Not converging is a status.
     """
     settings = settings or FitSettings()
     if not boards:
         raise CalibrationError("no whiteboard with the mask in: capture at least one")
-    if start is None:
-        soft = starting_placement(camera, mask)
-        start = register(max(boards, key=_contrast), mask, soft).placement
-    bench = _bench_prior(boards, camera, mask, start)
-    prior = bench.with_widths(bench.first_widths(mask.distance_um / mask.lens_um))
-    state, steps = _State(start, np.zeros((len(boards), OWN))), 0
-    for samples in _widening_samples(boards, mask, settings):
-        descent = _descend(mask, _point(mask, state, samples), samples, prior, settings)
+    ratio, steps = mask.distance_um / mask.lens_um, 0
+    whole = _drawn(boards, np.inf, settings.pixels, np.random.default_rng(settings.seed))
+    if isinstance(start, Fit):
+        state, windows = _State(start.placement, start.own), [whole]
+    else:
+        state = _State(start or _registered(boards, camera, mask), np.zeros((len(boards), OWN)))
+        windows = [*_widening_samples(boards, mask, settings), whole]
+    bench = _bench_prior(boards, camera, mask, state.placement)
+    widths = bench.first_widths(ratio)
+    prior = bench.with_widths(widths)
+    for samples in windows:
+        point = _point(mask, state, samples)
+        if steps == 0 and not isinstance(start, Fit) and state.placement.pupil is None:
+            # A pupil that is not known leads the fit astray: it is looked for after a few steps.
+            few = settings.model_copy(update={"max_steps": STEPS_TO_PUPIL})
+            point = _descend(mask, point, samples, prior, few, FIRST_GAIN).point
+            point = _with_pupil_seen(mask, point, samples, prior, settings)
+            bench = _bench_prior(boards, camera, mask, point.state.placement)
+            prior = bench.with_widths(widths)
+        descent = _descend(mask, point, samples, prior, settings, FIRST_GAIN)
         state, steps = descent.point.state, steps + descent.steps
-    found: list[FoundCause] = []
-    for turn in range(CAUSE_ROUNDS):
-        off_plate = any(cause.name in OF_PLATE for cause in found)
-        if turn > 1 and not off_plate:
-            break
+    found, off_plate = list[FoundCause](), False
+    for turn, least_gain in enumerate(CAUSE_GAINS):
         if off_plate:
             # Where pinholes stand decides how much of their light the aperture's edge cuts.
             bench = bench.about(found, descent.point.state.own, boards)
-        found = _find_causes(mask, descent.point, samples, bench)
-        prior = bench.with_widths(_own_widths(found, mask.distance_um / mask.lens_um))
-        descent = _descend(mask, descent.point, samples, prior, settings)
+        elif turn > 1:
+            break
+        found = _find_causes(mask, descent.point, whole, bench)
+        prior = bench.with_widths(_own_widths(found, ratio))
+        descent = _descend(mask, descent.point, whole, prior, settings, least_gain)
         steps += descent.steps
+        off_plate = any(cause.name in OF_PLATE for cause in found)
     point, state = descent.point, descent.point.state
-    checks = tuple(_check_board(point, sample, index) for index, sample in enumerate(samples))
-    _refuse_unexplained(alike := _fitted_correlation(point, samples))
+    checks = tuple(_check_board(point, sample, index) for index, sample in enumerate(whole))
+    _refuse_unexplained(alike := _fitted_correlation(point, whole))
     normal, placement = point.normal, with_aperture_mean_one(state.placement)
-    everything, astray2 = _covariance(mask, point, samples, prior)
+    everything, astray2 = _covariance(mask, point, whole, prior)
     size = len(placement.vector())
     covariance, own_covariance = everything[:size, :size], everything[size:, size:]
     undecided, more = _find_undecided(placement, covariance, len(boards))
@@ -791,6 +834,45 @@ def fit_placement(
     )
 
 
+def _registered(boards: Sequence[Board], camera: Camera, mask: ShadowMask) -> Placement:
+    """Return where the mask is, by the whiteboard of most contrast."""
+    soft = starting_placement(camera, mask)
+    return register(max(boards, key=_contrast), mask, soft).placement
+
+
+def _with_pupil_seen(
+    mask: ShadowMask,
+    point: _Point,
+    samples: Sequence[Sample],
+    prior: _Prior,
+    settings: FitSettings,
+) -> _Point:
+    """Return the point with the round pupil that the views' light shows, as it is without one.
+
+    The pupil is taken where the readings become clearly likelier.
+    """
+    state, normal = point.state, point.normal
+    weights = slice(len(SCALARS), len(state.placement.vector()))
+    precision = prior.precision.copy()
+    precision[weights, weights] = 0
+    pull = normal.gradient + precision @ (prior.centre - state.vector())
+    seen = measured_light(
+        state.placement.falloff, state.vector(), normal.matrix + precision, pull, mask
+    )
+    pupil = likeliest_pupil(seen, mask)
+    if pupil is None:
+        return point
+    # The weights were of views open to their edges.
+    even = tuple((1.0,) * mask.views[1] for _ in range(mask.views[0]))
+    start = replace(state, placement=replace(state.placement, aperture=even, pupil=pupil))
+    precision = prior.precision.copy()
+    precision[PUPIL, PUPIL] *= HELD**2
+    freed = _Prior(precision, prior.centre)
+    other = _descend(mask, _point(mask, start, samples), samples, freed, settings, FIRST_GAIN).point
+    likelier = point.loss(normal.spread, prior) - other.loss(normal.spread, freed)
+    return other if likelier > CLEARLY_ROUND else point
+
+
 def _contrast(board: Board) -> float:
     """Return how far above its noise a board varies."""
     usable = board.usable
@@ -799,23 +881,24 @@ def _contrast(board: Board) -> float:
     return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
 
 
+def _drawn(
+    boards: Sequence[Board], half_px: float, pixels: int, rng: np.random.Generator
+) -> list[Sample]:
+    """Return samples of all whiteboards, alike of each, within `half_px` of the middle."""
+    each = max(pixels // len(boards), FEWEST_PIXELS)
+    return [board.sampled(half_px, each, rng) for board in boards]
+
+
 def _widening_samples(
     boards: Sequence[Board], mask: ShadowMask, settings: FitSettings
 ) -> Iterator[list[Sample]]:
-    """Yield samples of all whiteboards, from windows that widen to the picture.
-
-    The last two are of the whole picture: of `first_pixels`, then of `pixels`.
-    """
+    """Yield samples of `first_pixels` from windows that widen to the picture."""
     rng = np.random.default_rng(settings.seed)
     whole_px, half_px = max(mask.pixel_shape()) / 2, float(FIRST_WINDOW_PX)
-    windows = []
     while half_px < whole_px:
-        windows.append((half_px, settings.first_pixels))
+        yield _drawn(boards, half_px, settings.first_pixels, rng)
         half_px *= 2
-    windows += [(whole_px, settings.first_pixels), (whole_px, settings.pixels)]
-    for half_px, pixels in windows:
-        each = max(pixels // len(boards), FEWEST_PIXELS)
-        yield [board.sampled(half_px, each, rng) for board in boards]
+    yield _drawn(boards, whole_px, settings.first_pixels, rng)
 
 
 def _covariance(

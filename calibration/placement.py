@@ -14,6 +14,10 @@ transmittance so averaged, and w_j(p) = a_j (1 + vignetting x.u_j) (1 + falloff 
 the views, x and u as shares of the picture's corner and of the aperture's: what falls off evenly
 over the views cancels against the white board seen without masks. The falloff could be part of the
 a_j; known apart, what is left of those is small.
+
+A round pupil covers the corners of the views: w_j then has the open share of view j as a factor,
+and u and the aperture cell's box are those of the view's open part (`emmc_rig.model.pupil`). The
+pupil's centre and diameter differ from its description by pupil_x_um, pupil_y_um, pupil_share.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.pupil import Pupil
 
 SCALARS = (
     "offset_x_um",
@@ -42,14 +47,26 @@ SCALARS = (
     "tilt_y_rad",
     "bow_um",
     "glass_um",
+    "pupil_x_um",
+    "pupil_y_um",
+    "pupil_share",
 )
 (
     OFFSET_X, OFFSET_Y, ROTATION, SCALE, SKEW, DISTANCE, DISTORTION, BLUR,
     CLEAR, LEAK, VIGNETTING, FALLOFF, TILT_X, TILT_Y, BOW, GLASS,
+    PUPIL_X, PUPIL_Y, PUPIL_SHARE,
 ) = range(len(SCALARS))  # fmt: skip
 """Where the scalars lie in the parameter vector."""
 LEAST_BLUR_UM = 0.3
 """Far below a cell; keeps the shadow differentiable where the mask's edges are sharp."""
+LIMITS = {
+    "blur_um": (LEAST_BLUR_UM, np.inf),
+    "distance_share": (-0.9, 3.0),
+    "falloff": (-0.9, 3.0),
+    "scale": (0.5, 2.0),
+    "pupil_share": (-0.5, 1.0),
+}
+"""Of the scalars: beyond them there is no shadow to compute."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +74,10 @@ class Placement:
     """The parameters, in the order of SCALARS and then the aperture's weights.
 
     distance_share: relative error of d. scale: of the mask's cells. skew: tangent of the angle by
-    which its columns lean. aperture: (v, u), mean 1.
+    which its columns lean. aperture: (v, u), mean 1, relative to the views' open shares.
+    pupil_x_um, pupil_y_um, pupil_share: the pupil's centre from that of `pupil`, and the relative
+    error of its diameter. pupil: as described, or of the shape that the whiteboards show; None: the
+    views are open to their edges, and the pupil's parameters mean nothing.
     """
 
     offset_x_um: float = 0.0
@@ -76,7 +96,11 @@ class Placement:
     tilt_y_rad: float = 0.0
     bow_um: float = 0.0
     glass_um: float = 0.0
+    pupil_x_um: float = 0.0
+    pupil_y_um: float = 0.0
+    pupil_share: float = 0.0
     aperture: tuple[tuple[float, ...], ...] = ()
+    pupil: Pupil | None = None
 
     def vector(self) -> NDArray[np.float64]:
         """Return the parameters as one vector."""
@@ -84,24 +108,36 @@ class Placement:
 
     def moved(self, step: NDArray[np.floating]) -> Placement:
         """Return the placement after a step, within what is possible."""
-        return placement_of(self.vector() + step, np.shape(self.aperture))
+        vector = self.vector() + step
+        scalars = dict(zip(SCALARS, map(float, vector), strict=False))
+        for name, (least, most) in LIMITS.items():
+            scalars[name] = min(max(scalars[name], least), most)
+        weights = np.maximum(vector[len(SCALARS) :], 1e-3).reshape(np.shape(self.aperture))
+        rows = tuple(tuple(map(float, row)) for row in weights)
+        return Placement(**scalars, aperture=rows, pupil=self.pupil)
 
-
-def placement_of(vector: NDArray[np.floating], views: tuple[int, ...]) -> Placement:
-    """Return the placement of a parameter vector for a grid of `views`, within what is possible."""
-    scalars = dict(zip(SCALARS, map(float, vector), strict=False))
-    scalars["blur_um"] = max(scalars["blur_um"], LEAST_BLUR_UM)
-    scalars["distance_share"] = min(max(scalars["distance_share"], -0.9), 3.0)
-    scalars["falloff"] = min(max(scalars["falloff"], -0.9), 3.0)
-    scalars["scale"] = min(max(scalars["scale"], 0.5), 2.0)
-    weights = np.maximum(vector[len(SCALARS) :], 1e-3).reshape(views)
-    return Placement(**scalars, aperture=tuple(tuple(map(float, row)) for row in weights))
+    def fitted_pupil(self) -> Pupil | None:
+        """Return the pupil with the centre and the diameter of these parameters."""
+        if self.pupil is None:
+            return None
+        x_mm, y_mm = self.pupil.centre_mm
+        return self.pupil.model_copy(
+            update={
+                "centre_mm": (x_mm + self.pupil_x_um / 1e3, y_mm + self.pupil_y_um / 1e3),
+                "diameter_mm": self.pupil.diameter_mm * (1 + self.pupil_share),
+            }
+        )
 
 
 def designed_placement(camera: Camera) -> Placement:
     """Return the placement of a camera built as described."""
     rows, columns = camera.views
-    return Placement(aperture=((1.0,) * columns,) * rows)
+    return Placement(aperture=((1.0,) * columns,) * rows, pupil=described_pupil(camera))
+
+
+def described_pupil(camera: Camera) -> Pupil | None:
+    """Return the pupil of the camera's lens; None where its description has none."""
+    return getattr(camera.lens, "pupil", None)
 
 
 def labels(views: tuple[int, int]) -> tuple[str, ...]:
@@ -132,6 +168,9 @@ class Tolerances:
     tilt_y_rad: float = 0.01
     bow_um: float = 10.0
     glass_um: float = 100.0
+    pupil_x_um: float = 500.0
+    pupil_y_um: float = 500.0
+    pupil_share: float = 0.05
     aperture: float = 0.05
 
     def deviations(self, views: tuple[int, int]) -> NDArray[np.float64]:

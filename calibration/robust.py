@@ -31,6 +31,12 @@ def tukey_weights(scaled: Array) -> Array:
     return np.clip(1 - (scaled / TUKEY) ** 2, 0, None) ** 2
 
 
+def tukey_curvatures(scaled: Array) -> Array:
+    """Return the second derivative of Tukey's loss of residuals in deviations."""
+    within = np.clip((scaled / TUKEY) ** 2, 0, 1)
+    return (1 - within) * (1 - 5 * within)
+
+
 def correlation(reading: Array, drawn: Array, channels: NDArray[np.integer]) -> float:
     """Return the correlation of readings with what is drawn, (n,) each, outliers clipped.
 

@@ -362,7 +362,7 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
     if dusty.any():
         findings.append(words.dust_finding(dusty))
         readings = readings.without(dusty)
-        fit = fit_placement(readings.seen, task.camera, mask, start=fit.placement)
+        fit = fit_placement(readings.seen, task.camera, mask, start=fit)
     of_causes = words.cause_lines(fit, readings.seen, mask)
     findings, advice = [*of_causes.findings, *findings], [*of_causes.advice, *advice]
     seen = settled(fit, readings.seen)
@@ -552,11 +552,11 @@ def _list_unwatched(
 
 def _fit_with_defects(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
     """Return the fit with defects: found, and the placement refined with them in the mask."""
-    start = parametric.fit.placement
-    defects = find_defects(settled(parametric.fit, seen), parametric.mask, start)
+    settled_boards = settled(parametric.fit, seen)
+    defects = find_defects(settled_boards, parametric.mask, parametric.fit.placement)
     if defects.count == 0:
         return Parametric(parametric.fit, parametric.mask, defects)
-    fit = fit_placement(seen, camera, defects.mask, start=start)
+    fit = fit_placement(seen, camera, defects.mask, start=parametric.fit)
     again = find_defects(settled(fit, seen), parametric.mask, fit.placement)
     return Parametric(fit, parametric.mask, again)
 

@@ -14,8 +14,18 @@ from emmc_rig.calibration.placement import (
     labels,
     with_aperture_mean_one,
 )
-from emmc_rig.calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, shadow_mask, share_tables
+from emmc_rig.calibration.shadow import (
+    ANY_COLOUR,
+    OF_VIEW,
+    PUPIL_STEPS,
+    TABLE_STEPS,
+    Shadow,
+    shadow_mask,
+    share_tables,
+)
 from emmc_rig.model.camera import Camera, build_imaging_matrix
+from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.pupil import Pupil
 
 SIZE = (16, 22)
 VIEWS = (3, 4)
@@ -90,19 +100,33 @@ def askew(camera):
     )
 
 
+ROUND = Pupil(diameter_mm=19.0, centre_mm=(0.5, -0.3))
+"""Before the 3 x 4 views of 5 mm: the corners are less than half open, and most views are cut."""
+PARAMETERS = [*SCALARS, "aperture_0_0", "aperture_2_1"]
+
+
 @pytest.mark.parametrize("binning", [1, 2])
-@pytest.mark.parametrize("name", [*SCALARS, "aperture_0_0", "aperture_2_1"])
-def test_derivatives_are_those_of_the_readings(name, binning):
+@pytest.mark.parametrize(
+    ("name", "pupil"),
+    [
+        (name, pupil)
+        for name in PARAMETERS
+        for pupil in (None, ROUND)
+        if pupil or "pupil" not in name
+    ],
+)
+def test_derivatives_are_those_of_the_readings(name, pupil, binning):
     camera = camera_of(binning=binning)
-    mask, at = shadow_mask(camera, SIZE), askew(camera)
+    mask, at = shadow_mask(camera, SIZE), replace(askew(camera), pupil=pupil)
     pixels = everywhere(mask.pixel_shape())
     colours = np.arange(len(pixels), dtype=np.uint8) % 4
     open_views = np.random.default_rng(1).random(VIEWS) < 0.6
     place = labels(VIEWS).index(name)
     _, slopes = Shadow(mask, at).with_slopes(pixels, colours, open_views, (12.0, 3.0))
     step = np.zeros(len(at.vector()))
-    # The tables' interpolation errs with the reach of the blur: a small step would see that.
-    step[place] = 0.2 if name == "blur_um" else 1e-3 * max(abs(at.vector()[place]), 0.01)
+    # A small step would see the tables' interpolation, and the lines that cut a pupil.
+    large = {"blur_um": 0.2, **PUPIL_STEPS}
+    step[place] = large.get(name, 1e-3 * max(abs(at.vector()[place]), 0.01))
     ahead, behind = (
         Shadow(mask, at.moved(sign * step)).readings(pixels, colours, open_views, (12.0, 3.0))
         for sign in (1, -1)
@@ -125,6 +149,32 @@ def test_what_each_view_adds_to_a_derivative_is_all_of_it(stage_um):
     softer = SCALARS.index("blur_um")
     np.testing.assert_allclose(sums[:, :2], slopes[:, :2], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(sums[:, 2] + sums[:, 3], slopes[:, softer], rtol=1e-9, atol=1e-12)
+
+
+def test_a_cut_view_casts_the_shadow_of_its_open_part():
+    camera = camera_of(cfa="mono", pattern={"kind": "random_rgbw", "seed": 2})
+    even = replace(askew(camera), vignetting=0.0, falloff=0.0, aperture=((1.0,) * 4,) * 3)
+    mask, pixels = shadow_mask(camera, SIZE), everywhere()
+    channels = np.full(len(pixels), ANY_COLOUR, np.uint8)
+    cut = Shadow(mask, replace(even, pupil=ROUND, pupil_x_um=200.0, pupil_share=0.02))
+    found = cut.coefficients(pixels, channels)
+    # The same by many small whole views, of which those in the disk are open.
+    fine = 20
+    cell_um = mask.aperture_cell_um / fine
+    v_um, u_um = (centred_grid(count * fine, cell_um) for count in VIEWS)
+    inside = np.hypot(v_um[:, None] + 300.0, u_um - 700.0) < 9500.0 * 1.02
+    points = replace(
+        mask, views=inside.shape, aperture_cell_um=cell_um, aperture_um=cell_um
+    )  # fmt: skip
+    rows = tuple(tuple(map(float, row)) for row in inside)
+    every = Shadow(points, replace(even, aperture=rows)).coefficients(pixels, channels)
+    expected = every.reshape(len(pixels), 3, fine, 4, fine).sum(axis=(2, 4))
+    opened = inside.reshape(3, fine, 4, fine).mean(axis=(1, 3))
+    np.testing.assert_allclose(cut.opened, opened, atol=5e-3)
+    assert (cut.opened < 0.5).any()
+    for light, by_rays in ((found, expected), (found / cut.opened, expected / opened)):
+        off = np.linalg.norm(light - by_rays) / np.linalg.norm(by_rays)
+        assert off < 4e-3
 
 
 def test_moving_the_stage_is_moving_the_mask():
@@ -162,6 +212,7 @@ def test_the_shares_of_the_cells_sum_to_one_and_their_derivatives_to_none(blur_u
     camera = camera_of()
     mask = shadow_mask(camera, SIZE)
     tables, reach = share_tables(mask, replace(designed_placement(camera), blur_um=blur_um))
+    tables = tables[:, 0]
     np.testing.assert_allclose(tables[0].sum(axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(tables[1:].sum(axis=2), 0, atol=1e-6)
     assert (tables[0] > -1e-9).all()
@@ -174,8 +225,8 @@ def test_the_shares_of_the_cells_sum_to_one_and_their_derivatives_to_none(blur_u
     for width in widths:
         density = np.convolve(density, np.abs(grid) <= width / 2, mode="same")
     density /= density.sum()
-    for place in (0, 200, 400):
-        at = grid + reach + place / 512
+    for place in (0, 100, 200):
+        at = grid + reach + place / TABLE_STEPS
         shares, _ = np.histogram(at, np.arange(tables.shape[2] + 1), weights=density)
         np.testing.assert_allclose(tables[0][place], shares, atol=2e-3)
 

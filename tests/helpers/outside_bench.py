@@ -17,13 +17,15 @@ Array = np.ndarray
 POINTS = 12
 COARSE_POINTS, COARSE_PARTS = 6, 6
 """Along a pixel and along an aperture cell, of rays that meet two masks."""
+ACROSS = 8
+"""Parts along a piece of the aperture that the pupil cuts, each with rays of its own."""
 FINER = 20
 BESIDE_UM = 300.0
 """How far beside the picture the mask is drawn: where rays aslant and a mask that moves reach."""
 GEOMETRY = (
     "lens_um", "mask_um", "pitch_um", "cell_um", "aperture_cell_um", "views", "offset_um",
     "rotation_rad", "blur_um", "tilt", "glass_um", "astray_um", "diffraction", "behind_um",
-    "behind_cell_um",
+    "behind_cell_um", "pupil_um", "pupil_at_um",
 )  # fmt: skip
 LAMPS = {
     "white": (1.0, 1.0, 1.0),
@@ -70,7 +72,8 @@ class Optics:
     spread of the areas of the pinhole plate's holes. plate_turn_deg: of the plate about the axis,
     x to y; plate_at_um: (x, y) of its middle. diffraction: behind the mask's edges, by the angular
     spectrum of plane waves. behind_um, behind_cell_um: distance and cells of a second mask, whose
-    middle is on the axis, where the bench has one.
+    middle is on the axis, where the bench has one. pupil_um, pupil_at_um: diameter and middle, x
+    and y, of the round pupil; 0: the aperture's cells are open to their edges.
     """
 
     lens_um: float = 50_000.0
@@ -104,6 +107,8 @@ class Optics:
     diffraction: bool = False
     behind_um: float = 500.0
     behind_cell_um: float = 20.0
+    pupil_um: float = 0.0
+    pupil_at_um: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -222,7 +227,10 @@ class Bench:
         return rows + columns if self.sensor.bayer else np.ones(self.size, int)
 
     def light(self) -> Array:
-        """Return what share of a view's light reaches each pixel, (v, u, y, x), of all views' 1."""
+        """Return the light of a whole cell at each pixel, (v, u, y, x); that of all is 1.
+
+        A cell that the pupil cuts sends its open share of it.
+        """
         optics = self.optics
         (v, u), (y, x) = self._aperture(), self._pixels()
         down = (y - v[:, None, None, None]) ** 2
@@ -230,7 +238,8 @@ class Bench:
         slope2 = (down + across) / optics.lens_um**2
         power = optics.falloff + optics.colour_falloff * (1 - self.colour)
         share = (1 + slope2) ** (-power / 2) * self.passed[:, :, None, None]
-        return share / share.sum((0, 1))
+        opened = np.reshape([self._opened(piece) for piece, _ in self._views()], optics.views)
+        return share / (share * opened[:, :, None, None]).sum((0, 1))
 
     def shadow(self, mask_x: float = 0.0, mask_y: float = 0.0, colour: int | None = None) -> Array:
         """Return what the mask passes of every view to every pixel, (v, u, y, x).
@@ -244,10 +253,13 @@ class Bench:
     def piece(
         self, piece: Piece, mask_x: float, mask_y: float, now: Optics, colour: int | None = None
     ) -> Array:
-        """Return what the mask passes of a piece of the aperture to every pixel, (y, x)."""
+        """Return what mask and pupil pass of a piece of the aperture to every pixel, (y, x)."""
         key = piece, round(mask_x, 6), round(mask_y, 6), now.lens_um, now.blur_um, colour
         if key not in self.known:
-            self.known[key] = self._traced(piece, mask_x, mask_y, now, colour)
+            self.known[key] = sum(
+                (share * self._traced(part, mask_x, mask_y, now, colour)
+                for part, share in self._open_parts(piece)), np.zeros(self.size),
+            )  # fmt: skip
         return self.known[key]
 
     def psi(self, mask_x: float = 0.0, mask_y: float = 0.0) -> Array:
@@ -320,7 +332,10 @@ class Bench:
         def seen(colour: int | None) -> Array:
             total = np.zeros(self.size)
             for piece, area in pieces:
-                passed = 1.0 if place is None else self.piece(piece, *place, now, colour)
+                if place is None:
+                    passed = self._opened(piece)
+                else:
+                    passed = self.piece(piece, *place, now, colour)
                 total += area * sent[piece.cell] * passed
             return total
 
@@ -385,6 +400,36 @@ class Bench:
                 found.append((Piece((j, i), middle, sides), sides[0] * sides[1] / side**2))
         return found
 
+    def _opened(self, piece: Piece) -> float:
+        """Return the share of a piece of the aperture that the pupil leaves open."""
+        return sum(share for _, share in self._open_parts(piece))
+
+    def _open_parts(self, piece: Piece) -> list[tuple[Piece, float]]:
+        """Return the parts of a piece of the aperture in the pupil, and their shares of it.
+
+        Parts on the pupil's edge lie about the middle of what is open of them.
+        """
+        radius, finer = self.optics.pupil_um / 2, 32
+        points = (np.arange(ACROSS * finer) + 0.5) / (ACROSS * finer) - 0.5
+        y = (piece.at_um[0] + piece.sides_um[0] * points)[:, None]
+        x = (piece.at_um[1] + piece.sides_um[1] * points)[None, :]
+        at_x, at_y = self.optics.pupil_at_um
+        disk = 1.0 * ((x - at_x) ** 2 + (y - at_y) ** 2 < radius**2)
+        if not radius or disk.all():
+            return [(piece, 1.0)]
+        opened, moved_y, moved_x = (
+            values.reshape(ACROSS, finer, ACROSS, finer).mean((1, 3))
+            for values in (disk, disk * y, disk * x)
+        )
+        sides = piece.sides_um[0] / ACROSS, piece.sides_um[1] / ACROSS
+        return [
+            (
+                Piece(piece.cell, (moved_y[at] / opened[at], moved_x[at] / opened[at]), sides),
+                opened[at] / ACROSS**2,
+            )
+            for at in zip(*np.nonzero(opened), strict=True)
+        ]
+
     def _now(self) -> Optics:
         """Return the optics as they stand at the frame being taken."""
         course, optics = self.course, self.optics
@@ -448,6 +493,9 @@ class Bench:
         y, x = np.broadcast_arrays(*self._pixels())
         two = len(self.masks) == 2
         points, parts = (COARSE_POINTS, COARSE_PARTS) if two else (POINTS, 1)
+        if piece.sides_um[0] < now.aperture_cell_um / 2:
+            # A part of a cell that the pupil cuts: its many neighbours have rays as well.
+            points, parts = COARSE_POINTS, 1
         within = ((np.arange(points) + 0.5) / points - 0.5) * now.pitch_um
         within *= points / np.sqrt(points**2 - 1)  # the variance of a whole pixel
         sides = piece.sides_um[0] / parts, piece.sides_um[1] / parts
