@@ -185,10 +185,12 @@ class SensorSheet:
         found = []
         for name, (quantity, unit) in QUANTITIES.items():
             value = self.between_pixels(name) if name in PATTERNS else float(getattr(self, name))
-            deviation = self.deviations.get(name) or None
+            remark, deviation = self.remark(name), self.deviations.get(name) or None
             if name == "prnu":
                 value, deviation = 100 * value, deviation and 100 * deviation
-            found.append(SheetRow(quantity, value, deviation, unit, self.remark(name)))
+            if remark.startswith(BELOW_STEPS):
+                deviation = None
+            found.append(SheetRow(quantity, value, deviation, unit, remark))
         return found
 
 
@@ -274,7 +276,7 @@ def characterise(
     prnu = _nonuniformity(lit, darks[0], good, phases_alike=monochrome)
     bounds = _bounds(frames, points, darks[0], dsnu)
     return SensorSheet(
-        **points.figures(effects.shared.size if effects.shared.significant else 0.0),
+        **points.figures(effects.shared.correction),
         exposures=len(flat.exposure_s),
         dsnu=dsnu,
         prnu=prnu,
@@ -553,6 +555,7 @@ class _Effects(NamedTuple):
 
 
 def _effects(frames: _Frames, points: _Points, carried: dict[int, Array]) -> _Effects:
+    """Return the effects that the frames show; carried: see `_read_flats`."""
     dim = points.bright_signal <= LINEAR_RANGE[1] * points.saturation[0]
     clear: Flags = np.logical_and.reduce((points.clipped < CLIPPED_SHARE) & dim, axis=1)
     lag, creep = lag_and_creep(frames.flat, points.signal.mean(axis=1), clear)
@@ -613,7 +616,7 @@ def _deviations(
     All blocks share the rounding, the black level's drift, the steps between exposures at
     saturation, and what the effects leave open of the gain.
     """
-    shared = effects.shared.size if effects.shared.significant else 0.0
+    shared = effects.shared.correction
     without = []
     for block in range(BLOCKS):
         tiles = EVERY.copy()

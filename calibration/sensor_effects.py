@@ -47,6 +47,11 @@ class Effect:
         return bool(2 * student.sf(abs(self.size) / self.deviation, self.freedom) < CHANCE)
 
     @property
+    def correction(self) -> float:
+        """The size to correct for: none without significance."""
+        return self.size if self.significant else 0.0
+
+    @property
     def left_open(self) -> float:
         """How large the effect may be: its size; without significance, beyond the deviation."""
         if self.significant:
