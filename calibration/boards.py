@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.frames import MeanFrame, SensorGain, bands, dark_at, photon_transfer
+from emmc_rig.calibration.frames import (
+    MeanFrame,
+    SensorGain,
+    bands,
+    dark_at,
+    hot_pixels,
+    photon_transfer,
+)
 from emmc_rig.calibration.levels import Check, Levels
 from emmc_rig.calibration.openings import CENTRED, Window, views_open
 from emmc_rig.calibration.robust import deviation_of
@@ -387,16 +394,14 @@ def channels_of(layout: PsiLayout, shot: int = 0) -> NDArray[np.uint8]:
 def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:
     """Return which pixels to use, (pixel_y, pixel_x): neither hot nor dead.
 
-    A pixel is hot whose dark frame, and dead whose reference, lies apart from its neighbours of
-    the same colour by far more than pixels differ: ten robust deviations, and for the reference
-    at least a fifth of its level.
+    Hot: see `hot_pixels`. A pixel is dead whose reference lies apart from its neighbours of the
+    same colour by far more than pixels differ: ten robust deviations, and at least a fifth of its
+    level.
     """
     dark = boards.dark.mean_dn.astype(np.float64)
     good = np.ones(dark.shape, dtype=bool)
     for frame in boards.darks:
-        level = frame.mean_dn.astype(np.float64)
-        off = np.abs(level - np.median(level))
-        good &= off <= 10 * max(deviation_of(off), 0.5)
+        good &= ~hot_pixels(frame.mean_dn.astype(np.float64), frame.step_dn)
     for reference in boards.references.values():
         signal = reference.mean_dn - dark
         for y in range(2):

@@ -16,6 +16,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter
 
 from emmc_rig.model.noise import SensorNoise
+from emmc_rig.model.pupil import Pupil
 
 Array = NDArray[np.floating]
 DUST_GRAIN = 6
@@ -44,6 +45,8 @@ class OpticsFlaws:
     deviation of the area of the hole before every view; plate_turn_deg: of the pinhole plate and
     its stage about the axis, x to y. creep_um_per_s: of the mask, in x. warming_um: by which the
     lens gets farther from the sensor, with WARM_UP_S.
+    standard deviation of the mask's edges in red, green and blue light. pupil: what the real lens
+    leaves open; None: what the camera describes.
     """
 
     aperture_spread: float = 0.0
@@ -63,6 +66,7 @@ class OpticsFlaws:
     plate_turn_deg: float = 0.0
     creep_um_per_s: float = 0.0
     warming_um: float = 0.0
+    pupil: Pupil | None = None
     seed: int = 1
 
     def aperture_weights(self, views: tuple[int, int]) -> NDArray[np.float64]:
