@@ -345,23 +345,14 @@ def _robust_spread(residuals: Sequence[Array]) -> float:
     return max(1.0, deviation_of(np.concatenate(residuals)))
 
 
-def _with_own_slopes(read: Array, slope: Array, brightness: float) -> NDArray[np.float64]:
-    """Return slopes of a whiteboard's readings, (n, parameter + OWN), from those of the shadow.
-
-    By the placement, the whiteboard's brightness, and the mask's move in x and y. read: (n,),
-    readings of the shadow.
-    """
-    rows = [brightness * slope, read[:, None], brightness * slope[:, OFFSETS]]
-    return np.concatenate(rows, axis=1)
-
-
 class _Linear(NamedTuple):
     """Readings of a whiteboard's sample, linear in the parameters around a state."""
 
     residual: Array
     """(n,), in deviations."""
     slope: Array
-    """(n, parameter + OWN), of the reading, over its deviation."""
+    """(n, parameter + OWN), of the reading, over its deviation: by the placement, the whiteboard's
+    brightness, and the mask's move in x and y."""
 
     def read(self, sample: Sample) -> Array:
         """Return the readings of the shadow, (n,): the slope by the whiteboard's brightness."""
@@ -376,9 +367,13 @@ def _linear_readings(
     for index, sample in enumerate(samples):
         opening, brightness = state.opening(sample.board, index), state.brightness(index)
         read, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
-        slope = _with_own_slopes(read, slope, brightness)
-        slope /= sample.deviation[:, None]
-        found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slope))
+        # In one pass over memory, which takes as long as the arithmetic.
+        count = slope.shape[1]
+        slopes = np.empty((len(read), count + OWN))
+        np.multiply(slope, (brightness / sample.deviation)[:, None], out=slopes[:, :count])
+        slopes[:, count] = read / sample.deviation
+        slopes[:, count + 1 :] = slopes[:, OFFSETS]
+        found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slopes))
     return tuple(found)
 
 
