@@ -99,8 +99,8 @@ MOST_OF_PRIOR = 0.7
 """Of the prior's deviation: a parameter known no better stays at the design."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
-FIRST_GAIN = 0.5
-"""The same, before the last fit: of a move by a standard deviation, which later steps make."""
+FIRST_GAIN = 2.0
+"""The same, before the last fit: of a move by two standard deviations, which later steps make."""
 LEAST_CURVATURE = 0.3
 """Of the loss, over that of its weights: below it most pixels are outliers, and steps too long."""
 MOST_MORE_BOARDS = 200
