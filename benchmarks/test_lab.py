@@ -18,7 +18,7 @@ OWN = [
 ]
 """Scripts with the arguments of `lab`, and scripts with their own."""
 SCRIPTS = [path for path in (*SHARED, *OWN) if path.stem not in ("lab", "test_lab")]
-KEEPING = [*SHARED, LAB / "calibration_checks.py"]
+KEEPING = [*SHARED, LAB / "calibration_checks.py", LAB / "outside_benches.py"]
 """Scripts that write into docs/results unless told otherwise."""
 NEEDS = {"train_network": "torch"}
 """By script, a package beyond the extra `lab`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.frames import MeanFrame, SensorGain, bands, dark_at, photon_transfer
+from emmc_rig.calibration.frames import (
+    MeanFrame,
+    SensorGain,
+    bands,
+    dark_at,
+    hot_pixels,
+    photon_transfer,
+)
 from emmc_rig.calibration.levels import Check, Levels
 from emmc_rig.calibration.openings import CENTRED, Window, views_open
 from emmc_rig.calibration.robust import deviation_of
@@ -22,6 +29,11 @@ DARKEST_REFERENCE_DN = 50.0
 """Above the dark: with rounding of 1 DN a ratio is known to 1 % of it and better."""
 
 
+BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
+"""Rows and columns to the views beside a view."""
+CLEARLY_CUT = 0.9
+"""Of the brightest view's light: a pupil that shuts a view cuts those beside it. Views of a bench
+differ by 5 %."""
 Opening = tuple[NDArray[np.bool_], tuple[float, float], int]
 """Views open, (view_y, view_x); place of the mask in um, x and y; shot."""
 
@@ -227,6 +239,8 @@ def as_readings(
 ) -> list[Board]:
     """Return the whiteboards as readings.
 
+    Whiteboards of views that the pupil shuts are left out.
+
     usable: (pixel_y, pixel_x), pixels known to be good; a pixel whose reference is not bright
     enough to divide by is left out as well. Raises CalibrationError for frames of another size,
     a reference that is missing, and whiteboards too dark to use.
@@ -235,11 +249,10 @@ def as_readings(
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
     found = []
-    for board in boards.frames:
+    for board, taken in lit_boards(boards):
         reference = boards.reference(board.shot, board.lamp)
         if reference is None:
             raise CalibrationError(f"{board.name}: no reference whiteboard under that lamp")
-        taken = board.frame
         for frame, what in ((taken, board.name), (reference, "reference"), (boards.dark, "dark")):
             if frame.mean_dn.shape != expected:
                 raise CalibrationError(
@@ -249,6 +262,49 @@ def as_readings(
                 )
         found.append(_board(board, taken, reference, boards, gain, layout, good))
     return found
+
+
+def lit_boards(boards: BoardSet) -> Iterator[tuple[BoardFrame, MeanFrame]]:
+    """Yield the whiteboards that have light, with their frames.
+
+    Raises CalibrationError at the end for dark ones, except of views that the lens's pupil shuts.
+    """
+    dark, rates = [], dict[tuple[int, int], float]()
+    for board in boards.frames:
+        frame = board.frame
+        if frame.mean_dn.shape == boards.dark.mean_dn.shape:
+            light_dn = frame.mean_dn - boards.dark_at(frame.exposure_s).mean_dn
+            above_dn = float(np.median(light_dn))
+            if above_dn < DARKEST_REFERENCE_DN / 10:
+                dark.append(board)
+                continue
+            if board.pinhole is not None:
+                rates[board.pinhole] = above_dn / frame.exposure_s
+        yield board, frame
+    shut = {board.pinhole for board in dark if board.pinhole is not None}
+    for board in dark:
+        if board.pinhole is None or not _is_shut(board.pinhole, shut, rates):
+            raise CalibrationError(
+                f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
+            )
+
+
+def _is_shut(
+    view: tuple[int, int], dark: set[tuple[int, int]], rates: Mapping[tuple[int, int], float]
+) -> bool:
+    """Return whether the pupil, not the lamp, may be why a view is dark.
+
+    dark: all views that are. rates: light of the others, in DN/s. Then the views beside have
+    clearly less light than the brightest; or, where none of these was taken, the opposite view is
+    dark as well.
+    """
+    beside = [(view[0] + down, view[1] + right) for down, right in BESIDE]
+    lit = [rates[near] for near in beside if near in rates]
+    if lit:
+        return max(lit) < CLEARLY_CUT * max(rates.values())
+    views = np.array([*dark, *rates])
+    v, u = (views.min(axis=0) + views.max(axis=0) - view).tolist()
+    return bool(rates) and (v, u) != view and (v, u) in dark
 
 
 def _board(
@@ -277,10 +333,6 @@ def _board(
         raise CalibrationError(
             f"the reference whiteboard under the {board.lamp} lamp is less than "
             f"{DARKEST_REFERENCE_DN:g} DN above the dark: raise the lamp or the exposure"
-        )
-    if float(np.median(frame.mean_dn - dark.mean_dn)) < DARKEST_REFERENCE_DN / 10:
-        raise CalibrationError(
-            f"{board.name}: the whiteboard is dark; is the lamp on, and the aperture open?"
         )
     channels = channels_of(layout, board.shot)
     if layout.colour is None and board.lamp in LAMP_COLOURS:
@@ -342,16 +394,14 @@ def channels_of(layout: PsiLayout, shot: int = 0) -> NDArray[np.uint8]:
 def sensor_blemishes(boards: BoardSet) -> NDArray[np.bool_]:
     """Return which pixels to use, (pixel_y, pixel_x): neither hot nor dead.
 
-    A pixel is hot whose dark frame, and dead whose reference, lies apart from its neighbours of
-    the same colour by far more than pixels differ: ten robust deviations, and for the reference
-    at least a fifth of its level.
+    Hot: see `hot_pixels`. A pixel is dead whose reference lies apart from its neighbours of the
+    same colour by far more than pixels differ: ten robust deviations, and at least a fifth of its
+    level.
     """
     dark = boards.dark.mean_dn.astype(np.float64)
     good = np.ones(dark.shape, dtype=bool)
     for frame in boards.darks:
-        level = frame.mean_dn.astype(np.float64)
-        off = np.abs(level - np.median(level))
-        good &= off <= 10 * max(deviation_of(off), 0.5)
+        good &= ~hot_pixels(frame.mean_dn.astype(np.float64), frame.step_dn)
     for reference in boards.references.values():
         signal = reference.mean_dn - dark
         for y in range(2):

@@ -1,10 +1,11 @@
 """Why whiteboards differ among themselves: single causes, compared by the evidence of the readings.
 
-Every whiteboard has three parameters of its own beside the placement: its brightness b, and by how
-much the mask seems to have moved, x and y. A cause gives these a pattern over the whiteboards: a
-lamp that is not steady changes every b by chance, holes of unequal size only those of whiteboards
-through the pinhole, a plate that is turned moves the shadow of every hole by its distance from the
-axis. A pinhole moved by du on the plate shows the shadow of a mask moved by -rho du, rho = d / D.
+Every whiteboard has parameters of its own beside the placement: its brightness, by how much the
+mask seems to have moved, x and y, and by how much larger its hole is than a view. A cause gives
+these a pattern over the whiteboards: a lamp that is not steady changes every brightness by chance,
+holes of unequal size only those of whiteboards through the pinhole, a plate that is turned moves
+the shadow of every hole by its distance from the axis. A pinhole moved by du on the plate shows the
+shadow of a mask moved by -rho du, rho = d / D.
 
 With the readings linear in the parameters, what the whiteboards say of their own parameters p, the
 placement's taken out, is an information S and a pull h. A cause of pattern A and width tau makes p
@@ -12,8 +13,8 @@ normal about 0 with covariance Sigma = tau^2 A A^T, several causes sum, and with
 
     log evidence = 1/2 (F^T h)^T (1 + F^T S F)^-1 F^T h - 1/2 log|1 + F^T S F|
 
-A cause is taken in after another where it raises the evidence most. What raises it nearly as much
-is named beside it: the whiteboards do not tell these apart.
+Causes are taken in one by one, each time the cause that raises the evidence most. A cause that
+raises it nearly as much is named beside it: the whiteboards do not tell the two apart.
 
 Source of the evidence: MacKay 1992.
 """
@@ -29,11 +30,13 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from emmc_rig.calibration.boards import Board
+from emmc_rig.model.pupil import Pupil, cell_openings
 
 Array = NDArray[np.floating]
-OWN = 3
-"""Parameters of one whiteboard: relative brightness, and by how much the mask moved (x, y), um."""
-LEAST_OWN = (2e-5, 0.002, 0.002)
+OWN = 4
+"""Parameters of one whiteboard: relative brightness, by how much the mask moved (x, y), um, and by
+how much larger its hole's area is than a view, relative."""
+LEAST_OWN = (2e-5, 0.002, 0.002, 2e-5)
 """Standard deviations of these without any cause: far below what noise shows."""
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
@@ -48,9 +51,12 @@ LONE = 0.9
 """Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
 LAMP, STAGE, CREEP, LENS = "lamp", "stage", "creep", "lens"
 HOLES, HANDS, EXPOSURE, PLATE, TURN = "holes", "hands", "exposure", "plate", "turn"
+SIZE = "size"
+OF_HOLES = (HANDS, HOLES, EXPOSURE, PLATE, SIZE, TURN)
+"""Causes of whiteboards through the pinhole alone."""
 OF_PLATE = (HANDS, PLATE, TURN)
 """Causes by which pinholes stand off their holes."""
-SHIFTING = (STAGE, HANDS, HOLES, PLATE, TURN)
+SHIFTING = (STAGE, HANDS, HOLES, PLATE, SIZE, TURN)
 """Causes that aberrations of the views imitate."""
 
 
@@ -58,8 +64,9 @@ SHIFTING = (STAGE, HANDS, HOLES, PLATE, TURN)
 class Cause:
     """A possible cause. columns: (own parameter of all whiteboards, coefficient), for a coefficient
     of 1. widths: standard deviations of the coefficients that are tried, in the cause's unit:
-    LAMP, HOLES, EXPOSURE relative; STAGE, CREEP (over the whole capture) and LENS (aberrations that
-    displace every view's shadow) um of the mask; HANDS, PLATE um of the plate; TURN rad.
+    LAMP, HOLES and SIZE (area), EXPOSURE relative; STAGE, CREEP (over the whole capture) and LENS
+    (aberrations that displace every view's shadow) um of the mask; HANDS, PLATE um of the plate;
+    TURN rad.
     """
 
     name: str
@@ -97,57 +104,63 @@ class Light(NamedTuple):
 
     share: float
     """Of the light through the hole on its place."""
-    x_um: float
-    """Of its middle, from the middle of the view."""
-    y_um: float
+    middle_um: NDArray[np.float64]
+    """(x, y), from the middle of the view."""
 
 
 @dataclass(frozen=True)
 class Geometry:
     """Of the camera: what a plate's place makes of the mask's shadow.
 
-    ratio: rho = d / D. cell_um: side of a view and of a hole. views: (v, u).
+    ratio: rho = d / D. cell_um: side of a view and of a hole. views: (v, u). pupil: None: what lies
+    beyond the outermost views passes no light.
     """
 
     ratio: float
     cell_um: float
     views: tuple[int, int]
+    pupil: Pupil | None = None
 
-    def light(self, view: tuple[int, int], x_um: float, y_um: float) -> Light:
-        """Return the light through a pinhole that stands (x, y) off its view's hole.
-
-        What lies beyond the outermost views passes none.
-        """
-        lengths, middles = [], []
-        for place, count, off_um in zip(view, self.views, (y_um, x_um), strict=True):
-            middle_um, half_um = (place - (count - 1) / 2) * self.cell_um, count * self.cell_um / 2
-            begin_um = max(middle_um + off_um - self.cell_um / 2, -half_um)
-            end_um = min(middle_um + off_um + self.cell_um / 2, half_um)
-            lengths.append(max(end_um - begin_um, 0.0) / self.cell_um)
-            middles.append((begin_um + end_um) / 2 - middle_um)
-        return Light(lengths[0] * lengths[1], middles[1], middles[0])
+    def light(self, view: tuple[int, int], off_um: Array) -> Light:
+        """Return the light through a pinhole that stands (x, y) off its view's hole."""
+        pupil = self.pupil
+        if pupil is None:
+            sides_um = self.cell_um * np.array(self.views[::-1])
+            places_um = self.cell_um * (np.array(view[::-1]) - (np.array(self.views[::-1]) - 1) / 2)
+            begin_um = np.maximum(places_um + off_um - self.cell_um / 2, -sides_um / 2)
+            end_um = np.minimum(places_um + off_um + self.cell_um / 2, sides_um / 2)
+            lengths_um = np.maximum(end_um - begin_um, 0.0)
+            share = float(np.prod(lengths_um / self.cell_um))
+            return Light(share, (begin_um + end_um) / 2 - places_um)
+        x_mm, y_mm = np.array(pupil.centre_mm) - np.asarray(off_um) / 1e3
+        seen = pupil.model_copy(update={"centre_mm": (float(x_mm), float(y_mm))})
+        opened = cell_openings(seen, self.views, self.cell_um)
+        boxes = opened.of_view(*view)
+        shares = opened.share[boxes]
+        total = max(float(shares.sum()), 1e-9)
+        places = np.stack([opened.x_um[boxes], opened.y_um[boxes]], axis=1)
+        middle = shares @ places / total
+        return Light(total, middle + off_um)
 
     def slopes(self, board: Board, off_um: Array) -> NDArray[np.float64]:
         """Return the slopes of a whiteboard's own parameters by its pinhole's place, (OWN, 2).
 
         off_um: (x, y) of the pinhole from its hole, about which the slopes are taken.
         """
+        found = np.zeros((OWN, 2))
         if board.views_open.sum() > 1:
-            return np.array([[0.0, 0.0], [-self.ratio, 0.0], [0.0, -self.ratio]])
+            found[1:3] = -self.ratio * np.eye(2)
+            return found
         v, u = np.argwhere(board.views_open)[0].tolist()
-        step_um, found = self.cell_um / 1000, np.empty((OWN, 2))
+        step_um, here = self.cell_um / 100, self.light((v, u), np.zeros(2))
         for axis in range(2):
             by = np.eye(2)[axis] * step_um
-            less, more = (self.light((v, u), *(off_um + sign * by)) for sign in (-1, 1))
-            middle = self.light((v, u), *off_um)
-            found[:, axis] = np.array(
-                [
-                    (more.share - less.share) / max(middle.share, 0.1),
-                    -self.ratio * (more.x_um - less.x_um),
-                    -self.ratio * (more.y_um - less.y_um),
-                ]
-            ) / (2 * step_um)
-        return found
+            less, more = self.light((v, u), off_um - by), self.light((v, u), off_um + by)
+            found[0, axis] = (more.share - less.share) / max(here.share, 0.01)
+            found[1:3, axis] = -self.ratio * (more.middle_um - less.middle_um)
+        # What is cut of a hole makes it narrower.
+        found[3] = found[0]
+        return found / (2 * step_um)
 
 
 def through_pinhole(board: Board) -> bool:
@@ -187,7 +200,12 @@ def possible_causes(
     on_plate = moved / geometry.ratio
     causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate))
     if few.sum() > 1:
-        causes.append(Cause(HOLES, _own_columns(np.eye(count)[:, few], 0), BRIGHTNESSES))
+        wider = np.zeros((count, OWN))
+        wider[few, 0], wider[few, 3] = 1.0, 1.0
+        each = np.eye(count)[:, None, few] * wider[:, :, None]
+        causes.append(Cause(HOLES, each.reshape(count * OWN, -1), BRIGHTNESSES))
+        if not few.all():
+            causes.append(Cause(SIZE, wider.reshape(-1, 1), BRIGHTNESSES))
     if few.all():
         return causes
     common = few[:, None].astype(np.float64)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from emmc_rig.calibration.boards import BoardSet
 from emmc_rig.calibration.defects import mask_with_losses
 from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.glare import Glare
 from emmc_rig.calibration.parametric import Parametric, Stages, psi_at
 from emmc_rig.calibration.robust import deviation_of
 from emmc_rig.calibration.shadow import Shadow, ShadowMask
@@ -50,32 +51,18 @@ class Crosstalk:
 
 
 def crosstalk(
-    boards: BoardSet, channels: NDArray[np.uint8], good: NDArray[np.bool_]
+    boards: BoardSet, channels: NDArray[np.uint8], good: NDArray[np.bool_], glare: float = 0.0
 ) -> Crosstalk | None:
     """Return what every filter sees of the lamps' colours.
 
-    None without whiteboards under coloured lamps, and where it is too little to matter. Raises
-    CalibrationError where pixels see another colour than their own.
+    glare: share of all electrons that is spread over the picture behind the filters, which is no
+    crosstalk. None without whiteboards under coloured lamps, and where it is too little to matter.
+    Raises CalibrationError where pixels see another colour than their own.
     """
-    references = [boards.references.get((0, lamp)) for lamp in LAMP_COLOURS]
-    if any(reference is None for reference in references) or channels.max() >= len(LAMP_COLOURS):
+    found = lamp_shares(boards, channels, good, glare)
+    if found is None:
         return None
-    seen, deviation = (np.empty((len(LAMP_COLOURS), len(LAMP_COLOURS))) for _ in range(2))
-    for colour, reference in enumerate(references):
-        assert reference is not None
-        rate = (
-            reference.mean_dn - boards.dark_at(reference.exposure_s).mean_dn
-        ) / reference.exposure_s
-        for f in range(len(LAMP_COLOURS)):
-            pixels = rate[good & (channels == f)]
-            if pixels.size == 0:
-                return None
-            level = float(np.median(pixels))
-            seen[f, colour] = max(level, 0.0)
-            spread = deviation_of(pixels - level)
-            deviation[f, colour] = MEDIAN_DEVIATION * spread / np.sqrt(pixels.size)
-    total = seen.sum(axis=1, keepdims=True)
-    seen, deviation = seen / total, deviation / total
+    seen, deviation = np.maximum(found.seen, 0), found.deviation
     if seen.diagonal().min() < LEAST_OWN:
         f = int(np.argmin(seen.diagonal()))
         raise CalibrationError(
@@ -86,6 +73,32 @@ def crosstalk(
     seen[seen < LEAST_SHARE] = 0
     found = Crosstalk(seen / seen.sum(axis=1, keepdims=True), np.where(seen > 0, deviation, 0))
     return found if found.largest > LEAST_CROSSTALK else None
+
+
+def lamp_shares(
+    boards: BoardSet, channels: NDArray[np.uint8], good: NDArray[np.bool_], glare: float = 0.0
+) -> Crosstalk | None:
+    """Return `crosstalk` however little it is; None without whiteboards under coloured lamps."""
+    references = [boards.references.get((0, lamp)) for lamp in LAMP_COLOURS]
+    if any(reference is None for reference in references) or channels.max() >= len(LAMP_COLOURS):
+        return None
+    seen, deviation = (np.empty((len(LAMP_COLOURS), len(LAMP_COLOURS))) for _ in range(2))
+    for colour, reference in enumerate(references):
+        assert reference is not None
+        rate = (
+            reference.mean_dn - boards.dark_at(reference.exposure_s).mean_dn
+        ) / reference.exposure_s
+        rate = (rate - glare * rate[good].mean()) / (1 - glare)
+        for f in range(len(LAMP_COLOURS)):
+            pixels = rate[good & (channels == f)]
+            if pixels.size == 0:
+                return None
+            level = float(np.median(pixels))
+            seen[f, colour] = level
+            spread = deviation_of(pixels - level)
+            deviation[f, colour] = MEDIAN_DEVIATION * spread / np.sqrt(pixels.size)
+    total = seen.sum(axis=1, keepdims=True)
+    return Crosstalk(seen / total, deviation / total)
 
 
 def mixing(mask: ShadowMask, seen: Array) -> ShadowMask:
@@ -113,10 +126,12 @@ def other_colours(
     crosstalk: Crosstalk,
     layout: PsiLayout,
     stages: Stages,
+    glare: Glare | None = None,
 ) -> OtherColours:
     """Return what the model says of the colours that a pixel's filter lets through beside its own.
 
-    plain: the mask as designed. Raises CalibrationError where a pixel sums several samples.
+    plain: the mask as designed. glare: brings light of other colours to every pixel. Raises
+    CalibrationError where a pixel sums several samples.
     """
     if layout.binning != 1 or layout.colour is None:
         raise CalibrationError("crosstalk is measured only on sensors whose pixels are samples")
@@ -128,16 +143,20 @@ def other_colours(
     through = 3 * psi_at(Shadow(mask, at), three, stages).weights
     own = np.arange(3)[:, None] == layout.colour[:, None, None, :, None, :]
     share, unsure = (
-        np.where(own, 0, np.moveaxis(matrix[layout.colour], -1, 2)[:, None, None])
+        np.moveaxis(matrix[layout.colour], -1, 2)[:, None, None]
         for matrix in (crosstalk.seen, crosstalk.deviation)
     )
+    weights = (share * through).astype(np.float32)
+    if glare is not None:
+        weights = glare.put_in(weights)
     missed = np.zeros_like(through)
     if known.misfit is not None:
         for shot, row, column, colour in np.ndindex(shots, v, u, 3):
             plane = through[shot, row, column, :, colour]
             missed[shot, row, column, :, colour] = known.misfit[row, column].variance(plane)
-    deviation = np.sqrt(share**2 * missed + (unsure * through) ** 2)
-    return OtherColours((share * through).astype(np.float32), deviation.astype(np.float32), own)
+    deviation = np.sqrt(share**2 * missed + (unsure * through) ** 2).astype(np.float32)
+    weights, deviation = (np.where(own, np.float32(0), each) for each in (weights, deviation))
+    return OtherColours(weights, deviation, own)
 
 
 def in_three_colours(known: Calibration, others: OtherColours) -> Calibration:

@@ -18,17 +18,21 @@ from emmc_rig.calibration.causes import (
     LAMP,
     LENS,
     PLATE,
+    SIZE,
     STAGE,
     TURN,
     FoundCause,
+    through_pinhole,
 )
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.colours import Crosstalk
 from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
+from emmc_rig.calibration.glare import Glare
 from emmc_rig.calibration.levels import Levels
 from emmc_rig.calibration.placement import Placement
 from emmc_rig.calibration.planning import PinholeWorth
-from emmc_rig.calibration.shadow import ShadowMask
+from emmc_rig.calibration.shadow import ShadowMask, openings
+from emmc_rig.model.pupil import LEAST_SHARE
 
 LARGEST_FLICKER = 0.01
 """Of a whiteboard's brightness against the others: more is named."""
@@ -61,6 +65,8 @@ NOTEWORTHY = {
     ),
 }
 USUAL = Placement()
+LEAST_OPEN = 0.995
+"""Of every view: a pupil that covers less is not worth a word."""
 
 
 def mask_findings(fit: Fit, names: Sequence[str] = tuple(NOTEWORTHY)) -> list[str]:
@@ -82,6 +88,34 @@ def mask_findings(fit: Fit, names: Sequence[str] = tuple(NOTEWORTHY)) -> list[st
                 )
             )
     return found
+
+
+def pupil_finding(fit: Fit, mask: ShadowMask) -> list[str]:
+    """Return the pupil's size and centre, and the views that it leaves less than half open."""
+    pupil = fit.placement.fitted_pupil()
+    if pupil is None:
+        return []
+    opened = openings(mask, fit.placement).shares(mask.views)
+    if opened.min() > LEAST_OPEN:
+        return []
+    x_mm, y_mm = pupil.centre_mm
+    size_spread = fit.deviation("pupil_share") * pupil.diameter_mm / (1 + fit.placement.pupil_share)
+    spread = max(fit.deviation("pupil_x_um"), fit.deviation("pupil_y_um")) / 1e3
+    words = (
+        f"the lens's {pupil.shape} pupil is {pupil.diameter_mm:.2f} +- {size_spread:.2f} mm "
+        f"across, its middle at ({x_mm:+.2f}, {y_mm:+.2f}) +- {spread:.2f} mm from the middle of "
+        "the views"
+    )
+    for names, least, most in (
+        ("less than half open", LEAST_SHARE, 0.5),
+        ("shut", -1, LEAST_SHARE),
+    ):
+        views = [
+            f"({v}, {u})" for v, u in np.argwhere((opened > least) & (opened <= most)).tolist()
+        ]
+        if views:
+            words += f"; {names}: view{'s' * (len(views) > 1)} {', '.join(views)}"
+    return [words]
 
 
 def level_findings(levels: Levels | None) -> list[str]:
@@ -132,6 +166,23 @@ def unwatched(missing: Sequence[str]) -> list[str]:
     return [
         f"not measured: {what} ({cost}); add `{line}` under whiteboards in the plan"
         for what, cost, line in lacking
+    ]
+
+
+def glare_findings(glare: Glare | None) -> list[str]:
+    """Return how much of the light is spread over the picture."""
+    if glare is None:
+        return []
+    kinds = ("in front of", glare.in_front), ("behind", glare.behind)
+    where = " and ".join(
+        f"{share:.2%} {place}" if glare.in_front and glare.behind else place
+        for place, share in kinds
+        if share
+    )
+    return [
+        f"veiling glare of {glare.total:.2%} +- {glare.deviation:.2%}, {where} the colour filters: "
+        "Psi has it as of an even scene; what scatters between mask and sensor (bare metal, glass "
+        "without coating, dust on it) can be blackened or cleaned"
     ]
 
 
@@ -274,6 +325,7 @@ SHORT = {
     HANDS: "pinholes off their holes",
     EXPOSURE: "other exposures of the pinhole than noted",
     PLATE: "a plate that stands off its place",
+    SIZE: "holes that are not as large as views",
     TURN: "a plate that is turned",
     LENS: "aberrations of the lens",
 }
@@ -281,30 +333,36 @@ SHORT = {
 
 
 def _lamp_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    flickering = [
-        check
-        for check in fit.boards
-        if abs(check.brightness - 1) > max(LARGEST_FLICKER, 5 * check.brightness_deviation)
-    ]
+    size, deviation = np.array(cause.size), np.array(cause.deviation)
+    flickering = int(np.sum(np.abs(size) > np.maximum(LARGEST_FLICKER, 5 * deviation)))
     if not flickering:
         return ""
-    worst = max(flickering, key=lambda check: abs(check.brightness - 1))
-    others = f" ({len(flickering)} of {len(fit.boards)} whiteboards differ)"
+    worst = int(np.argmax(np.abs(size)))
+    others = f" ({flickering} of {len(boards)} whiteboards differ)" if flickering > 1 else ""
     return (
-        f"{worst.name}: {worst.brightness - 1:+.1%} in brightness against the other "
-        f"whiteboards{others if len(flickering) > 1 else ''}; the lamp is not steady: let it "
-        "warm up, and capture it again"
+        f"{boards[worst].name}: {size[worst]:+.1%} in brightness against the other "
+        f"whiteboards{others}; the lamp is not steady: let it warm up, and capture it again"
     )
 
 
 def _holes_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    excess = np.array([0.0 if board.views_open.all() else 1.0 for board in boards]) * fit.own[:, 0]
-    worst = int(np.argmax(np.abs(excess)))
-    if abs(excess[worst]) < LEAST_HOLES:
+    if cause.width < LEAST_HOLES:
+        return ""
+    few = [board for board in boards if through_pinhole(board)]
+    worst = int(np.argmax(np.abs(cause.size)))
+    return (
+        f"the plate's holes are unequal: their areas differ by {cause.width:.1%}, most that of "
+        f"{few[worst].name} ({cause.size[worst]:+.1%}): corrected for"
+    )
+
+
+def _size_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
+    larger, deviation = cause.size[0], cause.deviation[0]
+    if abs(larger) < max(LEAST_EXPOSURE, SIGNIFICANT * deviation):
         return ""
     return (
-        f"the plate's holes are unequal: the light through them differs by {cause.width:.1%}, most "
-        f"in {boards[worst].name} ({excess[worst]:+.1%}): corrected for"
+        f"the plate's holes are all {abs(larger):.1%} +- {deviation:.1%} "
+        f"{'larger' if larger > 0 else 'smaller'} in area than a view: corrected for"
     )
 
 
@@ -314,8 +372,7 @@ def _exposure_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: 
         return ""
     return (
         f"the exposures through the pinhole were {abs(more):.1%} +- {deviation:.1%} "
-        f"{'longer' if more > 0 else 'shorter'} than noted, or all its holes are so much "
-        f"{'larger' if more > 0 else 'smaller'} than a view: corrected for"
+        f"{'longer' if more > 0 else 'shorter'} than noted: corrected for"
     )
 
 
@@ -359,19 +416,19 @@ def _creep_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: Sha
 
 
 def _stage_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    moved = [
-        check
-        for check in fit.boards
-        if np.hypot(*check.moved_um) > max(LARGEST_MOVE_UM, 5 * check.moved_deviation_um)
-    ]
-    if not moved:
+    moves_um, deviations_um = (
+        np.reshape(values, (2, -1)).T for values in (cause.size, cause.deviation)
+    )
+    far_um = np.hypot(*moves_um.T)
+    moved = far_um > np.maximum(LARGEST_MOVE_UM, 5 * deviations_um.max(axis=1))
+    if not moved.any():
         return ""
-    worst = max(moved, key=lambda check: float(np.hypot(*check.moved_um)))
+    worst = int(np.argmax(far_um))
     return (
-        f"the mask is not where the stage reports it in {len(moved)} of {len(fit.boards)} "
-        f"whiteboards, by up to ({worst.moved_um[0]:+.1f}, {worst.moved_um[1]:+.1f}) um in "
-        f"{worst.name}; Psi's deviation includes it: let the stage approach every place from the "
-        "same side, and settle, and capture again"
+        f"the mask is not where the stage reports it in {int(moved.sum())} of {len(boards)} "
+        f"whiteboards, by up to ({moves_um[worst, 0]:+.1f}, {moves_um[worst, 1]:+.1f}) um in "
+        f"{boards[worst].name}; Psi's deviation includes it: let the stage approach every place "
+        "from the same side, and settle, and capture again"
     )
 
 
@@ -391,6 +448,7 @@ _WORDS = {
     EXPOSURE: _exposure_words,
     HANDS: _hands_words,
     PLATE: _plate_words,
+    SIZE: _size_words,
     TURN: _turn_words,
     CREEP: _creep_words,
     STAGE: _stage_words,

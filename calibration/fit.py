@@ -46,6 +46,7 @@ from emmc_rig.calibration.causes import (
     LEAST_MOVED_UM,
     LEAST_OWN,
     LENS,
+    OF_HOLES,
     OF_PLATE,
     OWN,
     PLATE,
@@ -83,7 +84,14 @@ from emmc_rig.calibration.robust import (
     tukey_loss,
     tukey_weights,
 )
-from emmc_rig.calibration.shadow import ANY_COLOUR, OF_VIEW, Shadow, ShadowMask
+from emmc_rig.calibration.shadow import (
+    ANY_COLOUR,
+    OF_VIEW,
+    Shadow,
+    ShadowMask,
+    light_slopes,
+    openings,
+)
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.settings import Settings
@@ -106,6 +114,8 @@ LEAST_CURVATURE = 0.3
 MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
+LARGER = 3
+"""Where the hole's area lies in a whiteboard's own parameters."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
 PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
@@ -121,6 +131,8 @@ OF_LOOSE = 0.05
 CAUSE_GAINS = (FIRST_GAIN, LEAST_GAIN, LEAST_GAIN)
 """The causes depend on the fit and the fit on the causes: in turn, to these last gains; the third
 time where pinholes stand off their holes."""
+UNLIKE = 0.3
+"""Of a reading's share that an area differs by: what the shape of a cut hole may make beside it."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -181,8 +193,8 @@ class Fit:
     chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
     undecided: names of parameters that the prior decides more than the whiteboards.
     more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
-    own, own_deviation: (board, OWN), brightness over 1 and place of the mask by which whiteboards
-        differ, um, as the causes let them.
+    own, own_deviation: (board, OWN), brightness over 1, place of the mask, um, and area of
+        the hole over 1, by which whiteboards differ, as the causes let them.
     causes: why whiteboards differ, the strongest first. A lamp that is not steady makes references
         differ likewise, which the covariance does not count.
     moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
@@ -229,10 +241,14 @@ A narrow width would bend the placement, and bent causes would be found there.""
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The placement, and each whiteboard's own: (board, OWN)."""
+    """The placement, and each whiteboard's own: (board, OWN).
+
+    widening: whether holes of the pinhole may be larger than views.
+    """
 
     placement: Placement
     own: NDArray[np.float64]
+    widening: bool = False
 
     def vector(self) -> NDArray[np.float64]:
         """Return all parameters as one vector: of the placement, then of each whiteboard."""
@@ -242,7 +258,7 @@ class _State:
         """Return the state after a step, within what is possible."""
         size = len(step) - self.own.size
         own = self.own + step[size:].reshape(self.own.shape)
-        return _State(self.placement.moved(step[:size]), own)
+        return _State(self.placement.moved(step[:size]), own, self.widening)
 
     def opening(self, board: Board, index: int) -> Opening:
         """Return parameters of the mask's shadow, at the mask position of one whiteboard."""
@@ -292,15 +308,17 @@ class _BenchPrior:
     geometry: Geometry
 
     def about(
-        self, found: Sequence[FoundCause], own: NDArray[np.float64], boards: Sequence[Board]
+        self, found: Sequence[FoundCause], state: _State, boards: Sequence[Board]
     ) -> _BenchPrior:
         """Return the prior with causes about where pinholes stand by those found."""
+        own = state.own
         known = [cause for cause in found if cause.name in self.causes]
         causes, none = list(self.causes.values()), np.zeros((own.size, own.size))
         sized = with_sizes(known, causes, own.ravel(), none, self.own2)
         off_um = pinholes_off_um(sized, boards, self.geometry.cell_um)
-        again = possible_causes(boards, self.geometry, off_um)
-        return replace(self, causes={cause.name: cause for cause in again})
+        geometry = replace(self.geometry, pupil=state.placement.fitted_pupil())
+        again = possible_causes(boards, geometry, off_um)
+        return replace(self, causes={cause.name: cause for cause in again}, geometry=geometry)
 
     def with_widths(self, widths: Mapping[str, float]) -> _Prior:
         """Return the prior of all parameters; widths: of the causes, by name."""
@@ -334,7 +352,8 @@ def _bench_prior(
     own2 = np.tile(np.square(LEAST_OWN), (len(boards), 1))
     own2[:, 0] += unsteadiness2(boards) / np.array([board.repeats for board in boards])
     ratio = mask.distance_um / mask.lens_um
-    geometry = Geometry(ratio, mask.aperture_cell_um, mask.views)
+    pupil = placement.fitted_pupil()
+    geometry = Geometry(ratio, mask.aperture_cell_um, mask.views, pupil)
     known = {cause.name: cause for cause in possible_causes(boards, geometry)}
     always = (HANDS,) if loose else ()
     return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry)
@@ -362,17 +381,27 @@ class _Linear(NamedTuple):
 def _linear_readings(
     mask: ShadowMask, state: _State, samples: Sequence[Sample]
 ) -> tuple[_Linear, ...]:
-    """Return every whiteboard's readings and slopes at a state."""
+    """Return every whiteboard's readings and slopes at a state.
+
+    reading = (1 + brightness) (shadow, with the mask moved, + larger d(shadow)/d(area))
+    """
     shadow, found = Shadow(mask, state.placement), []
     for index, sample in enumerate(samples):
         opening, brightness = state.opening(sample.board, index), state.brightness(index)
-        read, slope = shadow.with_slopes(sample.pixels, sample.channels, *opening)
+        where = sample.pixels, sample.channels, *opening
+        if state.widening and sample.board.views_open.sum() == 1:
+            read, slope, by_area = shadow.with_widening(*where)
+            read = read + by_area * state.own[index, LARGER]
+        else:
+            read, slope = shadow.with_slopes(*where)
+            by_area = np.zeros(len(read))
         # In one pass over memory, which takes as long as the arithmetic.
-        count = slope.shape[1]
+        count, factor = slope.shape[1], brightness / sample.deviation
         slopes = np.empty((len(read), count + OWN))
-        np.multiply(slope, (brightness / sample.deviation)[:, None], out=slopes[:, :count])
+        np.multiply(slope, factor[:, None], out=slopes[:, :count])
         slopes[:, count] = read / sample.deviation
-        slopes[:, count + 1 :] = slopes[:, OFFSETS]
+        slopes[:, count + 1 : count + LARGER] = slopes[:, OFFSETS]
+        slopes[:, count + LARGER] = factor * by_area
         found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slopes))
     return tuple(found)
 
@@ -721,23 +750,27 @@ def _rows_covariance(
     return np.asarray(errors.own_dn2 * covariance @ added @ covariance, np.float64)
 
 
-def settled(fit: Fit, boards: Sequence[Board]) -> list[Board]:
-    """Return whiteboards as they would be without what the causes made of them.
+def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
+    """Return the whiteboards with the effects of the causes taken out.
 
-    boards: those of the fit, in order. Each has the mask's place as fitted, and the brightness of
-    the others; hands no longer count.
+    boards: those of the fit, in order. Each has the mask's place as fitted, the brightness of the
+    others, and the area of a view; hands no longer count.
     """
-    found = []
-    for board, (brighter, x_um, y_um) in zip(boards, fit.own.tolist(), strict=True):
-        level = np.float32(1 + brighter)
+    shadow, found = Shadow(mask, fit.placement), []
+    for board, own in zip(boards, fit.own, strict=True):
+        level = np.float32(1 + own[0])
+        stage_um = (board.stage_um[0] + float(own[1]), board.stage_um[1] + float(own[2]))
+        reading = board.reading / level
+        if own[LARGER] and board.views_open.sum() == 1:
+            pixels = np.argwhere(np.ones(reading.shape, dtype=bool))
+            where = pixels, board.channels.ravel(), board.views_open, stage_um, board.shot
+            wider = shadow.with_widening(*where)[2] * own[LARGER]
+            reading = reading - wider.reshape(reading.shape).astype(np.float32)
+        # What is cut of a hole has another shape as well as another area.
+        shape = (UNLIKE * own[LARGER] * np.maximum(reading, 0)) ** 2
+        variance = (board.variance / level**2 + shape).astype(np.float32)
         found.append(
-            replace(
-                board,
-                reading=board.reading / level,
-                variance=board.variance / level**2,
-                stage_um=(board.stage_um[0] + x_um, board.stage_um[1] + y_um),
-                loose=False,
-            )
+            replace(board, reading=reading, variance=variance, stage_um=stage_um, loose=False)
         )
     return found
 
@@ -783,9 +816,12 @@ def fit_placement(
         state, steps = descent.point.state, steps + descent.steps
     found, off_plate = list[FoundCause](), False
     for turn, least_gain in enumerate(CAUSE_GAINS):
+        if not descent.point.state.widening and any(cause.name in OF_HOLES for cause in found):
+            state = replace(descent.point.state, widening=True)
+            descent = descent._replace(point=_point(mask, state, whole))
         if off_plate:
             # Where pinholes stand decides how much of their light the aperture's edge cuts.
-            bench = bench.about(found, descent.point.state.own, boards)
+            bench = bench.about(found, descent.point.state, boards)
         elif turn > 1:
             break
         found = _find_causes(mask, descent.point, whole, bench)
@@ -800,12 +836,15 @@ def fit_placement(
     everything, astray2 = _covariance(mask, point, whole, prior)
     size = len(placement.vector())
     covariance, own_covariance = everything[:size, :size], everything[size:, size:]
-    undecided, more = _find_undecided(placement, covariance, len(boards))
+    undecided, more = _find_undecided(mask, placement, covariance, len(boards))
     causes = with_sizes(
         found, list(bench.causes.values()), state.own.ravel(), own_covariance, bench.own2
     )
     causes = doubt_lone_move(causes, boards)
     moved_um = _astray_um(causes, checks, boards)
+    own_deviation = np.sqrt(np.diag(own_covariance)).reshape(state.own.shape)
+    if any(cause.name == LENS for cause in causes) and not off_plate:
+        own_deviation[[through_pinhole(board) for board in boards], 1:3] = 0.0
     covariance[OFFSETS, OFFSETS] += np.eye(2) * moved_um**2
     return Fit(
         placement=placement,
@@ -820,10 +859,8 @@ def fit_placement(
         more_boards=more,
         boards=checks,
         causes=tuple(causes),
-        own=_without_aberrations(state.own, causes, boards),
-        own_deviation=_without_aberrations(
-            np.sqrt(np.diag(own_covariance)).reshape(state.own.shape), causes, boards
-        ),
+        own=_without_aberrations(state.own, causes, bench),
+        own_deviation=own_deviation,
         moved_um=moved_um,
         astray2=astray2,
     )
@@ -921,29 +958,30 @@ def _refuse_unexplained(alike: float) -> None:
 
 
 def _without_aberrations(
-    own: NDArray[np.float64], causes: Sequence[FoundCause], boards: Sequence[Board]
+    own: NDArray[np.float64], causes: Sequence[FoundCause], bench: _BenchPrior
 ) -> NDArray[np.float64]:
-    """Return own parameters or their deviations, (board, OWN), 0 for moves that are the views' own.
+    """Return the own parameters, (board, OWN), by what the causes say where the lens has a part.
 
     What aberrations make of a view is part of Psi, and not to be taken out.
     """
-    names = {cause.name for cause in causes}
-    if LENS not in names or HANDS in names:
+    if not any(cause.name == LENS for cause in causes):
         return own
-    kept = own.copy()
-    kept[[through_pinhole(board) for board in boards], 1:] = 0.0
-    return kept
+    explained = np.zeros(own.size)
+    for cause in causes:
+        if cause.name in bench.causes:
+            explained += bench.causes[cause.name].columns @ np.array(cause.size)
+    return explained.reshape(own.shape)
 
 
 def _find_undecided(
-    placement: Placement, covariance: NDArray[np.float64], boards: int
+    mask: ShadowMask, placement: Placement, covariance: NDArray[np.float64], boards: int
 ) -> tuple[tuple[str, ...], int]:
     """Return the parameters that the prior decides, and how many more boards would decide them.
 
     share^-2 = 1 + have, the precision that `boards` whiteboards have added to the prior's; it grows
     with their number. Decided: a share below MOST_OF_PRIOR.
     """
-    shares = shares_of_prior(placement, covariance, Tolerances())
+    shares = shares_of_prior(mask, placement, covariance, Tolerances())
     rows, columns = np.shape(placement.aperture)
     names = zip(labels((rows, columns)), shares, strict=True)
     have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
@@ -957,8 +995,8 @@ def _astray_um(
 ) -> float:
     """Return how far from the fitted place the mask may stand in a shot, um: 0 where it stays.
 
-    What the stage does by chance, what it creeps by from the middle of the capture to its end, and
-    the largest move that is sure of a whole aperture: the width of all takes an outlier for chance.
+    The largest of three: the stage's moves by chance, its creep from the middle of the capture to
+    the end, and the farthest sure move of a whiteboard, which the width of all takes for chance.
     """
     far_um = [cause.width for cause in causes if cause.name == STAGE]
     far_um += [float(np.hypot(*cause.size)) / 2 for cause in causes if cause.name == CREEP]
@@ -975,28 +1013,25 @@ def _astray_um(
 
 
 def shares_of_prior(
-    placement: Placement, covariance: NDArray[np.float64], tolerances: Tolerances
+    mask: ShadowMask,
+    placement: Placement,
+    covariance: NDArray[np.float64],
+    tolerances: Tolerances,
 ) -> NDArray[np.float64]:
     """Return every parameter's deviation over that of the prior, by their labels.
 
-    Of the aperture's weights what counts is their share of the light: neither their common level
-    nor what a falloff in their place would say is to be decided.
+    Of the aperture's weights what counts is the views' share of the light: neither their common
+    level is to be decided, nor what a falloff or another pupil in their place would say.
     """
-    weights = np.array(placement.aperture)
-    views = weights.shape
-    prior = tolerances.deviations((views[0], views[1]))
-    share = np.sqrt(np.diag(covariance)) / prior
-    v, u = ((np.arange(count) - (count - 1) / 2) for count in views)
-    far = (v[:, None] ** 2 + u**2).ravel()
-    far = far / max(far.max(), 1e-12)
-    count, first = weights.size, len(SCALARS)
-    slopes = np.zeros((count, len(covariance)))
-    slopes[:, first:] = np.diag(1 / weights.ravel())
-    slopes[:, SCALARS.index("falloff")] = far / (1 + placement.falloff * far)
-    slopes -= slopes.mean(axis=0)
+    count, first = mask.views[0] * mask.views[1], len(SCALARS)
+    share = np.sqrt(np.diag(covariance)) / tolerances.deviations(mask.views)
+    opened = openings(mask, placement).shares(mask.views).ravel()
+    slopes = light_slopes(mask, placement)
+    slopes = opened[:, None] * (slopes - opened @ slopes / opened.sum())
     spread = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
-    share[first:] = np.minimum(spread / tolerances.aperture, 1.0)
+    share[first : first + count] = np.minimum(spread / tolerances.aperture, 1.0)
     share[SCALARS.index("falloff")] = 0.0
+    share[PUPIL] = 0.0
     return share
 
 
@@ -1024,13 +1059,13 @@ def _check_board(point: _Point, sample: Sample, index: int) -> BoardCheck:
     brightness = point.state.brightness(index)
     # Of the shadow itself, as if the whiteboard had the brightness of all.
     rows = np.stack([slope[:, -OWN], *(slope[:, OFFSETS] / brightness).T], axis=1)
-    weight, step, matrix = np.ones(len(residual)), np.zeros(OWN), np.eye(OWN)
+    weight, step, matrix = np.ones(len(residual)), np.zeros(3), np.eye(3)
     for _ in range(8):
         matrix = rows.T @ (rows * weight[:, None])
         step = np.linalg.solve(matrix, rows.T @ (weight * residual))
         left = residual - rows @ step
         weight = tukey_weights(left / _robust_spread([left]))
-    brightness, x_um, y_um = map(float, point.state.own[index] + step)
+    brightness, x_um, y_um = map(float, point.state.own[index, :3] + step)
     spread = _robust_spread([residual])
     inside = tukey_weights(residual / spread) > 0
     brightness_deviation, *moved_deviations = np.sqrt(np.diag(np.linalg.inv(matrix))) * spread

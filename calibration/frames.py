@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.calibration.errors import CalibrationError
+from emmc_rig.calibration.robust import deviation_of
 
 Frame = NDArray[np.floating] | NDArray[np.integer]
 BAND_PIXELS = 2**20
@@ -27,6 +28,14 @@ DARK_ELECTRONS_PER_S = 100.0
 """Standard deviation of a dark current that no dark frame shows: uncooled sensors have as much."""
 SURE = 6.0
 """Deviations that noise alone hardly reaches."""
+QUANTISATION = 1 / 12
+"""Variance of rounding to whole steps, in squares of the step."""
+NEIGHBOURING_SHARE = 0.01
+"""Of the pixels, that lie beside the gaps between values where noise shows the steps."""
+USUAL_SHARE = 0.9
+"""Of the gaps between values, that are of one width where steps are: the rest lack a value."""
+HOT_DEVIATIONS = 10.0
+"""Robust ones of all pixels, from which on a dark pixel is hot: of normal noise none is."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,7 @@ class MeanFrame:
     extra_variance_dn2: of the mean, by the errors of frames that were subtracted from it.
     level_variance_dn2: of a frame's mean between repeats. rows_dn2: covariance of a row's mean
     between repeats with itself and with the next row's: lamp and shutter change whole rows alike,
-    which is no noise of single pixels.
+    which is no noise of single pixels. step_dn: between the values that the frames use.
     """
 
     mean_dn: NDArray[np.float32]
@@ -49,6 +58,7 @@ class MeanFrame:
     extra_variance_dn2: float = 0.0
     level_variance_dn2: float = 0.0
     rows_dn2: tuple[float, float] = (0.0, 0.0)
+    step_dn: float = 1.0
 
     def noise_dn2(self, dark_dn: NDArray[np.floating] | float) -> float:
         """Return the variance of a pixel of one frame without what whole rows do alike.
@@ -97,7 +107,7 @@ def average(
     than noise explains.
     """
     total: NDArray[np.float64] | None = None
-    count, squares = 0, 0.0
+    count, squares, step_dn = 0, 0.0, np.nan
     levels: list[float] = []
     rows: list[NDArray[np.float64]] = []
     for frame in frames:
@@ -109,6 +119,8 @@ def average(
             )
         if total is None:
             total = np.zeros(frame.shape)
+            # The steps matter where there is little noise, and the first frame shows them.
+            step_dn = 1.0 if lit else step_of_values([frame])
         if frame.shape != total.shape:
             raise CalibrationError(f"{what}: frames of {frame.shape} and {total.shape} differ")
         total += frame
@@ -127,7 +139,34 @@ def average(
         if lit:
             _check_rows(np.array(rows), spread / total.shape[1], what)
     mean = (total / count).astype(np.float32)
-    return MeanFrame(mean, spread, count, exposure_s, taken_s, 0.0, of_levels, lags)
+    step_dn = 1.0 if np.isnan(step_dn) else step_dn
+    return MeanFrame(mean, spread, count, exposure_s, taken_s, 0.0, of_levels, lags, step_dn)
+
+
+def step_of_values(frames: Iterable[NDArray[np.uint16]]) -> float:
+    """Return the step in DN between the values that frames (y, x) of one level use.
+
+    The usual gap between values in use, weighted by the rarer value of each two: wide gaps among
+    the few values far off do not count. 16 where 12 bits stand left-aligned in 16, whatever the
+    black level. Of gaps of two widths, as a digital gain makes by rounding, their mean. Where
+    nearly all pixels read alike, the least gap; NaN where all do. Where noise is so wide that
+    values are left out by chance, the step comes out too large, by far less than the noise.
+    """
+    counts = np.zeros(2**16, dtype=np.int64)
+    for frame in frames:
+        for rows in bands(frame):
+            counts += np.bincount(frame[rows].ravel(), minlength=len(counts))
+    used = np.flatnonzero(counts)
+    gaps, weights = np.diff(used), np.minimum(counts[used[1:]], counts[used[:-1]])
+    if weights.sum() < NEIGHBOURING_SHARE * counts.sum():
+        return float(gaps.min()) if len(gaps) else np.nan
+    order = np.argsort(gaps)
+    half = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)
+    usual = gaps[order[half]]
+    near = gaps <= 2 * usual
+    if weights[gaps == usual].sum() > USUAL_SHARE * weights[near].sum():
+        return float(usual)
+    return float(np.average(gaps[near], weights=weights[near]))
 
 
 def _lags(apart: NDArray[np.float64], freedom: float) -> tuple[float, float]:
@@ -170,6 +209,7 @@ def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:
         rows_dn2=_lags(
             (difference - change).mean(axis=1)[None], 1 / before.count + 1 / after.count
         ),
+        step_dn=max(before.step_dn, after.step_dn),
     )
 
 
@@ -204,8 +244,9 @@ def dark_at(darks: Sequence[MeanFrame], exposure_s: float) -> MeanFrame:
     extra = max(noise - spread / count, 0.0)
     mean_dn = np.asarray(mean, dtype=np.float32)
     own, following = (sum(share * dark.rows_dn2[lag] for share, dark in used) for lag in (0, 1))
+    step_dn = max(dark.step_dn for _, dark in used)
     return MeanFrame(
-        mean_dn, spread, count, exposure_s, extra_variance_dn2=extra, rows_dn2=(own, following)
+        mean_dn, spread, count, exposure_s, 0.0, extra, rows_dn2=(own, following), step_dn=step_dn
     )
 
 
@@ -274,6 +315,9 @@ class SensorGain:
 def photon_transfer(dark: MeanFrame, flat: MeanFrame) -> SensorGain:
     """Return the gain from repeated dark and flat frames (mean-variance method, EMVA 1288, 6.6).
 
+    The dark variance is at least that of rounding to the dark's steps: pixels with less noise read
+    alike in every repeat, and are off all the same.
+
     Raises CalibrationError when either was not repeated, or the flat is not brighter.
     """
     if dark.count < 2 or flat.count < 2:
@@ -283,4 +327,13 @@ def photon_transfer(dark: MeanFrame, flat: MeanFrame) -> SensorGain:
         raise CalibrationError("the whiteboard is no brighter than the dark: is the lamp on?")
     noise_dn2 = flat.noise_dn2(dark.mean_dn) - dark.variance_dn2
     gain = max(noise_dn2 / signal, 1e-9)
-    return SensorGain(gain, dark.variance_dn2)
+    return SensorGain(gain, max(dark.variance_dn2, QUANTISATION * dark.step_dn**2))
+
+
+def hot_pixels(dark_dn: NDArray[np.floating], step_dn: float) -> NDArray[np.bool_]:
+    """Return the pixels of a mean dark (y, x) apart from most others: hot ones, and cold ones.
+
+    By HOT_DEVIATIONS robust deviations of all pixels; where most pixels read alike, of half a step.
+    """
+    off = dark_dn - np.median(dark_dn)
+    return np.abs(off) > HOT_DEVIATIONS * max(deviation_of(off), step_dn / 2)

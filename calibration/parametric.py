@@ -49,9 +49,11 @@ class Parametric:
 
 
 def shot_stages(camera: Camera) -> Stages:
-    """Return where the mask stage stands in every shot, x and y in um: as the camera says."""
-    (name,) = camera.masks
-    return [shot.offset_um.get(name, (0.0, 0.0)) for shot in camera.shots]
+    """Return where the mask stage stands in every shot, x and y in um: as the camera says.
+
+    All masks that move are on one stage.
+    """
+    return [next(iter(shot.offset_um.values()), (0.0, 0.0)) for shot in camera.shots]
 
 
 def _bands(
@@ -106,6 +108,23 @@ def coefficient_plane(
     for band, samples, channels in _bands(layout, shot, stored):
         read = samples_shadow.readings(samples, channels, chosen, stage_um, shot)
         plane[band] = read.reshape(plane[band].shape) / scale
+    return plane
+
+
+def widening_plane(
+    samples_shadow: Shadow,
+    layout: PsiLayout,
+    place: tuple[int, int, int, int],
+    stage_um: tuple[float, float],
+) -> NDArray[np.float32]:
+    """Return slopes of `coefficient_plane` by the relative area of the hole, (y, x)."""
+    shot, v, u, stored = place
+    scale = layout.weights_shape[4] * layout.binning**2
+    plane = np.empty(layout.size, dtype=np.float32)
+    chosen = views_open((layout.weights_shape[1], layout.weights_shape[2]), (v, u))
+    for band, samples, channels in _bands(layout, shot, stored):
+        by_area = samples_shadow.with_widening(samples, channels, chosen, stage_um, shot)[2]
+        plane[band] = by_area.reshape(plane[band].shape) / scale
     return plane
 
 

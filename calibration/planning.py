@@ -169,7 +169,7 @@ def pinhole_worth(known: Parametric, boards: Sequence[Board], stated: float) -> 
 
     each = {view: added(view) for view in np.ndindex(mask.views)}
     best = min(each, key=lambda view: error(total + each[view]))
-    shares = shares_of_prior(fit.placement, fit.covariance, Tolerances())[len(SCALARS) :]
+    shares = shares_of_prior(mask, fit.placement, fit.covariance, Tolerances())[len(SCALARS) :]
     return PinholeWorth(
         weights=float(np.sqrt(np.mean(np.square(shares)))) * Tolerances().aperture,
         view=(int(best[0]), int(best[1])),

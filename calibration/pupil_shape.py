@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.calibration.placement import SCALARS, Tolerances
-from emmc_rig.calibration.shadow import ShadowMask
-from emmc_rig.model.geometry import centred_grid
+from emmc_rig.calibration.shadow import ShadowMask, far_shares
 from emmc_rig.model.pupil import Pupil, cell_openings
 
 Array = NDArray[np.floating]
@@ -63,19 +62,12 @@ def measured_light(
     precision[weights] = 1 / NO_BELIEF**2
     precision[SCALARS.index("falloff")] = 1e12
     inverse = np.linalg.inv(matrix + np.diag(precision))
-    through = 1 + falloff * _far(mask)
+    through = 1 + falloff * far_shares(mask.views).ravel()
     light = through * (vector + inverse @ pull)[weights]
     # The common level is free: slopes of the shares, at the light of the present weights.
     present = through * vector[weights]
     slopes = (np.eye(count) - (present / present.sum())[:, None]) / present.sum() * through
     return ViewLight(light / light.sum(), slopes @ inverse[weights, weights] @ slopes.T)
-
-
-def _far(mask: ShadowMask) -> NDArray[np.float64]:
-    """Return |u|^2 of the views as a share of the outermost's, (view,)."""
-    v, u = (centred_grid(count, 1.0) for count in mask.views)
-    far = (v[:, None] ** 2 + u**2).ravel()
-    return far / max(float(far.max()), 1e-12)
 
 
 def likeliest_pupil(seen: ViewLight, mask: ShadowMask) -> Pupil | None:
@@ -118,7 +110,7 @@ def _evidence(seen: ViewLight, mask: ShadowMask, pupil: Pupil | None) -> tuple[f
     found = cell_openings(pupil, mask.views, mask.aperture_cell_um, fill, strips=1)
     opened = found.shares(mask.views).ravel()
     opened, tolerances = opened / opened.sum(), Tolerances()
-    falling = tolerances.falloff * opened * _far(mask)
+    falling = tolerances.falloff * opened * far_shares(mask.views).ravel()
     project = np.eye(len(opened)) - opened[:, None]
     bench = np.diag(np.square(tolerances.aperture * opened)) + np.outer(falling, falling)
     variance = seen.covariance + project @ bench @ project.T + STRAY**2 * np.eye(len(opened))

@@ -37,13 +37,16 @@ from emmc_rig.calibration.colours import (
     Crosstalk,
     crosstalk,
     in_three_colours,
+    lamp_shares,
     mixing,
     other_colours,
 )
 from emmc_rig.calibration.defects import find_defects, loss_variance, moved_dust
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.fit import OFFSETS, fit_placement, settled
+from emmc_rig.calibration.fit import LARGER, OFFSETS, Fit, fit_placement, settled
 from emmc_rig.calibration.frames import MeanFrame
+from emmc_rig.calibration.glare import STEP as GLARE_STEP
+from emmc_rig.calibration.glare import Glare, measure_glare
 from emmc_rig.calibration.levels import Levels, fit_levels
 from emmc_rig.calibration.locator import SOFT_EDGES
 from emmc_rig.calibration.misfit import Misfit, beyond_chance, combined, measured_misfit
@@ -56,6 +59,7 @@ from emmc_rig.calibration.parametric import (
     of_samples,
     psi_deviation,
     shot_stages,
+    widening_plane,
 )
 from emmc_rig.calibration.planning import pinhole_worth
 from emmc_rig.calibration.shadow import Shadow, ShadowMask, shadow_mask
@@ -73,6 +77,8 @@ from emmc_rig.model.sensing import PsiLayout
 
 LEAST_LOSS = 1e-5
 """Of a reading, where a defect is in it."""
+GLARE_ROUNDS = 2
+"""Fits without the glare, which is then measured again: what is left of 1 % is linear to 1e-4."""
 REGISTERED_MISS = 3.0
 """Residual of a mask that is registered alone, over that of a fitted mask."""
 
@@ -145,11 +151,13 @@ def calibrate(
     advice, findings = [], words.level_findings(levels)
     shadow, modelled = None, _Modelled(readings, None)
     if not task.modelled or pinholes is not None:
-        shadow, found = _compare_with_design(task, readings)
-        findings += found
+        compared = _compare_with_design(task, readings)
+        shadow, task = compared.shadow, replace(task, crosstalk=compared.crosstalk)
+        findings += compared.findings
     if task.modelled:
         modelled = _fit_models(task, readings)
         readings, shadow = modelled.readings, modelled.shadow
+        task = replace(task, crosstalk=modelled.crosstalk)
         advice += modelled.advice
         findings += modelled.findings
     psis = dict(modelled.psis)
@@ -259,7 +267,8 @@ class _Modelled:
     """The fits of the mask, by the routes that model it.
 
     plain: the mask as designed. models: by route (parametric, mixed). bare: their calibrations
-    without the misfit in the deviations. psis: with it.
+    without the misfit in the deviations. psis: with it. crosstalk: of the colour filters, without
+    glare, which is in all Psi.
     """
 
     readings: _Readings
@@ -269,6 +278,8 @@ class _Modelled:
     psis: Mapping[str, _RoutePsi] = field(default_factory=dict)
     advice: Sequence[str] = ()
     findings: Sequence[str] = ()
+    crosstalk: Crosstalk | None = None
+    glare: Glare | None = None
 
     @property
     def best(self) -> Parametric | None:
@@ -311,7 +322,16 @@ def _validation_readings(
     return judges
 
 
-def _compare_with_design(task: _Task, readings: _Readings) -> tuple[Shadow | None, list[str]]:
+class _Compared(NamedTuple):
+    """What the comparison of whiteboards with the designed mask shows."""
+
+    shadow: Shadow | None
+    findings: list[str]
+    crosstalk: Crosstalk | None
+    """Of the colour filters, without glare."""
+
+
+def _compare_with_design(task: _Task, readings: _Readings) -> _Compared:
     """Return the registered mask's shadow and findings; another mask or board is refused.
 
     Where no route fits the mask it is fitted here: only a fit distinguishes another distance and
@@ -320,9 +340,10 @@ def _compare_with_design(task: _Task, readings: _Readings) -> tuple[Shadow | Non
     corners' are enough.
     """
     try:
-        mask = task.as_filtered(shadow_mask(task.camera, task.design.size))
+        plain = shadow_mask(task.camera, task.design.size)
     except CalibrationError:
-        return None, []
+        return _Compared(None, [], task.crosstalk)
+    mask = task.as_filtered(plain)
     v, u = task.camera.views
     wanted = [(v // 2, u // 2), (0, 0), (v - 1, u - 1)]
     boards = task.steady.pinholes or task.steady.held_out
@@ -333,15 +354,20 @@ def _compare_with_design(task: _Task, readings: _Readings) -> tuple[Shadow | Non
     shadow = Shadow(mask, placement)
     refusals.refuse_tilted_board(shadow, readings.judges, REGISTERED_MISS)
     if task.modelled:
-        return shadow, []
+        return _Compared(shadow, [], task.crosstalk)
     seen = [*seen, *readings.judges]
     start = replace(placement, blur_um=SOFT_EDGES * mask.cell_um)
     fit = fit_placement(seen, task.camera, mask, start=start)
     refusals.refuse_odd_fit(fit, seen, mask)
     shadow = Shadow(mask, fit.placement)
     refusals.refuse_tilted_board(shadow, seen, limits=refusals.FREE_GRADIENT)
+    # Every coefficient is measured with its glare, which is no crosstalk of coloured references.
+    glare = None if task.crosstalk is None else _glare(task, plain, mask, fit, seen)
+    if glare is not None:
+        task, _ = _without_glare(task, readings, glare)
     # Smaller differences are left to the measured Psi: few whiteboards do not determine them.
-    return shadow, words.mask_findings(fit, ("distance_share", "clear"))
+    found = words.mask_findings(fit, ("distance_share", "clear"))
+    return _Compared(shadow, [*words.glare_findings(glare), *found], task.crosstalk)
 
 
 def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
@@ -356,16 +382,23 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
     plain = shadow_mask(task.camera, task.design.size)
     mask = task.as_filtered(plain)
     fit = fit_placement(readings.seen, task.camera, mask)
+    with_glare, glare = readings, _glare(task, plain, mask, fit, readings.seen)
+    for _ in range(0 if glare is None else GLARE_ROUNDS):
+        assert glare is not None
+        task, readings = _without_glare(task, with_glare, glare)
+        mask = task.as_filtered(plain)
+        fit = fit_placement(readings.seen, task.camera, mask, start=fit)
+        glare = _glare(task, plain, mask, fit, readings.seen, glare) or glare
     refusals.refuse_odd_fit(fit, readings.seen, mask)
-    advice, findings = words.fit_advice(fit), list[str]()
-    dusty = moved_dust(Shadow(mask, fit.placement), settled(fit, readings.seen))
+    advice, findings = words.fit_advice(fit), words.glare_findings(glare)
+    dusty = moved_dust(Shadow(mask, fit.placement), settled(fit, readings.seen, mask))
     if dusty.any():
         findings.append(words.dust_finding(dusty))
-        readings = readings.without(dusty)
+        readings, with_glare = readings.without(dusty), with_glare.without(dusty)
         fit = fit_placement(readings.seen, task.camera, mask, start=fit)
     of_causes = words.cause_lines(fit, readings.seen, mask)
     findings, advice = [*of_causes.findings, *findings], [*of_causes.advice, *advice]
-    seen = settled(fit, readings.seen)
+    seen = settled(fit, readings.seen, mask)
     models = {"parametric": with_misfit(Parametric(fit, mask), seen)}
     if {"mixed", "combined"} & task.routes and task.design.binning == 1:
         task.on_stage("defects of the mask")
@@ -377,6 +410,8 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
         model = replace(fitted, of_defects=missed)
         task.on_stage(f"Psi, {name}")
         bare[name] = _calibration_by(model, task, few, readings.good)
+        if glare is not None:
+            bare[name] = _with_glare(bare[name], model, task, glare)
         psis[name] = _RoutePsi(
             _with_misfit_variance(bare[name], model),
             _judged_model(name, model, readings.judges, seen),
@@ -384,9 +419,70 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
         )
     best = models.get("mixed", models["parametric"])
     refusals.refuse_tilted_board(best.shadow, [*readings.judges, *seen])
+    findings += words.pupil_finding(best.fit, best.mask)
     findings += words.mask_findings(best.fit)
     findings += filter(None, [best.mask.repeats.words])
-    return _Modelled(readings, plain, models, bare, psis, advice, findings)
+    return _Modelled(with_glare, plain, models, bare, psis, advice, findings, task.crosstalk, glare)
+
+
+def _glare(
+    task: _Task,
+    plain: ShadowMask,
+    mask: ShadowMask,
+    fit: Fit,
+    seen: Sequence[Board],
+    known: Glare | None = None,
+) -> Glare | None:
+    """Return the glare that the whiteboards fitted show; plain: the mask as designed.
+
+    known: was taken out of them.
+    """
+    filters, good = channels_of(task.design), np.logical_and.reduce([b.usable for b in seen])
+    of_lamps, taken_out = (task.steady.held_out, filters, good), known.behind if known else 0.0
+    shares = lamp_shares(*of_lamps, taken_out)
+
+    def masks(behind: float) -> ShadowMask:
+        local = lamp_shares(*of_lamps, taken_out + behind)
+        # However little it is: what glare and crosstalk sum to is known.
+        return mask if local is None else mixing(plain, local.seen)
+
+    others = None
+    if shares is None and filters.max() < len(LAMP_COLOURS):
+        others = mixing(mask, np.eye(3) + GLARE_STEP * (0.5 - 1.5 * np.eye(3)))
+    white = _white_dn_per_s(task.steady.few or task.steady.held_out, task.design, 0)
+    boards = settled(fit, seen, mask)
+    return measure_glare(fit.placement, boards, white, filters, masks, others, known)
+
+
+def _without_glare(task: _Task, readings: _Readings, glare: Glare) -> tuple[_Task, _Readings]:
+    """Return the readings as they would be without glare, and the crosstalk."""
+    judges, seen = (
+        [glare.taken_out(board) for board in boards] for boards in (readings.judges, readings.seen)
+    )
+    how = task.steady.held_out, glare.filters, readings.good, glare.behind
+    return replace(task, crosstalk=crosstalk(*how)), replace(readings, judges=judges, seen=seen)
+
+
+def _with_glare(known: Calibration, model: Parametric, task: _Task, glare: Glare) -> Calibration:
+    """Return a model's calibration with the glare in Psi and in the deviations.
+
+    The placement fitted depends on the glare: Psi varies by both together.
+    """
+    binning = task.design.binning
+
+    def psi_with(step: NDArray[np.float64]) -> NDArray[np.float32]:
+        placement = model.fit.placement.moved(glare.response @ step)
+        moved = replace(model, fit=replace(model.fit, placement=placement))
+        return glare.changed(step).put_in(moved.psi(task.design, task.stages).weights, binning)
+
+    weights = glare.put_in(known.psi.weights, binning)
+    variance = np.square(known.deviation, dtype=np.float64)
+    values, vectors = np.linalg.eigh(glare.covariance)
+    for value, direction in zip(values, vectors.T, strict=True):
+        if value > 0:
+            variance += np.square(psi_with(np.sqrt(value) * direction) - weights)
+    deviation = np.sqrt(variance).astype(np.float32)
+    return replace(known, psi=replace(known.psi, weights=weights), deviation=deviation)
 
 
 def _calibration_by(
@@ -495,7 +591,8 @@ def _separate_colours(
             "the colour filters pass other colours, and the calibration method free does not "
             "show which: add open whiteboards, for the method parametric"
         )
-    others = other_colours(modelled.best, modelled.plain, seen, task.design, task.stages)
+    how = seen, task.design, task.stages, modelled.glare
+    others = other_colours(modelled.best, modelled.plain, *how)
     return {name: in_three_colours(known, others) for name, known in calibrations.items()}
 
 
@@ -552,12 +649,12 @@ def _list_unwatched(
 
 def _fit_with_defects(seen: Sequence[Board], camera: Camera, parametric: Parametric) -> Parametric:
     """Return the fit with defects: found, and the placement refined with them in the mask."""
-    settled_boards = settled(parametric.fit, seen)
+    settled_boards = settled(parametric.fit, seen, parametric.mask)
     defects = find_defects(settled_boards, parametric.mask, parametric.fit.placement)
     if defects.count == 0:
         return Parametric(parametric.fit, parametric.mask, defects)
     fit = fit_placement(seen, camera, defects.mask, start=parametric.fit)
-    again = find_defects(settled(fit, seen), parametric.mask, fit.placement)
+    again = find_defects(settled(fit, seen, parametric.mask), parametric.mask, fit.placement)
     return Parametric(fit, parametric.mask, again)
 
 
@@ -642,23 +739,6 @@ def _judged_model(
     return worst(groups)
 
 
-def _lost_at_aperture_edge(moved_um: tuple[float, float], board: Board, mask: ShadowMask) -> float:
-    """Return the share of a single pinhole's light that the aperture's edge keeps from it.
-
-    moved_um: of the mask, as its shadow shows it. What lies beyond the views passes no light: of a
-    pinhole pushed outward by d the middle of what is left is d / 2 further. The fit
-    takes part of it for another distance: the loss counts in the deviation.
-    """
-    ratio = mask.distance_um / mask.lens_um
-    left = 1.0
-    view = np.argwhere(board.views_open)[0].tolist()
-    for place, count, moved in zip(view, mask.views, reversed(moved_um), strict=True):
-        # A pinhole further out shows the mask further in.
-        outward_um = -moved / ratio * (place == count - 1) + moved / ratio * (place == 0)
-        left *= 1 - min(max(2 * outward_um / mask.aperture_cell_um, 0.0), 0.5)
-    return 1 - left
-
-
 def _correct_pinholes(
     known: Calibration, model: Parametric, seen: Sequence[Board], layout: PsiLayout
 ) -> None:
@@ -674,9 +754,10 @@ def _correct_pinholes(
         for board, own, unsure in zip(seen, model.fit.own, model.fit.own_deviation, strict=True)
         if board.views_open.sum() == 1
     )
-    for board, (brighter, off_x, off_y), (unsure, unsure_x, unsure_y) in pinholes:
+    for board, own, deviations in pinholes:
+        brighter, off_x, off_y = own[:3].tolist()
+        unsure, unsure_x, unsure_y = deviations[:3].tolist()
         (v, u), (x_um, y_um) = np.argwhere(board.views_open)[0].tolist(), board.stage_um
-        lost = _lost_at_aperture_edge((off_x, off_y), board, model.mask)
         for stored in range(layout.weights_shape[4]):
             place = board.shot, v, u, stored
 
@@ -686,12 +767,15 @@ def _correct_pinholes(
             right = at(x_um, y_um)
             index = board.shot, v, u, slice(None), stored
             moved = right - at(x_um + off_x, y_um + off_y)
+            by_area = widening_plane(shadow, layout, place, (x_um + off_x, y_um + off_y))
+            moved = moved - own[LARGER] * by_area
             weights[index] = weights[index] / (1 + brighter) + moved
             variance = sum(
                 np.square(at(x_um + by_x, y_um + by_y) - right)
                 for by_x, by_y in ((unsure_x, 0.0), (0.0, unsure_y))
             )
-            variance += np.square(np.hypot(lost, unsure) * right)
+            variance += np.square(unsure * right)
+            variance += np.square(deviations[LARGER] * by_area)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
 
 

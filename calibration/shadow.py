@@ -83,6 +83,8 @@ GLASS_INDEX = 1.52
 """Refractive index of crown glass, as of a sensor's cover."""
 ANY_COLOUR = 3
 """Channel of a pixel that sees all colours."""
+AREA_STEP = 0.02
+"""Relative, of an aperture cell's area, for the derivative by it."""
 OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
 SPARE_UM = 900.0
@@ -271,6 +273,34 @@ def openings(mask: ShadowMask, placement: Placement, **how: Any) -> Openings:
     strips = int(np.clip(np.ceil(STRIPS_PER_CELL * shadow), FEWEST_STRIPS, MOST_STRIPS))
     pupil = placement.fitted_pupil()
     return cell_openings(pupil, mask.views, mask.aperture_cell_um, fill, strips=strips, **how)
+
+
+def light_slopes(mask: ShadowMask, placement: Placement) -> NDArray[np.float64]:
+    """Return the relative slopes of the light of every view, (view, parameter).
+
+    Of a_j open_j (1 + falloff far_j); by the pupil, of what is open. Views that are all but shut
+    count as LEAST_SHARE open.
+    """
+    found = openings(mask, placement)
+    opened = np.maximum(found.shares(mask.views), LEAST_SHARE)
+    weights, first = np.array(placement.aperture), len(SCALARS)
+    slopes = np.zeros((weights.size, first + weights.size))
+    slopes[:, first:] = np.diag(1 / weights.ravel())
+    far = far_shares(mask.views).ravel()
+    slopes[:, FALLOFF] = far / (1 + placement.falloff * far)
+    changes = _pupil_slopes(mask, placement, found)
+    for p in range(changes.shape[1] if len(changes) else 0):
+        change = np.zeros(mask.views)
+        np.add.at(change, tuple(found.view.T), changes[:, p, 0])
+        slopes[:, PUPIL_X + p] = (change / opened).ravel()
+    return slopes
+
+
+def far_shares(views: tuple[int, int]) -> NDArray[np.float64]:
+    """Return |u|^2 of every view as a share of the outermost's, (v, u)."""
+    v, u = (centred_grid(count, 1.0) for count in views)
+    far = v[:, None] ** 2 + u**2
+    return far / max(float(far.max()), 1e-12)
 
 
 class _Boxes(NamedTuple):
@@ -836,6 +866,31 @@ class Shadow:
         """Return the readings (n,) and their derivatives (n, parameter)."""
         seen = self._run(pixels, channels, (views_open, stage_um, frame), slopes=True)
         return seen.readings, seen.slopes
+
+    def with_widening(
+        self,
+        pixels: Pixels,
+        channels: NDArray[np.uint8],
+        views_open: NDArray[np.bool_],
+        stage_um: tuple[float, float] = (0.0, 0.0),
+        frame: int = 0,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return `with_slopes`, and derivatives by the area of the aperture's cells, (n,).
+
+        The latter by the relative area, from cells that are AREA_STEP smaller and larger.
+        """
+        how = pixels, channels, views_open, stage_um, frame
+        smaller, larger = (shadow.readings(*how) for shadow in self._resized)
+        return *self.with_slopes(*how), (larger - smaller) / (2 * AREA_STEP)
+
+    @cached_property
+    def _resized(self) -> tuple[Shadow, Shadow]:
+        """The shadows through aperture cells of AREA_STEP less and more area."""
+        less, more = (
+            replace(self.mask, aperture_um=self.mask.aperture_um * (1 + sign * AREA_STEP / 2))
+            for sign in (-1, 1)
+        )
+        return Shadow(less, self.placement), Shadow(more, self.placement)
 
     def slopes_by_view(
         self,

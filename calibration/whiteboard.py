@@ -29,6 +29,7 @@ from emmc_rig.calibration.boards import (
 )
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
+from emmc_rig.model.camera import measured_views
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 
 Array = NDArray[np.floating]
@@ -121,20 +122,26 @@ def measured_planes(
 
     One plane is held at a time, and one whiteboard is read. What is computed is computed by bands
     of rows. designed: Psi's weights as
-    designed, which say how a pixel's coefficient is shared among its samples (default: evenly).
-    Raises as `measure_psi`.
+    designed, which say how a pixel's coefficient is shared among its samples (default: evenly). A
+    view outside of the lens's pupil needs no whiteboard: its coefficients are 0. Raises as
+    `measure_psi`.
     """
     lamps = lamps_needed(layout)
     gain = _gain(boards, layout)
     views_v, views_u = layout.views
     k = layout.binning
     pinholes = {(board.shot, board.pinhole, board.lamp): board for board in boards.frames}
+    measured = measured_views(layout)
     for shot in range(layout.weights_shape[0]):
         references = _references(boards, gain, layout, shot)
         for v, u in np.ndindex(views_v, views_u):
             for stored, lamp in enumerate(lamps):
                 name = f"shot {shot}, view ({v}, {u}), {lamp} lamp"
                 taken = pinholes.get((shot, (v, u), lamp))
+                if taken is None and not measured[v, u]:
+                    shut = np.zeros(layout.size, dtype=np.float32)
+                    yield (shot, v, u, stored), shut, shut
+                    continue
                 pinhole = _require_frame(boards, None if taken is None else taken.frame, name)
                 dark = boards.dark_at(pinhole.exposure_s)
                 values, deviation = (np.empty(layout.size, dtype=np.float32) for _ in range(2))
@@ -189,19 +196,21 @@ def ideal_boards(
     readings: Mapping[tuple[int, int, int, str], Array],
     lamps: tuple[str, ...],
     design: ImagingMatrix,
+    white: Array | None = None,
 ) -> BoardSet:
     """Return the whiteboards of a noise-free sensor from what a simulated bench really reads.
 
-    readings: (pixel_y, pixel_x) through the pinhole, by (shot, v, u, lamp); 1 is a white board
-    before the open camera, of which each of several lamp colours gives its share.
+    readings: (pixel_y, pixel_x) through the pinhole, by (shot, v, u, lamp). white: what the open
+    camera without masks reads of the white board, (pixel_y, pixel_x), of which each of several lamp
+    colours gives its share; None: 1.
     """
 
     def frame(reading: Array) -> MeanFrame:
         return MeanFrame((reading * IDEAL_DN).astype(np.float32), 0.0, 2, 1.0)
 
     size = design.frames_shape[1:]
-    white = frame(np.full(size, 1 / len(lamps)))
-    references = {(shot, lamp): white for shot in range(design.shots) for lamp in lamps}
+    of_lamp = frame(np.full(size, 1 / len(lamps)) if white is None else white / len(lamps))
+    references = {(shot, lamp): of_lamp for shot in range(design.shots) for lamp in lamps}
     pinholes = tuple(
         BoardFrame.held(frame(reading), (0.0, 0.0), shot, (v, u), lamp)
         for (shot, v, u, lamp), reading in readings.items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from emmc_rig.bench.hardware import Rig, simulated_rig
+from emmc_rig.bench.hardware import Rig, simulated_rig, with_simulated_pupil
 from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.calibration.whiteboard import Calibration, ideal_boards, lamps_needed, measure_psi
 from emmc_rig.captures.plan import Boards, Checks, Darks, Plan, PlannedShot
@@ -128,7 +128,8 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     watcher = watcher or Watcher()
     find_method(settings.method)
     stages = _Stages(watcher)
-    camera = settings.camera
+    # What a bench's owner reads off the lens is described; what nobody can know stays unknown.
+    camera = with_simulated_pupil(settings.camera)
     with stages("scene"):
         fine = fine_scene(
             settings.scene,
@@ -231,7 +232,8 @@ def _measured(session: Session, rig: Rig, bench: Bench, design: ImagingMatrix) -
     shown = [board.frame.mean_dn - calibration.dark_dn for board in chosen]
     peak = max(float(np.percentile(picture, 99.9)) for picture in shown)
     pictures = [(board.name, dn / peak) for board, dn in zip(chosen, shown, strict=True)]
-    ideal = ideal_boards(_noise_free(session, rig, bench), lamps_needed(design), design)
+    white = _noise_free_white(session, rig, bench)
+    ideal = ideal_boards(_noise_free(session, rig, bench), lamps_needed(design), design, white)
     taken = shot_readings(session, scale_of(calibration, session))
     of_shots = [frames[0] for frames in shot_frames(session).values()]
     frames_dn = np.stack([raw.mosaic for raw in decoded(session, of_shots)])
@@ -261,6 +263,13 @@ def _noise_free(session: Session, rig: Rig, bench: Bench) -> dict[tuple[int, int
             place_rig(rig, frame)
             seen[frame.bench.shot, *frame.view, frame.bench.lamp] = bench.readings()
     return seen
+
+
+def _noise_free_white(session: Session, rig: Rig, bench: Bench) -> Array:
+    """Return what pixels read of the white board through the open aperture, without masks."""
+    reference = next(frame for frame in session.frames if frame.kind == "reference")
+    place_rig(rig, replace(reference, bench=replace(reference.bench, lamp="white")))
+    return bench.readings()
 
 
 def _progress_words(progress: Progress) -> str:

@@ -40,7 +40,9 @@ class Reconstruction:
     objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
     it found, by name: `disparity` (y, x) in pixels per view step, ... screening: what was
     done to the frames before, in words. film: of a frame of a film, what the next one goes on from.
-    seconds: without compiling_seconds, in which kernels were compiled or loaded.
+    seconds: without compiling_seconds, in which kernels were compiled or loaded. measured: which
+    views (v, u) the readings say something of; None: all. Others follow from their neighbours, and
+    no figure of accuracy counts them.
     """
 
     method: str
@@ -55,11 +57,14 @@ class Reconstruction:
     screening: tuple[str, ...] = ()
     film: Any = None
     compiling_seconds: float = 0.0
+    measured: NDArray[np.bool_] | None = None
 
     @property
     def stated(self) -> dict[str, Any]:
         """The PSNR stated and its interval, see `stated_figures`."""
         sigma = self.maps.get("sigma")
+        if sigma is not None and self.measured is not None:
+            sigma = sigma[self.measured]
         variance = None if sigma is None else float(np.mean(np.square(sigma, dtype=np.float64)))
         return stated_figures(variance, self.parameters)
 

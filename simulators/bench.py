@@ -24,6 +24,7 @@ from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.camera import Camera, draw_plates, pixel_light, sensor_response
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.pupil import Pupil
 from emmc_rig.simulators.flaws import (
     EVEN_BOARD,
     PERFECT_OPTICS,
@@ -134,6 +135,28 @@ def _passes(lens_um: Array, openings_um: Array) -> NDArray[np.bool_]:
     return passes
 
 
+def inside_pupil(lens_um: Array, pupil: Pupil) -> NDArray[np.bool_]:
+    """Return which points of the lens, (..., 2), x and y from its axis, the stop leaves open.
+
+    The rim, which moves with the pixel, cuts the rays in `trace`.
+    """
+    x, y = np.moveaxis(lens_um / 1e3 - np.array(pupil.centre_mm), -1, 0)
+    if pupil.shape == "round":
+        return x**2 + y**2 <= (pupil.diameter_mm / 2) ** 2
+    turn = np.deg2rad(pupil.turn_deg)
+    x, y = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+    if pupil.shape == "square":
+        return np.maximum(np.abs(x), np.abs(y)) <= pupil.diameter_mm / 2
+    corners = np.arange(pupil.blades + 1) * 2 * np.pi / pupil.blades
+    at_x, at_y = (pupil.diameter_mm / 2 * of(corners) for of in (np.cos, np.sin))
+    # Inside a convex polygon a point lies to the left of every side from corner to corner.
+    left = [
+        (at_x[k + 1] - at_x[k]) * (y - at_y[k]) >= (at_y[k + 1] - at_y[k]) * (x - at_x[k])
+        for k in range(pupil.blades)
+    ]
+    return np.all(left, axis=0)
+
+
 @njit(forceinline=True, fastmath=True)
 def _met(x, y, u, v, lens_um, distance_um, slope_x, slope_y, sag, glass_um, index):
     """Return where the ray from sensor point (x, y) to lens point (u, v) meets a mask.
@@ -224,6 +247,7 @@ def trace(
     starts,
     shapes,
     plates,
+    rim,
     falloff,
     readings,
 ):
@@ -231,10 +255,11 @@ def trace(
 
     scene: (v f, u f, y g, x g, colour) with finer = (f, g); or 1 x 1 x 1 x 1 x 3 for a whiteboard.
     points: (v, u, ray, 4). at_lens_um: (v, u, ray, 2), where the rays meet the lens, x and y.
-    passes: (v, u, ray), whether the aperture plate lets them through. lengths_um: lens distance,
-    sample pitch, sample width. cells: (1 + all cells, colour), the first opaque; starts, shapes:
-    where each mask lies in it, (rows, columns). plates: a `MaskRow` for each mask. falloff:
-    (v, u, y, x), or all 1.
+    passes: (v, u, ray), whether plate and pupil let them through. rim: radius of the pupil's rim
+    in um, 0: none, and by how many um it moves with each um of the pixel. lengths_um: lens
+    distance, sample pitch, sample width. cells: (1 + all cells, colour), the first opaque; starts,
+    shapes: where each mask lies in it, (rows, columns). plates: a `MaskRow` for each mask.
+    falloff: (v, u, y, x), or all 1.
     points: (v, u, ray, 4 or 6), 6 where edges are blurred: the last two are normal.
     """
     rows, columns = readings.shape
@@ -269,6 +294,12 @@ def trace(
                     ray_y = (y - (rows - 1) / 2) * pitch_um + (in_y - 0.5) * width_um
                     for c in range(3):
                         passed[c, :] = lamp[c]
+                    if rim[0] > 0:
+                        away_v = ray_v - rim[1] * ray_y
+                        for x in range(columns):
+                            away_u = ray_u - rim[1] * (first_x + x * pitch_um)
+                            if away_u * away_u + away_v * away_v > rim[0] * rim[0]:
+                                passed[:, x] = 0
                     for mask in range(plates.shape[0]):
                         _find_cells(
                             place, plates[mask], starts[mask], shapes[mask],
@@ -351,7 +382,15 @@ class Bench:
         self._points[..., 4:] = ndtri(self._points[..., 4:])
         lens = camera.lens
         self._at_lens_um = lens_points_um(self._points, lens.aperture_cell_um, lens.aperture_fill)
+        pupil = optics.pupil or lens.pupil
+        self._in_pupil, self._rim = np.bool_(True), np.zeros(2)
+        if pupil is not None:
+            self._in_pupil = inside_pupil(self._at_lens_um, pupil)
+            if pupil.rim is not None:
+                self._rim = np.array([pupil.rim.diameter_mm * 500, pupil.rim.shift])
         lengths_um = (lens.distance_mm * 1e3, camera.sensor.sample_pitch_um, lens.aperture_cell_um)
+        self._optics = optics
+        self._hole_areas = optics.hole_areas(views)
         self._falloff = optics.falloff(size, views, lengths_um)
         self._plates = {
             name: [
@@ -377,7 +416,7 @@ class Bench:
 
     def _lit(self, lamp: tuple[float, ...]) -> Array:
         """Return the readings under a lamp of this level in red, green and blue."""
-        at_um = self.positions_um()
+        at_um = self._optics.moved(self.positions_um(), self._seconds())
         state = (lamp, self.target, self.shot, self.masks_in, self.board_turn_deg, *at_um.values())
         if self._scene_at is not None and self.target == "scene":
             self._scene = self._scene_at(self._began_s)
@@ -385,7 +424,7 @@ class Bench:
         if state not in self._seen:
             if sum(readings.nbytes for readings in self._seen.values()) > KEPT_BYTES:
                 self._seen.clear()
-            self._seen[state] = self._pixels(self._trace(at_um, lamp))
+            self._seen[state] = self._pixels(self._traced(at_um, lamp))
         return self._seen[state]
 
     def _focused(self, offset_um: float) -> NDArray[np.float32]:
@@ -427,13 +466,13 @@ class Bench:
         psi = np.empty((*camera.views, size[0], 3, size[1]), np.float32)
         try:
             self.shot, self.masks_in = shot, False
-            whole = self._pixels(self._trace(at_um, LAMPS["white"], "all"))
+            whole = self._pixels(self._traced(at_um, LAMPS["white"], "all"))
             share = 1 / (k**2 * whole).repeat(k, axis=0).repeat(k, axis=1)
             self.masks_in = True
             for v, u in np.ndindex(camera.views):
                 for colour in range(3):
                     lamp = tuple(np.eye(3)[colour])
-                    psi[v, u, :, colour] = self._trace(at_um, lamp, (v, u)) * share
+                    psi[v, u, :, colour] = self._traced(at_um, lamp, (v, u)) * share
         finally:
             self.shot, self.masks_in = standing
         return psi
@@ -453,6 +492,26 @@ class Bench:
     def light(self, shot: int) -> NDArray[np.float32]:
         """Return how much light each pixel collects in a shot, (pixel_y, pixel_x)."""
         return self._light[shot]
+
+    def _traced(
+        self,
+        at_um: Mapping[str, float],
+        lamp: tuple[float, ...],
+        cell: tuple[int, int] | Literal["all"] | None = None,
+    ) -> Array:
+        """Return `_trace` with the lens's glare, which every colour has of its own light."""
+        optics, response = self._optics, self._response[self.shot]
+        if not (optics.glare or optics.glare_after):
+            return self._trace(at_um, lamp, cell)
+        response = response / np.maximum(response.sum(axis=-1, keepdims=True), 1)
+        colours = [tuple(level * np.eye(3)[c]) for c, level in enumerate(lamp)]
+        return np.sum(
+            [
+                optics.with_glare(self._trace(at_um, colours[c], cell), response[..., c])
+                for c in range(3)
+            ],
+            axis=0,
+        )
 
     def _trace(
         self,
@@ -484,7 +543,7 @@ class Bench:
         scene = (
             np.ones((1, 1, 1, 1, 3), np.float32)
             if board
-            else self._focused(at_um.get("focus", 0.0))
+            else self._focused(at_um.get("focus", 0.0) + at_um.get("lens", 0.0))
         )
         response = self._response[self.shot]
         seen = np.maximum(response.sum(axis=-1, keepdims=True), 1)
@@ -503,9 +562,9 @@ class Bench:
             np.array(lamp),
             self._points,
             self._at_lens_um,
-            _passes(self._at_lens_um, openings),
+            _passes(self._at_lens_um, openings) & self._in_pupil,
             (
-                lens.distance_mm * 1e3,
+                lens.distance_mm * 1e3 + at_um.get("lens", 0.0),
                 sensor.sample_pitch_um,
                 sensor.sample_pitch_um * sensor.pixel_fill,
             ),
@@ -513,6 +572,7 @@ class Bench:
             np.array(starts, dtype=np.int64),
             np.array(shapes, dtype=np.int64).reshape(-1, 2),
             np.array(plates, dtype=np.float64).reshape(-1, len(MaskRow._fields)),
+            self._rim,
             falloff,
             samples,
         )
@@ -559,5 +619,15 @@ class Bench:
         """Return the plate's pinhole and window at the lens: (2, 3), x, y and half side in um."""
         cell_um = self.camera.lens.aperture_cell_um
         window_half_um = window_side_um(self.camera.views, cell_um) / 2
-        window_um = (x_um - self.window_um, y_um, window_half_um)
-        return np.array([(x_um, y_um, cell_um / 2), window_um])
+        # The window is beside the pinhole along the plate, which may be turned.
+        turn = np.deg2rad(self._optics.plate_turn_deg)
+        beside_um = self.window_um * np.cos(turn), self.window_um * np.sin(turn)
+        window_um = (x_um - beside_um[0], y_um - beside_um[1], window_half_um)
+        area = 1.0
+        if self._optics.hole_spread:
+            nearest = (
+                int(np.clip(round(at / cell_um + (count - 1) / 2), 0, count - 1))
+                for at, count in zip((y_um, x_um), self.camera.views, strict=True)
+            )
+            area = float(self._hole_areas[tuple(nearest)])
+        return np.array([(x_um, y_um, cell_um / 2 * np.sqrt(area)), window_um])

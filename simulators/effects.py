@@ -82,14 +82,22 @@ EFFECTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     },
     "board": {"board": {"angle_spread": 0.1, "place_spread": 0.1, "parallax_px": 1.0}},
     "lamp": {"lamp": {"level_drift": 0.02, "colour_drift": 0.01}},
+    "glare": {"optics": {"glare": 0.01, "glare_after": 0.01}},
+    "holes": {"optics": {"hole_spread": 0.05}},
+    "plate": {"optics": {"plate_turn_deg": 1.0}},
+    "creep": {"optics": {"creep_um_per_s": 0.05}},
+    "warming": {"optics": {"warming_um": 200.0}},
+    "columns": {"sensor": {"odd_gain": 0.02, "odd_dn": 2.0}},
 }
 """By name: what it changes in the fields of Flaws."""
+FAULTS = ("holes", "plate", "creep")
+"""Benches to mend rather than to calibrate as they are."""
 
 
 def flawed(base: Bench, names: Iterable[str]) -> Bench:
     """Return a bench with these effects beside what is wrong with it already.
 
-    names: of EFFECTS, or TOGETHER: all of them. Keeps the class of `base`.
+    names: of EFFECTS, or TOGETHER: all of them but FAULTS. Keeps the class of `base`.
     """
     for name in names:
         for effect in EFFECTS if name == TOGETHER else (name,):

@@ -7,6 +7,7 @@ are maps. The calibration fits other, simpler forms.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter
 
 from emmc_rig.model.noise import SensorNoise
+from emmc_rig.model.pupil import Pupil
 
 Array = NDArray[np.floating]
 DUST_GRAIN = 6
@@ -37,7 +39,14 @@ class OpticsFlaws:
     microlens_power: a pixel's response falls as that power of the cosine between the ray and its
     microlens' axis; chief_ray_error: share of the chief ray's slope by which that axis misses it.
     diffraction: at the mask's edges (angular spectrum, from mask to sensor). colour_blur_um:
-    standard deviation of the mask's edges in red, green and blue light.
+    standard deviation of the mask's edges in red, green and blue light. glare: share of the light
+    of every colour that is spread over the whole picture in front of the colour filters;
+    glare_after: of all colours' together, behind the filters. hole_spread: relative standard
+    deviation of the area of the hole before every view; plate_turn_deg: of the pinhole plate and
+    its stage about the axis, x to y. creep_um_per_s: of the mask, in x. warming_um: by which the
+    lens gets farther from the sensor, with WARM_UP_S.
+    standard deviation of the mask's edges in red, green and blue light. pupil: what the real lens
+    leaves open; None: what the camera describes.
     """
 
     aperture_spread: float = 0.0
@@ -51,12 +60,46 @@ class OpticsFlaws:
     chief_ray_error: float = 0.0
     diffraction: bool = False
     colour_blur_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    glare: float = 0.0
+    glare_after: float = 0.0
+    hole_spread: float = 0.0
+    plate_turn_deg: float = 0.0
+    creep_um_per_s: float = 0.0
+    warming_um: float = 0.0
+    pupil: Pupil | None = None
     seed: int = 1
 
     def aperture_weights(self, views: tuple[int, int]) -> NDArray[np.float64]:
         """Return the share of light of every aperture cell, (v, u)."""
         rng = np.random.default_rng([self.seed, 1])
         return 1 + self.aperture_spread * rng.standard_normal(views)
+
+    def hole_areas(self, views: tuple[int, int]) -> NDArray[np.float64]:
+        """Return the area of the hole before every view, (v, u), over that of its cell."""
+        rng = np.random.default_rng([self.seed, 5])
+        return 1 + self.hole_spread * rng.standard_normal(views)
+
+    def moved(self, at_um: Mapping[str, float], seconds: float) -> dict[str, float]:
+        """Return where mask and plate are when the stages report at_um, and the lens ("lens")."""
+        turn, warmed = np.deg2rad(self.plate_turn_deg), 1 - np.exp(-seconds / WARM_UP_S)
+        x, y = at_um["aperture_x"], at_um["aperture_y"]
+        return {
+            **at_um,
+            "aperture_x": float(np.cos(turn) * x - np.sin(turn) * y),
+            "aperture_y": float(np.sin(turn) * x + np.cos(turn) * y),
+            "mask_x": at_um["mask_x"] + self.creep_um_per_s * seconds,
+            "lens": float(self.warming_um * warmed),
+        }
+
+    def with_glare(self, readings: Array, response: Array) -> NDArray[np.float64]:
+        """Return readings (y, x) of light of one colour with its glare.
+
+        response: of the pixels' filters to this colour, (y, x).
+        """
+        arrives = readings[response > 0] / response[response > 0]
+        in_front = response * (arrives.mean() if arrives.size else 0.0)
+        found = (1 - self.glare) * readings + self.glare * in_front
+        return (1 - self.glare_after) * found + self.glare_after * found.mean()
 
     def falloff(
         self, size: tuple[int, int], views: tuple[int, int], lengths_um: tuple[float, float, float]
@@ -210,7 +253,8 @@ class SensorFlaws:
     pixels saturate (None: only where the converter does). bend: relative loss of response at full
     well, quadratic in the signal. row_noise_electrons: common to a row of one frame. warming_k: by
     which the sensor warms up, with WARM_UP_S; dark current doubles every DOUBLING_K. crosstalk:
-    share of a filter's response that is to the neighbouring colours.
+    share of a filter's response that is to the neighbouring colours. odd_gain, odd_dn: by which
+    odd columns respond more, relative, and are brighter in the dark.
     """
 
     response_spread: float = 0.0
@@ -223,6 +267,8 @@ class SensorFlaws:
     row_noise_electrons: float = 0.0
     warming_k: float = 0.0
     crosstalk: float = 0.0
+    odd_gain: float = 0.0
+    odd_dn: float = 0.0
     seed: int = 1
 
     def mixed(self, response: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -266,6 +312,9 @@ class SensorFlaws:
         drawn += rng.normal(0.0, noise.read_noise_electrons, size)
         if self.row_noise_electrons:
             drawn += rng.normal(0.0, self.row_noise_electrons, (size[0], 1))
+        odd = np.arange(size[1]) % 2
+        drawn *= 1 + self.odd_gain * odd
+        offset_dn += self.odd_dn * odd
         dn = np.floor(noise.gain_dn_per_electron * drawn + noise.black_level_dn + offset_dn + 0.5)
         return np.clip(dn, 0, noise.white_level_dn).astype(np.uint16)
 

@@ -56,7 +56,9 @@ from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Camera, Sensor
 from emmc_rig.model.masks import cfa_tile
+from emmc_rig.model.pupil import Pupil
 from emmc_rig.model.settings import validated
+from emmc_rig.model.view_axes import ANGLES
 from emmc_rig.simulators.apt import AptController
 from emmc_rig.simulators.bench import RAYS_PER_VIEW, Bench, window_side_um
 from emmc_rig.simulators.clock import ManualClock
@@ -86,6 +88,9 @@ NO_STAGE = "none"
 PROBE_TIMEOUT_S = 0.2
 MICROMETER = 0.1
 """By how much surer a hand puts a mask on its micrometer than a pinhole on its hole."""
+DEFAULT_PUPIL_OF_VIEWS: float | None = None
+"""Diameter of the simulated lens's round pupil, over the side of the square of all views: 1.1 is an
+f/1.8 50 mm lens behind 25 mm of views, whose corners are 37 % open. None: the views' square."""
 NO_FLAWS = Flaws()
 """But for a mask that sits a few um off, as every one does."""
 SIMULATED_SCALES = {
@@ -202,6 +207,31 @@ class SimulatedAttendant:
             self._wanted_um.pop(axis, None)
 
 
+def whole_pupil(camera: Camera) -> Pupil:
+    """Return the square pupil that leaves every view open."""
+    side_mm = max(camera.views) * camera.lens.aperture_cell_mm
+    return Pupil(shape="square", diameter_mm=side_mm)
+
+
+def default_pupil(camera: Camera) -> Pupil | None:
+    """Return the pupil of the simulated lens: the camera's own, or a round one; None: the views'.
+
+    Views that are no places of the aperture, or points of it, have no pupil but the camera's own.
+    """
+    described = camera.lens.pupil
+    apertures = camera.view_axes == ANGLES and camera.lens.aperture_fill > 0
+    if described is not None or DEFAULT_PUPIL_OF_VIEWS is None or not apertures:
+        return described
+    side_mm = whole_pupil(camera).diameter_mm
+    return Pupil(diameter_mm=round(DEFAULT_PUPIL_OF_VIEWS * side_mm, 6))
+
+
+def with_simulated_pupil(camera: Camera) -> Camera:
+    """Return the camera, described with the pupil of the lens that simulates it by default."""
+    lens = camera.lens.model_copy(update={"pupil": default_pupil(camera)})
+    return camera.model_copy(update={"lens": lens})
+
+
 def simulated_rig(
     camera: Camera,
     fine_scene: NDArray[np.float32] | Callable[[float], NDArray[np.float32]],
@@ -218,7 +248,8 @@ def simulated_rig(
 
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
     real one lets moves and exposures take their time; by default they take none. The noise of a
-    frame that is announced by name follows from the name alone. rays_per_view: of one pixel; few
+    frame that is announced by name follows from the name alone. The lens has the pupil of `flaws`,
+    or `default_pupil`. rays_per_view: of one pixel; few
     rays are quick, and grainy beside a good sensor's noise. flaws: imperfections of the bench.
     focus_um: place of a fifth axis, `focus`, where the scene is sharp; None: no such axis.
     fixed_positions_um: see `Rig`. fitted: with which axes and camera. Raises AppError for a size
@@ -261,6 +292,7 @@ def simulated_rig(
 
     window_um = 2 * aperture_um
     rng = np.random.default_rng(seed)
+    optics = replace(flaws.optics, pupil=flaws.optics.pupil or default_pupil(camera))
     bench = Bench(
         camera,
         fine_scene,
@@ -270,7 +302,7 @@ def simulated_rig(
         rng,
         flaws.mounting,
         rays_per_view,
-        flaws.optics,
+        optics,
         flaws.sensor,
         flaws.board,
         flaws.lamp,

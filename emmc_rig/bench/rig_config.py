@@ -9,19 +9,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationError, field_validator
 
 from emmc_rig.bench.environment import Source, SourceConfig
 from emmc_rig.bench.hands import Ask, AskingAttendant, NoAttendant
 from emmc_rig.bench.hardware import (
+    DEFAULT_PUPIL_OF_VIEWS,
     NO_FLAWS,
     NO_STAGE,
     STAGE_AXES,
     Fitted,
     Rig,
+    default_pupil,
     open_camera,
     open_stages,
     simulated_rig,
+    whole_pupil,
 )
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.stage import Stage
@@ -30,8 +33,9 @@ from emmc_rig.formats.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.arguments import path_of
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.json_text import shown_path
+from emmc_rig.model.pupil import Pupil
 from emmc_rig.model.reading import read_yaml
-from emmc_rig.model.settings import Settings, validated
+from emmc_rig.model.settings import Settings, explain, validated
 from emmc_rig.simulators.bench import RAYS_PER_VIEW
 from emmc_rig.simulators.effects import EFFECTS, TOGETHER, flawed
 from emmc_rig.simulators.scenes import MOVING_SCENES
@@ -112,6 +116,8 @@ class SimulatedAxes(AnyRig):
     focus_um: place of its focus axis where the scene is sharp; None: no such axis. axes: a subset
     of mask_x, mask_y, aperture_x and aperture_y. second_stage: axes of a second controller.
     hands_um: largest error of a hand that moves the other axes. usb_camera: protocol of the camera.
+    pupil: of its lens. none: the square of the views. round: as the camera describes it, else
+    `default_pupil`. None, of sessions before version 0.5: as the camera describes it.
     """
 
     focus_um: float | None = Field(default=None, gt=0)
@@ -119,6 +125,19 @@ class SimulatedAxes(AnyRig):
     second_stage: tuple[str, ...] = ()
     hands_um: float = Field(default=0.0, ge=0)
     usb_camera: Literal["ptp", "u3v"] = "ptp"
+    pupil: Pupil | Literal["round", "none"] | None = None
+
+    @field_validator("pupil", mode="before")
+    @classmethod
+    def _pupil_of_settings(cls, pupil: object) -> object:
+        if pupil in (None, "round", "none"):
+            return pupil
+        if not isinstance(pupil, (Mapping, Pupil)):
+            raise ValueError(f"{pupil}: use round, none, or a lens such as {{diameter_mm: 27.5}}")
+        try:
+            return Pupil.model_validate(pupil)
+        except ValidationError as fault:  # of a union, pydantic would list the faults of each part
+            raise ValueError(explain(fault, Pupil)) from fault
 
     @field_validator("axes", "second_stage")
     @classmethod
@@ -170,7 +189,7 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
     line.
     """
     if spec == SIMULATED:
-        return _described(SIMULATED, imaged)
+        return _described(SIMULATED, _of_now(imaged))
     if not spec.endswith((".yaml", ".yml")):
         raise AppError(
             f"rig {shown_path(spec)}: write simulated, or the name of a YAML file of devices"
@@ -179,11 +198,26 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
     if isinstance(read, dict) and read.get("kind") == SIMULATED:
         given = validated(SimulatedFile, read, spec, AppError)
         more = {name: getattr(given, name) for name in LATER}
-        return _described(SIMULATED, imaged.model_copy(update=more))
+        return _described(SIMULATED, _of_now(imaged.model_copy(update=more)))
     described = _described("real", validated(RealRig, read, spec, AppError))
     found = [_stage_file(stage, Path(spec).parent) for stage in _several(described["stage"])]
     described["stage"] = found if isinstance(described["stage"], list) else found[0]
     return described
+
+
+def _of_now(imaged: ImagedRig) -> ImagedRig:
+    """Return a new rig, the lens round where nothing is said of it."""
+    if imaged.pupil is not None or DEFAULT_PUPIL_OF_VIEWS is None:
+        return imaged
+    return imaged.model_copy(update={"pupil": "round"})
+
+
+def _real_pupil(imaged: ImagedRig, camera: Camera) -> Pupil:
+    """Return the pupil of a simulated rig's lens."""
+    if isinstance(imaged.pupil, Pupil):
+        return imaged.pupil
+    pupils = {"round": default_pupil(camera), "none": None, None: camera.lens.pupil}
+    return pupils[imaged.pupil] or whole_pupil(camera)
 
 
 def _several(stages: StageSpec | list[StageSpec]) -> list[StageSpec]:
@@ -284,6 +318,7 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
         fine = opened()
         height, width = fine.scene.light_field.shape[2:4]
         clock = SYSTEM_CLOCK if imaged.real_time else None
+        flaws = flawed(NO_FLAWS, imaged.flaws)
         rig, _ = simulated_rig(
             camera,
             (lambda at_s: opened(time_s=at_s).samples)
@@ -293,7 +328,7 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
             imaged.seed,
             clock,
             imaged.rays,
-            flawed(NO_FLAWS, imaged.flaws),
+            replace(flaws, optics=replace(flaws.optics, pupil=_real_pupil(imaged, camera))),
             imaged.focus_um,
             imaged.fixed_positions_um,
             Fitted(imaged.axes, imaged.second_stage, imaged.hands_um, imaged.usb_camera),

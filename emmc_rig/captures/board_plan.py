@@ -114,7 +114,7 @@ def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
     """Return the plan of a capture: whiteboards for every method, and the camera's shots."""
     through = {kind.pinhole: count for kind, count in planned.counts.items() if kind.pinhole}
     repeats = max(through.values(), default=1)
-    every = len(through) == np.prod(settings.camera.views)
+    every = len(through) == settings.camera.views_measured().sum()
     fitted = [
         OpenBoard(mask_um=kind.stage_um, window=kind.window, repeats=count)
         for kind, count in planned.counts.items()
@@ -168,7 +168,7 @@ def combined_plan(settings: PlanSettings, mask: ShadowMask, light: Light) -> Pla
     camera, most_frames, target = settings.camera, settings.most_frames, settings.target
     stages = STAGE_KINDS_UM if settings.moves_masks else STAGE_KINDS_UM[:1]
     opened = {Kind(None, stage): 2 for stage in stages}
-    views = [Kind((v, u)) for v, u in np.ndindex(camera.views)]
+    views = [Kind((int(v), int(u))) for v, u in np.argwhere(camera.views_measured())]
     least = PlannedFrames(opened | dict.fromkeys(views, 1), 0.0)
     others = frames_by_kind(settings, least).total() - len(views)
     most = MOST_FRAMES if most_frames is None else (most_frames - others) // len(views)
@@ -249,7 +249,7 @@ def write_plan(settings: PlanSettings, folder: Path) -> dict:
         "few_would_take_frames": more or None,
         "exposures": {
             "open_s": light.exposure_s,
-            "pinhole_s": light.exposure_s * float(np.prod(camera.views)),
+            "pinhole_s": light.exposure_s * camera.open_views(),
         },
         "whiteboards": [
             {

@@ -19,6 +19,7 @@ from emmc_rig.captures.schedule import spread
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.geometry import centred_grid
+from emmc_rig.model.pupil import LEAST_SHARE
 from emmc_rig.session.planned import SHOT_DARK, VALIDATION, Bench, Kind, PlannedFrame
 
 OPEN_LAMP = "white"
@@ -162,7 +163,8 @@ def _boards(plan: Plan, boards: Boards, camera: Camera) -> Iterator[PlannedFrame
     rows, columns = camera.views
     views = boards.views
     if views == "all":
-        views = tuple((v, u) for v in range(rows) for u in range(columns))
+        # Before a view outside of the lens's pupil no light reaches the pinhole.
+        views = tuple((int(v), int(u)) for v, u in np.argwhere(camera.views_measured()))
     for v, u in views:
         if not (0 <= v < rows and 0 <= u < columns):
             raise AppError(
@@ -177,8 +179,9 @@ def _boards(plan: Plan, boards: Boards, camera: Camera) -> Iterator[PlannedFrame
             raise AppError(
                 f"whiteboards.shots: {shot} is none of the {len(camera.shots)} shots, from 0"
             )
-    # The pinhole lets one view's light pass, the reference that of all.
-    light = float(rows * columns)
+    # The pinhole lets one view's light pass, the reference that of all. Views that the pupil cuts
+    # are exposed as whole ones, so that their readings compare.
+    light = camera.open_views()
     fitted = fittings(camera)
     for shot in shots:
         masks_um = mask_offsets_um(camera, shot)
@@ -199,8 +202,8 @@ def _open_boards(
     own_um = mask_offsets_um(camera, 0)
     cell_um = camera.lens.aperture_cell_um
     for place, board in enumerate(boards.open):
-        opened = int(views_open(camera.views, None, board.window).sum())
-        if opened == 0:
+        opened = camera.view_shares()[views_open(camera.views, None, board.window)].sum()
+        if opened < LEAST_SHARE:
             raise AppError(
                 f"whiteboards.open.{place}.window: {list(board.window)} uncovers none of the "
                 f"camera's {camera.views[0]}x{camera.views[1]} views: move it by fewer cells"
@@ -225,7 +228,7 @@ def _open_boards(
         }
         bench = Bench("whiteboard", OPEN_LAMP, 0, 0, True, moved | window)
         kind = VALIDATION if board.validation else "open"
-        exposed = _white(boards, float(np.prod(camera.views)) / opened)
+        exposed = _white(boards, camera.open_views() / float(opened))
         yield from _repeated(
             f"{kind}-{place}", kind, bench, board.repeats, window=board.window, **exposed
         )

@@ -154,9 +154,9 @@ def _calibrate_session(path: Path, method: str, out: Path | None, sensor: bool) 
     for label, key in (("finding: ", "findings"), ("", "unwatched"), ("advice: ", "advice")):
         for line in metrics[key]:
             tell(label + line)
-    for name, value, deviation, unit in () if sheet is None else sheet.rows():
-        spread = "" if deviation is None else f" +- {deviation:.2g}"
-        tell(f"    {name}: {value:.5g}{spread} {unit}".rstrip())
+    for row in () if sheet is None else sheet.rows():
+        spread = "" if row.deviation is None else f" +- {row.deviation:.2g}"
+        tell(f"    {row.title}: {row.value:.5g}{spread} {row.unit}".rstrip())
     tell(f"open {out / 'report.html'}")
     give_result(out)
 

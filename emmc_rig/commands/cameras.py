@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from emmc_rig.commands.options import out_option
-from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
+from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
 
 
 def _shown(value: object) -> str:
@@ -59,5 +59,7 @@ def cameras(
         else:
             rows.append((key, _shown(value)))
     show_table(("figure", "value"), rows, camera.title)
+    for warning in camera.warnings():
+        say("warning", warning)
     tell(f"open {folder_name / 'camera.png'}")
     give_result(folder_name)

@@ -213,10 +213,12 @@ def _places(captures: Sequence[Capture], out: Path | None) -> list[tuple[Capture
 
 def _say_result(metrics: dict, out: Path) -> None:
     from emmc_rig.model.view_axes import axes_of, middle_name
-    from emmc_rig.store.results import stated_words
+    from emmc_rig.store.results import stated_words, unmeasured_words
 
     if "assumed" in metrics:
         say("note", metrics["assumed"])
+    if unmeasured := unmeasured_words(metrics):
+        say("note", unmeasured)
     for line in metrics["screening"]:
         say("clean-up", line)
     compared = ""

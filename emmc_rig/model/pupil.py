@@ -32,8 +32,9 @@ Length = Annotated[float, Field(gt=0, lt=LONGEST_MM)]
 Place = Annotated[float, Field(gt=-LONGEST_MM, lt=LONGEST_MM)]
 STRIPS = 4
 """Of a cell that is cut: see the module's figures."""
-LINES = 16
-"""Lines in x by which a strip is integrated."""
+LINES = 64
+"""Lines in x by which a strip is integrated: 16 miss 0.2 % of Psi behind an upright square, and
+fits of the pupil stop at their steps."""
 LEAST_SHARE = 1e-4
 """Of a cell: a view that is less open is outside of the pupil."""
 

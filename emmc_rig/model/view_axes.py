@@ -6,7 +6,7 @@ page speaks of their disparity.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any, Literal
 
@@ -71,3 +71,9 @@ def place_name(axes: ViewAxes, views: tuple[int, int], place: tuple[int, int]) -
         return f"view {place}"
     named = zip(axis_names(axes, views), place, strict=True)
     return ", ".join(f"{name} {at}" for name, at in named if name)
+
+
+def view_names(views: Iterable[Sequence[int]]) -> str:
+    """Return views (v, u) by name: "view (0, 0)", "views (0, 0), (0, 4)"; of none: ""."""
+    names = [f"({v}, {u})" for v, u in views]
+    return f"view{'s' * (len(names) > 1)} {', '.join(names)}" if names else ""

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import ERRORS, AppError
+from emmc_rig.model.camera import measured_views
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.frames import Frames, even_frames
@@ -187,18 +188,19 @@ def block_task(task: BlockTask) -> Generator[tuple[str, None], None, None]:
                 key: getattr(result, key) for key in ("status", "advice", "steps", "parameters")
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
-            "variance": _variance(task.block, solved.arrays),
+            "variance": _variance(task, solved.arrays),
             "peak_mib": peak_memory_mib(),
         },
     )
     yield task.block.name, None
 
 
-def _variance(block: Block, arrays: Mapping[str, NDArray]) -> float | None:
-    """Return the sum of the light field's variance over a block's inner part; None without one."""
+def _variance(task: BlockTask, arrays: Mapping[str, NDArray]) -> float | None:
+    """Return the sum of the measured views' variance over a block's inner part; None without."""
     if "sigma" not in arrays:
         return None
-    inner = arrays["sigma"][:, :, *within(block.inner, block.part)]
+    block = task.block
+    inner = arrays["sigma"][:, :, *within(block.inner, block.part)][measured_views(task.job.psi)]
     return float(np.sum(np.square(inner, dtype=np.float64)))
 
 
@@ -317,13 +319,20 @@ class Blocks:
         variances = [block.variance for block in self.done]
         if None in variances:
             return None
-        samples = np.prod(self.job.psi.views) * np.prod(self.grid.size)
+        samples = measured_views(self.job.psi).sum() * np.prod(self.grid.size)
         return float(sum(v for v in variances if v is not None) / samples)
 
     def result(self) -> Reconstruction:
         """Return the figures of all blocks together, without arrays."""
         results = [block.result for block in self.done]
-        return summed_up(self.job.method, results, self.survey, self.seconds)
+        summed = summed_up(self.job.method, results, self.survey, self.seconds)
+        return replace(summed, measured=self.measured)
+
+    @property
+    def measured(self) -> NDArray[np.bool_] | None:
+        """Which views are measured, see `Reconstruction`."""
+        measured = measured_views(self.job.psi)
+        return None if measured.all() else measured
 
     def verdict(self) -> Verdict:
         """Return the verdict on all blocks; raises ReconstructionError without usable pixels."""

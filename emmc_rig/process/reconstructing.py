@@ -278,7 +278,11 @@ def reconstruct_undrawn(
         result = _result_of_blocks(blocks, saved.load(), frames)
     result = replace(result, verdict=result.verdict.with_reasons(capture.exposure_reasons()))
     true = None if truth is None else _true(truth, result.psi)
-    metrics = {**result.metrics(), **further, **_compared(result.light_field, truth, true)}
+    metrics = {
+        **result.metrics(),
+        **further,
+        **_compared(result.light_field, truth, true, result.solved.measured),
+    }
     result.write(out, metrics)
     return metrics, partial(result.draw, metrics=metrics, truth=true)
 
@@ -318,7 +322,9 @@ def _write_blocks(
     true = None if truth is None else _true(truth, psi)
     save_frames(out / FRAMES, frames)
     if (out / RESULT_GROUP).exists():
-        metrics |= _compared(opened_array(out / RESULT_GROUP, "light_field"), truth, true)
+        metrics |= _compared(
+            opened_array(out / RESULT_GROUP, "light_field"), truth, true, blocks.measured
+        )
     else:
         with h5py.File(out / LIGHT_FIELD, "w") as file, h5py.File(out / MAPS, "w") as maps:
             file.attrs["method"] = blocks.job.method
@@ -329,7 +335,7 @@ def _write_blocks(
                 if home is file:
                     made.attrs[ATTRIBUTE] = stored_as(psi.view_axes)
                 blocks.write(name, made)
-            metrics |= _compared(file["light_field"], truth, true)
+            metrics |= _compared(file["light_field"], truth, true, blocks.measured)
     write_metrics(out, metrics)
     return metrics
 
@@ -339,9 +345,14 @@ def _true(truth: str, psi: PsiLayout) -> NDArray:
     return np.asarray(open_scene(truth, size=psi.size, views=psi.views))
 
 
-def _compared(light_field: Any, truth: str | None, true: NDArray | None) -> dict[str, Any]:
+def _compared(
+    light_field: Any,
+    truth: str | None,
+    true: NDArray | None,
+    measured: NDArray[np.bool_] | None,
+) -> dict[str, Any]:
     """Return how near a light field, an array or dataset, is to the scene captured, if known."""
-    return {} if true is None else {"truth": truth, **compared(light_field, true)}
+    return {} if true is None else {"truth": truth, **compared(light_field, true, measured)}
 
 
 def ceiling_for(

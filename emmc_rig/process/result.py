@@ -45,13 +45,30 @@ if TYPE_CHECKING:
     from emmc_rig.report.result_figure import FigureSettings
 
 
-def compared(light_field: Any, truth: NDArray) -> dict[str, float]:
-    """Return how near a light field, an array or a dataset, is to the truth (v, u, y, x, c)."""
+def compared(
+    light_field: Any, truth: NDArray, measured: NDArray[np.bool_] | None = None
+) -> dict[str, float]:
+    """Return how near a light field, an array or a dataset, is to the truth (v, u, y, x, c).
+
+    measured: the views (v, u) that count; None: all.
+    """
+    baseline = replicate_centre(truth)
+    if measured is not None:
+        chosen = [tuple(view) for view in np.argwhere(measured)]
+        light_field, truth, baseline = (
+            np.stack([views[view] for view in chosen])[np.newaxis]
+            for views in (light_field, truth, baseline)
+        )
     return {
         "psnr_db": psnr_db(light_field, truth),
         "ssim": ssim(light_field, truth),
-        "replicate_psnr_db": psnr_db(replicate_centre(truth), truth),
+        "replicate_psnr_db": psnr_db(baseline, truth),
     }
+
+
+def unmeasured(measured: NDArray[np.bool_] | None) -> dict[str, list[list[int]]]:
+    """Return the views that no reading says anything of, as metrics.json has them."""
+    return {} if measured is None else {"views_not_measured": np.argwhere(~measured).tolist()}
 
 
 def estimates_of(frames: Frames) -> dict[str, list[str]]:
@@ -79,6 +96,7 @@ def figures(
         "usable_share": float(frames.usable.mean()),
         "frames_sha256": frames.sha256,
         **estimates_of(frames),
+        **unmeasured(solved.measured),
         **provenance(settings),
     }
 
@@ -165,10 +183,10 @@ class Result:
     def compare(self, truth: ArrayLike) -> dict[str, float]:
         """Return how near the estimate is to the true light field (v, u, y, x, c).
 
-        psnr_db, ssim: of all views and colours, peak 1. replicate_psnr_db: that of the true centre
-        view copied to all views, which a light field has to beat.
+        psnr_db, ssim: of all measured views and colours, peak 1. replicate_psnr_db: that of the
+        true centre view copied to all views, which a light field has to beat.
         """
-        return compared(self.light_field, np.asarray(truth))
+        return compared(self.light_field, np.asarray(truth), self.solved.measured)
 
     def metrics(self) -> dict[str, Any]:
         """Return the figures of the reconstruction, as metrics.json has them."""
@@ -331,6 +349,7 @@ class OpenedResult(Result):
             maps={name: values for name, values in saved.maps.items() if name != "misfit"},
             screening=tuple(known.get("screening", ())),
             compiling_seconds=compiling_s,
+            measured=_measured(known.get("views_not_measured"), saved.light_field.shape[:2]),
         )
         verdict, dictionary = Verdict.from_dict(known["verdict"]), known.get("dictionary")
         self.__dict__.update(saved=saved, solved=solved, verdict=verdict, dictionary=dictionary)
@@ -376,6 +395,15 @@ class OpenedResult(Result):
     def metrics(self) -> dict[str, Any]:
         """Return the figures as metrics.json of the folder has them."""
         return dict(self.saved.metrics)
+
+
+def _measured(outside: Any, views: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    """Return which views are measured; None: all. outside: `views_not_measured` of metrics.json."""
+    if not outside:
+        return None
+    measured = np.ones(views, dtype=bool)
+    measured[tuple(np.transpose(outside))] = False
+    return measured
 
 
 def open_result(folder: str | Path) -> Result:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -57,13 +57,6 @@ METHODS = {
 }
 Array = NDArray[np.floating]
 REPORT = "report.html"
-
-
-def _figures(rows: Iterable[tuple[str, float, float | None, str]]) -> dict[str, Any]:
-    return {
-        name: {"value": value, "deviation": deviation, "unit": unit}
-        for name, value, deviation, unit in rows
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +133,15 @@ class SessionCalibration:
         write_calibration_report(folder / REPORT, self.outcome, self.metrics, self.sensor)
         write_metrics(folder, self.metrics)
         if self.sensor is not None:
-            figures = _figures(self.sensor.rows())
+            figures: dict[str, Any] = {
+                row.quantity: {
+                    "value": row.value,
+                    "deviation": row.deviation,
+                    "unit": row.unit,
+                    "remark": row.remark,
+                }
+                for row in self.sensor.rows()
+            }
             curve = self.sensor.curve
             figures["Photon transfer curve"] = {
                 "signal_dn": curve.mean_dn.tolist(),
@@ -239,8 +240,9 @@ def _calibrated(
     sheet = None
     if sensor:
         watcher.begin("sensor", None)
-        white_dn = camera_of(session).sensor.noise.white_level_dn
-        sheet = characterise(*sensor_pairs(session), white_dn)
+        planned = camera_of(session).sensor
+        white_dn, monochrome = planned.noise.white_level_dn, planned.cfa == "mono"
+        sheet = characterise(*sensor_pairs(session), white_dn, monochrome)
     scale = scale_of(chosen, session, shots)
     inputs = {**psi_inputs(session), "method": method}
     return SessionCalibration(outcome, chosen, scale, metrics, sheet, inputs)
@@ -352,5 +354,8 @@ def _describe(file: h5py.File, outcome: Outcome, scale: Scale) -> None:
         for name in SCALARS:
             file.attrs[name] = getattr(known.fit.placement, name)
         file["aperture"] = np.array(known.fit.placement.aperture)
+        if known.fit.placement.pupil is not None:
+            # As described, or of the shape that the whiteboards show: the scalars are relative.
+            file.attrs["pupil"] = known.fit.placement.pupil.model_dump_json()
         if known.defects is not None:
             file["lost"] = known.defects.lost

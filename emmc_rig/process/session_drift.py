@@ -22,7 +22,8 @@ from emmc_rig.calibration.placement import SCALARS, Placement, with_aperture_mea
 from emmc_rig.calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import camera_of, psi_layout
-from emmc_rig.model.reading import stored_arrays
+from emmc_rig.model.pupil import Pupil
+from emmc_rig.model.reading import StoredArrays, stored_arrays
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.process.session_calibration import CALIBRATION_FILE
 from emmc_rig.store.folders import refuse_missing
@@ -78,9 +79,7 @@ def read_calibration(folder: Path) -> Known:
         deviation = stored.array("deviation")
         good = stored.array("good").astype(bool) if "good" in stored else None
         if "aperture" in stored:
-            scalars = {name: float(np.asarray(stored.attributes[name])) for name in SCALARS}
-            rows = tuple(tuple(map(float, row)) for row in stored.array("aperture"))
-            placement = Placement(**scalars, aperture=rows)
+            placement = _stored_placement(stored)
         if "lost" in stored:
             lost = stored.array("lost")
         if "crosstalk" in stored:
@@ -96,6 +95,20 @@ def read_calibration(folder: Path) -> Known:
         mask = mask_with_losses(mask, placement, lost)
     known = Known(psi, mask, placement, stages, seen, colour)
     return replace(known, placement=_with_views_of_psi(known))
+
+
+def _stored_placement(stored: StoredArrays) -> Placement:
+    """Return the placement in a calibration's file; files of version 0.4 and before have no pupil.
+
+    Raises KeyError or ValueError.
+    """
+    attributes, rows = stored.attributes, stored.array("aperture")
+    old = "pupil_share" not in attributes
+    names = [name for name in SCALARS if not (old and name.startswith("pupil_"))]
+    scalars = {name: float(np.asarray(attributes[name])) for name in names}
+    pupil = Pupil.model_validate_json(str(attributes["pupil"])) if "pupil" in attributes else None
+    aperture = tuple(tuple(map(float, row)) for row in rows)
+    return Placement(**scalars, aperture=aperture, pupil=pupil)
 
 
 def _pixel_coefficients(psi: ImagingMatrix, values: Array) -> Array:

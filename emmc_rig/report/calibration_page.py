@@ -337,8 +337,13 @@ def _sensor(sheet_: SensorSheet) -> str:
     titled(linearity, "Linearity", "exposure, s")
     heads = ("Quantity (EMVA 1288)", "Value", "Standard deviation", "Unit")
     rows = [
-        (name, f"{value:.5g}", "" if deviation is None else f"{deviation:.2g}", unit)
-        for name, value, deviation, unit in sheet_.rows()
+        (
+            row.title,
+            f"{row.value:.5g}",
+            "" if row.deviation is None else f"{row.deviation:.2g}",
+            row.unit,
+        )
+        for row in sheet_.rows()
     ]
     table = part("table", heads, rows, numbers=True)
     return table + _drawn({"Photon transfer curve": svg_of(first), "Linearity": svg_of(second)})

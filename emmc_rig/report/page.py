@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
-from emmc_rig.store.results import stated_words
+from emmc_rig.store.results import stated_words, unmeasured_words
 from emmc_rig.version import __version__
 
 KINDS = {
@@ -113,6 +113,8 @@ def estimated(metrics: Mapping[str, object]) -> list[str]:
     if isinstance(found, list) and found:
         words = "; ".join(map(str, found))
         sentences.append(f"Estimated from the frames, as nobody gave it: {words}.")
+    if unmeasured := unmeasured_words(metrics):
+        sentences.append(f"{unmeasured}.")
     return sentences
 
 

@@ -286,7 +286,8 @@ PROVENANCE = {
 }
 """Rows of where a result came from, by the name in metrics.json."""
 SHOWN_ELSEWHERE = {
-    "verdict", "versions", "warnings", "assumed", "estimated_from_frames", *PROVENANCE
+    "verdict", "versions", "warnings", "assumed", "estimated_from_frames", "views_not_measured",
+    *PROVENANCE,
 }  # fmt: skip
 
 

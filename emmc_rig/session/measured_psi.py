@@ -190,12 +190,16 @@ def boards_outcome(
 
 
 def _opens_every_view(camera: Camera, pinholes: BoardSet | None) -> bool:
-    """Return whether whiteboards show every view of every shot, as the method free takes them."""
+    """Return whether whiteboards show every view in the lens's pupil, in every shot.
+
+    The method free needs them.
+    """
     if pinholes is None:
         return False
     opened = {(board.shot, board.pinhole) for board in pinholes.frames}
     shots = range(len(camera.shots))
-    return opened >= {(shot, view) for shot in shots for view in np.ndindex(camera.views)}
+    views = [(int(v), int(u)) for v, u in np.argwhere(camera.views_measured())]
+    return opened >= {(shot, view) for shot in shots for view in views}
 
 
 def psi_inputs(session: Session) -> dict[str, Any]:

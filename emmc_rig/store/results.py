@@ -18,6 +18,7 @@ import h5py
 from numpy.typing import NDArray
 
 from emmc_rig.errors import WrongUsageError
+from emmc_rig.model.view_axes import view_names
 from emmc_rig.store.locks import command_line
 from emmc_rig.store.shards import ENDING, save_arrays
 from emmc_rig.version import __version__
@@ -97,6 +98,17 @@ def stated_words(metrics: Mapping[str, object]) -> str:
         case [float(low), float(high)]:
             return f"{stated_db:.1f} dB ({low:.1f} to {high:.1f} in 9 of 10 captures)"
     return f"{stated_db:.1f} dB"
+
+
+def unmeasured_words(metrics: Mapping[str, object]) -> str:
+    """Return which views no light reaches the sensor from, by metrics.json; "" without such."""
+    outside = metrics.get("views_not_measured")
+    if not isinstance(outside, list) or not outside:
+        return ""
+    return (
+        f"Not measured, as no light of theirs reaches the sensor: {view_names(outside)}; filled in "
+        "from their neighbours, and not counted in the accuracy"
+    )
 
 
 def save_frames(path: Path, frames: Frames, **more: NDArray) -> None:

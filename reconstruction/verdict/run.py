@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.blas import one_blas_thread
+from emmc_rig.model.camera import measured_views
 from emmc_rig.model.compiling import compiling_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -73,10 +74,11 @@ def reconstruct_judged(
     capture.fit()
     capture.fit_bounds()
     differing = capture.fit_motion()
-    psi = capture.psi
+    psi, measured = capture.psi, measured_views(psi)
     result = dataclasses.replace(
         capture.result, screening=capture.notes, maps=named_maps(capture.result.maps, psi),
         seconds=capture.seconds, compiling_seconds=compiling_s() - compiling,
+        measured=None if measured.all() else measured,
     )  # fmt: skip
     verdict = verdict_from(gathered(psi, capture.read, result, capture.relief, differing))
     psi.even_unseen_colours(result.light_field)

@@ -21,8 +21,9 @@ BEFORE_THE_BOARDS = 4 * (2 + 1)
 
 
 def measured(
-    routes=MODELS, turns=(), optics=None, course=None, sensor=None, seed=0, size=SIZE, pinholes=None
-):
+    routes=MODELS, turns=(), optics=None, course=None, sensor=None, seed=0, size=SIZE,
+    pinholes=None, colours=False,
+):  # fmt: skip
     """Return (outcome, {route: agreement}) of the outside bench with its flaws."""
     optics = Optics(**(optics or {}))
     camera = camera_of(optics)
@@ -32,7 +33,7 @@ def measured(
     )  # fmt: skip
     if pinholes is None:
         pinholes = ALL_VIEWS if routes == EVERY else SOME_VIEWS
-    sets = Photographer(bench).sets(pinholes=pinholes, turns=turns)
+    sets = Photographer(bench).sets(pinholes=pinholes, turns=turns, colours=colours)
     found = calibrate(camera, camera.psi(size), routes, **sets)
     return found, {
         route: agreement(bench, known.psi.weights, known.deviation, found.good)
@@ -51,8 +52,8 @@ def is_true(agreement, once=(0.45, 0.95), twice=(0.88, 1.0)):
 
 
 FLAWS = {
-    "tilt, hot pixels, and cells of 0.03 and 0.93": {
-        "optics": {"tilt": (0.004, -0.002), "open": 0.93, "closed": 0.03},
+    "tilt, glare, hot pixels, and cells of 0.03 and 0.93": {
+        "optics": {"tilt": (0.004, -0.002), "glare": 0.01, "open": 0.93, "closed": 0.03},
         "sensor": {"hot": 0.002},
     },
     "exposures that differ": {"course": {"shutter": 0.003}},
@@ -193,3 +194,59 @@ def test_masks_that_stand_elsewhere_than_the_stage_says_are_named_and_counted(co
     assert "the mask is not where the stage reports it" in said(found)
     assert words in said(found)
     assert by_route["parametric"]["within_2"] > 0.9
+
+
+GLARE = {"in front of": {"glare": 0.01}, "behind": {"glare_after": 0.01}}
+
+
+@pytest.mark.parametrize("colours", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("where", ["behind", pytest.param("in front of", marks=pytest.mark.slow)])
+def test_glare_is_named_and_psi_keeps_it_in_the_pixels_own_colour(where, colours):
+    found, by_route = measured(EVERY, optics=GLARE[where], size=SMALLER, colours=colours)
+    words = re.search(r"glare of ([\d.]+)% \+- ([\d.]+)%, (.*) the colour filters", said(found))
+    assert words
+    assert float(words[1]) == pytest.approx(1.0, abs=0.05 + 2 * float(words[2]))
+    assert words[3] == where
+    assert "dust moved" not in said(found)
+    assert "colour filters pass" not in said(found)
+    for route, known in found.calibrations.items():
+        assert known.psi.weights.shape[4] == 1
+        assert 0.5 < by_route[route]["true"] / by_route[route]["stated"] < 1.5, route
+        assert is_true(by_route[route]), route
+
+
+@pytest.mark.slow
+def test_glare_in_front_and_behind_are_both_found_beside_crosstalk():
+    optics, sensor = {"glare": 0.015, "glare_after": 0.02}, {"crosstalk": 0.05}
+    found, by_route = measured(optics=optics, sensor=sensor, colours=True)
+    words = re.search(
+        r"glare of ([\d.]+)% .*, ([\d.]+)% in front of and ([\d.]+)% behind", said(found)
+    )
+    assert words
+    assert [float(word) for word in words.groups()] == pytest.approx([3.5, 1.5, 2.0], rel=0.2)
+    passed = re.search(r"filters pass up to ([\d.]+)%", said(found))
+    assert passed
+    assert float(passed[1]) == pytest.approx(5.0, abs=0.2)
+    assert 0.5 < by_route["parametric"]["true"] / by_route["parametric"]["stated"] < 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("colours", [True, False])
+def test_crosstalk_is_no_glare(colours):
+    found, by_route = measured(sensor={"crosstalk": 0.05}, colours=colours, size=SMALLER)
+    assert "glare" not in said(found)
+    assert ("filters pass up to 5" in said(found)) == colours
+    if colours:
+        assert 0.5 < by_route["parametric"]["true"] / by_route["parametric"]["stated"] < 1.5
+
+
+@pytest.mark.slow
+def test_coloured_references_do_not_take_glare_for_crosstalk_where_no_mask_is_fitted():
+    found, by_route = measured(
+        ("free",), optics=GLARE["behind"], size=SMALLER, pinholes=ALL_VIEWS, colours=True
+    )
+    words = re.search(r"glare of ([\d.]+)%", said(found))
+    assert words
+    assert float(words[1]) == pytest.approx(1.0, abs=0.1)
+    assert found.calibration.psi.weights.shape[4] == 1
+    assert is_true(by_route["free"])

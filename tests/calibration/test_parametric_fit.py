@@ -260,18 +260,18 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
 
 
 def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():
-    views, tolerances = (2, 2), Tolerances()
-    weights = ((0.5, 1.5), (1.0, 1.0))
-    covariance = np.zeros((len(SCALARS) + 4, len(SCALARS) + 4))
+    count, tolerances = VIEWS[0] * VIEWS[1], Tolerances()
+    weights = tuple(tuple(row) for row in np.linspace(0.5, 1.5, count).reshape(VIEWS).tolist())
+    covariance = np.zeros((len(SCALARS) + count, len(SCALARS) + count))
     spread = tolerances.aperture * np.ravel(weights)
-    covariance[-4:, -4:] = np.diag(spread**2)
-    found = shares_of_prior(Placement(aperture=weights), covariance, tolerances)
-    # Of four independent logarithms each less their mean: (1 - 1/4) of the variance is left.
-    np.testing.assert_allclose(found[-4:], np.sqrt(3 / 4))
+    covariance[-count:, -count:] = np.diag(spread**2)
+    found = shares_of_prior(MASK, Placement(aperture=weights), covariance, tolerances)
+    # Of nine independent logarithms each less their mean: (1 - 1/9) of the variance is left.
+    np.testing.assert_allclose(found[-count:], np.sqrt(8 / 9))
     assert found[: len(SCALARS)].max() == 0
-    half = shares_of_prior(Placement(aperture=weights), covariance / 4, tolerances)
-    np.testing.assert_allclose(half[-4:], np.sqrt(3 / 4) / 2)
-    assert len(tolerances.deviations(views)) == len(found)
+    half = shares_of_prior(MASK, Placement(aperture=weights), covariance / 4, tolerances)
+    np.testing.assert_allclose(half[-count:], np.sqrt(8 / 9) / 2)
+    assert len(tolerances.deviations(VIEWS)) == len(found)
 
 
 def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):

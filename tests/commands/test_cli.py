@@ -45,6 +45,14 @@ def test_cameras_are_listed_and_drawn(run, tmp_path):
     assert json.loads((tmp_path / "sheet/metrics.json").read_text())["light_efficiency"] > 0.3
 
 
+def test_a_camera_s_views_that_its_pupil_cuts_are_named(run, tmp_path):
+    lens = {"pupil": {"diameter_mm": 25}}
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump({"title": "round", "lens": lens}))
+    code, out, said = run("cameras", "c.yaml", "--out", "sheet")
+    assert code == 0
+    assert "views (0, 0), (0, 4), (4, 0), (4, 4) 14 % open" in " ".join((out + said).split())
+
+
 def test_a_folder_of_views_is_imaged(run, tmp_path):
     save_views(tmp_path / "views", np.random.default_rng(0).random((2, 2, 24, 32, 3)))
     mask = {"distance_mm": 0.12, "cell_um": 48, "pattern": {"kind": "random_rgbw"}}

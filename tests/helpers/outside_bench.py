@@ -17,8 +17,9 @@ Array = np.ndarray
 POINTS = 12
 COARSE_POINTS, COARSE_PARTS = 6, 6
 """Along a pixel and along an aperture cell, of rays that meet two masks."""
-ACROSS = 8
-"""Parts along a piece of the aperture that the pupil cuts, each with rays of its own."""
+ACROSS, PART_POINTS = 6, 8
+"""Parts along a piece of the aperture that the pupil cuts, and along a pixel the points from which
+rays run to each."""
 FINER = 20
 BESIDE_UM = 300.0
 """How far beside the picture the mask is drawn: where rays aslant and a mask that moves reach."""
@@ -495,7 +496,7 @@ class Bench:
         points, parts = (COARSE_POINTS, COARSE_PARTS) if two else (POINTS, 1)
         if piece.sides_um[0] < now.aperture_cell_um / 2:
             # A part of a cell that the pupil cuts: its many neighbours have rays as well.
-            points, parts = COARSE_POINTS, 1
+            points, parts = PART_POINTS, 1
         within = ((np.arange(points) + 0.5) / points - 0.5) * now.pitch_um
         within *= points / np.sqrt(points**2 - 1)  # the variance of a whole pixel
         sides = piece.sides_um[0] / parts, piece.sides_um[1] / parts

@@ -97,6 +97,7 @@ def test_the_sensor_is_characterised_by_the_session_that_calibrates_it(captured,
     # The series of exposures ends below saturation, which gives a lower bound of the capacity.
     assert "Saturation capacity, at least" in reported
     figures = json.loads((out / "sensor.json").read_text())
+    assert figures["Saturation capacity"]["remark"] == "at least"
     noise = find_camera("rgbw-bayer-1shot").sensor.noise
     gain, read = (figures[name] for name in ("Overall system gain K", "Temporal dark noise"))
     assert abs(gain["value"] - noise.gain_dn_per_electron) < 4 * gain["deviation"]

@@ -6,7 +6,9 @@ from scipy.stats.qmc import Sobol
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.masks import CFA
+from emmc_rig.model.pupil import Pupil
 from emmc_rig.simulators.bench import NO_ERRORS, Bench, MountingErrors, lens_points_um, ray_points
+from emmc_rig.simulators.flaws import OpticsFlaws
 from emmc_rig.simulators.sobol import AXES, sobol_points
 
 SIZE = (12, 18)
@@ -222,3 +224,40 @@ def test_every_axis_of_sobol_points_has_one_in_each_of_as_many_intervals():
     points = sobol_points(64, AXES, np.random.default_rng(1))
     for axis in range(AXES):
         assert sorted((64 * points[:, axis]).astype(int)) == list(range(64))
+
+
+PUPILS = {
+    "round": {"diameter_mm": 25},
+    "decentred": {"diameter_mm": 22, "centre_mm": [1.2, -0.7]},
+    "blades": {"shape": "polygon", "blades": 5, "diameter_mm": 27, "turn_deg": 11},
+    "square": {"shape": "square", "diameter_mm": 21, "turn_deg": 20},
+    "behind a rim": {"diameter_mm": 25, "rim": {"diameter_mm": 24, "shift": -20}},
+}
+
+
+@pytest.mark.parametrize("name", PUPILS)
+def test_rays_inside_the_pupil_sum_to_its_imaging_matrix(name):
+    camera, scene = coded(), light_field()
+    lens = camera.lens.model_copy(update={"pupil": Pupil.model_validate(PUPILS[name])})
+    camera = camera.model_copy(update={"lens": lens})
+    psi = build_imaging_matrix(camera, SIZE)
+    bench = bench_for(camera, scene, OPEN)
+    true = bench.true_psi(0).sum(axis=3)  # pixels see one colour
+    assert relative_error(true, psi.weights[0, :, :, :, 0]) < 1e-2
+    coded_readings = bench.readings()
+    bench.target, bench.masks_in = "whiteboard", False
+    open_board = bench.readings()
+    # The light that the pupil stops is lost.
+    if camera.lens.pupil.rim is None:
+        assert open_board.mean() == pytest.approx(camera.view_shares().mean(), rel=2e-3)
+    assert relative_error(coded_readings / open_board, psi.forward(scene)[0]) < 4e-3
+
+
+def test_the_real_pupil_of_a_bench_need_not_be_the_described_one():
+    pupil = Pupil(diameter_mm=20)
+    bench = Bench(
+        coded(masks={}), light_field(), SIZE, lambda: OPEN, WINDOW_UM, np.random.default_rng(0),
+        optics=OpticsFlaws(pupil=pupil),
+    )  # fmt: skip
+    bench.lamp, bench.target = "white", "whiteboard"
+    np.testing.assert_allclose(bench.readings(), np.pi * 10**2 / 25**2, rtol=1e-2)

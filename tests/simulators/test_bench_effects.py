@@ -277,3 +277,51 @@ def test_the_lamp_warms_up_and_its_colours_drift_apart():
     assert ratio[1, 1] == pytest.approx(1.01, rel=1e-4)
     warming = LampFlaws(0.02, 0.01).levels(120.0)
     np.testing.assert_allclose(warming, 1 + (1 - np.exp(-1)) * np.array([0.03, 0.02, 0.01]))
+
+
+def test_glare_lifts_black_before_the_filters_by_colour_and_behind_them_by_all():
+    plain, before, after = (
+        bench_of(optics=OpticsFlaws(**how)).true_psi(0)
+        for how in ({}, {"glare": 0.01}, {"glare_after": 0.01})
+    )
+    own = own_colour(np.ones_like(plain), bench_of()._response[0].argmax(-1)[None]) > 0
+    assert own.all()
+    lifted = before - 0.99 * plain
+    assert lifted.sum((0, 1)).max() < 0.011
+    assert before.sum(axis=3) == pytest.approx(before.max(axis=3))
+    # Behind the filters pixels see colours that theirs do not pass.
+    assert (after > 0).sum() > 2.5 * (plain > 0).sum()
+
+
+def test_a_turned_plate_moves_its_pinhole_about_the_axis_and_a_mask_creeps():
+    at_um = {"mask_x": 1.0, "mask_y": 0.0, "aperture_x": 3000.0, "aperture_y": 0.0}
+    found = OpticsFlaws(plate_turn_deg=2.0, creep_um_per_s=0.1, warming_um=100.0).moved(at_um, 60.0)
+    assert found["aperture_y"] == pytest.approx(3000 * np.sin(np.deg2rad(2.0)))
+    assert found["mask_x"] == pytest.approx(7.0)
+    assert found["lens"] == pytest.approx(100 * (1 - np.exp(-0.5)))
+
+
+def test_a_hole_passes_light_by_its_area():
+    optics = OpticsFlaws(hole_spread=0.2)
+    at_um = {**OPEN, "aperture_x": 0.0}
+    plain, spread = (
+        bench_of(at_um=at_um, rays=4096, optics=how) for how in (OpticsFlaws(), optics)
+    )
+    for bench in (plain, spread):
+        bench.masks_in = False
+    area = optics.hole_areas(CAMERA.views)[1, 1]
+    assert spread.readings().mean() / plain.readings().mean() == pytest.approx(area, rel=0.02)
+
+
+def test_odd_columns_are_brighter_by_their_gain_and_offset():
+    odd = SensorFlaws(odd_gain=0.1, odd_dn=5.0)
+    noise = SensorNoise()
+    light, dark = (
+        odd.expose_dn(noise, np.full((40, 40), level), 0.1, 1.0, np.random.default_rng(0)).astype(
+            float
+        )
+        for level in (0.5, 0.0)
+    )
+    assert np.diff([dark[:, k::2].mean() for k in (0, 1)])[0] == pytest.approx(5.0, abs=1.0)
+    above = [(light - dark)[:, k::2].mean() for k in (0, 1)]
+    assert above[1] / above[0] == pytest.approx(1.1, rel=0.02)
