@@ -265,7 +265,8 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
         if taken == 0 or taken > LARGEST_SHARE * count:
             break
         if more.any():
-            rows = [_seen_grains(shadow, part, more) for part in _parts(boards)]
+            new = _Chosen.of(more)
+            rows = [_seen_grains(shadow, part, new) for part in _parts(boards)]
             seen = sparse.csr_array(sparse.hstack([seen, sparse.vstack(rows)]))
             chosen = np.concatenate([chosen, np.flatnonzero(more)])
         losses, covariance = _solve_losses(seen, clean, chosen, count, spread)
@@ -286,31 +287,45 @@ def _residual(shadow: Shadow, board: Board) -> Array:
     return (board.reading[board.usable] - predicted) / scale
 
 
-def _seen_grains(shadow: Shadow, part: _Part, chosen: NDArray[np.bool_]) -> sparse.csr_array:
-    """Return the influences of the grains chosen, (row, column), over the pixels' deviations.
+class _Chosen(NamedTuple):
+    """Some grains of the mask, in the order of the flat mask."""
 
-    Shaped (pixel, grain), the grains in the order of the flat mask.
-    """
+    count: int
+    place: NDArray[np.intp]
+    """(grain of the flat mask,), among those chosen; -1: not chosen."""
+    sums: NDArray[np.intp]
+    """(row + 1, column + 1): those chosen above and to the left."""
+
+    @classmethod
+    def of(cls, chosen: NDArray[np.bool_]) -> _Chosen:
+        """Return grains that are True, (row, column)."""
+        count = int(chosen.sum())
+        place = np.full(chosen.size, -1)
+        place[chosen.ravel()] = np.arange(count)
+        return cls(count, place, np.pad(chosen.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))))
+
+    def within(self, corners: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+        """Return whether some lie in `count` rows and columns from corners (n, view, 2) on."""
+        top, left, bottom, right = (
+            np.clip(edges[:, :, axis], 0, self.sums.shape[axis] - 1)
+            for edges in (corners, corners + count)
+            for axis in range(2)
+        )
+        sums = self.sums
+        return sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left] > 0
+
+
+def _seen_grains(shadow: Shadow, part: _Part, chosen: _Chosen) -> sparse.csr_array:
+    """Return the influences of the grains chosen over the pixels' deviations, (pixel, grain)."""
     views_open, stage_um, _ = part.board.opening
     corners, _, shares_x, _ = shadow.footprints(part.pixels, views_open, stage_um)
-    # Chosen grains above and to the left: four of these sums count those in a footprint.
-    sums = np.pad(chosen.cumsum(axis=0).cumsum(axis=1), (1, 0))
-    ends = corners + shares_x.shape[2]
-    top, left, bottom, right = (
-        np.clip(edges[:, :, axis], 0, chosen.shape[axis])
-        for edges in (corners, ends)
-        for axis in range(2)
-    )
-    within = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    touched = np.flatnonzero(within.any(axis=1))
-    place = np.full(chosen.size, -1)
-    place[chosen.ravel()] = np.arange(chosen.sum())
-    shape = (len(part.pixels), int(chosen.sum()))
+    touched = np.flatnonzero(chosen.within(corners, shares_x.shape[2]).any(axis=1))
+    shape = (len(part.pixels), chosen.count)
     if len(touched) == 0:
         return sparse.csr_array(shape)
     how = part.board.opening, part.pixels[touched], part.channels[touched]
     index, influence = _entries(shadow, *how)
-    column = place[index]
+    column = chosen.place[index]
     rows, entries = np.nonzero((column >= 0) & (influence > 0))
     values = influence[rows, entries] / part.deviations[touched[rows]]
     return sparse.csr_array((values, (touched[rows], column[rows, entries])), shape=shape)

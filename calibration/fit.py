@@ -107,8 +107,8 @@ MOST_OF_PRIOR = 0.7
 """Of the prior's deviation: a parameter known no better stays at the design."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
-FIRST_GAIN = 0.5
-"""The same, before the last fit: of a move by a standard deviation, which later steps make."""
+FIRST_GAIN = 2.0
+"""The same, before the last fit: of a move by two standard deviations, which later steps make."""
 LEAST_CURVATURE = 0.3
 """Of the loss, over that of its weights: below it most pixels are outliers, and steps too long."""
 MOST_MORE_BOARDS = 200
@@ -370,7 +370,8 @@ class _Linear(NamedTuple):
     residual: Array
     """(n,), in deviations."""
     slope: Array
-    """(n, parameter + OWN), of the reading, over its deviation."""
+    """(n, parameter + OWN), of the reading, over its deviation: by the placement, the whiteboard's
+    brightness, and the mask's move in x and y."""
 
     def read(self, sample: Sample) -> Array:
         """Return the readings of the shadow, (n,): the slope by the whiteboard's brightness."""
@@ -394,10 +395,14 @@ def _linear_readings(
         else:
             read, slope = shadow.with_slopes(*where)
             by_area = np.zeros(len(read))
-        own = read, *(brightness * slope[:, OFFSETS].T), brightness * by_area
-        slope = np.concatenate([brightness * slope, np.stack(own, axis=1)], axis=1)
-        slope /= sample.deviation[:, None]
-        found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slope))
+        # In one pass over memory, which takes as long as the arithmetic.
+        count, factor = slope.shape[1], brightness / sample.deviation
+        slopes = np.empty((len(read), count + OWN))
+        np.multiply(slope, factor[:, None], out=slopes[:, :count])
+        slopes[:, count] = read / sample.deviation
+        slopes[:, count + 1 : count + LARGER] = slopes[:, OFFSETS]
+        slopes[:, count + LARGER] = factor * by_area
+        found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slopes))
     return tuple(found)
 
 

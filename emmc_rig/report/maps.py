@@ -35,7 +35,7 @@ def colour_table(name: str) -> NDArray[np.uint8]:
     """Return 256 colours, (256, 3), from least to most: gray, magma or blue-red (0 is white)."""
     codes = np.arange(256)
     if name == "gray":
-        return np.repeat(codes[:, None], 3, axis=1).astype(np.uint8)
+        return np.repeat(codes.astype(np.uint8)[:, None], 3, axis=1)
     if name == "magma":
         drawn = cv2.applyColorMap(codes.astype(np.uint8)[:, None], cv2.COLORMAP_MAGMA)
         return np.ascontiguousarray(drawn[:, 0, ::-1])
