@@ -257,9 +257,9 @@ def trace(
     points: (v, u, ray, 4). at_lens_um: (v, u, ray, 2), where the rays meet the lens, x and y.
     passes: (v, u, ray), whether plate and pupil let them through. rim: radius of the pupil's rim
     in um, 0: none, and by how many um it moves with each um of the pixel. lengths_um: lens
-    distance, sample pitch, sample width. cells: (1 + all cells, colour), the first opaque; starts, shapes:
-    where each mask lies in it, (rows, columns). plates: a `MaskRow` for each mask. falloff:
-    (v, u, y, x), or all 1.
+    distance, sample pitch, sample width. cells: (1 + all cells, colour), the first opaque; starts,
+    shapes: where each mask lies in it, (rows, columns). plates: a `MaskRow` for each mask.
+    falloff: (v, u, y, x), or all 1.
     points: (v, u, ray, 4 or 6), 6 where edges are blurred: the last two are normal.
     """
     rows, columns = readings.shape
