@@ -120,7 +120,9 @@ def average(
         if total is None:
             total = np.zeros(frame.shape)
             # The steps matter where there is little noise, and the first frame shows them.
-            step_dn = 1.0 if lit else step_of_values([frame])
+            # Values that are no whole numbers are no sensor's, and have no step.
+            whole = frame.dtype.kind == "u"
+            step_dn = 1.0 if lit or not whole else step_of_values([frame])
         if frame.shape != total.shape:
             raise CalibrationError(f"{what}: frames of {frame.shape} and {total.shape} differ")
         total += frame
