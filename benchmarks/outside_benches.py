@@ -234,7 +234,7 @@ def main() -> None:
     rows = lab.measured(points, measure, "outside_benches", args)
     accepted = rows[rows.route.fillna("") != ""]
     within = [
-        (accepted[column].astype(float) - share).abs() < 0.05
+        np.abs(accepted[column].astype(float) - share) < 0.05
         for column, share in (("within_1", 0.683), ("within_2", 0.954))
     ]
     _, axes = plt.subplots(figsize=(7, 0.25 * len(rows) + 1.5))
@@ -242,8 +242,8 @@ def main() -> None:
     axes.axvspan(*TRUE, alpha=0.2)
     axes.set(xlabel="true over stated error of Psi", xscale="log")
     lab.finished(rows.drop(columns="said"), axes, "outside_benches", args)
-    for row in rows.itertuples():
-        print(f"{row.bench}: {row.said}")
+    for bench, said in zip(rows.bench, rows.said, strict=True):
+        print(f"{bench}: {said}")
     print(
         f"true as stated: {(accepted.stated_true.astype(str) == 'True').sum()} of {len(accepted)}"
     )

@@ -79,9 +79,10 @@ class Glare:
         """Its standard deviation."""
         return float(np.sqrt(self.covariance.sum()))
 
-    def changed(self, step: Sequence[float]) -> Glare:
-        """Return glare larger by these shares, in front and behind."""
-        return replace(self, in_front=self.in_front + step[0], behind=self.behind + step[1])
+    def changed(self, step: NDArray[np.float64]) -> Glare:
+        """Return glare larger by these shares, (2,), in front and behind."""
+        in_front, behind = self.in_front + float(step[0]), self.behind + float(step[1])
+        return replace(self, in_front=in_front, behind=behind)
 
     def taken_out(self, board: Board) -> Board:
         """Return a whiteboard as it would be without glare."""
@@ -99,9 +100,8 @@ class Glare:
 
     def put_in(self, weights: Array, binning: int = 1) -> Array:
         """Return coefficients (..., y, stored colour, x) with the glare; given without."""
-        white, filters = (
-            plane.repeat(binning, 0).repeat(binning, 1) for plane in (self.white, self.filters)
-        )
+        white = self.white.repeat(binning, 0).repeat(binning, 1)
+        filters = self.filters.repeat(binning, 0).repeat(binning, 1)
         found = np.empty_like(weights)
         clear = white - self.behind * white.mean()
         every = np.ones(white.shape, dtype=bool)
@@ -231,7 +231,8 @@ def _best_kind(
         of_kind = np.zeros(2)
         of_kind[list(kind)] = shares
         best = gain
-        found = Glare(*of_kind.tolist(), both, response, white.astype(np.float64), filters)
+        in_front, behind = of_kind.tolist()
+        found = Glare(in_front, behind, both, response, white.astype(np.float64), filters)
     return found
 
 
