@@ -158,7 +158,7 @@ class Geometry:
             less, more = self.light((v, u), off_um - by), self.light((v, u), off_um + by)
             found[0, axis] = (more.share - less.share) / max(here.share, 0.01)
             found[1:3, axis] = -self.ratio * (more.middle_um - less.middle_um)
-        # What is cut of a hole makes it narrower.
+        # A cut hole is narrower, too.
         found[3] = found[0]
         return found / (2 * step_um)
 

@@ -147,8 +147,8 @@ def _likeliest_excess(board: Board, predicted: Array, spread: Array, unsteady: f
 def choose(judged: Sequence[HeldOut], stated: Mapping[str, float]) -> tuple[HeldOut, str]:
     """Return the description to use, and why in words.
 
-    Of those that predict the open whiteboard, which none has fitted, to the noise and what they
-    state, the one that states the least error. stated: relative error that each states of its Psi,
+    No method has fitted the open whiteboard. Among the methods whose residual there is noise, the
+    method of the least stated error is chosen. stated: relative error that each states of its Psi,
     by route. Raises CalibrationError with none to choose from.
     """
     if not judged:

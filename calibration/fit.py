@@ -766,7 +766,7 @@ def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
             where = pixels, board.channels.ravel(), board.views_open, stage_um, board.shot
             wider = shadow.with_widening(*where)[2] * own[LARGER]
             reading = reading - wider.reshape(reading.shape).astype(np.float32)
-        # What is cut of a hole has another shape as well as another area.
+        # A cut hole differs from a view in shape as well as in area.
         shape = (UNLIKE * own[LARGER] * np.maximum(reading, 0)) ** 2
         variance = (board.variance / level**2 + shape).astype(np.float32)
         found.append(

@@ -48,7 +48,7 @@ LAMPS = {
 RAYS_PER_VIEW = 128
 WINDOW_MARGIN = 0.05
 MORE_RAYS = 16
-"""Points tried for each ray inside a pupil, at least 4096: a view's open share is right to 0.1 %."""
+"""Points tried for each ray inside a pupil, at least 4096: open shares are right to 0.1 %."""
 FOCUS_PX_PER_UM = 0.01
 """Samples by which the scene moves from view to view for each um that the lens is out of focus."""
 KEPT_BYTES = 64_000_000
