@@ -333,7 +333,9 @@ SHORT = {
 
 
 def _lamp_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    size, deviation = np.array(cause.size), np.array(cause.deviation)
+    # Against the others: a level that all share is the references' as well.
+    size = np.array(cause.size) - np.median(cause.size)
+    deviation = np.array([check.brightness_deviation for check in fit.boards])
     flickering = int(np.sum(np.abs(size) > np.maximum(LARGEST_FLICKER, 5 * deviation)))
     if not flickering:
         return ""

@@ -153,7 +153,7 @@ def cell_openings(
 
     cell_um: between the middles of two views; fill: open width of a cell, of cell_um. Without a
     pupil every cell is open. whole: views that are one box (default: those that are wholly open);
-    every other view has `strips` boxes, even a shut view, so that boxes of several pupils correspond.
+    every other view has `strips` boxes, even if shut, so that boxes of several pupils correspond.
     """
     v_um, u_um = (centred_grid(count, cell_um) for count in views)
     open_um = cell_um * fill

@@ -38,7 +38,7 @@ def colour_table(name: str) -> NDArray[np.uint8]:
         return np.repeat(codes.astype(np.uint8)[:, None], 3, axis=1)
     if name == "magma":
         drawn = cv2.applyColorMap(codes.astype(np.uint8)[:, None], cv2.COLORMAP_MAGMA)
-        return np.ascontiguousarray(drawn[:, 0, ::-1])
+        return np.ascontiguousarray(drawn[:, 0, ::-1]).astype(np.uint8)
     assert name == "blue-red"
     known = np.array(RED_TO_BLUE[::-1], np.float64)
     at = np.linspace(0, 255, len(known))

@@ -253,8 +253,9 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     assert "in brightness against the other whiteboards" in lines.advice[0]
     # 3 um of the mask's shadow; one pinhole alone may be a mask that moved as well.
     far_um = 3.0 / MASK.distance_um * MASK.lens_um
-    off_um = float(re.search(r"pinholes stand up to (\d+) um", lines.findings[0])[1])
-    assert off_um == pytest.approx(far_um, rel=0.1)
+    words = re.search(r"pinholes stand up to (\d+) um", lines.findings[0])
+    assert words
+    assert float(words[1]) == pytest.approx(far_um, rel=0.1)
     assert "a mask that is not where the stage reports it" in lines.findings[0]
     assert fit.moved_um == pytest.approx(3.0, rel=0.2)
 

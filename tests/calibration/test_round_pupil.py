@@ -74,8 +74,10 @@ def test_views_open_to_their_edges_need_no_pupil(pupil):
 
 def test_the_bench_of_day_one_is_accepted_and_its_psi_true():
     found, by_route = measured(pupil_um=25_000.0)
-    pupil = found.parametric.fit.placement.fitted_pupil()
+    assert found.parametric is not None
     fit = found.parametric.fit
+    pupil = fit.placement.fitted_pupil()
+    assert pupil is not None
     assert pupil.diameter_mm == pytest.approx(25.0, abs=4 * 25 * fit.deviation("pupil_share"))
     assert pupil.centre_mm == pytest.approx((0.0, 0.0), abs=0.05)
     agreed = by_route["parametric"]

@@ -423,8 +423,9 @@ class Bench:
             splits = max(int(np.ceil(np.log2(shadow_um / PART_UM))), 0)
         share = float(disk.mean())
         if share == 0 or splits == 0:
-            middle = (float((disk * at).mean()) / max(share, 1e-12) for at in (y, x))
-            return [(Piece(piece.cell, tuple(middle), piece.sides_um), share)] if share else []
+            middle_y, middle_x = (float((disk * at).mean()) / max(share, 1e-12) for at in (y, x))
+            part = Piece(piece.cell, (middle_y, middle_x), piece.sides_um)
+            return [(part, share)] if share else []
         (at_v, at_u), (side_v, side_u) = piece.at_um, piece.sides_um
         quarters = [
             Piece(

@@ -15,7 +15,9 @@ MAP = Map("a <title>", VALUES, (-1, 1), "bar,\nunit", "blue-red", "x", "y", {0.5
 
 def test_a_map_shows_every_value_in_its_colour_and_what_is_unknown_in_white():
     (picture, _) = re.findall(r'href="data:image/png;base64,([^"]+)"', maps_svg([MAP]).decode())
-    colours = cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
+    colours = np.asarray(
+        cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
+    )
     blue, white, red = (5, 48, 97), (247, 247, 247), (103, 0, 31)
     expected = np.array([[blue, white, red], [(255, 255, 255), red, blue]])
     assert np.abs(colours[..., ::-1].astype(int) - expected).max() <= 1

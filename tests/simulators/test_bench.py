@@ -248,7 +248,9 @@ def test_rays_inside_the_pupil_sum_to_its_imaging_matrix(name):
     bench.target, bench.masks_in = "whiteboard", False
     open_board = bench.readings()
     # The light that the pupil stops is lost.
-    if camera.lens.pupil.rim is None:
+    pupil = camera.lens.pupil
+    assert pupil is not None
+    if pupil.rim is None:
         assert open_board.mean() == pytest.approx(camera.view_shares().mean(), rel=2e-3)
     assert relative_error(coded_readings / open_board, psi.forward(scene)[0]) < 4e-3
 

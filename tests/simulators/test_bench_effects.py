@@ -281,8 +281,8 @@ def test_the_lamp_warms_up_and_its_colours_drift_apart():
 
 def test_glare_lifts_black_before_the_filters_by_colour_and_behind_them_by_all():
     plain, before, after = (
-        bench_of(optics=OpticsFlaws(**how)).true_psi(0)
-        for how in ({}, {"glare": 0.01}, {"glare_after": 0.01})
+        bench_of(optics=flaws).true_psi(0)
+        for flaws in (OpticsFlaws(), OpticsFlaws(glare=0.01), OpticsFlaws(glare_after=0.01))
     )
     own = own_colour(np.ones_like(plain), bench_of()._response[0].argmax(-1)[None]) > 0
     assert own.all()
