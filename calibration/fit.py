@@ -234,9 +234,9 @@ class Fit:
         return float(np.sqrt(self.covariance[index, index]))
 
 
-FIRST_WIDTHS = {LAMP: 2e-3, STAGE: 0.2, HOLES: 0.05, EXPOSURE: 0.05}
+FIRST_WIDTHS = {LAMP: 2e-3, STAGE: 0.2, HOLES: 2e-3, EXPOSURE: 2e-3}
 """Of what whiteboards have of their own, before their causes are known; pinholes beside: LOOSE_UM.
-A narrow width would bend the placement, and bent causes would be found there."""
+Holes of wider spread would take what a round pupil makes of the views."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -243,7 +243,8 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> None:
     if creep is not None and np.hypot(*creep.size) > ALIKE_UM:
         raise CalibrationError(
             f"the mask drifts: by ({creep.size[0]:+.1f}, {creep.size[1]:+.1f}) um over the "
-            "whiteboards; fasten it, let the bench settle, and capture all again"
+            "whiteboards, or it moved between them; fasten it, let the bench settle, and capture "
+            "all again, in one go"
         )
     # Where the plate explains what pinholes show, the mask has not moved.
     off_plate = any(cause.name in OF_PLATE for cause in fit.causes)
@@ -292,7 +293,7 @@ def _refuse_wrong_holes(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> 
             raise CalibrationError(
                 f"{check.name}: it shows the shadow through the hole of view {shown}: the pinhole "
                 "was in the wrong hole, or the whiteboard is named for the wrong view; capture it "
-                "again, or correct its name"
+                "again, or correct its name; if the mask moved instead, capture all again"
             )
 
 

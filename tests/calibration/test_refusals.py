@@ -135,8 +135,8 @@ BAD = {
     "another cell": ({"camera": with_mask(cell_um=40.0)}, "not the mask of the design"),
     "another distance": ({"camera": with_mask(distance_mm=0.3)}, "are of another camera or mask"),
     "other filters": ({"camera": with_sensor(cfa="grbg")}, "of another camera, whose colour"),
-    "half of another day": ({"other": moved(12.0)}, "it moved between them, or"),
-    "half of a moved bench": ({"other": moved(120.0)}, "times as bright as the others suggest"),
+    "half of another day": ({"other": moved(12.0)}, "or it moved between them"),
+    "half of a moved bench": ({"other": moved(120.0)}, "if the mask moved instead, capture all"),
     "dimmer references": ({"fault": when("references", brighter(0.8))}, "taken with less light"),
     "saturated": ({"longer": 3.0}, "reference whiteboard, white lamp: saturated below the white"),
     "one view saturated": (
