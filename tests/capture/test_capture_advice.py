@@ -65,6 +65,7 @@ GUARDS = (
     "estimates no accuracy",  # its method does
     "); resume it",
     " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
+    ": use round, none, or a lens such as {diameter_mm: 27.5}",  # likewise
     ": the stage has no such axis, only ",  # a rig is opened before a session is made
     " is moved by plans: give its zero_um instead",  # likewise
     # A hook, a focus, sources and axes that are wrong are refused before a session is made.
