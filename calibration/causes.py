@@ -41,7 +41,7 @@ LEAST_OWN = (2e-5, 0.002, 0.002, 2e-5)
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
 rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
-MOVED_STEPS, BRIGHTNESSES = np.geomspace(1.0, 64.0, 9), np.geomspace(5e-5, 0.1, 12)
+MOVED_STEPS, BRIGHTNESSES = np.geomspace(1 / 16, 64.0, 17), np.geomspace(5e-5, 0.1, 12)
 """Widths that are tried: of moves in units of LEAST_MOVED_UM; of brightness relative."""
 LEAST_GAIN = 1.0
 """Of the log evidence by a cause: less tells nothing."""
@@ -72,6 +72,8 @@ class Cause:
     name: str
     columns: NDArray[np.float64]
     widths: NDArray[np.float64]
+    least: float = 0.0
+    """A smaller width is taken for what the model misses, see LEAST_MOVED_UM."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,12 +184,12 @@ def possible_causes(
     moved = MOVED_STEPS * LEAST_MOVED_UM
     causes = [
         Cause(LAMP, _own_columns(np.eye(count), 0), BRIGHTNESSES),
-        Cause(STAGE, _moves(np.eye(count)), moved),
+        Cause(STAGE, _moves(np.eye(count)), moved, LEAST_MOVED_UM),
     ]
     times = np.array([board.taken_s for board in boards])
     if np.ptp(times) > 0 and count > 2:
         when = (times - times.mean()) / np.ptp(times)
-        causes.append(Cause(CREEP, _moves(when[:, None]), 2 * moved))
+        causes.append(Cause(CREEP, _moves(when[:, None]), 2 * moved, 2 * LEAST_MOVED_UM))
     if few.sum() == 0:
         return causes
     # By the place of every pinhole, x and y: (board, OWN, board of the pinhole, 2).
@@ -197,8 +199,8 @@ def possible_causes(
     by_place = slopes.reshape(count * OWN, count, 2)
     loose = np.array([board.loose for board in boards])
     by_hand = few & loose if loose.any() else few
-    on_plate = moved / geometry.ratio
-    causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate))
+    on_plate, least = moved / geometry.ratio, LEAST_MOVED_UM / geometry.ratio
+    causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate, least))
     if few.sum() > 1:
         wider = np.zeros((count, OWN))
         wider[few, 0], wider[few, 3] = 1.0, 1.0
@@ -210,12 +212,12 @@ def possible_causes(
         return causes
     common = few[:, None].astype(np.float64)
     causes.append(Cause(EXPOSURE, _own_columns(common, 0), BRIGHTNESSES))
-    causes.append(Cause(PLATE, by_place.sum(axis=1), on_plate))
+    causes.append(Cause(PLATE, by_place.sum(axis=1), on_plate, least))
     places_um = plate_places_um(boards, geometry.cell_um)
     far_um = float(np.hypot(*places_um.T)[few].max())
     if few.sum() > 1 and far_um > 0:
         turned = np.einsum("obk,bk->o", by_place, turned_by(places_um))
-        causes.append(Cause(TURN, turned[:, None], on_plate / far_um))
+        causes.append(Cause(TURN, turned[:, None], on_plate / far_um, least / far_um))
     return causes
 
 
@@ -332,7 +334,11 @@ def find_causes(
         tried = {}
         for name in known.keys() - widths.keys():
             more = widths | {name: 0.0}
-            tried[name] = _best_width(own, known, more, name, own2)
+            evidence, width = _best_width(own, known, more, name, own2)
+            if width >= known[name].least * (1 - 1e-9):
+                tried[name] = evidence, width
+        if not tried:
+            break
         best = max(tried, key=lambda name: tried[name][0])
         gain = tried[best][0] - reached
         if gain < LEAST_GAIN:

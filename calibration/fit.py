@@ -49,7 +49,6 @@ from emmc_rig.calibration.causes import (
     OF_HOLES,
     OF_PLATE,
     OWN,
-    PLATE,
     SHIFTING,
     STAGE,
     Cause,
@@ -235,7 +234,7 @@ class Fit:
 
 
 FIRST_WIDTHS = {LAMP: 2e-3, STAGE: 0.2, HOLES: 2e-3, EXPOSURE: 2e-3}
-"""Of what whiteboards have of their own, before their causes are known; pinholes beside: LOOSE_UM.
+"""Of what whiteboards have of their own, before their causes are known; hands beside: LOOSE_UM.
 Holes of wider spread would take what a round pupil makes of the views."""
 
 
@@ -325,13 +324,17 @@ class _BenchPrior:
         own = np.linalg.inv(covariance_of(self.causes, widths, self.own2))
         size = len(self.centre)
         precision = np.zeros((size + len(own), size + len(own)))
-        precision[:size, :size] = np.diag(self.precision)
+        of_placement = self.precision.copy()
+        if HANDS in widths and not self.always:
+            # Pinholes a little off their holes look like glass before the mask.
+            of_placement[SCALARS.index("glass_um")] /= OF_LOOSE**2
+        precision[:size, :size] = np.diag(of_placement)
         precision[size:, size:] = own
         return _Prior(precision, np.concatenate([self.centre, np.zeros(len(own))]))
 
     def first_widths(self, ratio: float) -> dict[str, float]:
         """Return the widths before the causes are known."""
-        widths = FIRST_WIDTHS | dict.fromkeys((HANDS, PLATE), LOOSE_UM / ratio)
+        widths = FIRST_WIDTHS | dict.fromkeys(self.always, LOOSE_UM / ratio)
         return {name: width for name, width in widths.items() if name in self.causes}
 
 
