@@ -90,7 +90,7 @@ EFFECTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "columns": {"sensor": {"odd_gain": 0.02, "odd_dn": 2.0}},
 }
 """By name: what it changes in the fields of Flaws."""
-FAULTS = ("holes", "plate", "creep")
+FAULTS = ("holes", "plate", "creep", "warming")
 """Benches to mend rather than to calibrate as they are."""
 
 
@@ -99,8 +99,9 @@ def flawed(base: Bench, names: Iterable[str]) -> Bench:
 
     names: of EFFECTS, or TOGETHER: all of them but FAULTS. Keeps the class of `base`.
     """
+    together = [effect for effect in EFFECTS if effect not in FAULTS]
     for name in names:
-        for effect in EFFECTS if name == TOGETHER else (name,):
+        for effect in together if name == TOGETHER else (name,):
             for part, changes in EFFECTS[effect].items():
                 base = replace(base, **{part: replace(getattr(base, part), **changes)})
     return base
