@@ -359,23 +359,21 @@ def _holes_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: Sha
 
 
 def _size_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    larger, deviation = cause.size[0], cause.deviation[0]
-    if abs(larger) < max(LEAST_EXPOSURE, SIGNIFICANT * deviation):
-        return ""
-    return (
-        f"the plate's holes are all {abs(larger):.1%} +- {deviation:.1%} "
-        f"{'larger' if larger > 0 else 'smaller'} in area than a view: corrected for"
-    )
+    larger = _share(cause, "larger", "smaller")
+    return larger and f"the plate's holes are all {larger} in area than a view: corrected for"
 
 
 def _exposure_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    more, deviation = cause.size[0], cause.deviation[0]
-    if abs(more) < max(LEAST_EXPOSURE, SIGNIFICANT * deviation):
+    longer = _share(cause, "longer", "shorter")
+    return longer and f"the exposures through the pinhole were {longer} than noted: corrected for"
+
+
+def _share(cause: FoundCause, more: str, less: str) -> str:
+    """Return a cause's one coefficient with its deviation, "" where it is small or chance."""
+    share, deviation = cause.size[0], cause.deviation[0]
+    if abs(share) < max(LEAST_EXPOSURE, SIGNIFICANT * deviation):
         return ""
-    return (
-        f"the exposures through the pinhole were {abs(more):.1%} +- {deviation:.1%} "
-        f"{'longer' if more > 0 else 'shorter'} than noted: corrected for"
-    )
+    return f"{abs(share):.1%} +- {deviation:.1%} {more if share > 0 else less}"
 
 
 def _hands_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:

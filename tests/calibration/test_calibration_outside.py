@@ -250,3 +250,43 @@ def test_coloured_references_do_not_take_glare_for_crosstalk_where_no_mask_is_fi
     assert float(words[1]) == pytest.approx(1.0, abs=0.1)
     assert found.calibration.psi.weights.shape[4] == 1
     assert is_true(by_route["free"])
+
+
+@pytest.mark.parametrize(
+    ("bench", "words", "value", "within"),
+    [
+        ({"optics": {"plate_turn_deg": 2.0}}, r"the plate is turned by \+([\d.]+)", 2.0, 0.1),
+        pytest.param(
+            {"optics": {"holes": 0.05}}, r"their areas differ by ([\d.]+)%", 5.0, 1.5,
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"course": {"hands_um": 100.0}}, r"stand up to (\d+) um off their holes", 100.0, 15.0,
+            marks=pytest.mark.slow,
+        ),
+        (
+            {"course": {"pinhole_longer": 0.02}},
+            r"exposures through the pinhole were ([\d.]+)% .* longer", 2.0, 0.1,
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_pinholes_is_named_first_with_its_size(bench, words, value, within):
+    found, by_route = measured(EVERY, **bench)
+    named = re.search(words, found.findings[0])
+    assert named, found.findings
+    assert float(named[1]) == pytest.approx(value, abs=within)
+    assert "the lamp is not steady" not in said(found)
+    assert "stage reports" not in said(found)
+    assert by_route[found.chosen]["true"] < 0.0065
+
+
+@pytest.mark.parametrize(
+    ("course", "words"),
+    [
+        ({"beside": ((1, 1), (1, 2))}, r"shows the shadow through the hole of view \(1, 2\)"),
+        ({"creep_um": 0.1}, "the mask drifts: by"),
+    ],
+)
+def test_a_hole_beside_and_a_mask_that_drifts_are_refused_by_name(course, words):
+    with pytest.raises(CalibrationError, match=words):
+        measured(EVERY, size=SMALLER, course=course)
