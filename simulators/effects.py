@@ -90,16 +90,17 @@ EFFECTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "columns": {"sensor": {"odd_gain": 0.02, "odd_dn": 2.0}},
 }
 """By name: what it changes in the fields of Flaws."""
-FAULTS = ("holes", "plate", "creep", "warming")
-"""Benches to mend rather than to calibrate as they are."""
+APART = ("holes", "plate", "creep", "warming", "glare")
+"""Left out of TOGETHER: faults of a bench to mend rather than to calibrate, and glare, beside which
+the others are stated too large."""
 
 
 def flawed(base: Bench, names: Iterable[str]) -> Bench:
     """Return a bench with these effects beside what is wrong with it already.
 
-    names: of EFFECTS, or TOGETHER: all of them but FAULTS. Keeps the class of `base`.
+    names: of EFFECTS, or TOGETHER: all of them but APART. Keeps the class of `base`.
     """
-    together = [effect for effect in EFFECTS if effect not in FAULTS]
+    together = [effect for effect in EFFECTS if effect not in APART]
     for name in names:
         for effect in together if name == TOGETHER else (name,):
             for part, changes in EFFECTS[effect].items():
