@@ -181,9 +181,14 @@ def possible_causes(
     count = len(boards)
     off_um = np.zeros((count, 2)) if off_um is None else off_um
     few = np.array([through_pinhole(board) for board in boards])
+    loose = np.array([board.loose for board in boards])
     moved = MOVED_STEPS * LEAST_MOVED_UM
+    # Where pinholes stand off their holes, a lone open whiteboard is the only sure level.
+    lit = np.eye(count)
+    if (loose.any() or off_um.any()) and (~few).sum() == 1:
+        lit[~few] = 0.0
     causes = [
-        Cause(LAMP, _own_columns(np.eye(count), 0), BRIGHTNESSES),
+        Cause(LAMP, _own_columns(lit, 0), BRIGHTNESSES),
         Cause(STAGE, _moves(np.eye(count)), moved, LEAST_MOVED_UM),
     ]
     times = np.array([board.taken_s for board in boards])
@@ -197,7 +202,6 @@ def possible_causes(
     for index in np.flatnonzero(few):
         slopes[index, :, index] = geometry.slopes(boards[index], off_um[index])
     by_place = slopes.reshape(count * OWN, count, 2)
-    loose = np.array([board.loose for board in boards])
     by_hand = few & loose if loose.any() else few
     on_plate, least = moved / geometry.ratio, LEAST_MOVED_UM / geometry.ratio
     causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate, least))

@@ -49,6 +49,7 @@ from emmc_rig.calibration.causes import (
     OF_HOLES,
     OF_PLATE,
     OWN,
+    PLATE,
     SHIFTING,
     STAGE,
     Cause,
@@ -319,14 +320,17 @@ class _BenchPrior:
         again = possible_causes(boards, geometry, off_um)
         return replace(self, causes={cause.name: cause for cause in again}, geometry=geometry)
 
-    def with_widths(self, widths: Mapping[str, float]) -> _Prior:
-        """Return the prior of all parameters; widths: of the causes, by name."""
+    def with_widths(self, widths: Mapping[str, float], aberrant: bool = False) -> _Prior:
+        """Return the prior of all parameters; widths: of the causes, by name.
+
+        aberrant: whether aberrations displace the views.
+        """
         own = np.linalg.inv(covariance_of(self.causes, widths, self.own2))
         size = len(self.centre)
         precision = np.zeros((size + len(own), size + len(own)))
         of_placement = self.precision.copy()
-        if HANDS in widths and not self.always:
-            # Pinholes a little off their holes look like glass before the mask.
+        if aberrant:
+            # Views that are displaced look like glass before the mask.
             of_placement[SCALARS.index("glass_um")] /= OF_LOOSE**2
         precision[:size, :size] = np.diag(of_placement)
         precision[size:, size:] = own
@@ -828,7 +832,8 @@ def fit_placement(
         elif turn > 1:
             break
         found = _find_causes(mask, descent.point, whole, bench)
-        prior = bench.with_widths(_own_widths(found, ratio))
+        aberrant = any(cause.name == LENS for cause in found)
+        prior = bench.with_widths(_own_widths(found, ratio), aberrant)
         descent = _descend(mask, descent.point, whole, prior, settings, least_gain)
         steps += descent.steps
         off_plate = any(cause.name in OF_PLATE for cause in found)
