@@ -47,6 +47,8 @@ LEAST_GAIN = 1.0
 """Of the log evidence by a cause: less tells nothing."""
 NEARLY = 3.0
 """Difference of the log evidence of causes that fit nearly alike: a factor of 20."""
+FEWEST_PINHOLES = 4
+"""Whiteboards of fewer do not tell their pinholes' places from the mask's distance."""
 LONE = 0.9
 """Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
 LAMP, STAGE, CREEP, LENS = "lamp", "stage", "creep", "lens"
@@ -195,7 +197,7 @@ def possible_causes(
     if np.ptp(times) > 0 and count > 2:
         when = (times - times.mean()) / np.ptp(times)
         causes.append(Cause(CREEP, _moves(when[:, None]), 2 * moved, 2 * LEAST_MOVED_UM))
-    if few.sum() == 0:
+    if few.sum() < (1 if loose.any() else FEWEST_PINHOLES):
         return causes
     # By the place of every pinhole, x and y: (board, OWN, board of the pinhole, 2).
     slopes = np.zeros((count, OWN, count, 2))

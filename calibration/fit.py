@@ -321,11 +321,12 @@ class _BenchPrior:
         return replace(self, causes={cause.name: cause for cause in again}, geometry=geometry)
 
     def with_widths(self, widths: Mapping[str, float], aberrant: bool = False) -> _Prior:
-        """Return the prior of all parameters; widths: of the causes, by name.
+        """Return the prior of all parameters; widths: of the causes, by name, possible or not.
 
         aberrant: whether aberrations displace the views.
         """
-        own = np.linalg.inv(covariance_of(self.causes, widths, self.own2))
+        possible = {name: width for name, width in widths.items() if name in self.causes}
+        own = np.linalg.inv(covariance_of(self.causes, possible, self.own2))
         size = len(self.centre)
         precision = np.zeros((size + len(own), size + len(own)))
         of_placement = self.precision.copy()
@@ -338,8 +339,7 @@ class _BenchPrior:
 
     def first_widths(self, ratio: float) -> dict[str, float]:
         """Return the widths before the causes are known."""
-        widths = FIRST_WIDTHS | dict.fromkeys(self.always, LOOSE_UM / ratio)
-        return {name: width for name, width in widths.items() if name in self.causes}
+        return FIRST_WIDTHS | dict.fromkeys((HANDS, PLATE), LOOSE_UM / ratio)
 
 
 def _bench_prior(

@@ -418,7 +418,7 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
             few.exposures,
         )
     best = models.get("mixed", models["parametric"])
-    refusals.refuse_tilted_board(best.shadow, [*readings.judges, *seen])
+    refusals.refuse_tilted_board(best.shadow, [*readings.judges, *readings.seen])
     findings += words.pupil_finding(best.fit, best.mask)
     findings += words.mask_findings(best.fit)
     findings += filter(None, [best.mask.repeats.words])
