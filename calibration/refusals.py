@@ -312,7 +312,8 @@ def refuse_tilted_board(
         across, deviation = _fit_gradient(shadow, board)
         limit = model * limits[bool(board.views_open.all())]
         worst = int(np.argmax(np.abs(across)))
-        if abs(across[worst]) > max(limit, SURE * deviation):
+        # Refused unless it is within the limit to its deviation.
+        if abs(across[worst]) > max(limit - deviation, SURE * deviation):
             raise CalibrationError(
                 f"{board.name}: its brightness against the reference changes by "
                 f"{abs(across[worst]):.0%} from {('top to bottom', 'left to right')[worst]}: the "
