@@ -51,7 +51,7 @@ class Parametric:
 def shot_stages(camera: Camera) -> Stages:
     """Return where the mask stage stands in every shot, x and y in um: as the camera says.
 
-    All masks that move are on one stage.
+    The stage moves every mask that moves.
     """
     return [next(iter(shot.offset_um.values()), (0.0, 0.0)) for shot in camera.shots]
 

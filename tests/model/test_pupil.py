@@ -1,4 +1,4 @@
-"""The lens's pupil in Psi, against rays that are followed one by one through its opening."""
+"""The lens's pupil in Psi, against single rays through its opening."""
 
 from __future__ import annotations
 
