@@ -6,7 +6,8 @@ saddles over the aperture, the same open whiteboard after the turn reads
 sum_j psi_j (1 + sum_k c_k (t_k(turned u_j) - t_k(u_j))): linear in c, and the views' shadows show
 the terms apart. Which way a board was turned is not taken on trust: half a turn reads alike both
 ways, and with it a quarter turn shows its sense. The mask may have moved meanwhile: its place is
-fitted beside.
+fitted beside. An error of Psi looks alike in all boards: the board as it stood before it was turned
+shows it.
 
 What no turn changes, a lamp from one side, gloss, a board that does not fill the aperture, looks as
 if the aperture let so much through. `leaning` measures the lopsided part.
@@ -97,23 +98,26 @@ def board_over_angle(
 ) -> BoardAngle:
     """Return the board's radiance from open whiteboards by the degrees it was turned.
 
-    psi: as measured with the board not turned. shadow: of the mask as fitted, which shows where it
-    stands (None: it is taken to stand still).
+    psi: as measured with the board not turned. turned: with the board at 0 degrees, what Psi errs
+    by is fitted beside; without it, Psi is taken as true. shadow: of the mask as fitted, which
+    shows where it stands (None: it is taken to stand still).
     """
     views = psi.light_field_shape[:2]
     upright = _radiance_terms(views, 0.0)
     size, flat = len(upright), upright.reshape(len(upright), -1)
     seen = {turn: _fit_turned_board(psi, board, flat, shadow) for turn, board in turned.items()}
     noise = max(1.0, float(np.mean([measured.squares for measured in seen.values()])))
+    of_psi = np.eye(size)[: size * (0.0 in seen)]
 
     def solve_for_sense(sense: int) -> tuple[Array, Array, float, Array]:
         """Return terms, covariance, squared misfit and what each board leaves."""
-        matrix, right = np.zeros((size, size)), np.zeros(size)
+        count = size + len(of_psi)
+        matrix, right = np.zeros((count, count)), np.zeros(count)
         maps = {}
         for turn, measured in seen.items():
             change = (_radiance_terms(views, sense * turn) - upright).reshape(size, -1)
-            # The change by its own terms.
-            maps[turn] = change @ np.linalg.pinv(flat)
+            # The change by its own terms, and the error of Psi, which is in every board.
+            maps[turn] = np.vstack([change @ np.linalg.pinv(flat), of_psi])
             matrix += maps[turn] @ measured.information @ maps[turn].T
             right += maps[turn] @ measured.information @ measured.change
         inverse = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
@@ -121,27 +125,27 @@ def board_over_angle(
         left = np.array([measured.change - maps[turn].T @ found for turn, measured in seen.items()])
         pairs = zip(left, seen.values(), strict=True)
         misfit = sum(float(off @ measured.information @ off) for off, measured in pairs)
-        return found, inverse * noise, misfit / noise, left
+        return found[:size], inverse[:size, :size] * noise, misfit / noise, left
 
     both = {sense: solve_for_sense(sense) for sense in (1, -1)}
     sense = min(both, key=lambda tried: both[tried][2])
     found, covariance, misfit, left = both[sense]
-    freedom = size * (len(seen) - 1)
+    inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
+    significance = float(np.sqrt(found @ inverse @ found / size))
+    freedom = size * (len(seen) - 1) - len(of_psi)
     if both[-sense][2] - misfit < CLEARLY:
         other = both[-sense][0]
         covariance = covariance + np.outer(found - other, found - other) / 4
         found, sense = (found + other) / 2, 0
     radiance = 1 + np.tensordot(found, upright, 1)
     deviation = np.sqrt(np.einsum("kvu,kl,lvu->vu", upright, covariance, upright))
-    inverse = np.linalg.pinv(both[1][1], rcond=1e-9, hermitian=True)
-    single = both[1][0]
     apart = max(float(np.ptp(change @ flat)) for change in left)
     return BoardAngle(
         radiance / radiance.mean(),
         deviation.astype(np.float64),
-        float(np.sqrt(single @ inverse @ single / size)),
+        significance,
         sense,
-        {turn: measured.moved_um for turn, measured in seen.items()},
+        {turn: measured.moved_um for turn, measured in seen.items() if turn},
         (apart, float(np.sqrt(misfit / freedom)) if freedom else 0.0),
     )
 

@@ -515,8 +515,7 @@ def _measure_views(
     free = replace(measure_psi(pinholes, task.design, empty, on_plane), good=readings.good)
     if modelled.best is not None and modelled.best.fit.causes:
         _correct_pinholes(free, modelled.best, readings.seen, task.design)
-    at_first = (board for board in readings.judges if board.shot == 0)
-    still = next((b for b in at_first if np.allclose(b.stage_um, task.stages[0])), None)
+    still = _board_of_first_shot(task, readings)
     if still is None:
         raise CalibrationError(
             "the calibration method free is judged by an open whiteboard with the mask where "
@@ -596,6 +595,12 @@ def _separate_colours(
     return {name: in_three_colours(known, others) for name, known in calibrations.items()}
 
 
+def _board_of_first_shot(task: _Task, readings: _Readings) -> Board | None:
+    """Return the open validation whiteboard with the mask where the first shot has it."""
+    at_first = (board for board in readings.judges if board.shot == 0)
+    return next((b for b in at_first if np.allclose(b.stage_um, task.stages[0])), None)
+
+
 def _correct_board_and_views(
     task: _Task,
     modelled: _Modelled,
@@ -613,6 +618,8 @@ def _correct_board_and_views(
             turn: as_readings(boards, task.design, modelled.readings.good)[0]
             for turn, boards in turned.items()
         }
+        if (upright := _board_of_first_shot(task, modelled.readings)) is not None:
+            open_boards[0.0] = upright
         board = board_over_angle(calibrations[chosen].psi, open_boards, shadow)
         refusals.refuse_uneven_board(board)
         findings += words.angle_findings(board)

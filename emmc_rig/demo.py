@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from emmc_rig.bench.hardware import Rig, simulated_rig, with_simulated_pupil
+from emmc_rig.bench.hardware import Rig, simulated_rig
 from emmc_rig.bench.rig_config import SIMULATED
 from emmc_rig.calibration.whiteboard import Calibration, ideal_boards, lamps_needed, measure_psi
 from emmc_rig.captures.plan import Boards, Checks, Darks, Plan, PlannedShot
@@ -128,8 +128,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
     watcher = watcher or Watcher()
     find_method(settings.method)
     stages = _Stages(watcher)
-    # What a bench's owner reads off the lens is described; what nobody can know stays unknown.
-    camera = with_simulated_pupil(settings.camera)
+    camera = settings.camera
     with stages("scene"):
         fine = fine_scene(
             settings.scene,

@@ -88,9 +88,9 @@ NO_STAGE = "none"
 PROBE_TIMEOUT_S = 0.2
 MICROMETER = 0.1
 """By how much surer a hand puts a mask on its micrometer than a pinhole on its hole."""
-DEFAULT_PUPIL_OF_VIEWS: float | None = None
-"""Diameter of the simulated lens's round pupil, over the side of the square of all views: 1.1 is an
-f/1.8 50 mm lens behind 25 mm of views, whose corners are 37 % open. None: the views' square."""
+PUPIL_OF_VIEWS = 10 / 7
+"""Diameter of the simulated lens's round pupil, over the side of the square of all views: docs/
+day-one.md recommends 25 mm around 5 x 3.5 mm, so that the corner views lie just inside."""
 NO_FLAWS = Flaws()
 """But for a mask that sits a few um off, as every one does."""
 SIMULATED_SCALES = {
@@ -220,16 +220,9 @@ def default_pupil(camera: Camera) -> Pupil | None:
     """
     described = camera.lens.pupil
     apertures = camera.view_axes == ANGLES and camera.lens.aperture_fill > 0
-    if described is not None or DEFAULT_PUPIL_OF_VIEWS is None or not apertures:
+    if described is not None or not apertures:
         return described
-    side_mm = whole_pupil(camera).diameter_mm
-    return Pupil(diameter_mm=round(DEFAULT_PUPIL_OF_VIEWS * side_mm, 6))
-
-
-def with_simulated_pupil(camera: Camera) -> Camera:
-    """Return the camera, described with the pupil of the lens that simulates it by default."""
-    lens = camera.lens.model_copy(update={"pupil": default_pupil(camera)})
-    return camera.model_copy(update={"lens": lens})
+    return Pupil(diameter_mm=round(PUPIL_OF_VIEWS * whole_pupil(camera).diameter_mm, 6))
 
 
 def simulated_rig(
@@ -249,8 +242,8 @@ def simulated_rig(
     fine_scene: see `simulators.bench.Bench`. size: rows and columns of the light field. clock: a
     real one lets moves and exposures take their time; by default they take none. The noise of a
     frame that is announced by name follows from the name alone. The lens has the pupil of `flaws`,
-    or `default_pupil`. rays_per_view: of one pixel; few
-    rays are quick, and grainy beside a good sensor's noise. flaws: imperfections of the bench.
+    or `default_pupil`. rays_per_view: of one pixel; few rays are quick, and grainy beside a good
+    sensor's noise. flaws: imperfections of the bench.
     focus_um: place of a fifth axis, `focus`, where the scene is sharp; None: no such axis.
     fixed_positions_um: see `Rig`. fitted: with which axes and camera. Raises AppError for a size
     that the camera's RAW files cannot hold.

@@ -14,7 +14,6 @@ from pydantic import Field, ValidationError, field_validator
 from emmc_rig.bench.environment import Source, SourceConfig
 from emmc_rig.bench.hands import Ask, AskingAttendant, NoAttendant
 from emmc_rig.bench.hardware import (
-    DEFAULT_PUPIL_OF_VIEWS,
     NO_FLAWS,
     NO_STAGE,
     STAGE_AXES,
@@ -207,7 +206,7 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
 
 def _of_now(imaged: ImagedRig) -> ImagedRig:
     """Return a new rig, the lens round where nothing is said of it."""
-    if imaged.pupil is not None or DEFAULT_PUPIL_OF_VIEWS is None:
+    if imaged.pupil is not None:
         return imaged
     return imaged.model_copy(update={"pupil": "round"})
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from emmc_rig.bench import hardware
-from emmc_rig.bench.hardware import default_pupil, with_simulated_pupil
+from emmc_rig.bench.hardware import default_pupil
 from emmc_rig.bench.rig_config import SIMULATED, ImagedRig, opened_rig, rig_description
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
@@ -59,13 +58,10 @@ def test_a_session_of_an_earlier_version_keeps_its_lens(described, open_share):
     assert white_reading(rig, camera_with(described)) == pytest.approx(open_share, rel=0.01)
 
 
-def test_by_default_the_lens_is_a_disk_a_little_wider_than_the_views(monkeypatch):
-    monkeypatch.setattr(hardware, "DEFAULT_PUPIL_OF_VIEWS", 1.1)
-    assert default_pupil(camera_with(None)) == Pupil(diameter_mm=27.5)
+def test_by_default_the_lens_is_a_disk_around_all_views():
+    assert default_pupil(camera_with(None)) == Pupil(diameter_mm=round(25 * 10 / 7, 6))
     assert default_pupil(camera_with(DESCRIBED)) == DESCRIBED
-    assert with_simulated_pupil(camera_with(None)).view_shares()[0, 0] == pytest.approx(
-        0.37, abs=0.01
-    )
+    assert camera_with(default_pupil(camera_with(None))).view_shares().min() == 1
     # The paper's apertures are points, and bands of a spectrum are no places of the aperture.
     assert default_pupil(find_camera("scenario-ii-cfa")) is None
     bands = camera_with(None).model_copy(update={"view_axes": ("angle", "band")})

@@ -121,6 +121,17 @@ def test_a_turned_board_separates_its_unevenness_from_the_cameras():
     assert (np.abs(once.radiance - true) < 2 * once.deviation + 1e-3).all()
 
 
+def test_an_error_of_psi_is_no_unevenness_of_the_board():
+    psi, rng = random_psi(), np.random.default_rng(1)
+    wrong = 1 + 0.05 * np.linspace(-1, 1, 5)[:, None] ** 2 + 0.03 * np.linspace(-1, 1, 5)
+    measured = ImagingMatrix(psi.weights * wrong[None, :, :, None, None, None], psi.colour)
+    turned = {90.0 * n: open_board(psi, np.ones((5, 5)), 1e-3, rng) for n in range(4)}
+    assert not board_over_angle(measured, turned).uneven
+    without = {turn: board for turn, board in turned.items() if turn}
+    assert board_over_angle(measured, without).uneven
+    assert board_over_angle(measured, without).disagreement[1] > 5
+
+
 def test_an_even_board_is_found_even():
     psi = random_psi()
     board = open_board(psi, np.ones((5, 5)), 1e-3, np.random.default_rng(2))

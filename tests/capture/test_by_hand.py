@@ -9,7 +9,7 @@ import yaml
 from programs import done, refused
 
 from emmc_rig.bench.hands import AskingAttendant, NoAttendant, hole_name
-from emmc_rig.bench.hardware import Fitted, simulated_rig, with_simulated_pupil
+from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.captures import bench_check
 from emmc_rig.captures.bench_check import ability
 from emmc_rig.captures.by_hand import HandPlaces, with_hands
@@ -54,7 +54,7 @@ def _ways_once():
 def bench_of(axes, hands_um=0.0, plan=PLAN, second=(), seed=0, rays=64):
     """Return rig, its bench, camera and ordered frames."""
     read = Plan.model_validate(plan)
-    camera = with_simulated_pupil(planned_camera(read))
+    camera = planned_camera(read)
     fine = fine_scene("deep-occlusions", 1, 1, size=SIZE, views=camera.views, seed=0)
     fitted = Fitted(tuple(axes), tuple(second), hands_um)
     rig, bench = simulated_rig(camera, fine.samples, SIZE, seed, None, rays, fitted=fitted)
@@ -161,11 +161,7 @@ def test_wrong_holes_are_named_and_asked_for_again(swaps, views, tmp_path, monke
 
     monkeypatch.setattr(hardware.SimulatedAttendant, "move", wrong_once)
     boards = PLAN["whiteboards"] | {"views": views}
-    # Of a lens that is described, places are those of the holes, not of what is open of them.
-    camera = with_simulated_pupil(find_camera(PLAN["camera"])).model_dump(mode="json")
-    (tmp_path / "round.yaml").write_text(yaml.safe_dump(camera))
-    described = PLAN | {"camera": "round.yaml", "whiteboards": boards}
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(described))
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN | {"whiteboards": boards}))
     (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_x, mask_y]\nhands_um: 100\n")
     plan, rig = tmp_path / "plan.yaml", tmp_path / "rig.yaml"
     done(run("capture", plan, "--rig", rig, "--size", "48x64", "--rays", 64))

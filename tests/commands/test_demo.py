@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from watching import Recorder
 
-from emmc_rig.bench.hardware import with_simulated_pupil
 from emmc_rig.demo import DemoSettings, run_demo
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.exports import open_export
@@ -72,7 +71,7 @@ def test_the_measured_psi_is_saved_with_its_camera(demo):
     folder, _, _ = demo
     psi = ImagingMatrix.load(folder / "psi.h5")
     described = Camera.model_validate_json(psi.camera_json)
-    assert described == with_simulated_pupil(find_camera("rgbw-bayer-3shots"))
+    assert described == find_camera("rgbw-bayer-3shots")
     with h5py.File(folder / "frames.h5") as file:
         frames_dn = np.asarray(file["frames_dn"])
     assert frames_dn.shape == psi.frames_shape
