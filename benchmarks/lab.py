@@ -93,6 +93,7 @@ def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, ar
     the program. The run's command and date go into RUNS.
     """
     points = list(points)
+    args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{name}.csv"
     kept = pd.read_csv(path, dtype=str) if path.is_file() else pd.DataFrame()
     keys = list(points[0])
