@@ -105,6 +105,8 @@ FEWEST_PIXELS = 400
 """Of a whiteboard, however many there are."""
 MOST_OF_PRIOR = 0.7
 """Of the prior's deviation: a parameter known no better stays at the design."""
+LEAST_CHANGE, CHANGE_PIXELS = 1e-3, 500
+"""Of Psi, by a parameter that the prior decides: less is of no account. By so many pixels."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
 FIRST_GAIN = 2.0
@@ -141,12 +143,12 @@ SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
-TAUS_UM = np.geomspace(0.003, 1.0, 6)
-"""Of each kind: from far less than any whiteboard shows to a tenth of a pixel."""
+TAUS_UM = np.array([0.0, *np.geomspace(0.003, 1.0, 5)])
+"""Of each kind: none, and from far less than any whiteboard shows to a tenth of a pixel."""
 TAU_UM = 0.1
-"""Beforehand tau is a half-t of 3 degrees of freedom and this scale (Gelman 2006, Bayesian Analysis
-1:515): there are too few views to determine it well. Uniform up to 1 um, whiteboards of nine views
-left a distance that was 12 % off undecided."""
+"""Beforehand tau is 0 or, as likely, a half-t of 3 degrees of freedom and this scale (Gelman 2006,
+Bayesian Analysis 1:515): there are too few views to determine it well. Uniform up to 1 um,
+whiteboards of nine views left a distance that was 12 % off undecided."""
 
 
 class FitSettings(Settings):
@@ -191,7 +193,7 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`.
     correlation: of the readings with the fitted shadow.
     chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
-    undecided: names of parameters that the prior decides more than the whiteboards.
+    undecided: names of parameters that the prior decides more than the whiteboards, and Psi shows.
     more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
     own, own_deviation: (board, OWN), brightness over 1, place of the mask, um, and area of
         the hole over 1, by which whiteboards differ, as the causes let them.
@@ -598,15 +600,17 @@ def _bias_covariance(
     left = own - mixed.T @ covariance @ mixed
     kind = np.resize(KINDS, len(pull))
     assert len(pull) % OF_VIEW == 0
+    # Steps of the grid grow with tau.
+    likely = TAUS_UM / np.square(1 + np.square(TAUS_UM / TAU_UM) / 3)
+    likely[0] = likely.sum()
     evidence, squares = [], []
-    for taus in product(TAUS_UM, repeat=max(KINDS) + 1):
-        tau = np.array(taus)[kind]
+    for steps in product(range(len(TAUS_UM)), repeat=max(KINDS) + 1):
+        taus = TAUS_UM[list(steps)]
+        tau = taus[kind]
         factor = np.linalg.cholesky(np.eye(len(pull)) + tau[:, None] * left * tau)
         seen = solve_triangular(factor, tau * pull, lower=True, check_finite=False)
         likelihood = 0.5 * float(seen @ seen) - float(np.log(np.diag(factor)).sum())
-        # Steps of the grid grow with tau.
-        beforehand = np.log(taus) - 2 * np.log1p(np.square(taus) / TAU_UM**2 / 3)
-        evidence.append(likelihood + float(beforehand.sum()))
+        evidence.append(likelihood + float(np.log(likely[list(steps)]).sum()))
         squares.append(np.square(taus))
     share = np.exp(np.array(evidence) - max(evidence))
     expected = share @ np.array(squares) / share.sum()
@@ -987,15 +991,39 @@ def _find_undecided(
     """Return the parameters that the prior decides, and how many more boards would decide them.
 
     share^-2 = 1 + have, the precision that `boards` whiteboards have added to the prior's; it grows
-    with their number. Decided: a share below MOST_OF_PRIOR.
+    with their number. Decided: a share below MOST_OF_PRIOR, or a deviation that Psi does not show.
     """
     shares = shares_of_prior(mask, placement, covariance, Tolerances())
-    rows, columns = np.shape(placement.aperture)
-    names = zip(labels((rows, columns)), shares, strict=True)
-    have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
-    lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
-    more = int(np.clip(np.ceil(lacking * boards), 0, MOST_MORE_BOARDS))
-    return tuple(name for name, share in names if share > MOST_OF_PRIOR), more
+    names = labels(np.shape(placement.aperture))  # type: ignore[arg-type]
+    lacking = [
+        index
+        for index in np.flatnonzero(shares > MOST_OF_PRIOR)
+        if _change_of_psi(mask, placement, covariance[index], index) > LEAST_CHANGE
+    ]
+    if not lacking:
+        return (), 0
+    have = max(1 / min(float(shares[lacking].max()), 1.0) ** 2 - 1, 1e-9)
+    more = int(
+        np.clip(np.ceil(((1 / MOST_OF_PRIOR**2 - 1) / have - 1) * boards), 0, MOST_MORE_BOARDS)
+    )
+    return tuple(names[index] for index in lacking), more
+
+
+def _change_of_psi(
+    mask: ShadowMask, placement: Placement, covariances: Array, parameter: int
+) -> float:
+    """Return by how much Psi changes, relative, with a parameter by its deviation.
+
+    covariances: (parameter,), with all others, which follow it.
+    """
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(mask.pixel_shape(), size=(CHANGE_PIXELS, 2))
+    channels = rng.integers(mask.cells[0].shape[-1], size=CHANGE_PIXELS).astype(np.uint8)
+    step = covariances / np.sqrt(covariances[parameter])
+    here, there = (
+        Shadow(mask, at).coefficients(pixels, channels) for at in (placement, placement.moved(step))
+    )
+    return float(np.linalg.norm(there - here) / np.linalg.norm(here))
 
 
 def _astray_um(
