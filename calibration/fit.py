@@ -1036,15 +1036,23 @@ def _astray_um(
     """
     far_um = [cause.width for cause in causes if cause.name == STAGE]
     far_um += [float(np.hypot(*cause.size)) / 2 for cause in causes if cause.name == CREEP]
-    if not any(cause.name == CREEP for cause in causes):
-        perhaps = any(cause.name == HANDS and STAGE in cause.instead for cause in causes)
-        far_um += [
-            float(np.hypot(*check.moved_um))
-            for check, board in zip(checks, boards, strict=True)
-            if (perhaps or not through_pinhole(board))
-            and np.hypot(*check.moved_um)
-            > max(LEAST_MOVED_UM, SURE_MOVE * check.moved_deviation_um)
-        ]
+    by_name = {cause.name: cause for cause in causes}
+    moves = [(*check.moved_um, check.moved_deviation_um) for check in checks]
+    if CREEP in by_name:
+        # The moves beside the creep are those of the stage.
+        if STAGE not in by_name:
+            return max(far_um)
+        x_um, y_um = np.split(np.array(by_name[STAGE].size), 2)
+        moves = list(
+            zip(x_um, y_um, np.split(np.array(by_name[STAGE].deviation), 2)[0], strict=True)
+        )
+    perhaps = HANDS in by_name and STAGE in by_name[HANDS].instead
+    far_um += [
+        float(np.hypot(x_um, y_um))
+        for (x_um, y_um, deviation_um), board in zip(moves, boards, strict=True)
+        if (perhaps or not through_pinhole(board))
+        and np.hypot(x_um, y_um) > max(LEAST_MOVED_UM, SURE_MOVE * deviation_um)
+    ]
     return max([0.0, *far_um])
 
 
