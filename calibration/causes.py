@@ -1,11 +1,11 @@
 """Why whiteboards differ among themselves: single causes, compared by the evidence of the readings.
 
 Every whiteboard has parameters of its own beside the placement: its brightness, by how much the
-mask seems to have moved, x and y, and by how much larger its hole is than a view. A cause gives
-these a pattern over the whiteboards: a lamp that is not steady changes every brightness by chance,
-holes of unequal size only those of whiteboards through the pinhole, a plate that is turned moves
-the shadow of every hole by its distance from the axis. A pinhole moved by du on the plate shows the
-shadow of a mask moved by -rho du, rho = d / D.
+mask seems to have moved, x and y, and by how much wider and higher its hole is than a view. A cause
+gives these a pattern over the whiteboards: a lamp that is not steady changes every brightness by
+chance, holes of unequal size only those of whiteboards through the pinhole, a plate that is turned
+moves the shadow of every hole by its distance from the axis. A pinhole moved by du on the plate
+shows the shadow of a mask moved by -rho du, rho = d / D.
 
 With the readings linear in the parameters, what the whiteboards say of their own parameters p, the
 placement's taken out, is an information S and a pull h. A cause of pattern A and width tau makes p
@@ -33,10 +33,10 @@ from emmc_rig.calibration.boards import Board
 from emmc_rig.model.pupil import Pupil, cell_openings
 
 Array = NDArray[np.floating]
-OWN = 4
+OWN = 5
 """Parameters of one whiteboard: relative brightness, by how much the mask moved (x, y), um, and by
-how much larger its hole's area is than a view, relative."""
-LEAST_OWN = (2e-5, 0.002, 0.002, 2e-5)
+how much wider and higher its hole is than a view, relative."""
+LEAST_OWN = (2e-5, 0.002, 0.002, 1e-5, 1e-5)
 """Standard deviations of these without any cause: far below what noise shows."""
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
@@ -163,7 +163,7 @@ class Geometry:
             found[0, axis] = (more.share - less.share) / max(here.share, 0.01)
             found[1:3, axis] = -self.ratio * (more.middle_um - less.middle_um)
         # A cut hole is narrower, too.
-        found[3] = found[0]
+        found[3:] = np.diag(found[0])
         return found / (2 * step_um)
 
 
@@ -209,7 +209,7 @@ def possible_causes(
     causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate, least))
     if few.sum() > 1:
         wider = np.zeros((count, OWN))
-        wider[few, 0], wider[few, 3] = 1.0, 1.0
+        wider[few, 0], wider[few, 3:] = 1.0, 0.5
         each = np.eye(count)[:, None, few] * wider[:, :, None]
         causes.append(Cause(HOLES, each.reshape(count * OWN, -1), BRIGHTNESSES))
         if not few.all():

@@ -116,8 +116,8 @@ LEAST_CURVATURE = 0.3
 MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
-LARGER = 3
-"""Where the hole's area lies in a whiteboard's own parameters."""
+SIDES = slice(3, 5)
+"""Where the hole's width and height lie in a whiteboard's own parameters."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
 PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
@@ -133,8 +133,8 @@ OF_LOOSE = 0.05
 CAUSE_GAINS = (FIRST_GAIN, LEAST_GAIN, LEAST_GAIN)
 """The causes depend on the fit and the fit on the causes: in turn, to these last gains; the third
 time where pinholes stand off their holes."""
-UNLIKE = 0.3
-"""Of a reading's share that an area differs by: what the shape of a cut hole may make beside it."""
+SECOND_ORDER = 0.3
+"""Of a reading's share: what it misses of a hole, over the square of what its sides differ by."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -195,8 +195,8 @@ class Fit:
     chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
     undecided: names of parameters that the prior decides more than the whiteboards, and Psi shows.
     more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
-    own, own_deviation: (board, OWN), brightness over 1, place of the mask, um, and area of
-        the hole over 1, by which whiteboards differ, as the causes let them.
+    own, own_deviation: (board, OWN), brightness over 1, place of the mask, um, and width and
+        height of the hole over 1, by which whiteboards differ, as the causes let them.
     causes: why whiteboards differ, the strongest first. A lamp that is not steady makes references
         differ likewise, which the covariance does not count.
     moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
@@ -392,25 +392,25 @@ def _linear_readings(
 ) -> tuple[_Linear, ...]:
     """Return every whiteboard's readings and slopes at a state.
 
-    reading = (1 + brightness) (shadow, with the mask moved, + larger d(shadow)/d(area))
+    reading = (1 + brightness) (shadow, with the mask moved, + wider d(shadow)/d(width) + ...)
     """
     shadow, found = Shadow(mask, state.placement), []
     for index, sample in enumerate(samples):
         opening, brightness = state.opening(sample.board, index), state.brightness(index)
         where = sample.pixels, sample.channels, *opening
         if state.widening and sample.board.views_open.sum() == 1:
-            read, slope, by_area = shadow.with_widening(*where)
-            read = read + by_area * state.own[index, LARGER]
+            read, slope, by_sides = shadow.with_widening(*where)
+            read = read + by_sides @ state.own[index, SIDES]
         else:
             read, slope = shadow.with_slopes(*where)
-            by_area = np.zeros(len(read))
+            by_sides = np.zeros((len(read), 2))
         # In one pass over memory, which takes as long as the arithmetic.
         count, factor = slope.shape[1], brightness / sample.deviation
         slopes = np.empty((len(read), count + OWN))
         np.multiply(slope, factor[:, None], out=slopes[:, :count])
         slopes[:, count] = read / sample.deviation
-        slopes[:, count + 1 : count + LARGER] = slopes[:, OFFSETS]
-        slopes[:, count + LARGER] = factor * by_area
+        slopes[:, count + 1 : count + 3] = slopes[:, OFFSETS]
+        slopes[:, count + 3 :] = factor[:, None] * by_sides
         found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slopes))
     return tuple(found)
 
@@ -772,13 +772,13 @@ def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
         level = np.float32(1 + own[0])
         stage_um = (board.stage_um[0] + float(own[1]), board.stage_um[1] + float(own[2]))
         reading = board.reading / level
-        if own[LARGER] and board.views_open.sum() == 1:
+        if own[SIDES].any() and board.views_open.sum() == 1:
             pixels = np.argwhere(np.ones(reading.shape, dtype=bool))
             where = pixels, board.channels.ravel(), board.views_open, stage_um, board.shot
-            wider = shadow.with_widening(*where)[2] * own[LARGER]
+            wider = shadow.with_widening(*where)[2] @ own[SIDES]
             reading = reading - wider.reshape(reading.shape).astype(np.float32)
-        # A cut hole differs from a view in shape as well as in area.
-        shape = (UNLIKE * own[LARGER] * np.maximum(reading, 0)) ** 2
+        # What a hole of other sides shows is known to first order.
+        shape = (SECOND_ORDER * np.square(own[SIDES]).sum() * np.maximum(reading, 0)) ** 2
         variance = (board.variance / level**2 + shape).astype(np.float32)
         found.append(
             replace(board, reading=reading, variance=variance, stage_um=stage_um, loose=False)

@@ -111,21 +111,22 @@ def coefficient_plane(
     return plane
 
 
-def widening_plane(
+def widening_planes(
     samples_shadow: Shadow,
     layout: PsiLayout,
     place: tuple[int, int, int, int],
     stage_um: tuple[float, float],
 ) -> NDArray[np.float32]:
-    """Return slopes of `coefficient_plane` by the relative area of the hole, (y, x)."""
+    """Return slopes of `coefficient_plane` by relative width and height of the hole, (2, y, x)."""
     shot, v, u, stored = place
     scale = layout.weights_shape[4] * layout.binning**2
-    plane = np.empty(layout.size, dtype=np.float32)
+    planes = np.empty((2, *layout.size), dtype=np.float32)
     chosen = views_open((layout.weights_shape[1], layout.weights_shape[2]), (v, u))
     for band, samples, channels in _bands(layout, shot, stored):
-        by_area = samples_shadow.with_widening(samples, channels, chosen, stage_um, shot)[2]
-        plane[band] = by_area.reshape(plane[band].shape) / scale
-    return plane
+        by_sides = samples_shadow.with_widening(samples, channels, chosen, stage_um, shot)[2]
+        for plane, slopes in zip(planes, by_sides.T, strict=True):
+            plane[band] = slopes.reshape(plane[band].shape) / scale
+    return planes
 
 
 def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:

@@ -84,8 +84,6 @@ GLASS_INDEX = 1.52
 """Refractive index of crown glass, as of a sensor's cover."""
 ANY_COLOUR = 3
 """Channel of a pixel that sees all colours."""
-AREA_STEP = 0.02
-"""Relative, of an aperture cell's area, for the derivative by it."""
 OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
 SPARE_UM = 900.0
@@ -803,6 +801,14 @@ def _find_footprints(pixels, cells, tables, turns, rays, boxes, weights, out):
             light_shares[n, k] = weight * light.leaning * light.falling / total
 
 
+class _Drawn(NamedTuple):
+    """What the kernel draws: see `share_tables`."""
+
+    tables: NDArray[np.float64]
+    boxes: _Boxes
+    weights: _Weights
+
+
 class Shadow:
     """The shadow of one placement: readings and derivatives of any pixels.
 
@@ -876,22 +882,28 @@ class Shadow:
         stage_um: tuple[float, float] = (0.0, 0.0),
         frame: int = 0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return `with_slopes`, and derivatives by the area of the aperture's cells, (n,).
+        """Return `with_slopes`, and derivatives by the sides of the open boxes, (n, 2).
 
-        The latter by the relative area, from cells that are AREA_STEP smaller and larger.
+        The latter by relative width and height, at the same light.
         """
-        how = pixels, channels, views_open, stage_um, frame
-        smaller, larger = (shadow.readings(*how) for shadow in self._resized)
-        return *self.with_slopes(*how), (larger - smaller) / (2 * AREA_STEP)
+        how = pixels, channels, (views_open, stage_um, frame)
+        sized = self._run(*how, slopes=True, drawn=self._sized)
+        by_sides = sized.slopes[:, PUPIL_X : PUPIL_X + 2].copy()
+        if self.placement.pupil is None:
+            sized.slopes[:, PUPIL_X : PUPIL_X + 2] = 0
+            return sized.readings, sized.slopes, by_sides
+        return *self.with_slopes(pixels, channels, views_open, stage_um, frame), by_sides
 
     @cached_property
-    def _resized(self) -> tuple[Shadow, Shadow]:
-        """The shadows through aperture cells of AREA_STEP less and more area."""
-        less, more = (
-            replace(self.mask, aperture_um=self.mask.aperture_um * (1 + sign * AREA_STEP / 2))
-            for sign in (-1, 1)
-        )
-        return Shadow(less, self.placement), Shadow(more, self.placement)
+    def _sized(self) -> _Drawn:
+        """What the kernel draws whose first two parameters of the pupil are width and height."""
+        tables = share_tables(self.mask, self.placement, KINDS, CUT_WIDTHS)[0]
+        places = _width_places(self._openings, self.mask)
+        slopes = np.zeros((len(places), len(PUPIL_STEPS), len(OF_BOX)))
+        slopes[:, 0, OF_BOX.index("width")] = 2 * places[:, 0]
+        slopes[:, 1, OF_BOX.index("height")] = 2 * places[:, 1]
+        boxes = _boxes_of(self._openings, self.mask, CUT_WIDTHS, slopes)
+        return _Drawn(tables, boxes, self._weights._replace(sums=self._weights.sums[:2].copy()))
 
     def slopes_by_view(
         self,
@@ -971,12 +983,14 @@ class Shadow:
         slopes: bool = False,
         each: bool = False,
         by_view: bool = False,
+        drawn: _Drawn | None = None,
     ) -> _Seen:
         """Return the readings and what is asked for; by_view needs slopes."""
         views_open, stage_um, frame = opening
-        if slopes and len(self._tables) == 1:
+        if slopes and drawn is None and len(self._tables) == 1:
             self._tables = share_tables(self.mask, self.placement, KINDS, self._widths)[0]
             self._set_boxes(_pupil_slopes(self.mask, self.placement, self._openings))
+        tables, boxes, weights = drawn or _Drawn(self._tables, self._boxes, self._weights)
         count, views = len(pixels), self._weights.aperture.size
         out = _Seen(
             np.empty(count),
@@ -988,11 +1002,11 @@ class Shadow:
             np.ascontiguousarray(pixels, dtype=np.int64),
             np.ascontiguousarray(channels, dtype=np.uint8),
             self.mask.cells[frame % len(self.mask.cells)],
-            self._tables if slopes else self._tables[:1],
+            tables if slopes else tables[:1],
             self._turns,
             self._rays(stage_um),
-            self._boxes.of_views(np.asarray(views_open, dtype=bool)),
-            self._weights,
+            boxes.of_views(np.asarray(views_open, dtype=bool)),
+            weights,
             out,
         )
         return out
