@@ -36,7 +36,7 @@ Array = NDArray[np.floating]
 OWN = 5
 """Parameters of one whiteboard: relative brightness, by how much the mask moved (x, y), um, and by
 how much wider and higher its hole is than a view, relative."""
-LEAST_OWN = (2e-5, 0.002, 0.002, 1e-5, 1e-5)
+LEAST_OWN = (2e-5, 0.002, 0.002, 1e-4, 1e-4)
 """Standard deviations of these without any cause: far below what noise shows."""
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
@@ -49,6 +49,7 @@ NEARLY = 3.0
 """Difference of the log evidence of causes that fit nearly alike: a factor of 20."""
 FEWEST_PINHOLES = 4
 """Whiteboards of fewer do not tell their pinholes' places from the mask's distance."""
+PLATE_STEPS = 12
 LONE = 0.9
 """Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
 LAMP, STAGE, CREEP, LENS = "lamp", "stage", "creep", "lens"
@@ -146,25 +147,60 @@ class Geometry:
         middle = shares @ places / total
         return Light(total, middle + off_um)
 
-    def slopes(self, board: Board, off_um: Array) -> NDArray[np.float64]:
-        """Return the slopes of a whiteboard's own parameters by its pinhole's place, (OWN, 2).
+    def own(self, view: tuple[int, int], off_um: Array) -> NDArray[np.float64]:
+        """Return the own parameters of a whiteboard through a pinhole that stands so, (OWN,)."""
+        on, off = self.light(view, np.zeros(2)), self.light(view, off_um)
+        moved_um = -self.ratio * (off.middle_um - on.middle_um)
+        # A cut hole is narrower by what a move across alone takes of its light; lower likewise.
+        cut = [self.light(view, along * off_um).share for along in np.eye(2)]
+        shares = np.array([off.share, *cut]) / max(on.share, 0.01) - 1
+        return np.array([shares[0], *moved_um, *shares[1:]])
 
-        off_um: (x, y) of the pinhole from its hole, about which the slopes are taken.
+    def about(self, board: Board, off_um: Array) -> tuple[Array, Array]:
+        """Return a whiteboard's own parameters, (OWN,), and their slopes by its pinhole's place.
+
+        off_um: (x, y) of the pinhole from its hole. The slopes, (OWN, 2), are taken there. What
+        opens some views moves with the plate, without an edge.
         """
-        found = np.zeros((OWN, 2))
         if board.views_open.sum() > 1:
-            found[1:3] = -self.ratio * np.eye(2)
-            return found
+            slopes = np.zeros((OWN, 2))
+            slopes[1:3] = -self.ratio * np.eye(2)
+            return slopes @ off_um, slopes
         v, u = np.argwhere(board.views_open)[0].tolist()
-        step_um, here = self.cell_um / 100, self.light((v, u), np.zeros(2))
-        for axis in range(2):
-            by = np.eye(2)[axis] * step_um
-            less, more = self.light((v, u), off_um - by), self.light((v, u), off_um + by)
-            found[0, axis] = (more.share - less.share) / max(here.share, 0.01)
-            found[1:3, axis] = -self.ratio * (more.middle_um - less.middle_um)
-        # A cut hole is narrower, too.
-        found[3:] = np.diag(found[0])
-        return found / (2 * step_um)
+        steps = np.eye(2) * self.cell_um / 100
+        slopes = [
+            (self.own((v, u), off_um + by) - self.own((v, u), off_um - by)) / (2 * by.sum())
+            for by in steps
+        ]
+        return self.own((v, u), off_um), np.stack(slopes, axis=1)
+
+
+def fit_plate(
+    own: OwnInformation, boards: Sequence[Board], geometry: Geometry
+) -> NDArray[np.float64]:
+    """Return how far pinholes stand off their holes, (board, 2), by one move and turn of the plate.
+
+    Least squares for the three, with the light that the aperture's edge cuts at every step.
+    """
+    few = np.array([through_pinhole(board) for board in boards])
+    turned = turned_by(plate_places_um(boards, geometry.cell_um))
+    far_um = max(float(np.abs(turned).max()), geometry.cell_um)
+    by_plate = np.stack([np.tile([1.0, 0.0], (len(few), 1)), np.tile([0.0, 1.0], (len(few), 1)),
+                         turned / far_um], axis=-1) * few[:, None, None]  # fmt: skip
+    found = np.zeros(3)
+    for _ in range(PLATE_STEPS):
+        off_um = by_plate @ found
+        here, slopes = np.zeros((len(boards), OWN)), np.zeros((len(boards), OWN, 3))
+        for index in np.flatnonzero(few):
+            here[index], each = geometry.about(boards[index], off_um[index])
+            slopes[index] = each @ by_plate[index]
+        rows = slopes.reshape(-1, 3)
+        left = own.pull - own.information @ here.ravel()
+        step = np.linalg.lstsq(rows.T @ own.information @ rows, rows.T @ left, rcond=1e-9)[0]
+        found = np.clip(found + step, -geometry.cell_um / 2, geometry.cell_um / 2)
+        if np.abs(step).max() < geometry.cell_um * 1e-4:
+            break
+    return by_plate @ found
 
 
 def through_pinhole(board: Board) -> bool:
@@ -202,7 +238,7 @@ def possible_causes(
     # By the place of every pinhole, x and y: (board, OWN, board of the pinhole, 2).
     slopes = np.zeros((count, OWN, count, 2))
     for index in np.flatnonzero(few):
-        slopes[index, :, index] = geometry.slopes(boards[index], off_um[index])
+        slopes[index, :, index] = geometry.about(boards[index], off_um[index])[1]
     by_place = slopes.reshape(count * OWN, count, 2)
     by_hand = few & loose if loose.any() else few
     on_plate, least = moved / geometry.ratio, LEAST_MOVED_UM / geometry.ratio

@@ -26,7 +26,7 @@ from emmc_rig.calibration.causes import (
 )
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.colours import Crosstalk
-from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
+from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit, Power
 from emmc_rig.calibration.glare import Glare
 from emmc_rig.calibration.levels import Levels
 from emmc_rig.calibration.placement import Placement
@@ -289,6 +289,18 @@ def fit_advice(fit: Fit) -> list[str]:
     return [
         f"too few whiteboards to measure {shown}: Psi takes the value of the camera's file "
         f"instead; {more}"
+    ]
+
+
+def power_advice(power: Power) -> list[str]:
+    """Return what a response says that no whiteboard measured, and that is not linear."""
+    if not power.sure:
+        return []
+    return [
+        f"readings go with the light to the power of {1 + power.size:.3f} +- "
+        f"{power.deviation:.3f}: the sensor's response is not linear, or its files are not; Psi's "
+        "deviation includes it; read linear files, or add `response: [0.25, 0.5, 0.75]` under "
+        "whiteboards in the plan and capture again"
     ]
 
 

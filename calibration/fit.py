@@ -59,6 +59,8 @@ from emmc_rig.calibration.causes import (
     covariance_of,
     doubt_lone_move,
     find_causes,
+    fit_plate,
+    log_evidence,
     pinholes_off_um,
     possible_causes,
     through_pinhole,
@@ -133,8 +135,10 @@ OF_LOOSE = 0.05
 CAUSE_GAINS = (FIRST_GAIN, LEAST_GAIN, LEAST_GAIN)
 """The causes depend on the fit and the fit on the causes: in turn, to these last gains; the third
 time where pinholes stand off their holes."""
-SECOND_ORDER = 0.3
-"""Of a reading's share: what it misses of a hole, over the square of what its sides differ by."""
+LEAST_POWER, SURE_POWER = 5e-3, 10.0
+"""By which the power of the light that readings go with differs from 1, and its deviations."""
+MOSTLY = 0.4
+"""Of the residuals beyond the noise: what explains less is imitated by another fault."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -143,12 +147,12 @@ SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
-TAUS_UM = np.array([0.0, *np.geomspace(0.003, 1.0, 5)])
-"""Of each kind: none, and from far less than any whiteboard shows to a tenth of a pixel."""
+TAUS_UM = np.geomspace(0.003, 1.0, 6)
+"""Of each kind: from far less than any whiteboard shows to a tenth of a pixel."""
 TAU_UM = 0.1
-"""Beforehand tau is 0 or, as likely, a half-t of 3 degrees of freedom and this scale (Gelman 2006,
-Bayesian Analysis 1:515): there are too few views to determine it well. Uniform up to 1 um,
-whiteboards of nine views left a distance that was 12 % off undecided."""
+"""Beforehand tau is a half-t of 3 degrees of freedom and this scale (Gelman 2006, Bayesian Analysis
+1:515): there are too few views to determine it well. Uniform up to 1 um, whiteboards of nine views
+left a distance that was 12 % off undecided."""
 
 
 class FitSettings(Settings):
@@ -186,6 +190,25 @@ class BoardCheck:
     outliers: float
 
 
+@dataclass(frozen=True)
+class Power:
+    """The power 1 + size of the light that readings seem to go with; 1 of a linear sensor.
+
+    explained: share of what the residuals exceed the noise by. error: relative, of Psi.
+    """
+
+    size: float = 0.0
+    deviation: float = 1.0
+    explained: float = 0.0
+    error: float = 0.0
+
+    @property
+    def sure(self) -> bool:
+        """Whether the power is not 1, and explains more of the residuals than another fault."""
+        large = abs(self.size) > max(LEAST_POWER, SURE_POWER * self.deviation)
+        return large and self.explained > MOSTLY
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The placement fitted, how sure it is, and how well it explains the whiteboards.
@@ -202,6 +225,7 @@ class Fit:
     moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
         covariance counts.
     astray2: (OF_VIEW,), variances of the views' own displacements and softenings, um^2.
+    power: of the light that readings go with.
     """
 
     placement: Placement
@@ -220,6 +244,7 @@ class Fit:
     causes: tuple[FoundCause, ...] = ()
     moved_um: float = 0.0
     astray2: tuple[float, ...] = ()
+    power: Power = Power()
 
     @property
     def brightness_spread(self) -> float:
@@ -308,19 +333,34 @@ class _BenchPrior:
     causes: Mapping[str, Cause]
     always: tuple[str, ...]
     geometry: Geometry
+    own: NDArray[np.float64]
+    """(own,), about which the causes act: that of pinholes where they stand, see `about`."""
 
-    def about(
+    def off_um(
         self, found: Sequence[FoundCause], state: _State, boards: Sequence[Board]
-    ) -> _BenchPrior:
-        """Return the prior with causes about where pinholes stand by those found."""
+    ) -> NDArray[np.float64]:
+        """Return where pinholes stand by the causes found, (board, 2)."""
         own = state.own
         known = [cause for cause in found if cause.name in self.causes]
         causes, none = list(self.causes.values()), np.zeros((own.size, own.size))
-        sized = with_sizes(known, causes, own.ravel(), none, self.own2)
-        off_um = pinholes_off_um(sized, boards, self.geometry.cell_um)
+        sized = with_sizes(known, causes, own.ravel() - self.own, none, self.own2)
+        return pinholes_off_um(sized, boards, self.geometry.cell_um)
+
+    def about(self, off_um: Array, state: _State, boards: Sequence[Board]) -> _BenchPrior:
+        """Return the prior with causes about where pinholes stand, (board, 2)."""
         geometry = replace(self.geometry, pupil=state.placement.fitted_pupil())
         again = possible_causes(boards, geometry, off_um)
-        return replace(self, causes={cause.name: cause for cause in again}, geometry=geometry)
+        own = np.zeros((len(boards), OWN))
+        for index, board in enumerate(boards):
+            if through_pinhole(board):
+                here, slopes = geometry.about(board, off_um[index])
+                own[index] = here - slopes @ off_um[index]
+        return replace(
+            self,
+            causes={cause.name: cause for cause in again},
+            geometry=geometry,
+            own=own.ravel(),
+        )
 
     def with_widths(self, widths: Mapping[str, float], aberrant: bool = False) -> _Prior:
         """Return the prior of all parameters; widths: of the causes, by name, possible or not.
@@ -328,7 +368,9 @@ class _BenchPrior:
         aberrant: whether aberrations displace the views.
         """
         possible = {name: width for name, width in widths.items() if name in self.causes}
-        own = np.linalg.inv(covariance_of(self.causes, possible, self.own2))
+        # In units of what is known beside the causes: their widths are millions of it.
+        unit = np.sqrt(np.outer(self.own2, self.own2))
+        own = np.linalg.inv(covariance_of(self.causes, possible, self.own2) / unit) / unit
         size = len(self.centre)
         precision = np.zeros((size + len(own), size + len(own)))
         of_placement = self.precision.copy()
@@ -337,7 +379,7 @@ class _BenchPrior:
             of_placement[SCALARS.index("glass_um")] /= OF_LOOSE**2
         precision[:size, :size] = np.diag(of_placement)
         precision[size:, size:] = own
-        return _Prior(precision, np.concatenate([self.centre, np.zeros(len(own))]))
+        return _Prior(precision, np.concatenate([self.centre, self.own]))
 
     def first_widths(self, ratio: float) -> dict[str, float]:
         """Return the widths before the causes are known."""
@@ -365,7 +407,8 @@ def _bench_prior(
     geometry = Geometry(ratio, mask.aperture_cell_um, mask.views, pupil)
     known = {cause.name: cause for cause in possible_causes(boards, geometry)}
     always = (HANDS,) if loose else ()
-    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry)
+    own = np.zeros(own2.size)
+    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry, own)
 
 
 def _robust_spread(residuals: Sequence[Array]) -> float:
@@ -399,8 +442,7 @@ def _linear_readings(
         opening, brightness = state.opening(sample.board, index), state.brightness(index)
         where = sample.pixels, sample.channels, *opening
         if state.widening and sample.board.views_open.sum() == 1:
-            read, slope, by_sides = shadow.with_widening(*where)
-            read = read + by_sides @ state.own[index, SIDES]
+            read, slope, by_sides = shadow.with_widening(*where, sides=state.own[index, SIDES])
         else:
             read, slope = shadow.with_slopes(*where)
             by_sides = np.zeros((len(read), 2))
@@ -600,17 +642,15 @@ def _bias_covariance(
     left = own - mixed.T @ covariance @ mixed
     kind = np.resize(KINDS, len(pull))
     assert len(pull) % OF_VIEW == 0
-    # Steps of the grid grow with tau.
-    likely = TAUS_UM / np.square(1 + np.square(TAUS_UM / TAU_UM) / 3)
-    likely[0] = likely.sum()
     evidence, squares = [], []
-    for steps in product(range(len(TAUS_UM)), repeat=max(KINDS) + 1):
-        taus = TAUS_UM[list(steps)]
-        tau = taus[kind]
+    for taus in product(TAUS_UM, repeat=max(KINDS) + 1):
+        tau = np.array(taus)[kind]
         factor = np.linalg.cholesky(np.eye(len(pull)) + tau[:, None] * left * tau)
         seen = solve_triangular(factor, tau * pull, lower=True, check_finite=False)
         likelihood = 0.5 * float(seen @ seen) - float(np.log(np.diag(factor)).sum())
-        evidence.append(likelihood + float(np.log(likely[list(steps)]).sum()))
+        # Steps of the grid grow with tau.
+        beforehand = np.log(taus) - 2 * np.log1p(np.square(taus) / TAU_UM**2 / 3)
+        evidence.append(likelihood + float(beforehand.sum()))
         squares.append(np.square(taus))
     share = np.exp(np.array(evidence) - max(evidence))
     expected = share @ np.array(squares) / share.sum()
@@ -637,6 +677,29 @@ def _find_causes(
     own = _own_information(point, bench, terms, displaced)
     own2 = np.concatenate([bench.own2, np.full(len(displaced), LEAST_OWN[1] ** 2)])
     return find_causes(own, with_lens(causes, len(displaced)), own2)
+
+
+def _about_pinholes(
+    point: _Point, bench: _BenchPrior, found: Sequence[FoundCause], boards: Sequence[Board]
+) -> _BenchPrior:
+    """Return the prior about the pinholes' likelier places: by the causes, or by the plate alone.
+
+    Their light bends at the aperture's edge, so that causes which are compared about a wrong place
+    may share out what the plate alone explains.
+    """
+    still = _own_information(point, replace(bench, own=np.zeros_like(bench.own)))
+    places = [bench.off_um(found, point.state, boards)]
+    if not any(board.loose for board in boards):
+        places.append(fit_plate(still, boards, bench.geometry))
+
+    def evidence(tried: _BenchPrior) -> float:
+        own = OwnInformation(still.information, still.pull - still.information @ tried.own)
+        causes = find_causes(own, list(tried.causes.values()), tried.own2, tried.always)
+        widths = {cause.name: cause.width for cause in causes}
+        there = float((still.pull + own.pull) @ tried.own) / 2
+        return there + log_evidence(own, covariance_of(tried.causes, widths, tried.own2))
+
+    return max((bench.about(place, point.state, boards) for place in places), key=evidence)
 
 
 def _own_widths(found: Sequence[FoundCause], ratio: float) -> dict[str, float]:
@@ -670,7 +733,7 @@ def _own_information(
     terms, displaced: of the views, and which of theirs count as own as well.
     """
     normal, state = point.normal, point.state
-    away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
+    away = state.vector() - np.concatenate([bench.centre, bench.own])
     matrix, pull = normal.matrix, normal.gradient + normal.matrix @ away
     if terms is not None:
         chosen = np.asarray(displaced)
@@ -775,11 +838,9 @@ def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
         if own[SIDES].any() and board.views_open.sum() == 1:
             pixels = np.argwhere(np.ones(reading.shape, dtype=bool))
             where = pixels, board.channels.ravel(), board.views_open, stage_um, board.shot
-            wider = shadow.with_widening(*where)[2] @ own[SIDES]
+            wider = shadow.with_widening(*where, sides=own[SIDES])[0] - shadow.readings(*where)
             reading = reading - wider.reshape(reading.shape).astype(np.float32)
-        # What a hole of other sides shows is known to first order.
-        shape = (SECOND_ORDER * np.square(own[SIDES]).sum() * np.maximum(reading, 0)) ** 2
-        variance = (board.variance / level**2 + shape).astype(np.float32)
+        variance = (board.variance / level**2).astype(np.float32)
         found.append(
             replace(board, reading=reading, variance=variance, stage_um=stage_um, loose=False)
         )
@@ -832,7 +893,7 @@ def fit_placement(
             descent = descent._replace(point=_point(mask, state, whole))
         if off_plate:
             # Where pinholes stand decides how much of their light the aperture's edge cuts.
-            bench = bench.about(found, descent.point.state, boards)
+            bench = _about_pinholes(descent.point, bench, found, boards)
         elif turn > 1:
             break
         found = _find_causes(mask, descent.point, whole, bench)
@@ -848,9 +909,14 @@ def fit_placement(
     everything, astray2 = _covariance(mask, point, whole, prior)
     size = len(placement.vector())
     covariance, own_covariance = everything[:size, :size], everything[size:, size:]
-    undecided, more = _find_undecided(mask, placement, covariance, len(boards))
+    alone = np.linalg.inv(normal.matrix + prior.precision)
+    undecided, more = _find_undecided(mask, placement, alone[:size, :size], len(boards))
     causes = with_sizes(
-        found, list(bench.causes.values()), state.own.ravel(), own_covariance, bench.own2
+        found,
+        list(bench.causes.values()),
+        state.own.ravel() - bench.own,
+        own_covariance,
+        bench.own2,
     )
     causes = doubt_lone_move(causes, boards)
     moved_um = _astray_um(causes, checks, boards)
@@ -875,6 +941,7 @@ def fit_placement(
         own_deviation=own_deviation,
         moved_um=moved_um,
         astray2=astray2,
+        power=_fit_power(point, whole, alone),
     )
 
 
@@ -959,6 +1026,33 @@ def _covariance(
     return covariance + of_views + of_rows, astray2
 
 
+def _fit_power(point: _Point, samples: Sequence[Sample], covariance: Array) -> Power:
+    """Return the power of the light by one step of least squares from the fit.
+
+    All parameters and each whiteboard's level are free: by a power of 1 + b a reading r changes by
+    b (r log r - level r). covariance: of the parameters.
+    """
+    normal, spread = point.normal, point.normal.spread
+    mixed, own, pull = np.zeros(len(covariance)), 0.0, 0.0
+    change2, light2 = 0.0, 0.0
+    for index, (sample, linear) in enumerate(zip(samples, point.linear, strict=True)):
+        residual, slope = linear
+        weight = tukey_weights(residual / spread) / spread**2
+        read = np.maximum(linear.read(sample), 1e-3)
+        bent = read * np.log(read)
+        # A reading of 1 is that of a reference: whole apertures have their levels about it.
+        if not through_pinhole(sample.board):
+            change2, light2 = change2 + float(bent @ bent), light2 + float(read @ read)
+        rows = (bent - read * float(bent @ read / (read @ read))) / sample.deviation
+        mixed[point.state.places(index)] += slope.T @ (weight * rows)
+        own += float((weight * rows) @ rows)
+        pull += float((weight * rows) @ residual)
+    left = max(own - float(mixed @ covariance @ mixed), 1e-12 * own)
+    excess = max(normal.squares - normal.kept, 1.0) / spread**2
+    error = abs(pull / left) * float(np.sqrt(change2 / max(light2, 1e-12)))
+    return Power(pull / left, 1 / float(np.sqrt(left)), pull**2 / left / excess, error)
+
+
 def _refuse_unexplained(alike: float) -> None:
     """Raise CalibrationError for a correlation of readings and fit that is too low."""
     if alike < LEAST_FIT_CORRELATION:
@@ -978,7 +1072,7 @@ def _without_aberrations(
     """
     if not any(cause.name == LENS for cause in causes):
         return own
-    explained = np.zeros(own.size)
+    explained = bench.own.copy()
     for cause in causes:
         if cause.name in bench.causes:
             explained += bench.causes[cause.name].columns @ np.array(cause.size)

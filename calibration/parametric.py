@@ -116,16 +116,21 @@ def widening_planes(
     layout: PsiLayout,
     place: tuple[int, int, int, int],
     stage_um: tuple[float, float],
+    sides: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return slopes of `coefficient_plane` by relative width and height of the hole, (2, y, x)."""
+    """Return `coefficient_plane` through a hole of other sides, and slopes by them, (3, y, x).
+
+    sides: relative width and height, over those of a view.
+    """
     shot, v, u, stored = place
     scale = layout.weights_shape[4] * layout.binning**2
-    planes = np.empty((2, *layout.size), dtype=np.float32)
+    planes = np.empty((3, *layout.size), dtype=np.float32)
     chosen = views_open((layout.weights_shape[1], layout.weights_shape[2]), (v, u))
     for band, samples, channels in _bands(layout, shot, stored):
-        by_sides = samples_shadow.with_widening(samples, channels, chosen, stage_um, shot)[2]
-        for plane, slopes in zip(planes, by_sides.T, strict=True):
-            plane[band] = slopes.reshape(plane[band].shape) / scale
+        how = samples, channels, chosen, stage_um, shot
+        read, _, by_sides = samples_shadow.with_widening(*how, sides=sides)
+        for plane, values in zip(planes, (read, *by_sides.T), strict=True):
+            plane[band] = values.reshape(plane[band].shape) / scale
     return planes
 
 

@@ -168,6 +168,12 @@ def calibrate(
     stated = {name: psi.calibration.stated_error for name, psi in psis.items()}
     chosen, why = choose(list(judged.values()), stated)
     refusals.refuse_another_bench(chosen)
+    if modelled.best is not None and not (levels is not None and levels.bend_known):
+        powers = [model.fit.power for model in modelled.models.values()]
+        power = max(powers, key=lambda power: power.explained)
+        advice[:0] = words.power_advice(power)
+        for psi in psis.values() if power.sure else ():
+            add_error(psi.calibration, power.error)
     advice += _count_residual(chosen, psis[chosen.route].calibration)
     calibrations = {name: psi.calibration for name, psi in psis.items()}
     if task.crosstalk is not None:
@@ -773,9 +779,9 @@ def _correct_pinholes(
 
             right = at(x_um, y_um)
             index = board.shot, v, u, slice(None), stored
-            moved = right - at(x_um + off_x, y_um + off_y)
-            by_sides = widening_planes(shadow, layout, place, (x_um + off_x, y_um + off_y))
-            moved = moved - np.tensordot(own[SIDES], by_sides, 1)
+            there = (x_um + off_x, y_um + off_y)
+            through, *by_sides = widening_planes(shadow, layout, place, there, own[SIDES])
+            moved = right - through
             weights[index] = weights[index] / (1 + brighter) + moved
             variance = sum(
                 np.square(at(x_um + by_x, y_um + by_y) - right)

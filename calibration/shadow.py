@@ -21,6 +21,7 @@ footprint, under 0.2 um at 0.3 degrees).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -76,6 +77,8 @@ PUPIL_STEPS = {"pupil_x_um": 100.0, "pupil_y_um": 100.0, "pupil_share": 8e-3}
 `emmc_rig.model.pupil` cuts views: with 16 lines a strip, 10 um made the slopes 5 % wrong."""
 OF_BOX = ("share", "x_um", "y_um", "width", "height")
 """What follows the pupil: width and height as places of their squares among the tables' widths."""
+NARROWEST = 0.2
+"""Side of a hole, over that of its view: a narrower hole counts as so wide."""
 TAILS = 4.0
 """Deviations of the blur that a footprint reaches beyond its boxes: 3e-5 of it lies beyond."""
 NARROWEST_CELLS = 1e-3
@@ -881,29 +884,44 @@ class Shadow:
         views_open: NDArray[np.bool_],
         stage_um: tuple[float, float] = (0.0, 0.0),
         frame: int = 0,
+        *,
+        sides: Sequence[float] | NDArray[np.float64] = (0.0, 0.0),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return `with_slopes`, and derivatives by the sides of the open boxes, (n, 2).
+        """Return `with_slopes` through boxes of other sides, and derivatives by these, (n, 2).
 
-        The latter by relative width and height, at the same light.
+        sides: relative width and height more than the boxes have, at the same light. Of more, what
+        is read is known to first order.
         """
+        narrower, wider = np.minimum(sides, 0.0), np.maximum(sides, 0.0)
         how = pixels, channels, (views_open, stage_um, frame)
-        sized = self._run(*how, slopes=True, drawn=self._sized)
+        sized = self._run(*how, slopes=True, drawn=self._sized(narrower))
         by_sides = sized.slopes[:, PUPIL_X : PUPIL_X + 2].copy()
+        slopes = sized.slopes
         if self.placement.pupil is None:
-            sized.slopes[:, PUPIL_X : PUPIL_X + 2] = 0
-            return sized.readings, sized.slopes, by_sides
-        return *self.with_slopes(pixels, channels, views_open, stage_um, frame), by_sides
+            slopes[:, PUPIL_X : PUPIL_X + 2] = 0
+        else:
+            slopes = self.with_slopes(pixels, channels, views_open, stage_um, frame)[1]
+        return sized.readings + by_sides @ wider, slopes, by_sides
+
+    def _sized(self, sides: NDArray[np.float64]) -> _Drawn:
+        """Return what the kernel draws, where two parameters are sides in place of the pupil's."""
+        scale = np.maximum(1 + sides, NARROWEST)
+        found = self._openings
+        cut = replace(
+            found, width_um=found.width_um * scale[0], height_um=found.height_um * scale[1]
+        )
+        places = _width_places(cut, self.mask)
+        slopes = np.zeros((len(places), len(PUPIL_STEPS), len(OF_BOX)))
+        for axis, side in enumerate(("width", "height")):
+            slopes[:, axis, OF_BOX.index(side)] = 2 * places[:, axis] / scale[axis]
+        boxes = _boxes_of(cut, self.mask, CUT_WIDTHS, slopes)
+        sums = self._weights.sums[:2].copy()
+        return _Drawn(self._wide_tables, boxes, self._weights._replace(sums=sums))
 
     @cached_property
-    def _sized(self) -> _Drawn:
-        """What the kernel draws whose first two parameters of the pupil are width and height."""
-        tables = share_tables(self.mask, self.placement, KINDS, CUT_WIDTHS)[0]
-        places = _width_places(self._openings, self.mask)
-        slopes = np.zeros((len(places), len(PUPIL_STEPS), len(OF_BOX)))
-        slopes[:, 0, OF_BOX.index("width")] = 2 * places[:, 0]
-        slopes[:, 1, OF_BOX.index("height")] = 2 * places[:, 1]
-        boxes = _boxes_of(self._openings, self.mask, CUT_WIDTHS, slopes)
-        return _Drawn(tables, boxes, self._weights._replace(sums=self._weights.sums[:2].copy()))
+    def _wide_tables(self) -> NDArray[np.float64]:
+        """The tables of boxes of every width."""
+        return share_tables(self.mask, self.placement, KINDS, CUT_WIDTHS)[0]
 
     def slopes_by_view(
         self,
