@@ -51,6 +51,7 @@ from emmc_rig.calibration.causes import (
     OWN,
     PLATE,
     SHIFTING,
+    SIZE,
     STAGE,
     Cause,
     FoundCause,
@@ -61,7 +62,7 @@ from emmc_rig.calibration.causes import (
     find_causes,
     fit_plate,
     log_evidence,
-    pinholes_off_um,
+    pinholes_found,
     possible_causes,
     through_pinhole,
     with_lens,
@@ -336,25 +337,25 @@ class _BenchPrior:
     own: NDArray[np.float64]
     """(own,), about which the causes act: that of pinholes where they stand, see `about`."""
 
-    def off_um(
+    def holes(
         self, found: Sequence[FoundCause], state: _State, boards: Sequence[Board]
     ) -> NDArray[np.float64]:
-        """Return where pinholes stand by the causes found, (board, 2)."""
+        """Return the pinholes by the causes found, (board, 3), see `Geometry.light`."""
         own = state.own
         known = [cause for cause in found if cause.name in self.causes]
         causes, none = list(self.causes.values()), np.zeros((own.size, own.size))
         sized = with_sizes(known, causes, own.ravel() - self.own, none, self.own2)
-        return pinholes_off_um(sized, boards, self.geometry.cell_um)
+        return pinholes_found(sized, boards, self.geometry.cell_um)
 
-    def about(self, off_um: Array, state: _State, boards: Sequence[Board]) -> _BenchPrior:
-        """Return the prior with causes about where pinholes stand, (board, 2)."""
+    def about(self, holes: Array, state: _State, boards: Sequence[Board]) -> _BenchPrior:
+        """Return the prior with causes about the pinholes as they are, (board, 3)."""
         geometry = replace(self.geometry, pupil=state.placement.fitted_pupil())
-        again = possible_causes(boards, geometry, off_um)
+        again = possible_causes(boards, geometry, holes)
         own = np.zeros((len(boards), OWN))
         for index, board in enumerate(boards):
             if through_pinhole(board):
-                here, slopes = geometry.about(board, off_um[index])
-                own[index] = here - slopes @ off_um[index]
+                here, slopes = geometry.about(board, holes[index])
+                own[index] = here - slopes @ holes[index]
         return replace(
             self,
             causes={cause.name: cause for cause in again},
@@ -688,9 +689,10 @@ def _about_pinholes(
     may share out what the plate alone explains.
     """
     still = _own_information(point, replace(bench, own=np.zeros_like(bench.own)))
-    places = [bench.off_um(found, point.state, boards)]
+    places = [bench.holes(found, point.state, boards)]
     if not any(board.loose for board in boards):
-        places.append(fit_plate(still, boards, bench.geometry))
+        places.append(places[0].copy())
+        places[1][:, :2] = fit_plate(still, boards, bench.geometry)
 
     def evidence(tried: _BenchPrior) -> float:
         own = OwnInformation(still.information, still.pull - still.information @ tried.own)
@@ -886,12 +888,12 @@ def fit_placement(
             prior = bench.with_widths(widths)
         descent = _descend(mask, point, samples, prior, settings, FIRST_GAIN)
         state, steps = descent.point.state, steps + descent.steps
-    found, off_plate = list[FoundCause](), False
+    found, off_plate, unlike = list[FoundCause](), False, False
     for turn, least_gain in enumerate(CAUSE_GAINS):
         if not descent.point.state.widening and any(cause.name in OF_HOLES for cause in found):
             state = replace(descent.point.state, widening=True)
             descent = descent._replace(point=_point(mask, state, whole))
-        if off_plate:
+        if unlike:
             # Where pinholes stand decides how much of their light the aperture's edge cuts.
             bench = _about_pinholes(descent.point, bench, found, boards)
         elif turn > 1:
@@ -902,6 +904,7 @@ def fit_placement(
         descent = _descend(mask, descent.point, whole, prior, settings, least_gain)
         steps += descent.steps
         off_plate = any(cause.name in OF_PLATE for cause in found)
+        unlike = off_plate or any(cause.name in (HOLES, SIZE) for cause in found)
     point, state = descent.point, descent.point.state
     checks = tuple(_check_board(point, sample, index) for index, sample in enumerate(whole))
     _refuse_unexplained(alike := _fitted_correlation(point, whole))
