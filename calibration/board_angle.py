@@ -6,8 +6,7 @@ saddles over the aperture, the same open whiteboard after the turn reads
 sum_j psi_j (1 + sum_k c_k (t_k(turned u_j) - t_k(u_j))): linear in c, and the views' shadows show
 the terms apart. Which way a board was turned is not taken on trust: half a turn reads alike both
 ways, and with it a quarter turn shows its sense. The mask may have moved meanwhile: its place is
-fitted beside. An error of Psi looks alike in all boards: the board as it stood before it was turned
-shows it.
+fitted beside. An error of Psi looks alike in all boards: the board before it was turned shows it.
 
 What no turn changes, a lamp from one side, gloss, a board that does not fill the aperture, looks as
 if the aperture let so much through. `leaning` measures the lopsided part.

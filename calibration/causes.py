@@ -226,7 +226,7 @@ def possible_causes(
     the outermost views loses light, and its middle moves half as far.
     """
     count = len(boards)
-    holes = np.zeros((count, 3)) if holes is None else holes
+    known, holes = holes is not None, np.zeros((count, 3)) if holes is None else holes
     few = np.array([through_pinhole(board) for board in boards])
     loose = np.array([board.loose for board in boards])
     moved = MOVED_STEPS * LEAST_MOVED_UM
@@ -248,6 +248,9 @@ def possible_causes(
     slopes = np.zeros((count, OWN, count, 3))
     for index in np.flatnonzero(few):
         slopes[index, :, index] = geometry.about(boards[index], holes[index])[1]
+    if not known:
+        # Of larger and smaller holes the aperture's edge cuts the larger alone.
+        slopes[:, :, :, 2] = np.eye(count)[:, None] * np.array([1, 0, 0, 0.5, 0.5])[:, None]
     by_place, by_area = np.split(slopes.reshape(count * OWN, count, 3), [2], axis=2)
     by_hand = few & loose if loose.any() else few
     on_plate, least = moved / geometry.ratio, LEAST_MOVED_UM / geometry.ratio

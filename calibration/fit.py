@@ -133,11 +133,13 @@ LOOSE_UM = 0.5
 """By which a hand's pinhole seems to move the mask, at first: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
 """Of the width of the prior of glass, which a displaced pinhole imitates."""
+CLEAR_GAIN = 50.0
+"""Of the log evidence by holes of other sizes: less does not bear to be looked at again."""
 CAUSE_GAINS = (FIRST_GAIN, LEAST_GAIN, LEAST_GAIN)
 """The causes depend on the fit and the fit on the causes: in turn, to these last gains; the third
 time where pinholes stand off their holes."""
 LEAST_POWER, SURE_POWER = 5e-3, 10.0
-"""By which the power of the light that readings go with differs from 1, and its deviations."""
+"""Least difference of a response's power from 1, and how many deviations it must be."""
 MOSTLY = 0.4
 """Of the residuals beyond the noise: what explains less is imitated by another fault."""
 SURE_ROWS = 3.0
@@ -335,7 +337,7 @@ class _BenchPrior:
     always: tuple[str, ...]
     geometry: Geometry
     own: NDArray[np.float64]
-    """(own,), about which the causes act: that of pinholes where they stand, see `about`."""
+    """(own,): the middle of the causes' prior, of pinholes as `about` has them."""
 
     def holes(
         self, found: Sequence[FoundCause], state: _State, boards: Sequence[Board]
@@ -689,10 +691,12 @@ def _about_pinholes(
     may share out what the plate alone explains.
     """
     still = _own_information(point, replace(bench, own=np.zeros_like(bench.own)))
-    places = [bench.holes(found, point.state, boards)]
+    seen = bench.holes(found, point.state, boards)
+    # With the areas found, or as if every hole were as large as a view.
+    places = [seen, seen * [1, 1, 0]]
     if not any(board.loose for board in boards):
-        places.append(places[0].copy())
-        places[1][:, :2] = fit_plate(still, boards, bench.geometry)
+        by_plate = fit_plate(still, boards, bench.geometry)
+        places.append(np.column_stack([by_plate, seen[:, 2]]))
 
     def evidence(tried: _BenchPrior) -> float:
         own = OwnInformation(still.information, still.pull - still.information @ tried.own)
@@ -904,7 +908,9 @@ def fit_placement(
         descent = _descend(mask, descent.point, whole, prior, settings, least_gain)
         steps += descent.steps
         off_plate = any(cause.name in OF_PLATE for cause in found)
-        unlike = off_plate or any(cause.name in (HOLES, SIZE) for cause in found)
+        unlike = off_plate or any(
+            cause.name in (HOLES, SIZE) and cause.gain > CLEAR_GAIN for cause in found
+        )
     point, state = descent.point, descent.point.state
     checks = tuple(_check_board(point, sample, index) for index, sample in enumerate(whole))
     _refuse_unexplained(alike := _fitted_correlation(point, whole))
@@ -1111,7 +1117,7 @@ def _change_of_psi(
 ) -> float:
     """Return by how much Psi changes, relative, with a parameter by its deviation.
 
-    covariances: (parameter,), with all others, which follow it.
+    covariances: (parameter,), of the parameter with each: the others move as it lets expect.
     """
     rng = np.random.default_rng(0)
     pixels = rng.integers(mask.pixel_shape(), size=(CHANGE_PIXELS, 2))

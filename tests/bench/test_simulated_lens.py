@@ -43,7 +43,7 @@ def white_reading(rig, camera):
     ],
 )
 def test_a_rig_s_file_says_what_the_lens_leaves_open(tmp_path, pupil, described, open_share):
-    """`round` is the lens that the camera describes, where it describes one."""
+    """`round` is the lens in the camera's file, if the file has a lens with a pupil."""
     (tmp_path / "rig.yaml").write_text(f"kind: simulated\npupil: {pupil}\n")
     imaged = ImagedRig(scene="dark", size=SIZE, rays=256)
     rig = rig_description(str(tmp_path / "rig.yaml"), imaged)

@@ -409,7 +409,7 @@ class Bench:
         """Return the parts of a piece of the aperture in the pupil, and their shares of it.
 
         Pieces on the pupil's edge are split in four, so often that the shadows of the last are
-        below PART_UM; those lie about the middle of what is open of them.
+        below PART_UM; the last lie about the middle of their open part.
         """
         optics, points = self.optics, (np.arange(32) + 0.5) / 32 - 0.5
         y = (piece.at_um[0] + piece.sides_um[0] * points)[:, None]
