@@ -26,7 +26,7 @@ from emmc_rig.calibration.causes import (
 )
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.colours import Crosstalk
-from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit, Power
+from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
 from emmc_rig.calibration.glare import Glare
 from emmc_rig.calibration.levels import Levels
 from emmc_rig.calibration.placement import Placement
@@ -292,18 +292,6 @@ def fit_advice(fit: Fit) -> list[str]:
     ]
 
 
-def power_advice(power: Power) -> list[str]:
-    """Return the line for a response that is not linear; no line for other benches."""
-    if not power.sure:
-        return []
-    return [
-        f"readings go with the light to the power of {1 + power.size:.3f} +- "
-        f"{power.deviation:.3f}: the sensor's response is not linear, or its files are not; Psi's "
-        "deviation includes it; read linear files, or add `response: [0.25, 0.5, 0.75]` under "
-        "whiteboards in the plan and capture again"
-    ]
-
-
 class CauseLines(NamedTuple):
     """Why whiteboards differ, in words, the likeliest first."""
 
@@ -381,7 +369,7 @@ def _exposure_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: 
 
 
 def _share(cause: FoundCause, more: str, less: str) -> str:
-    """Return the single coefficient of a cause and its deviation; "" if it is small or chance."""
+    """Return a cause's one coefficient with its deviation, "" where it is small or chance."""
     share, deviation = cause.size[0], cause.deviation[0]
     if abs(share) < max(LEAST_EXPOSURE, SIGNIFICANT * deviation):
         return ""
