@@ -369,7 +369,7 @@ def _exposure_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: 
 
 
 def _share(cause: FoundCause, more: str, less: str) -> str:
-    """Return a cause's one coefficient with its deviation, "" where it is small or chance."""
+    """Return the single coefficient of a cause and its deviation; "" if it is small or chance."""
     share, deviation = cause.size[0], cause.deviation[0]
     if abs(share) < max(LEAST_EXPOSURE, SIGNIFICANT * deviation):
         return ""
