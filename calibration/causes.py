@@ -1,11 +1,11 @@
 """Why whiteboards differ among themselves: single causes, compared by the evidence of the readings.
 
 Every whiteboard has parameters of its own beside the placement: its brightness, by how much the
-mask seems to have moved, x and y, and by how much larger its hole is than a view. A cause gives
-these a pattern over the whiteboards: a lamp that is not steady changes every brightness by chance,
-holes of unequal size only those of whiteboards through the pinhole, a plate that is turned moves
-the shadow of every hole by its distance from the axis. A pinhole moved by du on the plate shows the
-shadow of a mask moved by -rho du, rho = d / D.
+mask seems to have moved, x and y, and by how much wider and higher its hole is than a view. A cause
+gives these a pattern over the whiteboards: a lamp that is not steady changes every brightness by
+chance, holes of unequal size only those of whiteboards through the pinhole, a plate that is turned
+moves the shadow of every hole by its distance from the axis. A pinhole moved by du on the plate
+shows the shadow of a mask moved by -rho du, rho = d / D.
 
 With the readings linear in the parameters, what the whiteboards say of their own parameters p, the
 placement's taken out, is an information S and a pull h. A cause of pattern A and width tau makes p
@@ -33,10 +33,10 @@ from emmc_rig.calibration.boards import Board
 from emmc_rig.model.pupil import Pupil, cell_openings
 
 Array = NDArray[np.floating]
-OWN = 4
+OWN = 5
 """Parameters of one whiteboard: relative brightness, by how much the mask moved (x, y), um, and by
-how much larger its hole's area is than a view, relative."""
-LEAST_OWN = (2e-5, 0.002, 0.002, 2e-5)
+how much wider and higher its hole is than a view, relative."""
+LEAST_OWN = (2e-5, 0.002, 0.002, 1e-4, 1e-4)
 """Standard deviations of these without any cause: far below what noise shows."""
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256
@@ -49,9 +49,10 @@ NEARLY = 3.0
 """Difference of the log evidence of causes that fit nearly alike: a factor of 20."""
 FEWEST_PINHOLES = 4
 """Whiteboards of fewer do not tell their pinholes' places from the mask's distance."""
+PLATE_STEPS, AREA_STEP = 12, 1e-3
 LONE = 0.9
 """Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
-LAMP, STAGE, CREEP, LENS = "lamp", "stage", "creep", "lens"
+LAMP, STAGE, CREEP, LENS, BLUR = "lamp", "stage", "creep", "lens", "blur"
 HOLES, HANDS, EXPOSURE, PLATE, TURN = "holes", "hands", "exposure", "plate", "turn"
 SIZE = "size"
 OF_HOLES = (HANDS, HOLES, EXPOSURE, PLATE, SIZE, TURN)
@@ -110,6 +111,8 @@ class Light(NamedTuple):
     """Of the light through the hole on its place."""
     middle_um: NDArray[np.float64]
     """(x, y), from the middle of the view."""
+    sides: NDArray[np.float64]
+    """Width and height of the hole, over the view's."""
 
 
 @dataclass(frozen=True)
@@ -125,46 +128,88 @@ class Geometry:
     views: tuple[int, int]
     pupil: Pupil | None = None
 
-    def light(self, view: tuple[int, int], off_um: Array) -> Light:
-        """Return the light through a pinhole that stands (x, y) off its view's hole."""
-        pupil = self.pupil
-        if pupil is None:
-            sides_um = self.cell_um * np.array(self.views[::-1])
-            places_um = self.cell_um * (np.array(view[::-1]) - (np.array(self.views[::-1]) - 1) / 2)
-            begin_um = np.maximum(places_um + off_um - self.cell_um / 2, -sides_um / 2)
-            end_um = np.minimum(places_um + off_um + self.cell_um / 2, sides_um / 2)
-            lengths_um = np.maximum(end_um - begin_um, 0.0)
-            share = float(np.prod(lengths_um / self.cell_um))
-            return Light(share, (begin_um + end_um) / 2 - places_um)
-        x_mm, y_mm = np.array(pupil.centre_mm) - np.asarray(off_um) / 1e3
-        seen = pupil.model_copy(update={"centre_mm": (float(x_mm), float(y_mm))})
+    def light(self, view: tuple[int, int], hole: Array) -> Light:
+        """Return the light through a pinhole; hole: (x, y) off its view, um, and area over 1."""
+        side = float(np.sqrt(1 + hole[2]))
+        if self.pupil is None:
+            cells = np.array(self.views[::-1])
+            place, off = np.array(view[::-1]) - (cells - 1) / 2, hole[:2] / self.cell_um
+            begin = np.maximum(place + off - side / 2, -cells / 2)
+            end = np.minimum(place + off + side / 2, cells / 2)
+            sides = np.maximum(end - begin, 0.0)
+            return Light(float(np.prod(sides)), ((begin + end) / 2 - place) * self.cell_um, sides)
+        shares, middles_um = zip(
+            *(self._through_pupil(view, hole[:2] * along) for along in ([1, 1], [1, 0], [0, 1])),
+            strict=True,
+        )
+        # A cut hole is narrower by what a move across alone takes of its light; lower likewise.
+        whole = max(self._through_pupil(view, np.zeros(2))[0], 0.01)
+        return Light(shares[0] * side**2, middles_um[0], side * np.array(shares[1:]) / whole)
+
+    def _through_pupil(self, view: tuple[int, int], off_um: Array) -> tuple[float, Array]:
+        """Return the open share of a hole behind the pupil, and its middle from the view's, um."""
+        assert self.pupil is not None
+        x_mm, y_mm = np.array(self.pupil.centre_mm) - np.asarray(off_um) / 1e3
+        seen = self.pupil.model_copy(update={"centre_mm": (float(x_mm), float(y_mm))})
         opened = cell_openings(seen, self.views, self.cell_um)
         boxes = opened.of_view(*view)
         shares = opened.share[boxes]
         total = max(float(shares.sum()), 1e-9)
         places = np.stack([opened.x_um[boxes], opened.y_um[boxes]], axis=1)
-        middle = shares @ places / total
-        return Light(total, middle + off_um)
+        return total, shares @ places / total + off_um
 
-    def slopes(self, board: Board, off_um: Array) -> NDArray[np.float64]:
-        """Return the slopes of a whiteboard's own parameters by its pinhole's place, (OWN, 2).
+    def own(self, view: tuple[int, int], hole: Array) -> NDArray[np.float64]:
+        """Return the own parameters of a whiteboard through a pinhole, (OWN,), see `light`."""
+        on, off = self.light(view, np.zeros(3)), self.light(view, hole)
+        brighter = off.share / max(on.share, 0.01) - 1
+        return np.array(
+            [brighter, *(-self.ratio * (off.middle_um - on.middle_um)), *(off.sides - 1)]
+        )
 
-        off_um: (x, y) of the pinhole from its hole, about which the slopes are taken.
+    def about(self, board: Board, hole: Array) -> tuple[Array, Array]:
+        """Return a whiteboard's own parameters, (OWN,), and their slopes by its pinhole, (OWN, 3).
+
+        hole: see `light`; the slopes are taken there. What opens some views moves with the plate,
+        without an edge.
         """
-        found = np.zeros((OWN, 2))
         if board.views_open.sum() > 1:
-            found[1:3] = -self.ratio * np.eye(2)
-            return found
+            slopes = np.zeros((OWN, 3))
+            slopes[0, 2], slopes[1:3, :2] = 1.0, -self.ratio * np.eye(2)
+            return slopes @ hole, slopes
         v, u = np.argwhere(board.views_open)[0].tolist()
-        step_um, here = self.cell_um / 100, self.light((v, u), np.zeros(2))
-        for axis in range(2):
-            by = np.eye(2)[axis] * step_um
-            less, more = self.light((v, u), off_um - by), self.light((v, u), off_um + by)
-            found[0, axis] = (more.share - less.share) / max(here.share, 0.01)
-            found[1:3, axis] = -self.ratio * (more.middle_um - less.middle_um)
-        # A cut hole is narrower, too.
-        found[3] = found[0]
-        return found / (2 * step_um)
+        slopes = [
+            (self.own((v, u), hole + by) - self.own((v, u), hole - by)) / (2 * by.sum())
+            for by in np.diag([self.cell_um / 100, self.cell_um / 100, AREA_STEP])
+        ]
+        return self.own((v, u), hole), np.stack(slopes, axis=1)
+
+
+def fit_plate(
+    own: OwnInformation, boards: Sequence[Board], geometry: Geometry
+) -> NDArray[np.float64]:
+    """Return how far pinholes stand off their holes, (board, 2), by one move and turn of the plate.
+
+    Least squares for the three, with the light that the aperture's edge cuts at every step.
+    """
+    few = np.array([through_pinhole(board) for board in boards])
+    turned = turned_by(plate_places_um(boards, geometry.cell_um))
+    far_um = max(float(np.abs(turned).max()), geometry.cell_um)
+    by_plate = np.stack([np.tile([1.0, 0.0], (len(few), 1)), np.tile([0.0, 1.0], (len(few), 1)),
+                         turned / far_um], axis=-1) * few[:, None, None]  # fmt: skip
+    found = np.zeros(3)
+    for _ in range(PLATE_STEPS):
+        off_um = by_plate @ found
+        here, slopes = np.zeros((len(boards), OWN)), np.zeros((len(boards), OWN, 3))
+        for index in np.flatnonzero(few):
+            here[index], each = geometry.about(boards[index], np.append(off_um[index], 0.0))
+            slopes[index] = each[:, :2] @ by_plate[index]
+        rows = slopes.reshape(-1, 3)
+        left = own.pull - own.information @ here.ravel()
+        step = np.linalg.lstsq(rows.T @ own.information @ rows, rows.T @ left, rcond=1e-9)[0]
+        found = np.clip(found + step, -geometry.cell_um / 2, geometry.cell_um / 2)
+        if np.abs(step).max() < geometry.cell_um * 1e-4:
+            break
+    return by_plate @ found
 
 
 def through_pinhole(board: Board) -> bool:
@@ -173,21 +218,21 @@ def through_pinhole(board: Board) -> bool:
 
 
 def possible_causes(
-    boards: Sequence[Board], geometry: Geometry, off_um: Array | None = None
+    boards: Sequence[Board], geometry: Geometry, holes: Array | None = None
 ) -> list[Cause]:
     """Return the causes that these whiteboards could tell from a perfect bench.
 
-    off_um: (board, 2), x and y by which pinholes stand off their holes as far as that is known:
-    one that is pushed beyond the outermost views loses light, and its middle moves half as far.
+    holes: (board, 3), see `Geometry.light`, as far as they are known: one that is pushed beyond
+    the outermost views loses light, and its middle moves half as far.
     """
     count = len(boards)
-    off_um = np.zeros((count, 2)) if off_um is None else off_um
+    known, holes = holes is not None, np.zeros((count, 3)) if holes is None else holes
     few = np.array([through_pinhole(board) for board in boards])
     loose = np.array([board.loose for board in boards])
     moved = MOVED_STEPS * LEAST_MOVED_UM
     # Where pinholes stand off their holes, a lone open whiteboard is the only sure level.
     lit = np.eye(count)
-    if (loose.any() or off_um.any()) and (~few).sum() == 1:
+    if (loose.any() or holes[:, :2].any()) and (~few).sum() == 1:
         lit[~few] = 0.0
     causes = [
         Cause(LAMP, _own_columns(lit, 0), BRIGHTNESSES),
@@ -199,21 +244,21 @@ def possible_causes(
         causes.append(Cause(CREEP, _moves(when[:, None]), 2 * moved, 2 * LEAST_MOVED_UM))
     if few.sum() < (1 if loose.any() else FEWEST_PINHOLES):
         return causes
-    # By the place of every pinhole, x and y: (board, OWN, board of the pinhole, 2).
-    slopes = np.zeros((count, OWN, count, 2))
+    # By the place and area of every pinhole: (board, OWN, board of the pinhole, 3).
+    slopes = np.zeros((count, OWN, count, 3))
     for index in np.flatnonzero(few):
-        slopes[index, :, index] = geometry.slopes(boards[index], off_um[index])
-    by_place = slopes.reshape(count * OWN, count, 2)
+        slopes[index, :, index] = geometry.about(boards[index], holes[index])[1]
+    if not known:
+        # Of larger and smaller holes the aperture's edge cuts the larger alone.
+        slopes[:, :, :, 2] = np.diag(few)[:, None] * np.array([1, 0, 0, 0.5, 0.5])[:, None]
+    by_place, by_area = np.split(slopes.reshape(count * OWN, count, 3), [2], axis=2)
     by_hand = few & loose if loose.any() else few
     on_plate, least = moved / geometry.ratio, LEAST_MOVED_UM / geometry.ratio
     causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate, least))
     if few.sum() > 1:
-        wider = np.zeros((count, OWN))
-        wider[few, 0], wider[few, 3] = 1.0, 1.0
-        each = np.eye(count)[:, None, few] * wider[:, :, None]
-        causes.append(Cause(HOLES, each.reshape(count * OWN, -1), BRIGHTNESSES))
+        causes.append(Cause(HOLES, by_area[:, few, 0], BRIGHTNESSES))
         if not few.all():
-            causes.append(Cause(SIZE, wider.reshape(-1, 1), BRIGHTNESSES))
+            causes.append(Cause(SIZE, by_area.sum(axis=1), BRIGHTNESSES))
     if few.all():
         return causes
     common = few[:, None].astype(np.float64)
@@ -239,22 +284,25 @@ def plate_places_um(boards: Sequence[Board], cell_um: float) -> NDArray[np.float
     return (middles - (views - 1) / 2)[:, ::-1] * cell_um
 
 
-def pinholes_off_um(
+def pinholes_found(
     found: Sequence[FoundCause], boards: Sequence[Board], cell_um: float
 ) -> NDArray[np.float64]:
-    """Return how far pinholes stand off their holes by the causes found, x and y: (board, 2)."""
+    """Return the pinholes by the causes found, (board, 3): see `Geometry.light`."""
     few = np.array([through_pinhole(board) for board in boards])
     loose = np.array([board.loose for board in boards])
     by_hand = few & loose if loose.any() else few
-    off_um = np.zeros((len(boards), 2))
+    holes = np.zeros((len(boards), 3))
     for cause in found:
         if cause.name == HANDS:
-            off_um[by_hand] += np.reshape(cause.size, (-1, 2))
+            holes[by_hand, :2] += np.reshape(cause.size, (-1, 2))
         elif cause.name == PLATE:
-            off_um[few] += cause.size
+            holes[few, :2] += cause.size
         elif cause.name == TURN:
-            off_um += few[:, None] * cause.size[0] * turned_by(plate_places_um(boards, cell_um))
-    return off_um
+            turned = turned_by(plate_places_um(boards, cell_um))
+            holes[:, :2] += few[:, None] * cause.size[0] * turned
+        elif cause.name in (HOLES, SIZE):
+            holes[few, 2] += cause.size
+    return holes
 
 
 def _own_columns(of_boards: Array, which: int) -> NDArray[np.float64]:
@@ -269,18 +317,19 @@ def _moves(of_boards: Array) -> NDArray[np.float64]:
     return np.hstack([_own_columns(of_boards, 1), _own_columns(of_boards, 2)])
 
 
-def with_lens(causes: Sequence[Cause], displacements: int) -> list[Cause]:
-    """Return the causes with LENS, over the own parameters and then the views' displacements.
+def with_lens(causes: Sequence[Cause], displaced: Array) -> list[Cause]:
+    """Return the causes with LENS and BLUR, over the own parameters and then the views' own.
 
-    displacements: number of the latter, um, by x and y of every view.
+    displaced: (views' own,), whether each is a displacement, um, or a blur, um.
     """
+    own, count = len(causes[0].columns), len(displaced)
     more = [
-        replace(cause, columns=np.pad(cause.columns, ((0, displacements), (0, 0))))
-        for cause in causes
+        replace(cause, columns=np.pad(cause.columns, ((0, count), (0, 0)))) for cause in causes
     ]
-    own = len(causes[0].columns)
-    of_views = np.vstack([np.zeros((own, displacements)), np.eye(displacements)])
-    return [*more, Cause(LENS, of_views, MOVED_STEPS * LEAST_MOVED_UM / 5)]
+    of_views = np.vstack([np.zeros((own, count)), np.eye(count)])
+    widths = MOVED_STEPS * LEAST_MOVED_UM / 5
+    of_lens = ((LENS, displaced), (BLUR, ~displaced))
+    return [*more, *(Cause(name, of_views[:, which], widths) for name, which in of_lens)]
 
 
 def covariance_of(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from emmc_rig.calibration.board_angle import BoardAngle, Leaning
 from emmc_rig.calibration.boards import Board
 from emmc_rig.calibration.causes import (
+    BLUR,
     CREEP,
     EXPOSURE,
     HANDS,
@@ -26,7 +27,7 @@ from emmc_rig.calibration.causes import (
 )
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.colours import Crosstalk
-from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit
+from emmc_rig.calibration.fit import MOST_MORE_BOARDS, Fit, Power
 from emmc_rig.calibration.glare import Glare
 from emmc_rig.calibration.levels import Levels
 from emmc_rig.calibration.placement import Placement
@@ -292,6 +293,18 @@ def fit_advice(fit: Fit) -> list[str]:
     ]
 
 
+def power_advice(power: Power) -> list[str]:
+    """Return the line for a response that is not linear; no line for other benches."""
+    if not power.sure:
+        return []
+    return [
+        f"readings go with the light to the power of {1 + power.size:.3f} +- "
+        f"{power.deviation:.3f}: the sensor's response is not linear, or its files are not; Psi's "
+        "deviation includes it; read linear files, or add `response: [0.25, 0.5, 0.75]` under "
+        "whiteboards in the plan and capture again"
+    ]
+
+
 class CauseLines(NamedTuple):
     """Why whiteboards differ, in words, the likeliest first."""
 
@@ -308,7 +321,7 @@ def cause_lines(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> CauseLin
     """
     lines = CauseLines([], [])
     for cause in fit.causes:
-        words = _WORDS[cause.name](cause, fit, boards, mask)
+        words = _WORDS[cause.name](cause, fit, boards, mask) if cause.name in _WORDS else ""
         if not words:
             continue
         if cause.instead:
@@ -328,6 +341,7 @@ SHORT = {
     SIZE: "holes that are not as large as views",
     TURN: "a plate that is turned",
     LENS: "aberrations of the lens",
+    BLUR: "views that the lens blurs unlike each other",
 }
 """Causes as alternatives are named."""
 

@@ -38,6 +38,7 @@ from scipy.ndimage import correlate1d
 
 from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadiness2
 from emmc_rig.calibration.causes import (
+    BLUR,
     CREEP,
     EXPOSURE,
     HANDS,
@@ -51,6 +52,7 @@ from emmc_rig.calibration.causes import (
     OWN,
     PLATE,
     SHIFTING,
+    SIZE,
     STAGE,
     Cause,
     FoundCause,
@@ -59,7 +61,9 @@ from emmc_rig.calibration.causes import (
     covariance_of,
     doubt_lone_move,
     find_causes,
-    pinholes_off_um,
+    fit_plate,
+    log_evidence,
+    pinholes_found,
     possible_causes,
     through_pinhole,
     with_lens,
@@ -105,6 +109,8 @@ FEWEST_PIXELS = 400
 """Of a whiteboard, however many there are."""
 MOST_OF_PRIOR = 0.7
 """Of the prior's deviation: a parameter known no better stays at the design."""
+LEAST_CHANGE, CHANGE_PIXELS = 1e-3, 500
+"""Of Psi, by a parameter that the prior decides: less is of no account. By so many pixels."""
 LEAST_GAIN = 0.01
 """Of the log posterior, in a last step: that of a move by a seventh of a standard deviation."""
 FIRST_GAIN = 2.0
@@ -114,8 +120,8 @@ LEAST_CURVATURE = 0.3
 MOST_MORE_BOARDS = 200
 LEAST_FIT_CORRELATION = 0.7
 """Of readings and fitted shadow."""
-LARGER = 3
-"""Where the hole's area lies in a whiteboard's own parameters."""
+SIDES = slice(3, 5)
+"""Where the hole's width and height lie in a whiteboard's own parameters."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
 PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
@@ -128,11 +134,15 @@ LOOSE_UM = 0.5
 """By which a hand's pinhole seems to move the mask, at first: 0.2 mm of 50 mm at 0.12 mm."""
 OF_LOOSE = 0.05
 """Of the width of the prior of glass, which a displaced pinhole imitates."""
+CLEAR_GAIN = 50.0
+"""Of the log evidence by holes of other sizes: less does not bear to be looked at again."""
 CAUSE_GAINS = (FIRST_GAIN, LEAST_GAIN, LEAST_GAIN)
 """The causes depend on the fit and the fit on the causes: in turn, to these last gains; the third
 time where pinholes stand off their holes."""
-UNLIKE = 0.3
-"""Of a reading's share that an area differs by: what the shape of a cut hole may make beside it."""
+LEAST_POWER, SURE_POWER = 5e-3, 10.0
+"""Least difference of a response's power from 1, and how many deviations it must be."""
+MOSTLY = 0.4
+"""Of the residuals beyond the noise: what explains less is imitated by another fault."""
 SURE_ROWS = 3.0
 """Deviations from which on rows that err alike are no chance."""
 MOST_ALIKE, ROWS_ALIKE = 0.95, 64
@@ -184,6 +194,25 @@ class BoardCheck:
     outliers: float
 
 
+@dataclass(frozen=True)
+class Power:
+    """The power 1 + size of the light that readings seem to go with; 1 of a linear sensor.
+
+    explained: share of what the residuals exceed the noise by. error: relative, of Psi.
+    """
+
+    size: float = 0.0
+    deviation: float = 1.0
+    explained: float = 0.0
+    error: float = 0.0
+
+    @property
+    def sure(self) -> bool:
+        """Whether the power is not 1, and explains more of the residuals than another fault."""
+        large = abs(self.size) > max(LEAST_POWER, SURE_POWER * self.deviation)
+        return large and self.explained > MOSTLY
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The placement fitted, how sure it is, and how well it explains the whiteboards.
@@ -191,15 +220,16 @@ class Fit:
     covariance: (parameter, parameter), in the order of `placement.vector()`.
     correlation: of the readings with the fitted shadow.
     chi2: mean squared residual over the noise without outliers. outliers: share of the pixels.
-    undecided: names of parameters that the prior decides more than the whiteboards.
+    undecided: names of parameters that the prior decides more than the whiteboards, and Psi shows.
     more_boards: how many more of the same kinds would decide them; MOST_MORE_BOARDS: no number.
-    own, own_deviation: (board, OWN), brightness over 1, place of the mask, um, and area of
-        the hole over 1, by which whiteboards differ, as the causes let them.
+    own, own_deviation: (board, OWN), brightness over 1, place of the mask, um, and width and
+        height of the hole over 1, by which whiteboards differ, as the causes let them.
     causes: why whiteboards differ, the strongest first. A lamp that is not steady makes references
         differ likewise, which the covariance does not count.
     moved_um: how far the mask stands from its place; so it may in the shots of a scene, which the
         covariance counts.
     astray2: (OF_VIEW,), variances of the views' own displacements and softenings, um^2.
+    power: of the light that readings go with.
     """
 
     placement: Placement
@@ -218,6 +248,7 @@ class Fit:
     causes: tuple[FoundCause, ...] = ()
     moved_um: float = 0.0
     astray2: tuple[float, ...] = ()
+    power: Power = Power()
 
     @property
     def brightness_spread(self) -> float:
@@ -306,19 +337,34 @@ class _BenchPrior:
     causes: Mapping[str, Cause]
     always: tuple[str, ...]
     geometry: Geometry
+    own: NDArray[np.float64]
+    """(own,): the middle of the causes' prior, of pinholes as `about` has them."""
 
-    def about(
+    def holes(
         self, found: Sequence[FoundCause], state: _State, boards: Sequence[Board]
-    ) -> _BenchPrior:
-        """Return the prior with causes about where pinholes stand by those found."""
+    ) -> NDArray[np.float64]:
+        """Return the pinholes by the causes found, (board, 3), see `Geometry.light`."""
         own = state.own
         known = [cause for cause in found if cause.name in self.causes]
         causes, none = list(self.causes.values()), np.zeros((own.size, own.size))
-        sized = with_sizes(known, causes, own.ravel(), none, self.own2)
-        off_um = pinholes_off_um(sized, boards, self.geometry.cell_um)
+        sized = with_sizes(known, causes, own.ravel() - self.own, none, self.own2)
+        return pinholes_found(sized, boards, self.geometry.cell_um)
+
+    def about(self, holes: Array, state: _State, boards: Sequence[Board]) -> _BenchPrior:
+        """Return the prior with causes about the pinholes as they are, (board, 3)."""
         geometry = replace(self.geometry, pupil=state.placement.fitted_pupil())
-        again = possible_causes(boards, geometry, off_um)
-        return replace(self, causes={cause.name: cause for cause in again}, geometry=geometry)
+        again = possible_causes(boards, geometry, holes)
+        own = np.zeros((len(boards), OWN))
+        for index, board in enumerate(boards):
+            if through_pinhole(board):
+                here, slopes = geometry.about(board, holes[index])
+                own[index] = here - slopes @ holes[index]
+        return replace(
+            self,
+            causes={cause.name: cause for cause in again},
+            geometry=geometry,
+            own=own.ravel(),
+        )
 
     def with_widths(self, widths: Mapping[str, float], aberrant: bool = False) -> _Prior:
         """Return the prior of all parameters; widths: of the causes, by name, possible or not.
@@ -326,7 +372,9 @@ class _BenchPrior:
         aberrant: whether aberrations displace the views.
         """
         possible = {name: width for name, width in widths.items() if name in self.causes}
-        own = np.linalg.inv(covariance_of(self.causes, possible, self.own2))
+        # In units of what is known beside the causes: their widths are millions of it.
+        unit = np.sqrt(np.outer(self.own2, self.own2))
+        own = np.linalg.inv(covariance_of(self.causes, possible, self.own2) / unit) / unit
         size = len(self.centre)
         precision = np.zeros((size + len(own), size + len(own)))
         of_placement = self.precision.copy()
@@ -335,7 +383,19 @@ class _BenchPrior:
             of_placement[SCALARS.index("glass_um")] /= OF_LOOSE**2
         precision[:size, :size] = np.diag(of_placement)
         precision[size:, size:] = own
-        return _Prior(precision, np.concatenate([self.centre, np.zeros(len(own))]))
+        return _Prior(precision, np.concatenate([self.centre, self.own]))
+
+    def softened(self, found: Sequence[FoundCause], placement: Placement) -> _BenchPrior:
+        """Return the prior with a hole of its own to every view that the lens blurs by its own.
+
+        A box of side a has the variance a^2 / 12: a blur of sigma that grows by b is a side of 12
+        sigma b / a^2 more. Light is none the more.
+        """
+        blur_um = next((cause.width for cause in found if cause.name == BLUR), 0.0)
+        side_um = self.geometry.ratio * self.geometry.cell_um
+        own2 = self.own2.reshape(-1, OWN).copy()
+        own2[:, SIDES] += (12 * placement.blur_um * blur_um / side_um**2) ** 2
+        return replace(self, own2=own2.ravel())
 
     def first_widths(self, ratio: float) -> dict[str, float]:
         """Return the widths before the causes are known."""
@@ -363,7 +423,8 @@ def _bench_prior(
     geometry = Geometry(ratio, mask.aperture_cell_um, mask.views, pupil)
     known = {cause.name: cause for cause in possible_causes(boards, geometry)}
     always = (HANDS,) if loose else ()
-    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry)
+    own = np.zeros(own2.size)
+    return _BenchPrior(1 / deviations**2, centre, own2.ravel(), known, always, geometry, own)
 
 
 def _robust_spread(residuals: Sequence[Array]) -> float:
@@ -390,25 +451,24 @@ def _linear_readings(
 ) -> tuple[_Linear, ...]:
     """Return every whiteboard's readings and slopes at a state.
 
-    reading = (1 + brightness) (shadow, with the mask moved, + larger d(shadow)/d(area))
+    reading = (1 + brightness) (shadow, with the mask moved, + wider d(shadow)/d(width) + ...)
     """
     shadow, found = Shadow(mask, state.placement), []
     for index, sample in enumerate(samples):
         opening, brightness = state.opening(sample.board, index), state.brightness(index)
         where = sample.pixels, sample.channels, *opening
         if state.widening and sample.board.views_open.sum() == 1:
-            read, slope, by_area = shadow.with_widening(*where)
-            read = read + by_area * state.own[index, LARGER]
+            read, slope, by_sides = shadow.with_widening(*where, sides=state.own[index, SIDES])
         else:
             read, slope = shadow.with_slopes(*where)
-            by_area = np.zeros(len(read))
+            by_sides = np.zeros((len(read), 2))
         # In one pass over memory, which takes as long as the arithmetic.
         count, factor = slope.shape[1], brightness / sample.deviation
         slopes = np.empty((len(read), count + OWN))
         np.multiply(slope, factor[:, None], out=slopes[:, :count])
         slopes[:, count] = read / sample.deviation
-        slopes[:, count + 1 : count + LARGER] = slopes[:, OFFSETS]
-        slopes[:, count + LARGER] = factor * by_area
+        slopes[:, count + 1 : count + 3] = slopes[:, OFFSETS]
+        slopes[:, count + 3 :] = factor[:, None] * by_sides
         found.append(_Linear((sample.reading - brightness * read) / sample.deviation, slopes))
     return tuple(found)
 
@@ -629,10 +689,37 @@ def _find_causes(
     if not any(cause.name in SHIFTING for cause in found) or bench.always:
         return found
     terms = _view_terms(mask, point, samples)
-    displaced = np.flatnonzero(np.resize(KINDS, len(terms.pull)) == KINDS[0])
-    own = _own_information(point, bench, terms, displaced)
-    own2 = np.concatenate([bench.own2, np.full(len(displaced), LEAST_OWN[1] ** 2)])
-    return find_causes(own, with_lens(causes, len(displaced)), own2)
+    every = np.arange(len(terms.pull))
+    displaced = np.resize(KINDS, len(every)) == KINDS[0]
+    own = _own_information(point, bench, terms, every)
+    own2 = np.concatenate([bench.own2, np.full(len(every), LEAST_OWN[1] ** 2)])
+    return find_causes(own, with_lens(causes, displaced), own2)
+
+
+def _about_pinholes(
+    point: _Point, bench: _BenchPrior, found: Sequence[FoundCause], boards: Sequence[Board]
+) -> _BenchPrior:
+    """Return the prior about the pinholes' likelier places: by the causes, or by the plate alone.
+
+    Their light bends at the aperture's edge, so that causes which are compared about a wrong place
+    may share out what the plate alone explains.
+    """
+    still = _own_information(point, replace(bench, own=np.zeros_like(bench.own)))
+    seen = bench.holes(found, point.state, boards)
+    # With the areas found, or as if every hole were as large as a view.
+    places = [seen, seen * [1, 1, 0]]
+    if not any(board.loose for board in boards):
+        by_plate = fit_plate(still, boards, bench.geometry)
+        places.append(np.column_stack([by_plate, seen[:, 2]]))
+
+    def evidence(tried: _BenchPrior) -> float:
+        own = OwnInformation(still.information, still.pull - still.information @ tried.own)
+        causes = find_causes(own, list(tried.causes.values()), tried.own2, tried.always)
+        widths = {cause.name: cause.width for cause in causes}
+        there = float((still.pull + own.pull) @ tried.own) / 2
+        return there + log_evidence(own, covariance_of(tried.causes, widths, tried.own2))
+
+    return max((bench.about(place, point.state, boards) for place in places), key=evidence)
 
 
 def _own_widths(found: Sequence[FoundCause], ratio: float) -> dict[str, float]:
@@ -666,7 +753,7 @@ def _own_information(
     terms, displaced: of the views, and which of theirs count as own as well.
     """
     normal, state = point.normal, point.state
-    away = state.vector() - np.concatenate([bench.centre, np.zeros(state.own.size)])
+    away = state.vector() - np.concatenate([bench.centre, bench.own])
     matrix, pull = normal.matrix, normal.gradient + normal.matrix @ away
     if terms is not None:
         chosen = np.asarray(displaced)
@@ -768,14 +855,12 @@ def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
         level = np.float32(1 + own[0])
         stage_um = (board.stage_um[0] + float(own[1]), board.stage_um[1] + float(own[2]))
         reading = board.reading / level
-        if own[LARGER] and board.views_open.sum() == 1:
+        if own[SIDES].any() and board.views_open.sum() == 1:
             pixels = np.argwhere(np.ones(reading.shape, dtype=bool))
             where = pixels, board.channels.ravel(), board.views_open, stage_um, board.shot
-            wider = shadow.with_widening(*where)[2] * own[LARGER]
+            wider = shadow.with_widening(*where, sides=own[SIDES])[0] - shadow.readings(*where)
             reading = reading - wider.reshape(reading.shape).astype(np.float32)
-        # A cut hole differs from a view in shape as well as in area.
-        shape = (UNLIKE * own[LARGER] * np.maximum(reading, 0)) ** 2
-        variance = (board.variance / level**2 + shape).astype(np.float32)
+        variance = (board.variance / level**2).astype(np.float32)
         found.append(
             replace(board, reading=reading, variance=variance, stage_um=stage_um, loose=False)
         )
@@ -821,22 +906,26 @@ def fit_placement(
             prior = bench.with_widths(widths)
         descent = _descend(mask, point, samples, prior, settings, FIRST_GAIN)
         state, steps = descent.point.state, steps + descent.steps
-    found, off_plate = list[FoundCause](), False
+    found, off_plate, unlike = list[FoundCause](), False, False
     for turn, least_gain in enumerate(CAUSE_GAINS):
         if not descent.point.state.widening and any(cause.name in OF_HOLES for cause in found):
             state = replace(descent.point.state, widening=True)
             descent = descent._replace(point=_point(mask, state, whole))
-        if off_plate:
+        if unlike:
             # Where pinholes stand decides how much of their light the aperture's edge cuts.
-            bench = bench.about(found, descent.point.state, boards)
+            bench = _about_pinholes(descent.point, bench, found, boards)
         elif turn > 1:
             break
         found = _find_causes(mask, descent.point, whole, bench)
         aberrant = any(cause.name == LENS for cause in found)
-        prior = bench.with_widths(_own_widths(found, ratio), aberrant)
+        softened = bench.softened(found, descent.point.state.placement)
+        prior = softened.with_widths(_own_widths(found, ratio), aberrant)
         descent = _descend(mask, descent.point, whole, prior, settings, least_gain)
         steps += descent.steps
         off_plate = any(cause.name in OF_PLATE for cause in found)
+        unlike = off_plate or any(
+            cause.name in (HOLES, SIZE) and cause.gain > CLEAR_GAIN for cause in found
+        )
     point, state = descent.point, descent.point.state
     checks = tuple(_check_board(point, sample, index) for index, sample in enumerate(whole))
     _refuse_unexplained(alike := _fitted_correlation(point, whole))
@@ -844,9 +933,14 @@ def fit_placement(
     everything, astray2 = _covariance(mask, point, whole, prior)
     size = len(placement.vector())
     covariance, own_covariance = everything[:size, :size], everything[size:, size:]
-    undecided, more = _find_undecided(mask, placement, covariance, len(boards))
+    alone = np.linalg.inv(normal.matrix + prior.precision)
+    undecided, more = _find_undecided(mask, placement, alone[:size, :size], len(boards))
     causes = with_sizes(
-        found, list(bench.causes.values()), state.own.ravel(), own_covariance, bench.own2
+        found,
+        list(bench.causes.values()),
+        state.own.ravel() - bench.own,
+        own_covariance,
+        softened.own2,
     )
     causes = doubt_lone_move(causes, boards)
     moved_um = _astray_um(causes, checks, boards)
@@ -871,6 +965,7 @@ def fit_placement(
         own_deviation=own_deviation,
         moved_um=moved_um,
         astray2=astray2,
+        power=_fit_power(point, whole, alone),
     )
 
 
@@ -955,6 +1050,33 @@ def _covariance(
     return covariance + of_views + of_rows, astray2
 
 
+def _fit_power(point: _Point, samples: Sequence[Sample], covariance: Array) -> Power:
+    """Return the power of the light by one step of least squares from the fit.
+
+    All parameters and each whiteboard's level are free: by a power of 1 + b a reading r changes by
+    b (r log r - level r). covariance: of the parameters.
+    """
+    normal, spread = point.normal, point.normal.spread
+    mixed, own, pull = np.zeros(len(covariance)), 0.0, 0.0
+    change2, light2 = 0.0, 0.0
+    for index, (sample, linear) in enumerate(zip(samples, point.linear, strict=True)):
+        residual, slope = linear
+        weight = tukey_weights(residual / spread) / spread**2
+        read = np.maximum(linear.read(sample), 1e-3)
+        bent = read * np.log(read)
+        # A reading of 1 is that of a reference: whole apertures have their levels about it.
+        if not through_pinhole(sample.board):
+            change2, light2 = change2 + float(bent @ bent), light2 + float(read @ read)
+        rows = (bent - read * float(bent @ read / (read @ read))) / sample.deviation
+        mixed[point.state.places(index)] += slope.T @ (weight * rows)
+        own += float((weight * rows) @ rows)
+        pull += float((weight * rows) @ residual)
+    left = max(own - float(mixed @ covariance @ mixed), 1e-12 * own)
+    excess = max(normal.squares - normal.kept, 1.0) / spread**2
+    error = abs(pull / left) * float(np.sqrt(change2 / max(light2, 1e-12)))
+    return Power(pull / left, 1 / float(np.sqrt(left)), pull**2 / left / excess, error)
+
+
 def _refuse_unexplained(alike: float) -> None:
     """Raise CalibrationError for a correlation of readings and fit that is too low."""
     if alike < LEAST_FIT_CORRELATION:
@@ -974,7 +1096,7 @@ def _without_aberrations(
     """
     if not any(cause.name == LENS for cause in causes):
         return own
-    explained = np.zeros(own.size)
+    explained = bench.own.copy()
     for cause in causes:
         if cause.name in bench.causes:
             explained += bench.causes[cause.name].columns @ np.array(cause.size)
@@ -987,15 +1109,39 @@ def _find_undecided(
     """Return the parameters that the prior decides, and how many more boards would decide them.
 
     share^-2 = 1 + have, the precision that `boards` whiteboards have added to the prior's; it grows
-    with their number. Decided: a share below MOST_OF_PRIOR.
+    with their number. Decided: a share below MOST_OF_PRIOR, or a deviation that Psi does not show.
     """
     shares = shares_of_prior(mask, placement, covariance, Tolerances())
-    rows, columns = np.shape(placement.aperture)
-    names = zip(labels((rows, columns)), shares, strict=True)
-    have = np.maximum(1 / np.maximum(shares, 1e-6) ** 2 - 1, 1e-9)
-    lacking = float((1 / MOST_OF_PRIOR**2 - 1) / have.min()) - 1
-    more = int(np.clip(np.ceil(lacking * boards), 0, MOST_MORE_BOARDS))
-    return tuple(name for name, share in names if share > MOST_OF_PRIOR), more
+    names = labels(np.shape(placement.aperture))  # type: ignore[arg-type]
+    lacking = [
+        index
+        for index in np.flatnonzero(shares > MOST_OF_PRIOR)
+        if _change_of_psi(mask, placement, covariance[index], index) > LEAST_CHANGE
+    ]
+    if not lacking:
+        return (), 0
+    have = max(1 / min(float(shares[lacking].max()), 1.0) ** 2 - 1, 1e-9)
+    more = int(
+        np.clip(np.ceil(((1 / MOST_OF_PRIOR**2 - 1) / have - 1) * boards), 0, MOST_MORE_BOARDS)
+    )
+    return tuple(names[index] for index in lacking), more
+
+
+def _change_of_psi(
+    mask: ShadowMask, placement: Placement, covariances: Array, parameter: int
+) -> float:
+    """Return by how much Psi changes, relative, with a parameter by its deviation.
+
+    covariances: (parameter,), of the parameter with each: the others move as it lets expect.
+    """
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(mask.pixel_shape(), size=(CHANGE_PIXELS, 2))
+    channels = rng.integers(mask.cells[0].shape[-1], size=CHANGE_PIXELS).astype(np.uint8)
+    step = covariances / np.sqrt(covariances[parameter])
+    here, there = (
+        Shadow(mask, at).coefficients(pixels, channels) for at in (placement, placement.moved(step))
+    )
+    return float(np.linalg.norm(there - here) / np.linalg.norm(here))
 
 
 def _astray_um(
@@ -1008,15 +1154,23 @@ def _astray_um(
     """
     far_um = [cause.width for cause in causes if cause.name == STAGE]
     far_um += [float(np.hypot(*cause.size)) / 2 for cause in causes if cause.name == CREEP]
-    if not any(cause.name == CREEP for cause in causes):
-        perhaps = any(cause.name == HANDS and STAGE in cause.instead for cause in causes)
-        far_um += [
-            float(np.hypot(*check.moved_um))
-            for check, board in zip(checks, boards, strict=True)
-            if (perhaps or not through_pinhole(board))
-            and np.hypot(*check.moved_um)
-            > max(LEAST_MOVED_UM, SURE_MOVE * check.moved_deviation_um)
-        ]
+    by_name = {cause.name: cause for cause in causes}
+    moves = [(*check.moved_um, check.moved_deviation_um) for check in checks]
+    if CREEP in by_name:
+        # The moves beside the creep are those of the stage.
+        if STAGE not in by_name:
+            return max(far_um)
+        x_um, y_um = np.split(np.array(by_name[STAGE].size), 2)
+        moves = list(
+            zip(x_um, y_um, np.split(np.array(by_name[STAGE].deviation), 2)[0], strict=True)
+        )
+    perhaps = HANDS in by_name and STAGE in by_name[HANDS].instead
+    far_um += [
+        float(np.hypot(x_um, y_um))
+        for (x_um, y_um, deviation_um), board in zip(moves, boards, strict=True)
+        if (perhaps or not through_pinhole(board))
+        and np.hypot(x_um, y_um) > max(LEAST_MOVED_UM, SURE_MOVE * deviation_um)
+    ]
     return max([0.0, *far_um])
 
 

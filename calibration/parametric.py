@@ -111,21 +111,27 @@ def coefficient_plane(
     return plane
 
 
-def widening_plane(
+def widening_planes(
     samples_shadow: Shadow,
     layout: PsiLayout,
     place: tuple[int, int, int, int],
     stage_um: tuple[float, float],
+    sides: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return slopes of `coefficient_plane` by the relative area of the hole, (y, x)."""
+    """Return `coefficient_plane` through a hole of other sides, and slopes by them, (3, y, x).
+
+    sides: relative width and height, over those of a view.
+    """
     shot, v, u, stored = place
     scale = layout.weights_shape[4] * layout.binning**2
-    plane = np.empty(layout.size, dtype=np.float32)
+    planes = np.empty((3, *layout.size), dtype=np.float32)
     chosen = views_open((layout.weights_shape[1], layout.weights_shape[2]), (v, u))
     for band, samples, channels in _bands(layout, shot, stored):
-        by_area = samples_shadow.with_widening(samples, channels, chosen, stage_um, shot)[2]
-        plane[band] = by_area.reshape(plane[band].shape) / scale
-    return plane
+        how = samples, channels, chosen, stage_um, shot
+        read, _, by_sides = samples_shadow.with_widening(*how, sides=sides)
+        for plane, values in zip(planes, (read, *by_sides.T), strict=True):
+            plane[band] = values.reshape(plane[band].shape) / scale
+    return planes
 
 
 def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:

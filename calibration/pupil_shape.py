@@ -28,7 +28,7 @@ SIDES = np.geomspace(0.85, 1.41, 22)
 square of views is open."""
 CLEARLY_ROUND = 12.0
 """Difference of log evidence; three parameters more (centre, diameter) take about 10 of it."""
-SURE_EVEN = 4.0
+SURE_EVEN = 2.0
 """Deviations of chi^2 up to which views open to their edges are explanation enough."""
 NO_BELIEF = 10.0
 """Deviation of a view's weight where nothing is believed of it."""

@@ -227,6 +227,7 @@ def _raise_dim_references(clear: float) -> None:
 def refuse_odd_fit(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> None:
     """Raise CalibrationError for a fit that no bench has, and for whiteboards unlike the others."""
     at = fit.placement
+    _refuse_wrong_holes(fit, boards, mask)
     if at.clear > max(CLEAREST, 1 + SURE * fit.deviation("clear")):
         _raise_dim_references(at.clear)
     usual = Placement(aperture=at.aperture).vector()[: len(SCALARS)]
@@ -238,7 +239,6 @@ def refuse_odd_fit(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> None:
             f"{abs(off[worst]):.1f} times as far from the design as benches are: these whiteboards "
             "are of another camera or mask, or its description is wrong"
         )
-    _refuse_wrong_holes(fit, boards, mask)
     creep = next((cause for cause in fit.causes if cause.name == CREEP), None)
     if creep is not None and np.hypot(*creep.size) > ALIKE_UM:
         raise CalibrationError(

@@ -43,7 +43,7 @@ from emmc_rig.calibration.colours import (
 )
 from emmc_rig.calibration.defects import find_defects, loss_variance, moved_dust
 from emmc_rig.calibration.errors import CalibrationError
-from emmc_rig.calibration.fit import LARGER, OFFSETS, Fit, fit_placement, settled
+from emmc_rig.calibration.fit import OFFSETS, SIDES, Fit, fit_placement, settled
 from emmc_rig.calibration.frames import MeanFrame
 from emmc_rig.calibration.glare import STEP as GLARE_STEP
 from emmc_rig.calibration.glare import Glare, measure_glare
@@ -59,7 +59,7 @@ from emmc_rig.calibration.parametric import (
     of_samples,
     psi_deviation,
     shot_stages,
-    widening_plane,
+    widening_planes,
 )
 from emmc_rig.calibration.planning import pinhole_worth
 from emmc_rig.calibration.shadow import Shadow, ShadowMask, shadow_mask
@@ -168,6 +168,12 @@ def calibrate(
     stated = {name: psi.calibration.stated_error for name, psi in psis.items()}
     chosen, why = choose(list(judged.values()), stated)
     refusals.refuse_another_bench(chosen)
+    if modelled.best is not None and not (levels is not None and levels.bend_known):
+        powers = [model.fit.power for model in modelled.models.values()]
+        power = max(powers, key=lambda power: power.explained)
+        advice[:0] = words.power_advice(power)
+        for psi in psis.values() if power.sure else ():
+            add_error(psi.calibration, power.error)
     advice += _count_residual(chosen, psis[chosen.route].calibration)
     calibrations = {name: psi.calibration for name, psi in psis.items()}
     if task.crosstalk is not None:
@@ -773,16 +779,16 @@ def _correct_pinholes(
 
             right = at(x_um, y_um)
             index = board.shot, v, u, slice(None), stored
-            moved = right - at(x_um + off_x, y_um + off_y)
-            by_area = widening_plane(shadow, layout, place, (x_um + off_x, y_um + off_y))
-            moved = moved - own[LARGER] * by_area
+            there = (x_um + off_x, y_um + off_y)
+            through, *by_sides = widening_planes(shadow, layout, place, there, own[SIDES])
+            moved = right - through
             weights[index] = weights[index] / (1 + brighter) + moved
             variance = sum(
                 np.square(at(x_um + by_x, y_um + by_y) - right)
                 for by_x, by_y in ((unsure_x, 0.0), (0.0, unsure_y))
             )
             variance += np.square(unsure * right)
-            variance += np.square(deviations[LARGER] * by_area)
+            variance += np.tensordot(np.square(deviations[SIDES]), np.square(by_sides), 1)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
 
 

@@ -21,6 +21,7 @@ footprint, under 0.2 um at 0.3 degrees).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -76,6 +77,8 @@ PUPIL_STEPS = {"pupil_x_um": 100.0, "pupil_y_um": 100.0, "pupil_share": 8e-3}
 `emmc_rig.model.pupil` cuts views: with 16 lines a strip, 10 um made the slopes 5 % wrong."""
 OF_BOX = ("share", "x_um", "y_um", "width", "height")
 """What follows the pupil: width and height as places of their squares among the tables' widths."""
+NARROWEST = 0.2
+"""Side of a hole, over that of its view: a narrower hole counts as so wide."""
 TAILS = 4.0
 """Deviations of the blur that a footprint reaches beyond its boxes: 3e-5 of it lies beyond."""
 NARROWEST_CELLS = 1e-3
@@ -84,8 +87,6 @@ GLASS_INDEX = 1.52
 """Refractive index of crown glass, as of a sensor's cover."""
 ANY_COLOUR = 3
 """Channel of a pixel that sees all colours."""
-AREA_STEP = 0.02
-"""Relative, of an aperture cell's area, for the derivative by it."""
 OF_VIEW = 5
 """Derivatives of a reading by what one view alone sees."""
 SPARE_UM = 900.0
@@ -803,6 +804,14 @@ def _find_footprints(pixels, cells, tables, turns, rays, boxes, weights, out):
             light_shares[n, k] = weight * light.leaning * light.falling / total
 
 
+class _Drawn(NamedTuple):
+    """What the kernel draws: see `share_tables`."""
+
+    tables: NDArray[np.float64]
+    boxes: _Boxes
+    weights: _Weights
+
+
 class Shadow:
     """The shadow of one placement: readings and derivatives of any pixels.
 
@@ -875,23 +884,44 @@ class Shadow:
         views_open: NDArray[np.bool_],
         stage_um: tuple[float, float] = (0.0, 0.0),
         frame: int = 0,
+        *,
+        sides: Sequence[float] | NDArray[np.float64] = (0.0, 0.0),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return `with_slopes`, and derivatives by the area of the aperture's cells, (n,).
+        """Return `with_slopes` through boxes of other sides, and derivatives by these, (n, 2).
 
-        The latter by the relative area, from cells that are AREA_STEP smaller and larger.
+        sides: relative width and height more than the boxes have, at the same light. Of more, what
+        is read is known to first order.
         """
-        how = pixels, channels, views_open, stage_um, frame
-        smaller, larger = (shadow.readings(*how) for shadow in self._resized)
-        return *self.with_slopes(*how), (larger - smaller) / (2 * AREA_STEP)
+        narrower, wider = np.minimum(sides, 0.0), np.maximum(sides, 0.0)
+        how = pixels, channels, (views_open, stage_um, frame)
+        sized = self._run(*how, slopes=True, drawn=self._sized(narrower))
+        by_sides = sized.slopes[:, PUPIL_X : PUPIL_X + 2].copy()
+        slopes = sized.slopes
+        if self.placement.pupil is None:
+            slopes[:, PUPIL_X : PUPIL_X + 2] = 0
+        else:
+            slopes = self.with_slopes(pixels, channels, views_open, stage_um, frame)[1]
+        return sized.readings + by_sides @ wider, slopes, by_sides
+
+    def _sized(self, sides: NDArray[np.float64]) -> _Drawn:
+        """Return what the kernel draws, where two parameters are sides in place of the pupil's."""
+        scale = np.maximum(1 + sides, NARROWEST)
+        found = self._openings
+        cut = replace(
+            found, width_um=found.width_um * scale[0], height_um=found.height_um * scale[1]
+        )
+        places = _width_places(cut, self.mask)
+        slopes = np.zeros((len(places), len(PUPIL_STEPS), len(OF_BOX)))
+        for axis, side in enumerate(("width", "height")):
+            slopes[:, axis, OF_BOX.index(side)] = 2 * places[:, axis] / scale[axis]
+        boxes = _boxes_of(cut, self.mask, CUT_WIDTHS, slopes)
+        sums = self._weights.sums[:2].copy()
+        return _Drawn(self._wide_tables, boxes, self._weights._replace(sums=sums))
 
     @cached_property
-    def _resized(self) -> tuple[Shadow, Shadow]:
-        """The shadows through aperture cells of AREA_STEP less and more area."""
-        less, more = (
-            replace(self.mask, aperture_um=self.mask.aperture_um * (1 + sign * AREA_STEP / 2))
-            for sign in (-1, 1)
-        )
-        return Shadow(less, self.placement), Shadow(more, self.placement)
+    def _wide_tables(self) -> NDArray[np.float64]:
+        """The tables of boxes of every width."""
+        return share_tables(self.mask, self.placement, KINDS, CUT_WIDTHS)[0]
 
     def slopes_by_view(
         self,
@@ -971,12 +1001,14 @@ class Shadow:
         slopes: bool = False,
         each: bool = False,
         by_view: bool = False,
+        drawn: _Drawn | None = None,
     ) -> _Seen:
         """Return the readings and what is asked for; by_view needs slopes."""
         views_open, stage_um, frame = opening
-        if slopes and len(self._tables) == 1:
+        if slopes and drawn is None and len(self._tables) == 1:
             self._tables = share_tables(self.mask, self.placement, KINDS, self._widths)[0]
             self._set_boxes(_pupil_slopes(self.mask, self.placement, self._openings))
+        tables, boxes, weights = drawn or _Drawn(self._tables, self._boxes, self._weights)
         count, views = len(pixels), self._weights.aperture.size
         out = _Seen(
             np.empty(count),
@@ -988,11 +1020,11 @@ class Shadow:
             np.ascontiguousarray(pixels, dtype=np.int64),
             np.ascontiguousarray(channels, dtype=np.uint8),
             self.mask.cells[frame % len(self.mask.cells)],
-            self._tables if slopes else self._tables[:1],
+            tables if slopes else tables[:1],
             self._turns,
             self._rays(stage_um),
-            self._boxes.of_views(np.asarray(views_open, dtype=bool)),
-            self._weights,
+            boxes.of_views(np.asarray(views_open, dtype=bool)),
+            weights,
             out,
         )
         return out

@@ -265,6 +265,13 @@ def test_coloured_references_do_not_take_glare_for_crosstalk_where_no_mask_is_fi
             marks=pytest.mark.slow,
         ),
         (
+            {"course": {"hands_um": 300.0}}, r"stand up to (\d+) um off their holes", 300.0, 20.0,
+        ),
+        pytest.param(
+            {"optics": {"plate_at_um": (150.0, -100.0)}}, r"stands \(\+([\d.]+), -", 150.0, 5.0,
+            marks=pytest.mark.slow,
+        ),
+        (
             {"course": {"pinhole_longer": 0.02}},
             r"exposures through the pinhole were ([\d.]+)% .* longer", 2.0, 0.1,
         ),
@@ -277,7 +284,17 @@ def test_what_is_wrong_with_pinholes_is_named_first_with_its_size(bench, words, 
     assert float(named[1]) == pytest.approx(value, abs=within)
     assert "the lamp is not steady" not in said(found)
     assert "stage reports" not in said(found)
-    assert by_route[found.chosen]["true"] < 0.0065
+    assert by_route[found.chosen]["true"] < 0.006
+
+
+def test_a_response_that_is_not_linear_is_named_and_counted():
+    found, by_route = measured(EVERY, sensor={"gamma": 0.9}, size=SMALLER)
+    words = re.search(r"to the power of ([\d.]+)", found.advice[0])
+    assert words
+    assert float(words[1]) == pytest.approx(0.9, abs=0.02)
+    assert "not linear" in found.advice[0]
+    chosen = by_route[found.chosen]
+    assert 0.5 < chosen["true"] / chosen["stated"] < 1.5
 
 
 @pytest.mark.parametrize(
