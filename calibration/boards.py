@@ -181,7 +181,8 @@ class Board:
     reading, variance: (pixel_y, pixel_x); the variance of a pixel that is not to be used is
     infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all). repeats: frames
     averaged. unsteady2: relative variance of the brightness between these, see `MeanFrame`. rows:
-    how rows err alike. loose: see `BoardFrame`.
+    how rows err alike. loose: see `BoardFrame`. white2: (pixel_y, pixel_x), relative variance of
+    the reference, which the variance includes; whiteboards of one reference share the array.
     """
 
     name: str
@@ -196,6 +197,7 @@ class Board:
     unsteady2: float = 0.0
     rows: Rows | None = None
     loose: bool = False
+    white2: NDArray[np.float32] | None = None
 
     @property
     def opening(self) -> Opening:
@@ -248,7 +250,7 @@ def as_readings(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
-    found = []
+    found, whites2 = [], dict[int, NDArray[np.float32]]()
     for board, taken in lit_boards(boards):
         reference = boards.reference(board.shot, board.lamp)
         if reference is None:
@@ -260,7 +262,21 @@ def as_readings(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        found.append(_board(board, taken, reference, boards, gain, layout, good))
+        if id(reference) not in whites2:
+            whites2[id(reference)] = _white2(reference, boards, gain)
+        white2 = whites2[id(reference)]
+        found.append(_board(board, taken, reference, boards, gain, layout, good, white2))
+    return found
+
+
+def _white2(reference: MeanFrame, boards: BoardSet, gain: SensorGain) -> NDArray[np.float32]:
+    """Return the relative variance of a reference, (pixel_y, pixel_x); 0 of dark pixels."""
+    dark = boards.dark_at(reference.exposure_s)
+    found = np.zeros(reference.mean_dn.shape, dtype=np.float32)
+    for rows in bands(found):
+        white, variance = signal_of(reference, dark, gain, rows)
+        enough = white * reference.exposure_s > DARKEST_REFERENCE_DN
+        found[rows] = np.where(enough, variance / np.where(enough, white, 1) ** 2, 0)
     return found
 
 
@@ -315,18 +331,19 @@ def _board(
     gain: SensorGain,
     layout: PsiLayout,
     good: NDArray[np.bool_],
+    white2: NDArray[np.float32],
 ) -> Board:
     dark, dark_of_white = (boards.dark_at(each.exposure_s) for each in (frame, reference))
     reading, variance = (np.empty(good.shape, dtype=np.float32) for _ in range(2))
     bright = 0
     for rows in bands(reading):
         signal, signal_variance = signal_of(frame, dark, gain, rows)
-        white, white_variance = signal_of(reference, dark_of_white, gain, rows)
+        white, _ = signal_of(reference, dark_of_white, gain, rows)
         enough = white * reference.exposure_s > DARKEST_REFERENCE_DN
         bright += int(enough.sum())
         safe = np.where(enough, white, 1)
         ratio = signal / safe
-        spread = signal_variance / safe**2 + ratio**2 * white_variance / safe**2
+        spread = signal_variance / safe**2 + ratio**2 * white2[rows]
         reading[rows] = ratio
         variance[rows] = np.where(enough & good[rows], spread, np.inf)
     if bright < 0.5 * reading.size:
@@ -350,6 +367,7 @@ def _board(
         frame.unsteady2(dark.mean_dn),
         _rows(frame, reference, dark),
         board.loose,
+        white2,
     )
 
 

@@ -36,7 +36,7 @@ Array = NDArray[np.floating]
 OWN = 5
 """Parameters of one whiteboard: relative brightness, by how much the mask moved (x, y), um, and by
 how much wider and higher its hole is than a view, relative."""
-LEAST_OWN = (2e-5, 0.002, 0.002, 1e-4, 1e-4)
+LEAST_OWN = (2e-5, 0.001, 0.001, 1e-4, 1e-4)
 """Standard deviations of these without any cause: far below what noise shows."""
 LEAST_MOVED_UM = 0.25
 """Moves below it are taken for what the model misses of neighbouring pixels alike: a bench of 256

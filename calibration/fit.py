@@ -151,7 +151,7 @@ SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
 """Of a view's own derivatives: displacement, softening along an axis, softening across both."""
-TAUS_UM = np.geomspace(0.003, 1.0, 6)
+TAUS_UM = np.geomspace(0.001, 1.0, 7)
 """Of each kind: from far less than any whiteboard shows to a tenth of a pixel."""
 TAU_UM = 0.1
 """Beforehand tau is a half-t of 3 degrees of freedom and this scale (Gelman 2006, Bayesian Analysis
@@ -844,6 +844,47 @@ def _rows_covariance(
     return np.asarray(errors.own_dn2 * covariance @ added @ covariance, np.float64)
 
 
+def _references_covariance(
+    point: _Point, samples: Sequence[Sample], covariance: Array
+) -> NDArray[np.float64]:
+    """Return what it adds to the covariance C that whiteboards share the noise of a reference.
+
+    A reference's pixel that is brighter by e makes every reading r of the pixel r e darker. With
+    g = w J r / (deviation spread^2) of a whiteboard's reading, and all g of a pixel summed first,
+
+        added = C (sum over pixels of var e ((sum g) (sum g)^T - sum g g^T)) C
+
+    The second is counted in C, as if every whiteboard had a reference of its own.
+    """
+    size, spread = len(covariance), point.normal.spread
+    added = np.zeros((size, size))
+    of_reference = defaultdict[int, list[int]](list)
+    for index, sample in enumerate(samples):
+        if sample.board.white2 is not None:
+            of_reference[id(sample.board.white2)].append(index)
+    for indices in of_reference.values():
+        white2 = samples[indices[0]].board.white2
+        assert white2 is not None
+        flat = [np.ravel_multi_index(tuple(samples[i].pixels.T), white2.shape) for i in indices]
+        drawn = np.unique(np.concatenate(flat))
+        for first in range(0, len(drawn), CHUNK):
+            pixels = drawn[first : first + CHUNK]
+            summed = np.zeros((len(pixels), size))
+            deviation = np.sqrt(white2.ravel()[pixels].astype(np.float64))
+            for index, of_board in zip(indices, flat, strict=True):
+                # Drawn pixels are in order.
+                part = slice(*np.searchsorted(of_board, [pixels[0], pixels[-1] + 1]))
+                at = np.searchsorted(pixels, of_board[part])
+                residual, slope = point.linear[index]
+                pull = tukey_weights(residual[part] / spread) / spread**2 * deviation[at]
+                pull *= point.linear[index].slope[part, -OWN]
+                alone, places = slope[part] * pull[:, None], point.state.places(index)
+                summed[np.ix_(at, places)] += alone
+                added[np.ix_(places, places)] -= alone.T @ alone
+            added += summed.T @ summed
+    return np.asarray(covariance @ added @ covariance, np.float64)
+
+
 def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
     """Return the whiteboards with the effects of the causes taken out.
 
@@ -1041,13 +1082,15 @@ def _covariance(
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return the covariance of all parameters, and the variances of the views' own, see `Fit`.
 
-    C = (matrix + P)^-1 of all parameters, and what the views' own and rows that err alike add.
+    C = (matrix + P)^-1 of all parameters, and what the views' own, rows that err alike and the
+    noise of references add.
     """
     information = point.normal.matrix + prior.precision
     covariance = np.asarray(np.linalg.inv(information), np.float64)
     of_views, astray2 = _bias_covariance(covariance, _view_terms(mask, point, samples))
     of_rows = _rows_covariance(point, samples, covariance)
-    return covariance + of_views + of_rows, astray2
+    of_references = _references_covariance(point, samples, covariance)
+    return covariance + of_views + of_rows + of_references, astray2
 
 
 def _fit_power(point: _Point, samples: Sequence[Sample], covariance: Array) -> Power:
