@@ -166,6 +166,38 @@ def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
 
 
 @pytest.mark.slow
+def test_the_noise_of_the_reference_is_that_of_all_whiteboards(design):
+    truth, rng = replace(designed_placement(CAMERA), blur_um=3.0), np.random.default_rng(5)
+    chosen = [labels(VIEWS).index(name) for name in ("clear", "vignetting")]
+    white2 = np.full(SIZE, 0.02**2, np.float32)
+    fits, alone = [], []
+    for seed in range(24):
+        darker = 1 - rng.normal(0, 0.02, SIZE)
+        boards = [
+            replace(
+                board,
+                reading=(board.reading * darker).astype(np.float32),
+                variance=board.variance + np.square(board.reading) * white2,
+            )
+            for board in synthetic(design, truth, seed=seed)
+        ]
+        for shared, found in ((white2, fits), (None, alone)):
+            each = [replace(board, white2=shared) for board in boards]
+            settings = FitSettings(seed=seed, first_pixels=1500)
+            found.append(fit_placement(each, CAMERA, MASK, settings, start=truth))
+    spread = np.std([fit.placement.vector()[chosen] for fit in fits], axis=0, ddof=1)
+    stated, of_own = (
+        np.mean([np.sqrt(np.diag(fit.covariance))[chosen] for fit in found], axis=0)
+        for found in (fits, alone)
+    )
+    # The deviation of 24 is known to 15 %.
+    assert np.all(np.abs(spread / stated - 1) < 0.35)
+    # The level is less sure than if every whiteboard had its own reference, a slope surer.
+    assert stated[0] > 1.2 * of_own[0]
+    assert stated[1] < 0.8 * of_own[1]
+
+
+@pytest.mark.slow
 def test_views_displaced_on_their_own_bias_the_weights_by_as_much_as_is_stated(design):
     truth = replace(designed_placement(CAMERA), blur_um=3.0, leak=0.02)
     shadow, rng = Shadow(MASK, truth), np.random.default_rng(3)
