@@ -93,7 +93,7 @@ class _Design:
 
 def _moved(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camera:
     """Return the camera with the masks near its sensor moved, and further by a factor."""
-    near = _near_masks(camera)
+    near = near_masks(camera)
     shots = []
     for shot in camera.shots:
         offsets = dict(shot.offset_um)
@@ -110,17 +110,17 @@ def _moved(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camer
     return camera.model_copy(update={"shots": tuple(shots), "masks": masks})
 
 
-def _camera(psi: ImagingMatrix) -> Camera | None:
+def known_camera(psi: ImagingMatrix) -> Camera | None:
     """Return the camera of a Psi, None where it is not known or has no mask near the sensor."""
     try:
         camera = camera_of(psi)
     except SensingError:
         return None
     fits = len(camera.shots) == psi.shots and camera.views == psi.light_field_shape[:2]
-    return camera if _near_masks(camera) and fits else None
+    return camera if near_masks(camera) and fits else None
 
 
-def _near_masks(camera: Camera) -> list[str]:
+def near_masks(camera: Camera) -> list[str]:
     """Return the names of the masks nearer to the sensor than to the lens."""
     half_mm = 0.5 * camera.lens.distance_mm
     return [name for name, mask in camera.masks.items() if mask.distance_mm < half_mm]
@@ -154,7 +154,7 @@ def _tiled(relief: Relief, shift_y: Array, shift_x: Array) -> _Regression | None
 def _design(psi: ImagingMatrix, relief: Relief) -> _Design | None:
     """Return the changes of the masks' shadow by the camera's design; None for a Psi of another
     design."""
-    camera = _camera(psi)
+    camera = known_camera(psi)
     good = relief.good
     if camera is None or not good.any():
         return None

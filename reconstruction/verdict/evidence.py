@@ -18,6 +18,7 @@ from emmc_rig.reconstruction.colour import unseen_colour
 from emmc_rig.reconstruction.result import SCALE, Reconstruction
 from emmc_rig.reconstruction.verdict.displaced import displaced
 from emmc_rig.reconstruction.verdict.kept import compare_held_out, over_baselines
+from emmc_rig.reconstruction.verdict.orientation import WEAK, seen_masks
 from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
 from emmc_rig.reconstruction.verdict.shadow import Relief, measured_relief, shadow
 from emmc_rig.reconstruction.verdict.shots import Motion, compared
@@ -74,6 +75,8 @@ class Evidence:
     steps: float | None = None  #: noise by quantisation, over the noise stated
     stated: float | None = None  #: deviation by held-out readings, rms, over the light field's mean
     view_axes: ViewAxes = ANGLES
+    #: fields of `orientation.Seen`, where the masks stand clearly otherwise than in Psi
+    masks_seen: tuple[Any, ...] | None = None
 
     def as_dict(self) -> dict:
         """Return the figures as plain data."""
@@ -147,6 +150,7 @@ def gathered(
     if relief is None:
         relief = measured_relief(psi, frames, noise_sigma, usable)
     masks = shadow(relief)
+    seen = seen_masks(psi, relief) if np.nanmin([1, *masks.strength]) < WEAK else None
     residual = frames - psi.forward(result.light_field)
     with ThreadPoolExecutor(1) as beside:  # the two that take long
         given = psi, frames, residual, noise_sigma, usable, fitted.kept
@@ -183,6 +187,7 @@ def gathered(
         steps=None if step is None else step / np.sqrt(12) / max(noise_sigma, 1e-12),
         stated=_stated(result),
         view_axes=psi.view_axes,
+        masks_seen=None if seen is None else tuple(seen),
     )
 
 

@@ -17,6 +17,7 @@ from emmc_rig.model.view_axes import picture_name, shows_parallax
 from emmc_rig.reconstruction.method import Sensitivity
 from emmc_rig.reconstruction.methods import METHODS
 from emmc_rig.reconstruction.verdict.evidence import Evidence
+from emmc_rig.reconstruction.verdict.orientation import Seen
 
 Level = Literal["trust", "cannot tell", "doubt", "do not use"]
 LEVELS: tuple[Level, ...] = ("trust", "cannot tell", "doubt", "do not use")
@@ -385,10 +386,18 @@ class Cause(NamedTuple):
 NO_CAUSE = Cause("", 0.0, 0.0, 0.0)
 
 
+def _orientation(e: Evidence) -> Iterator[Reason]:
+    """Whether the masks are mirrored, turned, a negative, or far from their place."""
+    if e.masks_seen is not None:
+        seen = Seen(*e.masks_seen)
+        remedy = "put mask and frames as the camera's file has them, or calibrate"
+        yield Reason(str(seen), seen.strength, remedy, "do not use")
+
+
 def _masks(e: Evidence) -> Iterator[Reason]:
     """The likeliest reason among possible errors of the masks, given the readings."""
     weakest = _weakest(e)
-    if weakest is None:
+    if weakest is None or e.masks_seen is not None:
         return
     strength = weakest.value
     lost = 1 - strength - 2 * weakest.deviation
@@ -650,6 +659,6 @@ def _fit(e: Evidence) -> Iterator[Reason]:
 
 
 RULES = (
-    _compression, _shots, _coding, _colour, _masks, _pixels, _noise, _search, _misfit, _fit,
+    _orientation, _compression, _shots, _coding, _colour, _masks, _pixels, _noise, _search, _misfit, _fit,
 )  # fmt: skip
 """Of reasons of one level the first is named first: a cause before what it leads to."""

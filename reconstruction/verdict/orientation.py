@@ -1,0 +1,199 @@
+"""Whether the readings show Psi's masks mirrored, turned, as a negative, or far from their place.
+
+Masks that show weakly may stand otherwise in their holder than the camera's file says. The design's
+masks are drawn in their eight orientations, and each shadow m is correlated with what is seen at
+every displacement d that keeps the colour filters,
+
+    cross = sum w seen m(d),    square = sum w m(d)^2,    gain = cross^2 / square
+
+with w the texture's inverse variance. A negative has cross < 0. The likeliest is that of the
+largest gain. What is seen are the readings over their local means: a smooth picture found with
+wrong masks follows these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+
+from emmc_rig.model.camera import Camera, Plate, draw_plates, seen_of_white
+from emmc_rig.model.errors import ModelError
+from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.reconstruction.verdict.displaced import known_camera, near_masks
+from emmc_rig.reconstruction.verdict.shadow import (
+    LOCAL_PX,
+    SMOOTH_PX,
+    Relief,
+    averaged,
+    channels,
+    predicted_relief,
+)
+
+Array = NDArray[np.floating]
+ORIENTATIONS = {
+    "": (0, False),
+    "turned by 90 degrees to the left": (1, False),
+    "turned by 180 degrees": (2, False),
+    "turned by 90 degrees to the right": (3, False),
+    "mirrored left to right": (0, True),
+    "mirrored top to bottom": (2, True),
+    "transposed": (1, True),
+    "transposed about the other diagonal": (3, True),
+}
+"""Quarter turns to the left, of the mask mirrored left to right or not."""
+FURTHEST_PX = 24
+"""Displacements that are tried."""
+NEAR_PX = 4
+"""Displacements of one peak, and of masks that are in their place."""
+CLEARLY = 1.7
+"""Gain over that of every other orientation and place, from which on the masks are named."""
+LEAST_STRENGTH = 0.3
+"""Of the masks as found: 1 where every cell is where it is drawn."""
+LEAST_ROUGH = 0.3
+"""Least variance of the texture, over its median."""
+WEAK = 0.65
+"""Strength of a shot's masks below which others are tried."""
+
+
+class Seen(NamedTuple):
+    """The masks as the readings show them; orientation: of ORIENTATIONS, "" as in Psi.
+
+    negative: whether clear cells are dark. by_px: their displacement from there, (y, x). strength:
+    of their shadow, 1 in Psi.
+    """
+
+    orientation: str
+    negative: bool
+    by_px: tuple[int, int]
+    strength: float
+
+    def __str__(self) -> str:
+        """The masks in words."""
+        y, x = self.by_px
+        turned = ["a negative" * self.negative, self.orientation]
+        # Masks that are turned stand elsewhere than drawn, too.
+        far = "" if any(turned) else f"({x:+d}, {y:+d}) pixels off in x and y"
+        return "against Psi the masks are " + ", ".join(filter(None, [*turned, far]))
+
+
+def seen_masks(psi: ImagingMatrix, relief: Relief) -> Seen | None:
+    """Return how the masks stand, where they stand clearly otherwise than in Psi; else None.
+
+    None as well for a Psi without a design, and for masks at the lens.
+    """
+    camera = known_camera(psi)
+    if camera is None:
+        return None
+    period, detail = camera.seen_tile().shape[:2], _detail(psi, relief)
+    found = list[tuple[float, Seen]]()
+    try:
+        for name, masks in _oriented(psi, camera, relief.picture):
+            tried = _correlated(detail, masks, period)
+            for peak in _two_peaks(tried):
+                strength = float(tried.strength[peak])
+                by_px = tried.by_px[0][peak[0]], tried.by_px[1][peak[1]]
+                seen = Seen(name, strength < 0, by_px, abs(strength))
+                found.append((float(tried.gain[peak]), seen))
+    except ModelError:
+        return None
+    (next_gain, _), (gain, seen) = sorted(found)[-2:]
+    otherwise = seen.orientation or seen.negative or max(map(abs, seen.by_px)) > NEAR_PX
+    clearly = gain > CLEARLY * next_gain and seen.strength > LEAST_STRENGTH
+    return seen if otherwise and clearly else None
+
+
+class _Detail(NamedTuple):
+    """Readings over their local means less 1, the inverse variance of their texture, and where both
+    are known, (shot, pixel_y, pixel_x) each."""
+
+    seen: Array
+    weight: Array
+    good: NDArray[np.bool_]
+
+
+def _detail(psi: ImagingMatrix, relief: Relief) -> _Detail:
+    good, filters = relief.good, channels(psi)
+    read = relief.level * (1 + relief.read)
+    around = averaged(read, good, filters, SMOOTH_PX)
+    seen = np.where(good & (around > 0), read / np.where(around > 0, around, 1) - 1, 0)
+    rough = averaged(np.square(seen), good, filters, LOCAL_PX)
+    least = LEAST_ROUGH * float(np.median(rough[good])) if good.any() else 1.0
+    return _Detail(seen, np.where(good, 1 / np.maximum(rough, least + 1e-12), 0), good)
+
+
+def _two_peaks(tried: _Correlated) -> Iterator[tuple[int, int]]:
+    """Yield where the gain is largest, and where it is largest further than NEAR_PX from there."""
+    y, x = np.unravel_index(int(tried.gain.argmax()), tried.gain.shape)
+    yield int(y), int(x)
+    down, right = (
+        np.abs(np.array(by_px) - by_px[at]) > NEAR_PX
+        for by_px, at in zip(tried.by_px, (y, x), strict=True)
+    )
+    rest = np.where(down[:, None] | right, tried.gain, 0.0)
+    y, x = np.unravel_index(int(rest.argmax()), rest.shape)
+    yield int(y), int(x)
+
+
+def _oriented(
+    psi: ImagingMatrix, camera: Camera, picture: Array
+) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Yield every orientation with what the masks near the sensor then add to the readings."""
+    plates = draw_plates(camera, psi.size)
+    for name, (turns, mirrored) in ORIENTATIONS.items():
+        turned = {
+            mask: replace(plate, cells=_turned(plate, turns, mirrored))
+            if mask in near_masks(camera)
+            else plate
+            for mask, plate in plates.items()
+        }
+        yield name, predicted_relief(psi, seen_of_white(camera, psi.size, turned), picture)[1]
+
+
+def _turned(plate: Plate, turns: int, mirrored: bool) -> NDArray[np.float32]:
+    """Return the cells of a plate turned about its middle; beyond its edges they are grey."""
+    cells = plate.cells[:, :, ::-1] if mirrored else plate.cells
+    turned = np.rot90(cells, turns, axes=(1, 2))
+    found = np.empty_like(plate.cells)
+    found[:] = plate.cells.mean(axis=(1, 2), keepdims=True)
+    cuts = [
+        (max(0, (have - want) // 2), max(0, (want - have) // 2), min(have, want))
+        for have, want in zip(turned.shape[1:3], found.shape[1:3], strict=True)
+    ]
+    (top, down, rows), (left, right, columns) = cuts
+    found[:, down : down + rows, right : right + columns] = turned[
+        :, top : top + rows, left : left + columns
+    ]
+    return found
+
+
+class _Correlated(NamedTuple):
+    """gain, strength: (y, x) by displacement; by_px: the displacements along y and x."""
+
+    gain: NDArray[np.float64]
+    strength: NDArray[np.float64]
+    by_px: tuple[list[int], list[int]]
+
+
+def _correlated(detail: _Detail, masks: Array, period: tuple[int, ...]) -> _Correlated:
+    """Return how a shadow of masks correlates with the readings, by displacement."""
+    rows, columns = masks.shape[1:]
+    size = tuple(next_fast_len(n + FURTHEST_PX) for n in (rows, columns))
+
+    def summed(fixed: Array, moved: Array) -> NDArray[np.float64]:
+        product = (rfft2(fixed, size) * np.conj(rfft2(moved, size))).sum(axis=0)
+        return np.asarray(irfft2(product, size), np.float64)
+
+    weight = detail.weight.astype(np.float64)
+    known = np.where(detail.good, masks, 0).astype(np.float64)
+    by_px = tuple(
+        [by for by in range(-FURTHEST_PX, FURTHEST_PX + 1) if by % step == 0] for step in period
+    )
+    chosen = np.ix_(*by_px)
+    cross = summed(weight * detail.seen, known)[chosen]
+    square = np.maximum(summed(weight, np.square(known))[chosen], 1e-12)
+    return _Correlated(cross**2 / square, cross / square, (by_px[0], by_px[1]))
