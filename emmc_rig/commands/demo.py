@@ -50,7 +50,7 @@ def demo(
     from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
     from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find_method
     from emmc_rig.store.folders import result_folder
-    from emmc_rig.store.results import parse_size, stated_words
+    from emmc_rig.store.results import parse_size
 
     method = method or DEFAULT_METHOD
     if not find_method(method).needs_dictionary:
@@ -78,7 +78,6 @@ def demo(
         helped_to_compile(method, camera, shots),
     ):
         metrics = run_demo(settings, folder, bars)
-    stated = stated_words(metrics)
     gain, middle = (
         metrics["psnr_db"] - metrics["replicate_psnr_db"],
         middle_name(described.view_axes),
@@ -86,10 +85,9 @@ def demo(
     tell(
         f"PSNR {metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB over "
         f"the baseline ({middle} in all places); SSIM {metrics['ssim']:.3f}; "
-        + (f"estimated accuracy {stated}; " if stated else "")
         + f"calibration error {metrics['psi_relative_error']:.2%}; {metrics['status']}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )
     tell(f"open {out / 'report.html'}")
-    show_verdict(metrics["verdict"])
+    show_verdict(metrics)
     give_result(out)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import shlex
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -84,13 +84,18 @@ def show_reason(level: str, what: str, remedy: str, figure: float) -> None:
     tell(f"{level}: {what}; {remedy}", VERDICT_COLOURS[level])
 
 
-def show_verdict(verdict: dict) -> None:
-    """Print a verdict, a line for each reason."""
-    colour = VERDICT_COLOURS[verdict["level"]]
+def show_verdict(metrics: Mapping[str, Any]) -> None:
+    """Print the verdict of metrics.json, a line for each reason, and the accuracy."""
+    from emmc_rig.reconstruction.verdict.rules import CONSISTENT
+    from emmc_rig.store.results import stated_words
+
+    verdict = metrics["verdict"]
     if not verdict["reasons"]:
-        tell("trust: the light field agrees with frames, Psi and noise", colour)
+        tell(f"trust: {CONSISTENT}", VERDICT_COLOURS[verdict["level"]])
     for reason in verdict["reasons"]:
         show_reason(**reason)
+    if stated := stated_words(metrics):
+        tell(f"estimated accuracy: {stated}")
 
 
 def say(label: str, text: object, style: str = "yellow") -> None:

@@ -157,7 +157,7 @@ def _show_outcomes(outcomes: Sequence[tuple[Place, dict | Exception]], strict: b
             failed = True
             continue
         _say_result(outcome, written)
-        show_verdict(outcome["verdict"])
+        show_verdict(outcome)
         give_result(written)
         failed |= strict and outcome["verdict"]["level"] == "do not use"
     if failed:
@@ -187,7 +187,7 @@ def _film(capture: Any, out: Path, strict: bool, **given: Any) -> None:
         f"{film['verdicts']['trust']}; worst: frame {worst['frame']} at {worst['time_s']:.1f} s"
         + (f", estimated accuracy {stated}" if stated else "")
     )
-    show_verdict(metrics["verdict"])
+    show_verdict(metrics)
     shown = capture.folder if out == capture.own_place else out
     tell(f"emmc-rig export {shown} shows it")
     give_result(out)
@@ -213,7 +213,7 @@ def _places(captures: Sequence[Capture], out: Path | None) -> list[tuple[Capture
 
 def _say_result(metrics: dict, out: Path) -> None:
     from emmc_rig.model.view_axes import axes_of, middle_name
-    from emmc_rig.store.results import stated_words, unmeasured_words
+    from emmc_rig.store.results import unmeasured_words
 
     if "assumed" in metrics:
         say("note", metrics["assumed"])
@@ -228,8 +228,6 @@ def _say_result(metrics: dict, out: Path) -> None:
             f"; PSNR {metrics['psnr_db']:.2f} dB, {gain:+.2f} dB over the baseline "
             f"({middle_name(axes_of(metrics))} in all places), SSIM {metrics['ssim']:.3f}"
         )
-    if stated := stated_words(metrics):
-        compared += f"; estimated accuracy {stated}"
     if "blocks" in metrics:
         rows, columns = metrics["blocks"]
         compared += f"; {rows}x{columns} blocks, at most {metrics['peak_gib']:.2f} GiB a worker"

@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
+from emmc_rig.reconstruction.verdict.rules import CONSISTENT
 from emmc_rig.store.results import stated_words, unmeasured_words
 from emmc_rig.version import __version__
 
@@ -24,7 +25,6 @@ KINDS = {
     ".webp": "image/webp",
 }
 TEMPLATES = PackageLoader("emmc_rig.report")
-AGREE = "the frames, Psi and the noise agree with it"
 VERDICTS = {
     "trust": ("You can trust this light field", "good"),
     "cannot tell": ("We cannot tell whether this light field is right", "watch"),
@@ -86,7 +86,7 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
         why = "this light field was not reconstructed from frames, or they were not checked"
         return Head("No verdict", why, _uses(metrics, source, viewer))
     level, reasons = verdict["level"], verdict["reasons"]
-    why = [reason["what"] for reason in reasons] or [AGREE]
+    why = [reason["what"] for reason in reasons] or [CONSISTENT]
     if lost_db := below_baseline_db(metrics):
         why.append(
             f"against the truth it is {lost_db:.1f} dB worse than the baseline "
@@ -94,14 +94,16 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
         )
     if stated := stated_words(metrics):
         why.append(f"estimated accuracy {stated}")
-    remedies = [*(reason["remedy"] for reason in reasons), str(metrics.get("advice") or "")]
+    advice = str(metrics.get("advice") or "")
+    remedies = list(filter(None, [*(reason["remedy"] for reason in reasons), advice]))
+    uses = _uses(metrics, source, viewer) if level == "cannot tell" or not remedies else []
     words, tone = VERDICTS[level]
     if lost_db and tone == "good":
         words, tone = "Look at this light field with care", "watch"
     return Head(
         words,
         "; ".join(why),
-        [remedy for remedy in remedies if remedy] or _uses(metrics, source, viewer),
+        [*remedies, *uses],
         tone,
     )
 

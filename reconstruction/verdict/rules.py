@@ -21,8 +21,10 @@ from emmc_rig.reconstruction.verdict.orientation import Seen
 
 Level = Literal["trust", "cannot tell", "doubt", "do not use"]
 LEVELS: tuple[Level, ...] = ("trust", "cannot tell", "doubt", "do not use")
-"""Graver ones later. `cannot tell`: nothing speaks against the light field, but a wrong Psi, or
-wrong colours, would not show in these readings."""
+"""Graver ones later. `trust`: consistent, and of an accuracy that is stated. `cannot tell`: nothing
+speaks against the light field, but its accuracy is not known, or a wrong Psi, or wrong colours,
+would not show in these readings."""
+CONSISTENT = "consistent with frames, Psi and noise"
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ class Verdict:
     def words(self) -> str:
         """The verdict in one line."""
         if not self.reasons:
-            return "trust: the light field agrees with frames, Psi and noise"
+            return f"trust: {CONSISTENT}"
         return f"{self.level}: " + "; ".join(f"{r.what}: {r.remedy}" for r in self.reasons)
 
     def __str__(self) -> str:
@@ -188,7 +190,7 @@ class Verdict:
 def verdict_from(evidence: Evidence) -> Verdict:
     """Return the verdict that the evidence leads to."""
     reasons = [reason for rule in RULES for reason in rule(evidence) if reason.level != "trust"]
-    return _of(evidence, reasons)
+    return _of(evidence, reasons or _accuracy(evidence))
 
 
 def _of(evidence: Evidence, reasons: Iterable[Reason]) -> Verdict:
@@ -198,6 +200,17 @@ def _of(evidence: Evidence, reasons: Iterable[Reason]) -> Verdict:
 
 def _sensitivity(e: Evidence) -> Sensitivity:
     return METHODS[e.method].sensitivity if e.method in METHODS else Sensitivity()
+
+
+def _accuracy(e: Evidence) -> Iterator[Reason]:
+    """Whether the method states how far a light field, consistent as it is, lies from the truth."""
+    if e.stated is None:
+        yield Reason(
+            f"{CONSISTENT}, but the accuracy is not known: {e.method} states none",
+            0.0,
+            "reconstruct by adaptive or adaptive-fast, which state it",
+            "cannot tell",
+        )
 
 
 def _shots(e: Evidence) -> Iterator[Reason]:
@@ -659,6 +672,7 @@ def _fit(e: Evidence) -> Iterator[Reason]:
 
 
 RULES = (
-    _orientation, _compression, _shots, _coding, _colour, _masks, _pixels, _noise, _search, _misfit, _fit,
+    _orientation, _compression, _shots, _coding, _colour, _masks, _pixels, _noise, _search,
+    _misfit, _fit,
 )  # fmt: skip
 """Of reasons of one level the first is named first: a cause before what it leads to."""

@@ -1,4 +1,4 @@
-"""Masks that stand otherwise than in Psi are named, on a bench that shares no code with the model."""
+"""Masks that stand otherwise than in Psi are named, on a bench of no code in common."""
 
 import numpy as np
 import pytest

@@ -222,14 +222,14 @@ def blocks(random_psi):
     _, verdict = reconstruct_judged("tv", psi, even_frames(frames, 0.01))
     wrong, _, _ = scene(random_psi, shots=2)
     _, bad = reconstruct_judged("tv", wrong, even_frames(frames[:, ::-1, ::-1].copy(), 0.01))
-    assert (verdict.level, bad.level) == ("trust", "do not use")
+    assert (verdict.level, bad.level) == ("cannot tell", "do not use")
     return verdict, bad
 
 
 def test_the_verdict_on_equal_blocks_is_that_of_one(blocks):
     verdict, _ = blocks
     together = judged_together([JudgedBlock(verdict, 0, at, 100) for at in (0, 80)])
-    assert together.level == "trust"
+    assert together.level == "cannot tell"
     first, two = verdict.evidence, together.evidence
     assert two.kept == 2 * first.kept
     assert two.explained == pytest.approx(first.explained)
@@ -241,7 +241,7 @@ def test_the_verdict_on_equal_blocks_is_that_of_one(blocks):
 def test_one_bad_block_of_many_raises_doubt_and_is_named(blocks):
     good, bad = blocks
     found = [JudgedBlock(good, 0, 100 * at, 100) for at in range(15)]
-    assert judged_together(found).level == "trust"
+    assert judged_together(found).level == "cannot tell"
     together = judged_together([*found, JudgedBlock(bad, 7, 1500, 100)])
     assert together.level == "doubt"
     assert "1 of 16 blocks" in together.words

@@ -35,7 +35,7 @@ from emmc_rig.reconstruction.verdict.kept import (
     over_baselines,
 )
 from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
-from emmc_rig.reconstruction.verdict.rules import LEVELS, verdict_from
+from emmc_rig.reconstruction.verdict.rules import CONSISTENT, LEVELS, verdict_from
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.reconstruction.verdict.shadow import Relief, measured_relief, shadow, tile_edges
 from emmc_rig.reconstruction.verdict.shots import _differences, _differing, compared, motion
@@ -86,7 +86,7 @@ def evidence_of(psi):
 @pytest.fixture(scope="module")
 def clean(three):
     """Evidence without a fault, as of a scene with depth."""
-    return dataclasses.replace(evidence_of(three), parallax=0.05)
+    return dataclasses.replace(evidence_of(three), parallax=0.05, stated=0.03)
 
 
 def test_masks_of_an_even_scene_show_at_their_full_strength(three):
@@ -378,7 +378,7 @@ def test_many_shots_that_screening_left_out_are_reported_and_few_are_not():
     verdict = judged_trial("missing-shot", 2)
     assert verdict.level == "doubt"
     assert "2 of 3 shots are excluded, as dark or as the same as another: 2, 3" in verdict.words
-    assert judged_trial("missing-shot", 1).level == "trust"
+    assert judged_trial("missing-shot", 1).reasons[0].what.startswith(CONSISTENT)
 
 
 @pytest.mark.parametrize("share", [0.7, 0.9])
@@ -416,10 +416,15 @@ def test_a_light_field_that_foretells_less_than_anybody_would_is_doubted(three):
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-bayer-3shots"])
 @pytest.mark.parametrize("scene", ["near-planar", "wide-disparity"])
-def test_a_capture_without_a_fault_is_trusted(scene, camera):
+def test_a_capture_without_a_fault_is_consistent_and_trusted_where_accuracy_is_stated(
+    scene, camera
+):
     verdict = judged_trial("mask-shift", 0, camera, scene, seed=3)
-    assert verdict.level == "trust", verdict.words
-    assert verdict.reasons == ()
+    assert verdict.level == "cannot tell"
+    (reason,) = verdict.reasons
+    assert reason.what == f"{CONSISTENT}, but the accuracy is not known: tv states none"
+    stated = verdict_from(dataclasses.replace(verdict.evidence, stated=0.02))
+    assert (stated.level, stated.reasons) == ("trust", ())
 
 
 def test_evidence_survives_json(clean):
@@ -549,7 +554,13 @@ def test_causes_are_named_with_size_and_remedy_where_they_do_harm(
 ):
     changes = {"contrast": (0.03, 0.001, 0.5), "blur": (0.1, 0.01, 0.4), cause: (value, 0.001, 1.0)}
     found = dataclasses.replace(
-        clean, strengths=(0.95,) * 3, noise=0.01, changes=changes, noise_share=0.25, explained=None
+        clean,
+        strengths=(0.95,) * 3,
+        noise=0.01,
+        changes=changes,
+        noise_share=0.25,
+        explained=None,
+        stated=None,
     )
     verdict = verdict_from(found)
     assert verdict.level == "doubt"
@@ -557,11 +568,13 @@ def test_causes_are_named_with_size_and_remedy_where_they_do_harm(
     assert remedy in verdict.reasons[0].remedy
     # Where the light field errs by far more, it is no matter; gamma is, as it is wrong brightness.
     harmless = verdict_from(dataclasses.replace(found, noise_share=0.01))
-    assert harmless.level == ("trust" if cause not in ("gamma", "vignetting") else "doubt")
+    assert harmless.level == (
+        "cannot tell" if cause not in ("gamma", "vignetting") else "doubt"
+    )
     # So is a blur or a distance that changes much of the masks' modulation.
     much = dict(changes, contrast=(0.05, 0.001, 0.5)) if cause != "contrast" else changes
     strong = verdict_from(dataclasses.replace(found, changes=much, noise_share=0.01))
-    assert strong.level == ("trust" if cause in ("offset", "contrast") else "doubt")
+    assert strong.level == ("cannot tell" if cause in ("offset", "contrast") else "doubt")
 
 
 @pytest.mark.slow
@@ -781,13 +794,13 @@ def test_the_command_ends_with_its_verdict_and_strict_fails_on_what_is_not_to_be
     settings = tmp_path / "settings.yaml"
     settings.write_text("tv: {max_steps: 40}\n")
     options = ["--method", "tv", "--settings", str(settings), "--strict"]
-    for folder, code, level in zip(folders, (0, 1), ("trust", "do not use"), strict=True):
+    for folder, code, level in zip(folders, (0, 1), ("cannot tell", "do not use"), strict=True):
         out = tmp_path / level
         done = CliRunner().invoke(app, ["reconstruct", str(folder), *options, "--out", str(out)])
         last = done.stdout.strip().splitlines()[-1]
         verdict = json.loads((out / "metrics.json").read_text())["verdict"]
         assert (done.exit_code, verdict["level"]) == (code, level)
-        assert last.startswith(verdict["reasons"][-1]["level"] if code else "trust")
+        assert last.startswith(verdict["reasons"][-1]["level"])
         assert "\x1b" not in last
         assert (out / "light_field.h5").is_file()
     assert "calibrate the drift" in verdict["reasons"][0]["remedy"]
