@@ -49,9 +49,9 @@ ORIENTATIONS = {
 FURTHEST_PX = 24
 """Displacements that are tried."""
 NEAR_PX = 4
-"""Displacements of one peak, and of masks that are in their place."""
+"""Masks displaced by less count as in their place, and gains so near as one peak."""
 CLEARLY = 1.7
-"""Gain over that of every other orientation and place, from which on the masks are named."""
+"""Least ratio of the largest gain to the next largest: below it nothing is named."""
 LEAST_STRENGTH = 0.3
 """Of the masks as found: 1 where every cell is where it is drawn."""
 LEAST_ROUGH = 0.3
