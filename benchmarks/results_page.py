@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -719,6 +720,20 @@ def run_text(file: str, runs: Mapping[str, Row]) -> str:
     )
 
 
+def current_version() -> str:
+    """Return the version of this code."""
+    found = re.search(r'__version__ = "(.+)"', (ROOT / "emmc_rig" / "version.py").read_text(encoding="utf-8"))
+    assert found is not None
+    return found[1]
+
+
+def older_text(files: Sequence[str], runs: Mapping[str, Row]) -> str:
+    """Return ", by version 0.1.0" where a file was measured by older code than this; else ""."""
+    versions = {runs[f"{file}.csv"]["version"] for file in files}
+    older = sorted(versions - {current_version()})
+    return f", by version {' and '.join(older)}" if older else ""
+
+
 def made() -> dict[Path, str]:
     """Return every file that the command writes, and its text."""
     runs = {row["file"]: row for row in rows_of("runs")}
@@ -726,7 +741,9 @@ def made() -> dict[Path, str]:
     page, lines = [HEAD], [("what", "reached", "measured by")]
     shown: set[str] = set()
     for section in (make() for make in SECTIONS):
-        page.append(f"## {section.heading}\n\n{section.answer}\n")
+        older = older_text(section.files, runs)
+        answer = section.answer + (f" (Measured{older.lstrip(',')}.)" if older else "")
+        page.append(f"## {section.heading}\n\n{answer}\n")
         for name, chart in section.charts.items():
             files[RESULTS / "charts" / f"{name}.svg"] = chart
             page.append(f"![{section.heading}](results/charts/{name}.svg)\n")
@@ -738,7 +755,7 @@ def made() -> dict[Path, str]:
         shown |= set(section.files)
         if section.line:
             command = runs[f"{section.files[0]}.csv"]["command"].split(" --")[0]
-            lines.append((*section.line, f"`{command}`"))
+            lines.append((*section.line, f"`{command}`{older_text(section.files, runs)}"))
     page.append("## Other runs\n")
     page += [
         f"- {run_text(Path(file).stem, runs)}"
