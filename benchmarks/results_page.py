@@ -722,7 +722,8 @@ def run_text(file: str, runs: Mapping[str, Row]) -> str:
 
 def current_version() -> str:
     """Return the version of this code."""
-    found = re.search(r'__version__ = "(.+)"', (ROOT / "emmc_rig" / "version.py").read_text(encoding="utf-8"))
+    text = (ROOT / "emmc_rig" / "version.py").read_text(encoding="utf-8")
+    found = re.search(r'__version__ = "(.+)"', text)
     assert found is not None
     return found[1]
 

@@ -295,9 +295,13 @@ def _motion(e: Evidence) -> Iterator[Reason]:
 
 
 def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
-    """What evening the shots' brightness leaves open; kept: shots that were not left out."""
+    """What evening the shots' brightness leaves open; kept: shots that were not left out.
+
+    Most shots of one brightness leave nothing open: the others are scaled to them.
+    """
     gains = {shot: e.gains[shot] for shot in kept if e.gains}
-    if len(gains) < 2:
+    alike = sum(abs(gain - 1) <= FLICKER.doubt for gain in gains.values())
+    if len(gains) < 2 or (len(gains) > 2 and alike > len(gains) / 2):
         return
     worst = max(gains, key=lambda shot: abs(np.log(max(gains[shot], 1e-6))))
     apart = abs(gains[worst] - 1)
