@@ -50,6 +50,8 @@ all."""
 REST, REST_PX = 1.12, 2.0
 """Squared residual of total variation without motion over that with it, up to which a place rests:
 0.95 to 1.12 at rest, 1.2 to 2 with motion of 0.3 px. And the blur of the places."""
+UP_TO = 0.99
+"""Share of the places that moved by less than what a scene is said to have moved by."""
 RESTING, ALL_MOVES = np.float32(0.1), np.float32(1)
 """Share of the residual added to the readings' variance, where the scene rests and elsewhere."""
 
@@ -282,12 +284,13 @@ def of_samples(pixels: NDArray, of: Array) -> NDArray:
 
 
 def moved(others: Sequence[OtherTime]) -> dict[str, float]:
-    """Return by how much the scene moved to the furthest time, pixels, and what share is seen."""
+    """Return by how much places moved at most to the furthest time, pixels, and what share is seen.
+    """
     steps = (
         np.linalg.norm(other.there[of_samples(other.used[0], other.there)], axis=-1)
         for other in others
     )
     return {
-        "moved_px": max((float(np.median(by)) for by in steps if by.size), default=0.0),
+        "moved_px": max((float(np.quantile(by, UP_TO)) for by in steps if by.size), default=0.0),
         "seen_share": float(np.mean([other.used.mean() for other in others])),
     }

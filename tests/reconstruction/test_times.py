@@ -6,7 +6,7 @@ import pytest
 from emmc_rig.model.camera import build_imaging_matrix, shipped_cameras
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.film import Film
-from emmc_rig.reconstruction.adaptive.times import OtherTime, aligned, rested
+from emmc_rig.reconstruction.adaptive.times import OtherTime, aligned, moved, rested
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import Readings
 from emmc_rig.reconstruction.methods import reconstruct
@@ -62,14 +62,14 @@ def test_an_aligned_frame_reads_the_present_scene(random_psi, binning):
     usable = np.ones(frames.shape, bool)
     readings = Readings(psi, frames, 0.01, np.full(frames.shape, 1e-4, np.float32), usable)
     back = np.zeros((*psi.size, 2), np.float32) + np.array((down, right), np.float32) + 0.2
-    moved = aligned(OtherTime(readings, usable, light_field[1, 1], -back, back), binning)
-    seen = moved.usable[0]
+    carried = aligned(OtherTime(readings, usable, light_field[1, 1], -back, back), binning)
+    seen = carried.usable[0]
     # What went out of the picture below, and on its left.
     assert not seen[-2:].any()
     assert not seen[:, :1].any()
     assert seen[:-2, 1:].all()
     np.testing.assert_allclose(
-        moved.frames[0][seen], moved.psi.forward(light_field)[0][seen], rtol=1e-4, atol=1e-5
+        carried.frames[0][seen], carried.psi.forward(light_field)[0][seen], rtol=1e-4, atol=1e-5
     )
 
 
@@ -102,7 +102,8 @@ def test_a_traced_scene_that_moves_by_fractions_of_a_pixel_is_carried_too():
     gain_db = psnr_db(result.light_field, seen[0]) - psnr_db(alone.light_field, seen[0])
     assert gain_db > LEAST_GAIN_DB
     true_px = np.nanmedian(np.linalg.norm(flow_px(scene, size, 0, 0.2, 0.0), axis=-1))
-    assert result.parameters["moved_px"] == pytest.approx(true_px, abs=0.2)
+    # The largest of flows, each of which is off by 0.1 to 0.2 pixels.
+    assert result.parameters["moved_px"] == pytest.approx(true_px, abs=0.3)
 
 
 def test_shots_of_another_scene_do_next_to_no_harm(psi):
@@ -163,3 +164,13 @@ def test_a_film_at_rest_before_a_mask_that_steps_gains_by_each_frame(psi):
 def test_a_method_without_surfaces_takes_no_scene_that_moves(psi, slid):
     with pytest.raises(ReconstructionError, match="'tv' takes no films"):
         reconstruct("tv", *_given(psi, slid)[1:], moving=True)
+
+
+def test_a_small_object_that_moved_counts_by_its_own_motion(random_psi):
+    psi = random_psi(1, (3, 3), (64, 96), 1, 1)
+    frames = np.ones(psi.frames_shape, np.float32)
+    readings = Readings(psi, frames, 0.01, frames * 1e-4, frames > 0)
+    flow = np.zeros((64, 96, 2), np.float32)
+    flow[20:30, 20:30] = 0, 8
+    other = OtherTime(readings, readings.usable, np.ones((64, 96, 3), np.float32), flow, -flow)
+    assert moved([other])["moved_px"] == pytest.approx(8)
