@@ -323,9 +323,7 @@ def with_lens(causes: Sequence[Cause], displaced: Array) -> list[Cause]:
     displaced: (views' own,), whether each is a displacement, um, or a blur, um.
     """
     own, count = len(causes[0].columns), len(displaced)
-    more = [
-        replace(cause, columns=np.pad(cause.columns, ((0, count), (0, 0)))) for cause in causes
-    ]
+    more = [replace(cause, columns=np.pad(cause.columns, ((0, count), (0, 0)))) for cause in causes]
     of_views = np.vstack([np.zeros((own, count)), np.eye(count)])
     widths = MOVED_STEPS * LEAST_MOVED_UM / 5
     of_lens = ((LENS, displaced), (BLUR, ~displaced))

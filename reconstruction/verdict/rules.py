@@ -297,7 +297,7 @@ def _motion(e: Evidence) -> Iterator[Reason]:
 def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
     """What evening the shots' brightness leaves open; kept: shots that were not left out.
 
-    Most shots of one brightness leave nothing open: the others are scaled to them.
+    Where most shots have one brightness, nothing is open: screening scaled the rest to it.
     """
     gains = {shot: e.gains[shot] for shot in kept if e.gains}
     alike = sum(abs(gain - 1) <= FLICKER.doubt for gain in gains.values())

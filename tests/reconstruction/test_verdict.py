@@ -571,9 +571,7 @@ def test_causes_are_named_with_size_and_remedy_where_they_do_harm(
     assert remedy in verdict.reasons[0].remedy
     # Where the light field errs by far more, it is no matter; gamma is, as it is wrong brightness.
     harmless = verdict_from(dataclasses.replace(found, noise_share=0.01))
-    assert harmless.level == (
-        "cannot tell" if cause not in ("gamma", "vignetting") else "doubt"
-    )
+    assert harmless.level == ("cannot tell" if cause not in ("gamma", "vignetting") else "doubt")
     # So is a blur or a distance that changes much of the masks' modulation.
     much = dict(changes, contrast=(0.05, 0.001, 0.5)) if cause != "contrast" else changes
     strong = verdict_from(dataclasses.replace(found, changes=much, noise_share=0.01))
