@@ -284,7 +284,7 @@ def of_samples(pixels: NDArray, of: Array) -> NDArray:
 
 
 def moved(others: Sequence[OtherTime]) -> dict[str, float]:
-    """Return by how much places moved at most to the furthest time, pixels, and what share is seen."""
+    """Return how far places moved at most to the furthest time, pixels, and what share is seen."""
     steps = (
         np.linalg.norm(other.there[of_samples(other.used[0], other.there)], axis=-1)
         for other in others
