@@ -87,11 +87,12 @@ def show_reason(level: str, what: str, remedy: str, figure: float) -> None:
 def show_verdict(metrics: Mapping[str, Any]) -> None:
     """Print the verdict of metrics.json, a line for each reason, and the accuracy."""
     from emmc_rig.reconstruction.verdict.rules import CONSISTENT
-    from emmc_rig.store.results import stated_words
+    from emmc_rig.store.results import stated_words, worse_words
 
-    verdict = metrics["verdict"]
+    verdict, worse = metrics["verdict"], worse_words(metrics)
     if not verdict["reasons"]:
-        tell(f"trust: {CONSISTENT}", VERDICT_COLOURS[verdict["level"]])
+        words = f"trust with care: {CONSISTENT}, but {worse}" if worse else f"trust: {CONSISTENT}"
+        tell(words, VERDICT_COLOURS["doubt" if worse else "trust"])
     for reason in verdict["reasons"]:
         show_reason(**reason)
     if stated := stated_words(metrics):

@@ -13,9 +13,9 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
+from emmc_rig.model.view_axes import axes_of, picture_name, shows_parallax
 from emmc_rig.reconstruction.verdict.rules import CONSISTENT
-from emmc_rig.store.results import stated_words, unmeasured_words
+from emmc_rig.store.results import stated_words, unmeasured_words, worse_words
 from emmc_rig.version import __version__
 
 KINDS = {
@@ -87,18 +87,15 @@ def light_field_head(metrics: Mapping[str, object], source: str = "", viewer: bo
         return Head("No verdict", why, _uses(metrics, source, viewer))
     level, reasons = verdict["level"], verdict["reasons"]
     why = [reason["what"] for reason in reasons] or [CONSISTENT]
-    if lost_db := below_baseline_db(metrics):
-        why.append(
-            f"against the truth it is {lost_db:.1f} dB worse than the baseline "
-            f"({middle_name(axes_of(metrics))} in all places)"
-        )
+    if worse := worse_words(metrics):
+        why.append(worse)
     if stated := stated_words(metrics):
         why.append(f"estimated accuracy {stated}")
     advice = str(metrics.get("advice") or "")
     remedies = list(filter(None, [*(reason["remedy"] for reason in reasons), advice]))
     uses = _uses(metrics, source, viewer) if level == "cannot tell" or not remedies else []
     words, tone = VERDICTS[level]
-    if lost_db and tone == "good":
+    if worse and tone == "good":
         words, tone = "Look at this light field with care", "watch"
     return Head(
         words,
@@ -118,17 +115,6 @@ def estimated(metrics: Mapping[str, object]) -> list[str]:
     if unmeasured := unmeasured_words(metrics):
         sentences.append(f"{unmeasured}.")
     return sentences
-
-
-def below_baseline_db(metrics: Mapping[str, object]) -> float:
-    """Return by how much a result with a truth falls short of the baseline; 0: it does not.
-
-    The baseline is the true centre view in all places, which shows no parallax.
-    """
-    found, baseline = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")
-    if isinstance(found, int | float) and isinstance(baseline, int | float):
-        return max(float(baseline - found), 0.0)
-    return 0.0
 
 
 def _uses(metrics: Mapping[str, object], source: str, viewer: bool) -> list[str]:

@@ -18,7 +18,7 @@ import h5py
 from numpy.typing import NDArray
 
 from emmc_rig.errors import WrongUsageError
-from emmc_rig.model.view_axes import view_names
+from emmc_rig.model.view_axes import axes_of, middle_name, view_names
 from emmc_rig.store.locks import command_line
 from emmc_rig.store.shards import ENDING, save_arrays
 from emmc_rig.version import __version__
@@ -98,6 +98,22 @@ def stated_words(metrics: Mapping[str, object]) -> str:
         case [float(low), float(high)]:
             return f"{stated_db:.1f} dB ({low:.1f} to {high:.1f} in 9 of 10 captures)"
     return f"{stated_db:.1f} dB"
+
+
+def worse_words(metrics: Mapping[str, object]) -> str:
+    """Return by how much a result falls short of the baseline, where the truth is known; else "".
+
+    The baseline is the true centre view in all places, which shows no parallax.
+    """
+    found, baseline = metrics.get("psnr_db"), metrics.get("replicate_psnr_db")
+    if not (isinstance(found, int | float) and isinstance(baseline, int | float)):
+        return ""
+    if found >= baseline:
+        return ""
+    return (
+        f"against the truth it is {baseline - found:.1f} dB worse than the baseline "
+        f"({middle_name(axes_of(metrics))} in all places)"
+    )
 
 
 def unmeasured_words(metrics: Mapping[str, object]) -> str:

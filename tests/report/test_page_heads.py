@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from emmc_rig.commands.output import show_verdict
 from emmc_rig.formats.format import Export
 from emmc_rig.reconstruction.verdict.rules import CONSISTENT, LEVELS
 from emmc_rig.report.page import light_field_head, typed
@@ -74,3 +75,12 @@ def test_a_path_is_typed_short_below_this_folder_and_quoted(tmp_path, monkeypatc
 @pytest.fixture(scope="module")
 def light_field():
     return np.random.default_rng(0).random((3, 3, 24, 32, 3), dtype=np.float32)
+
+
+def test_the_terminal_says_with_care_where_the_page_does(capsys):
+    metrics = {"verdict": {"level": "trust", "reasons": []}, "stated_db": 25.3}
+    show_verdict(metrics)
+    assert capsys.readouterr().out == f"trust: {CONSISTENT}\nestimated accuracy: 25.3 dB\n"
+    show_verdict({**metrics, "psnr_db": 20.0, "replicate_psnr_db": 21.5})
+    worse = "against the truth it is 1.5 dB worse than the baseline (centre view in all places)"
+    assert capsys.readouterr().out.startswith(f"trust with care: {CONSISTENT}, but {worse}\n")
