@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -96,6 +97,14 @@ def _worst_motion(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _masks_seen(blocks: Sequence[JudgedBlock]) -> tuple[Any, ...] | None:
+    """Return how the masks stand in most pixels: see `Evidence`."""
+    pixels = defaultdict[tuple[Any, ...] | None, int](int)
+    for block in blocks:
+        pixels[block.evidence.masks_seen] += block.pixels
+    return max(pixels, key=lambda seen: pixels[seen])
+
+
 def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
     """Return the evidence of all blocks together: means by pixels, and the worst places."""
     evidence = [block.evidence for block in blocks]
@@ -106,6 +115,7 @@ def combined(blocks: Sequence[JudgedBlock]) -> Evidence:
         "left_out": tuple(sorted({shot for e in evidence for shot in e.left_out})),
         "kept": sum(e.kept for e in evidence),
         "hole_at": worst_hole.in_whole(worst_hole.evidence.hole_at),
+        "masks_seen": _masks_seen(blocks),
         **_worst_motion(blocks),
     }
     figures = {

@@ -1,5 +1,6 @@
 """Blocks: they cover the light field once, and the result does not depend on who computes them."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -27,6 +28,8 @@ from emmc_rig.reconstruction.tiles import (
 from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.reconstruction.verdict import run
 from emmc_rig.reconstruction.verdict.blocks import JudgedBlock, combined, judged_together
+from emmc_rig.reconstruction.verdict.orientation import Seen
+from emmc_rig.reconstruction.verdict.rules import verdict_from
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.store.psi import StoredPsi
 
@@ -236,6 +239,19 @@ def test_the_verdict_on_equal_blocks_is_that_of_one(blocks):
     assert two.strengths == pytest.approx(first.strengths)
     assert two.strength_errors == pytest.approx(np.array(first.strength_errors) / 2**0.5)
     json.dumps(together.as_dict(), allow_nan=False)
+
+
+def test_masks_that_most_blocks_show_turned_are_named_for_the_whole(blocks):
+    good, _ = blocks
+    seen = Seen("turned by 180 degrees", False, (0, 0), 0.9)
+    turned = verdict_from(dataclasses.replace(good.evidence, masks_seen=tuple(seen)))
+    few, most = (
+        judged_together([JudgedBlock(each, 0, 0, 100) for each in found])
+        for found in ([good, good, turned], [good, turned, turned])
+    )
+    assert few.evidence.masks_seen is None
+    assert "turned by 180 degrees" in most.reasons[0].what
+    assert most.level == "do not use"
 
 
 def test_one_bad_block_of_many_raises_doubt_and_is_named(blocks):
