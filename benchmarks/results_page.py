@@ -729,10 +729,10 @@ def current_version() -> str:
 
 
 def older_text(files: Sequence[str], runs: Mapping[str, Row]) -> str:
-    """Return ", by version 0.1.0" where a file was measured by older code than this; else ""."""
+    """Return "by version 0.1.0" where a file was measured by older code than this; else ""."""
     versions = {runs[f"{file}.csv"]["version"] for file in files}
     older = sorted(versions - {current_version()})
-    return f", by version {' and '.join(older)}" if older else ""
+    return f"by version {' and '.join(older)}" if older else ""
 
 
 def made() -> dict[Path, str]:
@@ -743,8 +743,8 @@ def made() -> dict[Path, str]:
     shown: set[str] = set()
     for section in (make() for make in SECTIONS):
         older = older_text(section.files, runs)
-        answer = section.answer + (f" (Measured{older.lstrip(',')}.)" if older else "")
-        page.append(f"## {section.heading}\n\n{answer}\n")
+        measured = f" (Measured {older}.)" if older else ""
+        page.append(f"## {section.heading}\n\n{section.answer}{measured}\n")
         for name, chart in section.charts.items():
             files[RESULTS / "charts" / f"{name}.svg"] = chart
             page.append(f"![{section.heading}](results/charts/{name}.svg)\n")
@@ -756,7 +756,7 @@ def made() -> dict[Path, str]:
         shown |= set(section.files)
         if section.line:
             command = runs[f"{section.files[0]}.csv"]["command"].split(" --")[0]
-            lines.append((*section.line, f"`{command}`{older_text(section.files, runs)}"))
+            lines.append((*section.line, ", ".join(filter(None, [f"`{command}`", older]))))
     page.append("## Other runs\n")
     page += [
         f"- {run_text(Path(file).stem, runs)}"

@@ -689,10 +689,9 @@ def _find_causes(
     if not any(cause.name in SHIFTING for cause in found) or bench.always:
         return found
     terms = _view_terms(mask, point, samples)
-    every = np.arange(len(terms.pull))
-    displaced = np.resize(KINDS, len(every)) == KINDS[0]
-    own = _own_information(point, bench, terms, every)
-    own2 = np.concatenate([bench.own2, np.full(len(every), LEAST_OWN[1] ** 2)])
+    displaced = np.resize(KINDS, len(terms.pull)) == KINDS[0]
+    own = _own_information(point, bench, terms)
+    own2 = np.concatenate([bench.own2, np.full(len(displaced), LEAST_OWN[1] ** 2)])
     return find_causes(own, with_lens(causes, displaced), own2)
 
 
@@ -736,10 +735,7 @@ def _own_widths(found: Sequence[FoundCause], ratio: float) -> dict[str, float]:
 
 
 def _own_information(
-    point: _Point,
-    bench: _BenchPrior,
-    terms: _ViewTerms | None = None,
-    displaced: Sequence[int] | NDArray[np.intp] = (),
+    point: _Point, bench: _BenchPrior, terms: _ViewTerms | None = None
 ) -> OwnInformation:
     """Return what the readings say of the whiteboards' own parameters, the placement's taken out.
 
@@ -750,16 +746,14 @@ def _own_information(
         S = matrix_oo - matrix_op (matrix_pp + P)^-1 matrix_po
         h = g_o - matrix_op (matrix_pp + P)^-1 g_p
 
-    terms, displaced: of the views, and which of theirs count as own as well.
+    terms: of the views, whose own parameters count as own as well.
     """
     normal, state = point.normal, point.state
     away = state.vector() - np.concatenate([bench.centre, bench.own])
     matrix, pull = normal.matrix, normal.gradient + normal.matrix @ away
     if terms is not None:
-        chosen = np.asarray(displaced)
-        mixed, of_views = terms.mixed[:, chosen], terms.own[np.ix_(chosen, chosen)]
-        matrix = np.block([[matrix, mixed], [mixed.T, of_views]])
-        pull = np.concatenate([pull, terms.pull[chosen] + mixed.T @ away])
+        matrix = np.block([[matrix, terms.mixed], [terms.mixed.T, terms.own]])
+        pull = np.concatenate([pull, terms.pull + terms.mixed.T @ away])
     size = len(bench.centre)
     of_placement = matrix[:size, :size] + np.diag(bench.precision)
     across = np.linalg.solve(of_placement, matrix[:size, size:]).T
@@ -877,7 +871,7 @@ def _references_covariance(
                 at = np.searchsorted(pixels, of_board[part])
                 residual, slope = point.linear[index]
                 pull = tukey_weights(residual[part] / spread) / spread**2 * deviation[at]
-                pull *= point.linear[index].slope[part, -OWN]
+                pull *= slope[part, -OWN]
                 alone, places = slope[part] * pull[:, None], point.state.places(index)
                 summed[np.ix_(at, places)] += alone
                 added[np.ix_(places, places)] -= alone.T @ alone

@@ -26,12 +26,12 @@ from emmc_rig.model.errors import ModelError
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.verdict.displaced import known_camera, near_masks
 from emmc_rig.reconstruction.verdict.shadow import (
-    LOCAL_PX,
     SMOOTH_PX,
     Relief,
     averaged,
     channels,
     predicted_relief,
+    texture_weight,
 )
 
 Array = NDArray[np.floating]
@@ -54,10 +54,6 @@ CLEARLY = 1.7
 """Least ratio of the largest gain to the next largest: below it nothing is named."""
 LEAST_STRENGTH = 0.3
 """Of the masks as found: 1 where every cell is where it is drawn."""
-LEAST_ROUGH = 0.3
-"""Least variance of the texture, over its median."""
-WEAK = 0.65
-"""Strength of a shot's masks below which others are tried."""
 
 
 class Seen(NamedTuple):
@@ -121,9 +117,7 @@ def _detail(psi: ImagingMatrix, relief: Relief) -> _Detail:
     read = relief.level * (1 + relief.read)
     around = averaged(read, good, filters, SMOOTH_PX)
     seen = np.where(good & (around > 0), read / np.where(around > 0, around, 1) - 1, 0)
-    rough = averaged(np.square(seen), good, filters, LOCAL_PX)
-    least = LEAST_ROUGH * float(np.median(rough[good])) if good.any() else 1.0
-    return _Detail(seen, np.where(good, 1 / np.maximum(rough, least + 1e-12), 0), good)
+    return _Detail(seen, texture_weight(seen, good, filters), good)
 
 
 def _two_peaks(tried: _Correlated) -> Iterator[tuple[int, int]]:

@@ -108,9 +108,7 @@ def measured_relief(
     read = np.where(good, np.where(usable, frames, 0) / safe - 1, 0).astype(np.float32)
     # The smooth picture errs where brightness turns: what is left of the means is taken away.
     seen = read - np.where(good, averaged(read - masks, good, filters, SMOOTH_PX), 0)
-    rough = averaged(np.square(seen - masks), good, filters, LOCAL_PX)
-    least = float(np.median(rough[good])) if good.any() else 1.0
-    weight = np.where(good, 1 / np.maximum(rough, 0.3 * least + 1e-12), 0)
+    weight = texture_weight(seen - masks, good, filters)
     # Few bright spots make the smooth picture brighter than the calm places that count most.
     calm = averaged(weight * (read - masks), good, filters, SMOOTH_PX) / np.maximum(
         averaged(weight, good, filters, SMOOTH_PX), 1e-12
@@ -119,6 +117,13 @@ def measured_relief(
     return Relief(
         level, masks, read, seen.astype(np.float32), good, weight.astype(np.float32), picture
     )
+
+
+def texture_weight(texture: Array, good: NDArray[np.bool_], filters: NDArray[np.int64]) -> Array:
+    """Return the inverse variance of what the masks do not explain, 0 where it is not known."""
+    rough = averaged(np.square(texture), good, filters, LOCAL_PX)
+    least = float(np.median(rough[good])) if good.any() else 1.0
+    return np.where(good, 1 / np.maximum(rough, 0.3 * least + 1e-12), 0)
 
 
 def tile_edges(length: int) -> NDArray[np.int64]:
