@@ -106,6 +106,10 @@ CASES = {
     "lens warms": Case(course={"focus_um": 1.0}),
     "round pupil": Case("pupil", optics={"pupil_um": 9000.0, "pupil_at_um": (100.0, -60.0)}),
     "round pupil within the views": Case("pupil", optics={"pupil_um": 7500.0}),
+    "rim before a round pupil": Case(
+        "a rim", optics={"pupil_um": 9000.0, "rim_um": 8500.0, "rim_shift": -1.0}
+    ),
+    "rim alone": Case("a rim", optics={"rim_um": 8000.0, "rim_shift": -0.5}),
     "round pupil, glare, plate turned": Case(
         "plate is turned",
         True,

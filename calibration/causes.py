@@ -151,7 +151,10 @@ class Geometry:
         assert self.pupil is not None
         x_mm, y_mm = np.array(self.pupil.centre_mm) - np.asarray(off_um) / 1e3
         seen = self.pupil.model_copy(update={"centre_mm": (float(x_mm), float(y_mm))})
-        opened = cell_openings(seen, self.views, self.cell_um)
+        rim = self.pupil.rim
+        # What moves the rim as a moved hole would.
+        pixel_um = (0.0, 0.0) if rim is None else tuple(-np.asarray(off_um) / rim.shift)
+        opened = cell_openings(seen, self.views, self.cell_um, pixel_um=pixel_um)
         boxes = opened.of_view(*view)
         shares = opened.share[boxes]
         total = max(float(shares.sum()), 1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -92,21 +93,34 @@ def mask_findings(fit: Fit, names: Sequence[str] = tuple(NOTEWORTHY)) -> list[st
 
 
 def pupil_finding(fit: Fit, mask: ShadowMask) -> list[str]:
-    """Return the pupil's size and centre, and the views that it leaves less than half open."""
-    pupil = fit.placement.fitted_pupil()
-    if pupil is None:
+    """Return size and centre of pupil and rim, and the views that are less than half open."""
+    at = fit.placement
+    pupil = at.fitted_pupil()
+    if pupil is None or at.pupil is None:
         return []
-    opened = openings(mask, fit.placement).shares(mask.views)
-    if opened.min() > LEAST_OPEN:
+    opened = openings(mask, at).shares(mask.views)
+    alone = replace(at, pupil=at.pupil.model_copy(update={"rim": None}))
+    cuts = openings(mask, alone).shares(mask.views).min() <= LEAST_OPEN
+    if not cuts and pupil.rim is None:
         return []
-    x_mm, y_mm = pupil.centre_mm
-    size_spread = fit.deviation("pupil_share") * pupil.diameter_mm / (1 + fit.placement.pupil_share)
-    spread = max(fit.deviation("pupil_x_um"), fit.deviation("pupil_y_um")) / 1e3
-    words = (
-        f"the lens's {pupil.shape} pupil is {pupil.diameter_mm:.2f} +- {size_spread:.2f} mm "
-        f"across, its middle at ({x_mm:+.2f}, {y_mm:+.2f}) +- {spread:.2f} mm from the middle of "
-        "the views"
-    )
+    phrases = list[str]()
+    if pupil.rim is not None:
+        share = fit.deviation("rim_share") / (1 + at.rim_share)
+        phrases.append(
+            f"a rim of {pupil.rim.diameter_mm:.2f} +- {pupil.rim.diameter_mm * share:.3f} mm cuts "
+            f"the views (vignetting); it moves by {pupil.rim.shift:+.2f} +- "
+            f"{fit.deviation('rim_shift'):.3f} mm for each mm of the pixel"
+        )
+    if cuts:
+        x_mm, y_mm = pupil.centre_mm
+        share = fit.deviation("pupil_share") / (1 + at.pupil_share)
+        spread = max(fit.deviation("pupil_x_um"), fit.deviation("pupil_y_um")) / 1e3
+        phrases.append(
+            f"the lens's {pupil.shape} pupil is {pupil.diameter_mm:.2f} +- "
+            f"{pupil.diameter_mm * share:.2f} mm across, its middle at ({x_mm:+.2f}, {y_mm:+.2f}) "
+            f"+- {spread:.2f} mm from the middle of the views"
+        )
+    words = "; ".join(phrases)
     for names, least, most in (
         ("less than half open", LEAST_SHARE, 0.5),
         ("shut", -1, LEAST_SHARE),

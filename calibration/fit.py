@@ -72,15 +72,23 @@ from emmc_rig.calibration.causes import (
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.locator import register, starting_placement
 from emmc_rig.calibration.placement import (
-    PUPIL_SHARE,
     PUPIL_X,
+    RIM_SHARE,
+    RIM_SHIFT,
     SCALARS,
     Placement,
     Tolerances,
     labels,
     with_aperture_mean_one,
 )
-from emmc_rig.calibration.pupil_shape import CLEARLY_ROUND, likeliest_pupil, measured_light
+from emmc_rig.calibration.pupil_shape import (
+    CLEARLY_ROUND,
+    LightGrowth,
+    ViewLight,
+    likeliest_pupil,
+    likeliest_rim,
+    measured_light,
+)
 from emmc_rig.calibration.robust import (
     correlation,
     deviation_of,
@@ -91,13 +99,16 @@ from emmc_rig.calibration.robust import (
 from emmc_rig.calibration.shadow import (
     ANY_COLOUR,
     OF_VIEW,
+    PUPIL_PARAMETERS,
     Shadow,
     ShadowMask,
+    far_shares,
     light_slopes,
     openings,
 )
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
+from emmc_rig.model.pupil import Pupil
 from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
@@ -124,8 +135,8 @@ SIDES = slice(3, 5)
 """Where the hole's width and height lie in a whiteboard's own parameters."""
 OFFSETS = slice(0, 2)
 """Where offset_x_um and offset_y_um lie in the placement's vector."""
-PUPIL = slice(PUPIL_X, PUPIL_SHARE + 1)
-"""Where the pupil's parameters lie there."""
+PUPIL, RIM = slice(PUPIL_X, RIM_SHARE), slice(RIM_SHARE, RIM_SHIFT + 1)
+"""Where the parameters of pupil and rim lie there."""
 STEPS_TO_PUPIL = 4
 """Of the fit, before the views' light is looked at: the mask is then about where it stands."""
 HELD = 1e-6
@@ -412,6 +423,8 @@ def _bench_prior(
     deviations = Tolerances().deviations(camera.views)
     if placement.pupil is None:
         deviations[PUPIL] *= HELD
+    if placement.pupil is None or placement.pupil.rim is None:
+        deviations[RIM] *= HELD
     loose = any(board.loose for board in boards)
     if loose:
         # Pinholes a little off their holes look like glass before the mask.
@@ -941,6 +954,19 @@ def fit_placement(
             prior = bench.with_widths(widths)
         descent = _descend(mask, point, samples, prior, settings, FIRST_GAIN)
         state, steps = descent.point.state, steps + descent.steps
+    pupil = descent.point.state.placement.pupil
+    if not isinstance(start, Fit) and (pupil is None or pupil.rim is None):
+        point = _with_rim_seen(mask, descent.point, whole, prior, settings)
+        if point is not descent.point:
+            # About the rim as fitted: it has the knots that its move needs.
+            at = point.state.placement
+            held = dict.fromkeys(PUPIL_PARAMETERS, 0.0)
+            at = replace(at, pupil=at.fitted_pupil(), **held)
+            point = _point(mask, replace(point.state, placement=at), whole)
+            bench = _bench_prior(boards, camera, mask, point.state.placement)
+            prior = bench.with_widths(widths)
+            descent = _descend(mask, point, whole, prior, settings, FIRST_GAIN)
+            steps += descent.steps
     found, off_plate, unlike = list[FoundCause](), False, False
     for turn, least_gain in enumerate(CAUSE_GAINS):
         if not descent.point.state.widening and any(cause.name in OF_HOLES for cause in found):
@@ -1021,26 +1047,95 @@ def _with_pupil_seen(
 
     The pupil is taken where the readings become clearly likelier.
     """
+    pupil = likeliest_pupil(_view_light(mask, point, prior), mask)
+    return point if pupil is None else _likelier(mask, point, samples, prior, settings, pupil)
+
+
+def _with_rim_seen(
+    mask: ShadowMask,
+    point: _Point,
+    samples: Sequence[Sample],
+    prior: _Prior,
+    settings: FitSettings,
+) -> _Point:
+    """Return the point with the rim that the views' light shows, as it is without one.
+
+    The rim is taken where the readings become clearly likelier.
+    """
+    growth = _light_growth(mask, point, samples, prior)
+    seen = _view_light(mask, point, prior)
+    pupil = likeliest_rim(seen, growth, mask, point.state.placement.fitted_pupil())
+    return point if pupil is None else _likelier(mask, point, samples, prior, settings, pupil)
+
+
+def _view_light(mask: ShadowMask, point: _Point, prior: _Prior) -> ViewLight:
+    """Return the views' shares of the light, without a prior of the aperture's weights."""
     state, normal = point.state, point.normal
     weights = slice(len(SCALARS), len(state.placement.vector()))
     precision = prior.precision.copy()
     precision[weights, weights] = 0
     pull = normal.gradient + precision @ (prior.centre - state.vector())
-    seen = measured_light(
-        state.placement.falloff, state.vector(), normal.matrix + precision, pull, mask
-    )
-    pupil = likeliest_pupil(seen, mask)
-    if pupil is None:
-        return point
-    # The weights were of views open to their edges.
+    through = openings(mask, state.placement).shares(mask.views).ravel()
+    through *= 1 + state.placement.falloff * far_shares(mask.views).ravel()
+    return measured_light(through, state.vector(), normal.matrix + precision, pull, mask)
+
+
+def _likelier(
+    mask: ShadowMask,
+    point: _Point,
+    samples: Sequence[Sample],
+    prior: _Prior,
+    settings: FitSettings,
+    pupil: Pupil,
+) -> _Point:
+    """Return the point fitted behind another pupil, as it is where that is not clearly likelier."""
+    # The weights were of views open as before.
     even = tuple((1.0,) * mask.views[1] for _ in range(mask.views[0]))
-    start = replace(state, placement=replace(state.placement, aperture=even, pupil=pupil))
-    precision = prior.precision.copy()
-    precision[PUPIL, PUPIL] *= HELD**2
+    at = point.state.placement
+    placement = replace(at, aperture=even, pupil=pupil, **dict.fromkeys(PUPIL_PARAMETERS, 0.0))
+    start = replace(point.state, placement=placement)
+    precision, deviations = prior.precision.copy(), Tolerances().deviations(mask.views)
+    for part in (PUPIL, RIM) if pupil.rim else (PUPIL,):
+        precision[part, part] = np.diag(1 / deviations[part] ** 2)
     freed = _Prior(precision, prior.centre)
     other = _descend(mask, _point(mask, start, samples), samples, freed, settings, FIRST_GAIN).point
-    likelier = point.loss(normal.spread, prior) - other.loss(normal.spread, freed)
+    likelier = point.loss(point.normal.spread, prior) - other.loss(point.normal.spread, freed)
     return other if likelier > CLEARLY_ROUND else point
+
+
+def _light_growth(
+    mask: ShadowMask, point: _Point, samples: Sequence[Sample], prior: _Prior
+) -> LightGrowth:
+    """Return how the light of single views grows over the picture, all parameters free.
+
+    By a growth (g_x, g_y) a reading r at the place (x, y) of a whiteboard of the view grows by
+    r (g_x x + g_y y), x and y as shares of the corner's distance.
+    """
+    opened = [np.argwhere(sample.board.views_open).tolist() for sample in samples]
+    of_sample = [tuple(views[0]) if len(views) == 1 else None for views in opened]
+    views = sorted({view for view in of_sample if view is not None})
+    size, count, spread = len(prior.centre), 2 * len(views), point.normal.spread
+    matrix, gradient = prior.precision.copy(), prior.pull(point.state)
+    mixed, own, pull = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)
+    middle = (np.array(mask.pixel_shape()) - 1) / 2
+    corner_px = mask.corner_um / (mask.pitch_um * mask.binning)
+    for index, (sample, linear) in enumerate(zip(samples, point.linear, strict=True)):
+        residual, slope = linear
+        places, view = point.state.places(index), of_sample[index]
+        # Light that grows much is no outlier: the whiteboard's own spread decides.
+        weight = tukey_weights(residual / _robust_spread([residual])) / spread**2
+        weighted = slope * weight[:, None]
+        matrix[np.ix_(places, places)] += weighted.T @ slope
+        gradient[places] += weighted.T @ residual
+        if view is not None:
+            at = slice(2 * views.index(view), 2 * views.index(view) + 2)
+            grown = (sample.pixels - middle)[:, ::-1] / corner_px * slope[:, -OWN, None]
+            own[at, at] += grown.T @ (weight[:, None] * grown)
+            mixed[places, at] += weighted.T @ grown
+            pull[at] += grown.T @ (weight * residual)
+    through = np.linalg.solve(matrix, mixed)
+    information = own - mixed.T @ through
+    return LightGrowth(np.array(views).reshape(-1, 2), pull - through.T @ gradient, information)
 
 
 def _contrast(board: Board) -> float:
@@ -1230,7 +1325,7 @@ def shares_of_prior(
     spread = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
     share[first : first + count] = np.minimum(spread / tolerances.aperture, 1.0)
     share[SCALARS.index("falloff")] = 0.0
-    share[PUPIL] = 0.0
+    share[PUPIL] = share[RIM] = 0.0
     return share
 
 

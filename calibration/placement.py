@@ -17,7 +17,8 @@ a_j; known apart, what is left of those is small.
 
 A round pupil covers the corners of the views: w_j then has the open share of view j as a factor,
 and u and the aperture cell's box are those of the view's open part (`emmc_rig.model.pupil`). The
-pupil's centre and diameter differ from its description by pupil_x_um, pupil_y_um, pupil_share.
+pupil's centre and diameter differ from its description by pupil_x_um, pupil_y_um, pupil_share; the
+diameter of the rim that moves over it, and its move, by rim_share and rim_shift.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.pupil import Pupil
+from emmc_rig.model.pupil import Pupil, Rim
 
 SCALARS = (
     "offset_x_um",
@@ -50,11 +51,13 @@ SCALARS = (
     "pupil_x_um",
     "pupil_y_um",
     "pupil_share",
+    "rim_share",
+    "rim_shift",
 )
 (
     OFFSET_X, OFFSET_Y, ROTATION, SCALE, SKEW, DISTANCE, DISTORTION, BLUR,
     CLEAR, LEAK, VIGNETTING, FALLOFF, TILT_X, TILT_Y, BOW, GLASS,
-    PUPIL_X, PUPIL_Y, PUPIL_SHARE,
+    PUPIL_X, PUPIL_Y, PUPIL_SHARE, RIM_SHARE, RIM_SHIFT,
 ) = range(len(SCALARS))  # fmt: skip
 """Where the scalars lie in the parameter vector."""
 LEAST_BLUR_UM = 0.3
@@ -65,6 +68,7 @@ LIMITS = {
     "falloff": (-0.9, 3.0),
     "scale": (0.5, 2.0),
     "pupil_share": (-0.5, 1.0),
+    "rim_share": (-0.5, 1.0),
 }
 """Of the scalars: beyond them there is no shadow to compute."""
 
@@ -76,8 +80,10 @@ class Placement:
     distance_share: relative error of d. scale: of the mask's cells. skew: tangent of the angle by
     which its columns lean. aperture: (v, u), mean 1, relative to the views' open shares.
     pupil_x_um, pupil_y_um, pupil_share: the pupil's centre from that of `pupil`, and the relative
-    error of its diameter. pupil: as described, or of the shape that the whiteboards show; None: the
-    views are open to their edges, and the pupil's parameters mean nothing.
+    error of its diameter. rim_share, rim_shift: the relative error of the rim's diameter, and what
+    it moves more for each mm of the pixel. pupil: as described, or of the shape that the
+    whiteboards show; None: the views are open to their edges, and the pupil's parameters mean
+    nothing, as those of the rim do without a rim.
     """
 
     offset_x_um: float = 0.0
@@ -99,6 +105,8 @@ class Placement:
     pupil_x_um: float = 0.0
     pupil_y_um: float = 0.0
     pupil_share: float = 0.0
+    rim_share: float = 0.0
+    rim_shift: float = 0.0
     aperture: tuple[tuple[float, ...], ...] = ()
     pupil: Pupil | None = None
 
@@ -117,12 +125,17 @@ class Placement:
         return Placement(**scalars, aperture=rows, pupil=self.pupil)
 
     def fitted_pupil(self) -> Pupil | None:
-        """Return the pupil with the centre and the diameter of these parameters."""
+        """Return the pupil with centre, diameter and rim of these parameters."""
         if self.pupil is None:
             return None
         x_mm, y_mm = self.pupil.centre_mm
+        rim = self.pupil.rim
+        if rim is not None:
+            diameter_mm = rim.diameter_mm * (1 + self.rim_share)
+            rim = Rim(diameter_mm=diameter_mm, shift=rim.shift + self.rim_shift)
         return self.pupil.model_copy(
             update={
+                "rim": rim,
                 "centre_mm": (x_mm + self.pupil_x_um / 1e3, y_mm + self.pupil_y_um / 1e3),
                 "diameter_mm": self.pupil.diameter_mm * (1 + self.pupil_share),
             }
@@ -171,6 +184,8 @@ class Tolerances:
     pupil_x_um: float = 500.0
     pupil_y_um: float = 500.0
     pupil_share: float = 0.05
+    rim_share: float = 0.05
+    rim_shift: float = 0.5
     aperture: float = 0.05
 
     def deviations(self, views: tuple[int, int]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Whether the lens's pupil is round, and how large: from the views' light, as whiteboards show it.
+"""The lens's pupil, round or not, and its rim: from the views' light, as whiteboards show it.
 
 Their shares of the light, measured without a prior, are l (sum 1, covariance C). A pupil predicts
 shares o (sum 1). The bench's tolerances (see `placement.Tolerances`) add to the difference: weights
@@ -9,6 +9,14 @@ of the aperture, and a falloff f towards its rim. With P the projection that kee
     log evidence = -1/2 r^T V^-1 r - 1/2 log|V|
 
 A round pupil is taken where its evidence is clearly more than that of views open to their edges.
+
+Behind a rim that moves over the pupil with the pixel (vignetting), a view's light grows to one side
+of the picture and falls to the other: by g, relative, from the middle to the corner. Whiteboards of
+single views show it, with the information S. The growth g' that pupil and rim predict adds
+
+    g^T S g' - 1/2 g'^T S g'
+
+to the log evidence.
 """
 
 from __future__ import annotations
@@ -20,7 +28,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.calibration.placement import SCALARS, Tolerances
 from emmc_rig.calibration.shadow import ShadowMask, far_shares
-from emmc_rig.model.pupil import Pupil, cell_openings
+from emmc_rig.model.pupil import Pupil, Rim, cell_openings
 
 Array = NDArray[np.floating]
 SIDES = np.geomspace(0.85, 1.41, 22)
@@ -30,6 +38,14 @@ CLEARLY_ROUND = 12.0
 """Difference of log evidence; three parameters more (centre, diameter) take about 10 of it."""
 SURE_EVEN = 2.0
 """Deviations of chi^2 up to which views open to their edges are explanation enough."""
+SURE_GROWTH = 8.0
+"""Deviations of chi^2 from which on light that grows over the picture is looked at."""
+MOVES = np.geomspace(0.005, 0.3, 7)
+"""Of a rim, tried from the middle of the picture to its corner, of the longer side of all views."""
+WIDE = 1.5
+"""Diameter of a pupil that cuts no view, of that side."""
+LEAST_SEEN = 1e-3
+"""Of all light, in a view behind a rim: growths of less are those of stray light."""
 NO_BELIEF = 10.0
 """Deviation of a view's weight where nothing is believed of it."""
 
@@ -47,13 +63,45 @@ class ViewLight(NamedTuple):
     """(view, view)."""
 
 
+class LightGrowth(NamedTuple):
+    """How the light of single views grows over the picture, relative, from middle to corner.
+
+    views: (view, 2), row and column. pull, information: (view x 2,), (view x 2, view x 2), of the
+    growths along x and y: S g, and S.
+    """
+
+    views: NDArray[np.int64]
+    pull: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+    @property
+    def sure(self) -> bool:
+        """Whether some view's light grows by more than chance."""
+        count = len(self.pull)
+        chi2 = float(self.pull @ np.linalg.solve(self.information, self.pull)) if count else 0.0
+        return chi2 > count + SURE_GROWTH * np.sqrt(2 * count)
+
+    def evidence(self, mask: ShadowMask, pupil: Pupil) -> float:
+        """Return what the growth behind a pupil adds to the log evidence, see the module."""
+        if pupil.rim is None:
+            return 0.0
+        half_um, logs = mask.corner_um / 2, []
+        for place in ((half_um, 0.0), (-half_um, 0.0), (0.0, half_um), (0.0, -half_um)):
+            opened = _opened(pupil, mask, place)
+            opened = np.maximum(opened / opened.sum(), LEAST_SEEN)
+            logs.append(np.log(opened[tuple(self.views.T)]))
+        growth = np.stack([logs[0] - logs[1], logs[2] - logs[3]], axis=1).ravel()
+        return float(growth @ self.pull - 0.5 * growth @ self.information @ growth)
+
+
 def measured_light(
-    falloff: float, vector: Array, matrix: Array, pull: Array, mask: ShadowMask
+    through: Array, vector: Array, matrix: Array, pull: Array, mask: ShadowMask
 ) -> ViewLight:
     """Return the views' shares of the light, by one Gauss-Newton step without the weights' prior.
 
-    falloff, vector: of the placement, and all parameters. matrix, pull: normal equations, with the
-    prior of the other parameters. The falloff is held: the weights take its place.
+    through: (view,), light of the views by the placement, at weights of 1. vector: all parameters.
+    matrix, pull: normal equations, with the prior of the other parameters. Falloff and pupil are
+    held: the weights take their place.
     """
     count = mask.views[0] * mask.views[1]
     weights = slice(len(SCALARS), len(SCALARS) + count)
@@ -61,7 +109,6 @@ def measured_light(
     precision[weights] = 1 / NO_BELIEF**2
     precision[SCALARS.index("falloff")] = 1e12
     inverse = np.linalg.inv(matrix + np.diag(precision))
-    through = 1 + falloff * far_shares(mask.views).ravel()
     light = through * (vector + inverse @ pull)[weights]
     # The common level is free: slopes of the shares, at the light of the present weights.
     present = through * vector[weights]
@@ -103,11 +150,74 @@ def likeliest_pupil(seen: ViewLight, mask: ShadowMask) -> Pupil | None:
     return pupil_of(found.x) if -found.fun > even + CLEARLY_ROUND else None
 
 
+def likeliest_rim(
+    seen: ViewLight, growth: LightGrowth, mask: ShadowMask, pupil: Pupil | None
+) -> Pupil | None:
+    """Return the pupil with the rim that the views' light and its growth show; None: no rim.
+
+    pupil: as known without a rim. Diameters of SIDES and moves of MOVES on either side, before the
+    pupil as known and before views open to their edges; then the best by the simplex.
+    """
+    if not growth.sure:
+        return None
+    side_mm = max(mask.views) * mask.aperture_cell_um / 1e3
+    corner_mm = mask.corner_um / 1e3
+    wide = Pupil(diameter_mm=side_mm * WIDE)
+
+    def pupil_of(values: Array) -> Pupil:
+        x, y, size, rim, move = (float(value) for value in values)
+        return Pupil(
+            diameter_mm=side_mm * max(size, 1e-3),
+            centre_mm=(side_mm * x, side_mm * y),
+            rim=Rim(diameter_mm=side_mm * max(rim, 1e-3), shift=side_mm * move / corner_mm),
+        )
+
+    def evidence(values: Array) -> float:
+        tried = pupil_of(values)
+        return _evidence(seen, mask, tried)[0] + growth.evidence(mask, tried)
+
+    def start_of(base: Pupil, rim: float, move: float) -> Array:
+        x_mm, y_mm = base.centre_mm
+        return np.array([x_mm / side_mm, y_mm / side_mm, base.diameter_mm / side_mm, rim, move])
+
+    starts = [
+        start_of(base, float(rim), float(move))
+        for base in ([wide] if pupil is None else [pupil, wide])
+        for rim in SIDES
+        for move in (*MOVES, *-MOVES)
+    ]
+    from scipy.optimize import minimize
+
+    best = max(starts, key=evidence)
+    sides = np.diag([0.02, 0.02, 0.02, 0.02, 0.2 * best[-1]])
+    found = minimize(
+        lambda values: -evidence(values),
+        best,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": best + np.vstack([np.zeros(5), sides]),
+            "xatol": 5e-4,
+            "fatol": 0.1,
+            "maxiter": 300,
+        },
+    )
+    return (
+        pupil_of(found.x) if -found.fun > _evidence(seen, mask, pupil)[0] + CLEARLY_ROUND else None
+    )
+
+
+def _opened(
+    pupil: Pupil | None, mask: ShadowMask, pixel_um: tuple[float, float] = (0.0, 0.0)
+) -> NDArray[np.float64]:
+    """Return the open share of every view, (v, u), as a pixel at x and y sees it."""
+    fill = mask.aperture_um / mask.aperture_cell_um
+    found = cell_openings(pupil, mask.views, mask.aperture_cell_um, fill, pixel_um, strips=1)
+    return found.shares(mask.views)
+
+
 def _evidence(seen: ViewLight, mask: ShadowMask, pupil: Pupil | None) -> tuple[float, float]:
     """Return the log evidence of a pupil, see the module, and r^T V^-1 r."""
-    fill = mask.aperture_um / mask.aperture_cell_um
-    found = cell_openings(pupil, mask.views, mask.aperture_cell_um, fill, strips=1)
-    opened = found.shares(mask.views).ravel()
+    opened = _opened(pupil, mask).ravel()
     opened, tolerances = opened / opened.sum(), Tolerances()
     falling = tolerances.falloff * opened * far_shares(mask.views).ravel()
     project = np.eye(len(opened)) - opened[:, None]

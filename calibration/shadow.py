@@ -43,6 +43,7 @@ from emmc_rig.calibration.placement import (
     OFFSET_X,
     OFFSET_Y,
     PUPIL_X,
+    RIM_SHIFT,
     ROTATION,
     SCALARS,
     TILT_X,
@@ -54,7 +55,13 @@ from emmc_rig.calibration.repeats import Repeats, repeats_of
 from emmc_rig.model.camera import Camera, Plate, draw_plates
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.geometry import centred_grid
-from emmc_rig.model.pupil import LEAST_SHARE, Openings, cell_openings
+from emmc_rig.model.pupil import (
+    LEAST_SHARE,
+    Knot,
+    Openings,
+    cell_openings,
+    field_knots,
+)
 
 Array = NDArray[np.floating]
 Pixels = NDArray[np.int64]
@@ -72,9 +79,11 @@ STRIPS_PER_CELL, FEWEST_STRIPS, MOST_STRIPS = 6.0, 4, 12
 """Of a cut view, by the width of a whole view's shadow in cells of the mask: Psi of a round pupil
 of 25 mm behind 5 x 5 views of 5 mm, fitted to whiteboards of every view, is then 0.04 % off; with 4
 and 9 strips a cell 0.06 and 0.03 %, in the same time but for a tenth."""
-PUPIL_STEPS = {"pupil_x_um": 100.0, "pupil_y_um": 100.0, "pupil_share": 8e-3}
-"""Of central differences by the pupil's parameters. Smaller differences resolve the lines by which
-`emmc_rig.model.pupil` cuts views: with 16 lines a strip, 10 um made the slopes 5 % wrong."""
+PUPIL_PARAMETERS = SCALARS[PUPIL_X : RIM_SHIFT + 1]
+STEP_UM = 100.0
+"""By which central differences by these parameters move the pupil's edge. Smaller ones resolve the
+lines by which `emmc_rig.model.pupil` cuts views: with 16 lines a strip, 10 um made the slopes 5 %
+wrong."""
 OF_BOX = ("share", "x_um", "y_um", "width", "height")
 """What follows the pupil: width and height as places of their squares among the tables' widths."""
 NARROWEST = 0.2
@@ -277,11 +286,24 @@ def openings(mask: ShadowMask, placement: Placement, **how: Any) -> Openings:
     return cell_openings(pupil, mask.views, mask.aperture_cell_um, fill, strips=strips, **how)
 
 
+def pupil_steps(mask: ShadowMask, placement: Placement) -> dict[str, float]:
+    """Return the steps of central differences by the parameters of pupil and rim that there are."""
+    pupil = placement.pupil
+    if pupil is None:
+        return {}
+    steps = {"pupil_x_um": STEP_UM, "pupil_y_um": STEP_UM}
+    steps["pupil_share"] = 2 * STEP_UM / 1e3 / pupil.diameter_mm
+    if pupil.rim is not None:
+        steps["rim_share"] = 2 * STEP_UM / 1e3 / pupil.rim.diameter_mm
+        steps["rim_shift"] = STEP_UM / mask.corner_um
+    return steps
+
+
 def light_slopes(mask: ShadowMask, placement: Placement) -> NDArray[np.float64]:
     """Return the relative slopes of the light of every view, (view, parameter).
 
     Of a_j open_j (1 + falloff far_j); by the pupil, of what is open. Views that are all but shut
-    count as LEAST_SHARE open.
+    count as LEAST_SHARE open. Behind a rim, of a pixel in the middle of the picture.
     """
     found = openings(mask, placement)
     opened = np.maximum(found.shares(mask.views), LEAST_SHARE)
@@ -321,7 +343,7 @@ class _Boxes(NamedTuple):
     part: NDArray[np.float64]
     """(box, 2): how far the box's squared width lies from there towards the next width's."""
     slopes: NDArray[np.float64]
-    """(box, 3, 5): of OF_BOX by PUPIL_STEPS' parameters; no boxes without a pupil."""
+    """(box, 5, 5): of OF_BOX by PUPIL_PARAMETERS; no boxes without a pupil."""
 
     def of_views(self, views_open: NDArray[np.bool_]) -> _Boxes:
         """Return the boxes of the open views, (v, u)."""
@@ -350,16 +372,21 @@ def _width_places(found: Openings, mask: ShadowMask) -> NDArray[np.float64]:
     return (CUT_WIDTHS - 1) * np.square(widths / max(mask.aperture_um, 1e-9))
 
 
-def _pupil_slopes(mask: ShadowMask, placement: Placement, found: Openings) -> NDArray[np.float64]:
-    """Return the slopes of every box by the pupil, see `_Boxes`."""
+def _pupil_slopes(
+    mask: ShadowMask,
+    placement: Placement,
+    found: Openings,
+    pixel_um: tuple[float, float] = (0.0, 0.0),
+) -> NDArray[np.float64]:
+    """Return the slopes of every box by pupil and rim, see `_Boxes`; pixel_um: x and y of it."""
     if placement.pupil is None:
-        return np.zeros((0, len(PUPIL_STEPS), len(OF_BOX)))
+        return np.zeros((0, len(PUPIL_PARAMETERS), len(OF_BOX)))
     boxes = [tuple(view) for view in found.view]
     whole = [view for view in boxes if boxes.count(view) == 1]
-    slopes = np.zeros((len(boxes), len(PUPIL_STEPS), len(OF_BOX)))
-    for p, (name, step) in enumerate(PUPIL_STEPS.items()):
+    slopes = np.zeros((len(boxes), len(PUPIL_PARAMETERS), len(OF_BOX)))
+    for p, (name, step) in enumerate(pupil_steps(mask, placement).items()):
         near = (replace(placement, **{name: getattr(placement, name) + by}) for by in (step, -step))
-        ahead, behind = (openings(mask, other, whole=whole) for other in near)
+        ahead, behind = (openings(mask, other, whole=whole, pixel_um=pixel_um) for other in near)
         changes = [ahead.share - behind.share, ahead.x_um - behind.x_um, ahead.y_um - behind.y_um]
         widths = _width_places(ahead, mask) - _width_places(behind, mask)
         slopes[:, p] = np.column_stack([*changes, widths]) / (2 * step)
@@ -665,7 +692,7 @@ def _sum_widenings(cells, top, left, channel, down, across):
 def _add_pupil_slopes(slope, rays, of_box, by_share, by_x, by_y, by_width, by_height):
     """Add to slope (parameter,) the derivatives of one box's reading by the pupil's parameters.
 
-    xi follows the box's middle by rho. of_box: (3, 5), see `_Boxes`. by_share ... by_height:
+    xi follows the box's middle by rho. of_box: (parameter, 5), see `_Boxes`. The others are the
     derivatives of the reading by the box's share, by xi, and by the box's sides.
     """
     for p in range(of_box.shape[0]):
@@ -812,6 +839,27 @@ class _Drawn(NamedTuple):
     weights: _Weights
 
 
+@dataclass(eq=False)
+class _Part:
+    """The pixels about a knot, and the openings that they see; of a lens without a rim, all."""
+
+    knot: Knot
+    openings: Openings
+    boxes: _Boxes
+    weights: _Weights
+
+    def counts(self, pixels: Pixels) -> NDArray[np.float64]:
+        """Return how much the part counts at each pixel, (n,)."""
+        count = np.ones(len(pixels))
+        along = (self.knot.rows, self.knot.down), (self.knot.columns, self.knot.across)
+        for axis, (near, counts) in enumerate(along):
+            start = near.start or 0
+            inside = (pixels[:, axis] >= start) & (pixels[:, axis] < start + len(counts))
+            place = np.where(inside, pixels[:, axis] - start, 0)
+            count *= np.where(inside, counts[place], 0.0)
+        return count
+
+
 class Shadow:
     """The shadow of one placement: readings and derivatives of any pixels.
 
@@ -821,23 +869,36 @@ class Shadow:
 
     def __init__(self, mask: ShadowMask, placement: Placement) -> None:
         self.mask, self.placement = mask, placement
-        self._openings = openings(mask, placement)
         # A pupil whose slopes are asked for may cut a view that it leaves whole now.
         self._widths = 1 if placement.pupil is None else CUT_WIDTHS
         self._tables, self._reach = share_tables(mask, placement, 1, self._widths)
         self._turns = _turns(placement)
         span = np.array([(count - 1) / 2 * mask.aperture_cell_um for count in mask.views])
         self._far_um = max(float(np.hypot(*span)), 1.0)
-        self._set_boxes(np.zeros((0, len(PUPIL_STEPS), len(OF_BOX))))
+        rows, columns = mask.pixel_shape()
+        pixel_um = mask.pitch_um * mask.binning
+        pixels_um = centred_grid(rows, pixel_um), centred_grid(columns, pixel_um)
+        # Knots of the pupil as described: a fit must not jump by more of them.
+        knots = field_knots(placement.pupil, mask.aperture_cell_um, pixels_um)
+        self._parts = [self._part(knot) for knot in knots]
 
-    def _set_boxes(self, slopes: NDArray[np.float64]) -> None:
-        """Keep boxes and light of the views; slopes: see `_Boxes`."""
-        self._boxes = _boxes_of(self._openings, self.mask, self._widths, slopes)
+    def _part(self, knot: Knot, *, slopes: bool = False) -> _Part:
+        """Return boxes and light of the views as a knot sees them; slopes: by the pupil as well."""
+        place = knot.x_um, knot.y_um
+        found = openings(self.mask, self.placement, pixel_um=place)
+        by_pupil = np.zeros((0, len(PUPIL_PARAMETERS), len(OF_BOX)))
+        if slopes:
+            by_pupil = _pupil_slopes(self.mask, self.placement, found, place)
+        boxes = _boxes_of(found, self.mask, self._widths, by_pupil)
+        return _Part(knot, found, boxes, self._light(found, by_pupil))
+
+    def _light(self, found: Openings, slopes: NDArray[np.float64]) -> _Weights:
+        """Return the light of the views; slopes: see `_Boxes`."""
         aperture = np.array(self.placement.aperture, dtype=np.float64)
-        opened = self._openings.shares(self.mask.views)
-        by_pupil = np.zeros((len(PUPIL_STEPS), *self.mask.views))
+        opened = found.shares(self.mask.views)
+        by_pupil = np.zeros((len(PUPIL_PARAMETERS), *self.mask.views))
         for p in range(len(by_pupil) if len(slopes) else 0):
-            np.add.at(by_pupil[p], tuple(self._openings.view.T), slopes[:, p, 0])
+            np.add.at(by_pupil[p], tuple(found.view.T), slopes[:, p, 0])
         rows, columns = self.mask.views
         v_um = centred_grid(rows, self.mask.aperture_cell_um)[:, None]
         u_um = centred_grid(columns, self.mask.aperture_cell_um)[None, :]
@@ -847,12 +908,19 @@ class Shadow:
         if len(slopes):
             light += [aperture * change * falling for change in by_pupil]
         sums = [[part.sum(), (part * u_um).sum(), (part * v_um).sum()] for part in light]
-        self._weights = _Weights(aperture, opened, np.array(sums))
+        return _Weights(aperture, opened, np.array(sums))
+
+    def _middle(self) -> _Part:
+        """Return the part of the picture's middle."""
+        return min(self._parts, key=lambda part: np.hypot(part.knot.x_um, part.knot.y_um))
 
     @property
     def opened(self) -> NDArray[np.float64]:
-        """The share of every view's cell that the pupil leaves open, (v, u)."""
-        return self._weights.opened
+        """The share of every view's cell that the pupil leaves open, (v, u).
+
+        Of a lens with a rim, seen from about the middle of the picture.
+        """
+        return self._middle().weights.opened
 
     def readings(
         self,
@@ -894,7 +962,7 @@ class Shadow:
         """
         narrower, wider = np.minimum(sides, 0.0), np.maximum(sides, 0.0)
         how = pixels, channels, (views_open, stage_um, frame)
-        sized = self._run(*how, slopes=True, drawn=self._sized(narrower))
+        sized = self._run(*how, slopes=True, narrower=narrower)
         by_sides = sized.slopes[:, PUPIL_X : PUPIL_X + 2].copy()
         slopes = sized.slopes
         if self.placement.pupil is None:
@@ -903,20 +971,20 @@ class Shadow:
             slopes = self.with_slopes(pixels, channels, views_open, stage_um, frame)[1]
         return sized.readings + by_sides @ wider, slopes, by_sides
 
-    def _sized(self, sides: NDArray[np.float64]) -> _Drawn:
+    def _sized(self, part: _Part, sides: NDArray[np.float64]) -> _Drawn:
         """Return what the kernel draws, where two parameters are sides in place of the pupil's."""
         scale = np.maximum(1 + sides, NARROWEST)
-        found = self._openings
+        found = part.openings
         cut = replace(
             found, width_um=found.width_um * scale[0], height_um=found.height_um * scale[1]
         )
         places = _width_places(cut, self.mask)
-        slopes = np.zeros((len(places), len(PUPIL_STEPS), len(OF_BOX)))
+        slopes = np.zeros((len(places), len(PUPIL_PARAMETERS), len(OF_BOX)))
         for axis, side in enumerate(("width", "height")):
             slopes[:, axis, OF_BOX.index(side)] = 2 * places[:, axis] / scale[axis]
         boxes = _boxes_of(cut, self.mask, CUT_WIDTHS, slopes)
-        sums = self._weights.sums[:2].copy()
-        return _Drawn(self._wide_tables, boxes, self._weights._replace(sums=sums))
+        sums = part.weights.sums[:2].copy()
+        return _Drawn(self._wide_tables, boxes, part.weights._replace(sums=sums))
 
     @cached_property
     def _wide_tables(self) -> NDArray[np.float64]:
@@ -959,17 +1027,19 @@ class Shadow:
 
         Corners (n, box, 2), the first row and column of cells; shares of the cells from there down
         and across, (n, box, cell) each; and what each box counts in the reading (n, box). A whole
-        view is one box. Pixels must be samples (binning 1).
+        view is one box. Pixels must be samples (binning 1). Behind a rim all see what the middle of
+        the picture sees.
         """
         if self.mask.binning != 1:
             raise CalibrationError("defects are sought on sensors whose pixels are samples")
-        boxes = self._boxes.of_views(views_open)
+        middle = self._middle()
+        boxes = middle.boxes.of_views(views_open)
         shape, tables = (len(pixels), len(boxes.v)), self._tables[:1]
         corners = np.empty((*shape, 2), dtype=np.int64)
         shares, light_shares = np.empty((2, *shape, tables.shape[3])), np.empty(shape)
         cells, rays = self.mask.cells[0], self._rays(stage_um)
         out = corners, shares, light_shares
-        _find_footprints(pixels, cells, tables, self._turns, rays, boxes, self._weights, out)
+        _find_footprints(pixels, cells, tables, self._turns, rays, boxes, middle.weights, out)
         return corners, shares[0], shares[1], light_shares
 
     def _rays(self, stage_um: tuple[float, float]) -> _Rays:
@@ -1001,30 +1071,53 @@ class Shadow:
         slopes: bool = False,
         each: bool = False,
         by_view: bool = False,
-        drawn: _Drawn | None = None,
+        narrower: NDArray[np.float64] | None = None,
     ) -> _Seen:
-        """Return the readings and what is asked for; by_view needs slopes."""
-        views_open, stage_um, frame = opening
-        if slopes and drawn is None and len(self._tables) == 1:
+        """Return the readings and what is asked for; by_view needs slopes; narrower: `_sized`."""
+        if slopes and narrower is None and len(self._tables) == 1:
             self._tables = share_tables(self.mask, self.placement, KINDS, self._widths)[0]
-            self._set_boxes(_pupil_slopes(self.mask, self.placement, self._openings))
-        tables, boxes, weights = drawn or _Drawn(self._tables, self._boxes, self._weights)
-        count, views = len(pixels), self._weights.aperture.size
-        out = _Seen(
-            np.empty(count),
-            np.empty((slopes * count, len(SCALARS) + views)),
-            np.zeros((each * count, views)),
-            np.zeros((by_view * count, views, OF_VIEW)),
-        )
-        _read(
-            np.ascontiguousarray(pixels, dtype=np.int64),
-            np.ascontiguousarray(channels, dtype=np.uint8),
-            self.mask.cells[frame % len(self.mask.cells)],
-            tables if slopes else tables[:1],
-            self._turns,
-            self._rays(stage_um),
-            boxes.of_views(np.asarray(views_open, dtype=bool)),
-            weights,
-            out,
-        )
-        return out
+            self._parts = [self._part(part.knot, slopes=True) for part in self._parts]
+        views = self.mask.views[0] * self.mask.views[1]
+
+        def rows(count: int) -> _Seen:
+            return _Seen(
+                np.empty(count),
+                np.empty((slopes * count, len(SCALARS) + views)),
+                np.zeros((each * count, views)),
+                np.zeros((by_view * count, views, OF_VIEW)),
+            )
+
+        def read(part: _Part, pixels: Pixels, channels: NDArray[np.uint8], out: _Seen) -> None:
+            views_open, stage_um, frame = opening
+            drawn = _Drawn(self._tables, part.boxes, part.weights)
+            if narrower is not None:
+                drawn = self._sized(part, narrower)
+            _read(
+                np.ascontiguousarray(pixels, dtype=np.int64),
+                np.ascontiguousarray(channels, dtype=np.uint8),
+                self.mask.cells[frame % len(self.mask.cells)],
+                drawn.tables if slopes else drawn.tables[:1],
+                self._turns,
+                self._rays(stage_um),
+                drawn.boxes.of_views(np.asarray(views_open, dtype=bool)),
+                drawn.weights,
+                out,
+            )
+
+        seen = rows(len(pixels))
+        if len(self._parts) == 1:
+            read(self._parts[0], pixels, channels, seen)
+            return seen
+        for values in seen:
+            values[...] = 0
+        for part in self._parts:
+            counts = part.counts(pixels)
+            near = np.flatnonzero(counts)
+            if len(near):
+                out = rows(len(near))
+                read(part, pixels[near], channels[near], out)
+                for values, found in zip(seen, out, strict=True):
+                    if len(values):
+                        shape = (-1,) + (1,) * (values.ndim - 1)
+                        values[near] += counts[near].reshape(shape) * found
+        return seen

@@ -31,7 +31,7 @@ from emmc_rig.model.geometry import (
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.masks import AnyPattern, cfa_tile
 from emmc_rig.model.noise import SensorNoise
-from emmc_rig.model.pupil import LEAST_SHARE, Openings, Pupil, cell_openings
+from emmc_rig.model.pupil import LEAST_SHARE, Openings, Pupil, cell_openings, field_knots
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.model.settings import Settings, validated
@@ -48,14 +48,6 @@ NARROW_SHARE = 0.5
 PSI_STRIPS = 8
 """Boxes of a view that is cut. Of points of the sensor they miss 0.1 % of Psi behind 5 x 5 views of
 5 mm and 25 mm of round pupil; 4 miss 0.3 %, 16 miss 0.04 %."""
-KNOTS_PER_CELL = 12
-"""Places of the picture where openings are integrated while the rim moves by an aperture cell.
-
-Bilinear blending between them misses 0.2 % of Psi (samples of 0.5 mm, rim of 26 mm before 25 mm of
-round pupil); 8 miss 0.5 %, 16 miss 0.15 %.
-"""
-MOST_KNOTS = 33
-"""Along an axis of the picture."""
 FILTER_COLOURS = {"none": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
 
 
@@ -578,41 +570,22 @@ class _Field:
 
 
 def _fields(camera: Camera, size: tuple[int, int]) -> list[_Field]:
-    """Return the parts of the picture with the openings that they see.
-
-    Without a rim all pixels see the same. A rim moves over the pupil with the pixel: openings are
-    integrated at knots of a grid over the picture, and blended bilinearly between them,
-
-        opening(y, x) = sum_knots max(0, 1 - |y - y_knot| / step) max(0, 1 - |x - x_knot| / step)
-                        opening(y_knot, x_knot).
-    """
+    """Return the parts of the picture with the openings that they see, see `field_knots`."""
     axes = _axes(camera, size)
-    pupil = camera.lens.pupil
-    if pupil is None or pupil.rim is None:
-        everything = slice(None)
-        return [_field(camera, axes, (0.0, 0.0), everything, everything)]
-    step_um = camera.lens.aperture_cell_um / KNOTS_PER_CELL / max(abs(pupil.rim.shift), 1e-9)
-    knots = []
-    for along in axes:
-        first, last = along.samples_um[[0, -1]]
-        count = int(np.clip(np.ceil((last - first) / step_um) + 1, 2, MOST_KNOTS))
-        knots.append(np.linspace(first, last, count) if last > first else np.array([first]))
-
-    def tents(along: _Axis, places: NDArray[np.float64]) -> list[tuple[slice, NDArray]]:
-        """Return for every knot the samples around it and how much it counts there."""
-        found = []
-        for knot in range(len(places)):
-            tent = np.interp(along.samples_um, places, np.eye(len(places))[knot])
-            near = np.flatnonzero(tent)
-            samples = slice(near[0], near[-1] + 1) if len(near) else slice(0, 0)
-            found.append((samples, tent[samples]))
-        return found
-
+    knots = field_knots(
+        camera.lens.pupil, camera.lens.aperture_cell_um, (axes[0].samples_um, axes[1].samples_um)
+    )
+    whole = len(knots) == 1
     return [
-        _field(camera, axes, (x_um, y_um), rows, columns, np.outer(down, across).astype(np.float32))
-        for y_um, (rows, down) in zip(knots[0], tents(axes[0], knots[0]), strict=True)
-        for x_um, (columns, across) in zip(knots[1], tents(axes[1], knots[1]), strict=True)
-        if down.size and across.size
+        _field(
+            camera,
+            axes,
+            (knot.x_um, knot.y_um),
+            knot.rows,
+            knot.columns,
+            1.0 if whole else np.outer(knot.down, knot.across).astype(np.float32),
+        )
+        for knot in knots
     ]
 
 

@@ -37,6 +37,12 @@ LINES = 64
 fits of the pupil stop at their steps."""
 LEAST_SHARE = 1e-4
 """Of a cell: a view that is less open is outside of the pupil."""
+KNOTS_PER_CELL = 16
+"""Places of the picture where openings are integrated while the rim moves by an aperture cell.
+Bilinear blending between them misses 0.15 % of Psi (samples of 0.5 mm, rim of 26 mm before 25 mm
+of round pupil); 8 miss 0.5 %, 12 miss 0.2 %."""
+MOST_KNOTS = 33
+"""Along an axis of the picture."""
 
 
 class Rim(Settings):
@@ -178,10 +184,11 @@ def cell_openings(
     right = np.clip(end[:, None] - middle_um, -open_um / 2, open_um / 2)
     length = np.maximum(right - left, 0.0)
     area = length / open_um / lines
-    cube = np.where(length > 0, (right**3 - left**3) / 3, 0.0)
+    # (right^3 - left^3) / 3, without powers, which take most of the time.
+    cube = length * (right * right + right * left + left * left) / 3
     sums = {
         "share": area,
-        "x": np.where(length > 0, (right + left) / 2, 0.0) * area,
+        "x": (right + left) / 2 * area,
         "x2": cube / open_um / lines,
         "y": within_um * area,
         "y2": (within_um**2 + (open_um / lines) ** 2 / 12) * area,
@@ -192,21 +199,88 @@ def cell_openings(
         is_whole = np.zeros(views, dtype=bool)
         for view in whole:
             is_whole[view] = True
-    boxes: dict[str, list[NDArray[np.float64]]] = {name: [] for name in sums}
-    chosen = []
-    for row, column in np.ndindex(views):
-        parts = 1 if is_whole[row, column] else strips
-        chosen += [(row, column)] * parts
-        for name, values in sums.items():
-            boxes[name].append(values[row, column].reshape(parts, -1).sum(axis=1))
-    share, x, x2, y, y2 = (np.concatenate(boxes[name]) for name in sums)
+    parts = np.where(is_whole, 1, strips).ravel()
+    chosen = np.repeat(np.stack([v, u], 1), parts, axis=0)
+    # A whole view's box is the sum of its strips.
+    first = np.concatenate([[0], np.cumsum(parts)[:-1]])
+
+    def of_boxes(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        by_strip = values.reshape(len(v), strips, LINES).sum(axis=2)
+        found = np.empty(len(chosen))
+        found[first[parts == 1]] = by_strip[parts == 1].sum(axis=1)
+        if strips > 1:
+            cut = first[parts > 1][:, None] + np.arange(strips)
+            found[cut] = by_strip[parts > 1]
+        return found
+
+    share, x, x2, y, y2 = (of_boxes(values) for values in sums.values())
     safe = np.maximum(share, 1e-12)
     x, y = x / safe, y / safe
     return Openings(
-        np.array(chosen, dtype=np.int64),
+        chosen,
         share,
         x,
         y,
         np.sqrt(12 * np.maximum(x2 / safe - x**2, 0.0)),
         np.sqrt(12 * np.maximum(y2 / safe - y**2, 0.0)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Knot:
+    """A place of the picture where openings are integrated.
+
+    x_um, y_um: from the axis. rows, columns: of the picture's samples around it. down, across: how
+    much the knot counts at these; of all knots together 1.
+    """
+
+    x_um: float
+    y_um: float
+    rows: slice
+    columns: slice
+    down: NDArray[np.float64]
+    across: NDArray[np.float64]
+
+
+def field_knots(
+    pupil: Pupil | None,
+    cell_um: float,
+    samples_um: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> list[Knot]:
+    """Return the knots of a picture with samples at y and x: one, wherever all see the same.
+
+    A rim moves over the pupil with the pixel: openings are integrated at knots of a grid over the
+    picture, and blended bilinearly between them,
+
+        opening(y, x) = sum_knots max(0, 1 - |y - y_knot| / step) max(0, 1 - |x - x_knot| / step)
+                        opening(y_knot, x_knot),
+
+    KNOTS_PER_CELL of them while the rim moves by cell_um.
+    """
+    if pupil is None or pupil.rim is None:
+        everywhere = slice(None)
+        return [Knot(0.0, 0.0, everywhere, everywhere, *(np.ones(len(s)) for s in samples_um))]
+    step_um = cell_um / KNOTS_PER_CELL / max(abs(pupil.rim.shift), 1e-9)
+    along = [_tents(places_um, step_um) for places_um in samples_um]
+    return [
+        Knot(x_um, y_um, rows, columns, down, across)
+        for y_um, rows, down in along[0]
+        for x_um, columns, across in along[1]
+    ]
+
+
+def _tents(
+    samples_um: NDArray[np.float64], step_um: float
+) -> list[tuple[float, slice, NDArray[np.float64]]]:
+    """Return the knots along an axis, with the samples around each and how much it counts there."""
+    first, last = samples_um[[0, -1]]
+    count = int(np.clip(np.ceil((last - first) / step_um) + 1, 2, MOST_KNOTS))
+    places = np.linspace(first, last, count) if last > first else np.array([first])
+    found = []
+    for place, tent in zip(places, np.eye(len(places)), strict=True):
+        counts = np.interp(samples_um, places, tent)
+        near = np.flatnonzero(counts)
+        if len(near):
+            samples = slice(int(near[0]), int(near[-1]) + 1)
+            found.append((float(place), samples, counts[samples]))
+    return found

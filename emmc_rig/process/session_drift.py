@@ -98,13 +98,13 @@ def read_calibration(folder: Path) -> Known:
 
 
 def _stored_placement(stored: StoredArrays) -> Placement:
-    """Return the placement in a calibration's file; files of version 0.4 and before have no pupil.
+    """Return the placement in a calibration's file; older files know neither pupil nor rim.
 
     Raises KeyError or ValueError.
     """
     attributes, rows = stored.attributes, stored.array("aperture")
-    old = "pupil_share" not in attributes
-    names = [name for name in SCALARS if not (old and name.startswith("pupil_"))]
+    later = ("pupil_", "rim_")
+    names = [name for name in SCALARS if name in attributes or not name.startswith(later)]
     scalars = {name: float(np.asarray(attributes[name])) for name in names}
     pupil = Pupil.model_validate_json(str(attributes["pupil"])) if "pupil" in attributes else None
     aperture = tuple(tuple(map(float, row)) for row in rows)

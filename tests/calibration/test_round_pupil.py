@@ -8,7 +8,12 @@ import pytest
 from outside_bench import Optics, Sensor
 from outside_boards import Photographer, agreement, bench_of, camera_of
 
-from emmc_rig.calibration.pupil_shape import ViewLight, likeliest_pupil
+from emmc_rig.calibration.pupil_shape import (
+    LightGrowth,
+    ViewLight,
+    likeliest_pupil,
+    likeliest_rim,
+)
 from emmc_rig.calibration.routes import calibrate
 from emmc_rig.calibration.shadow import shadow_mask
 from emmc_rig.model.pupil import Pupil, cell_openings
@@ -116,3 +121,53 @@ def test_every_route_is_true_behind_a_round_pupil(mask_um, pupil_um, at_um):
         # The mask of 120 um shifts by half a sample from view to view, and is the least sure.
         assert agreed["true"] < (0.004 if mask_um == 120.0 else 0.003), (route, agreed)
     assert blames_nothing(found), said(found)
+
+
+@pytest.mark.parametrize("route", ["parametric", pytest.param("mixed", marks=pytest.mark.slow)])
+def test_a_rim_that_moves_over_the_pupil_is_measured(route):
+    optics = Optics(pupil_um=9_000.0, rim_um=8_500.0, rim_shift=-1.0)
+    camera = camera_of(optics)
+    bench = bench_of(camera, SIZE, optics=optics, sensor=Sensor())
+    sets = Photographer(bench).sets(pinholes=EVERY_VIEW)
+    found = calibrate(camera, camera.psi(SIZE), (route,), **sets)
+    known = found.calibrations[route]
+    agreed = agreement(bench, known.psi.weights, known.deviation, found.good)
+    # Without the rim in the model the bench is refused: the corners' light changes by a quarter.
+    assert agreed["true"] < max(1.5 * agreed["stated"], BENCH_GRAIN)
+    model = found.parametric or found.mixed
+    assert model is not None
+    pupil = model.fit.placement.fitted_pupil()
+    assert pupil is not None
+    assert pupil.rim is not None
+    assert pupil.rim.diameter_mm == pytest.approx(8.5, abs=0.02)
+    assert pupil.rim.shift == pytest.approx(-1.0, abs=0.02)
+    line = next(line for line in found.findings if "rim" in line)
+    assert re.search(r"a rim of 8\.[45]\d \+- .* moves by -(1\.0|0\.9)\d", line)
+    assert blames_nothing(found), said(found)
+
+
+@pytest.mark.parametrize("rim", [None, {"diameter_mm": 26.0, "shift": -2.0}])
+def test_growing_light_shows_the_rim_alone_that_makes_it_grow(rim):
+    pupil = Pupil.model_validate({"diameter_mm": 30.0, "rim": rim})
+    seen, mask = light_of(pupil)
+    half_um = mask.corner_um / 2
+    sides = [(half_um, 0.0), (-half_um, 0.0), (0.0, half_um), (0.0, -half_um)]
+    logs = [
+        np.log(shares / shares.sum())
+        for place in sides
+        for shares in [cell_openings(pupil, VIEWS, 5_000.0, pixel_um=place).shares(VIEWS).ravel()]
+    ]
+    noise = 0.002
+    growth = np.stack([logs[0] - logs[1], logs[2] - logs[3]], axis=1).ravel()
+    growth += noise * np.random.default_rng(1).standard_normal(len(growth))
+    information = np.eye(len(growth)) / noise**2
+    found = likeliest_rim(
+        seen, LightGrowth(np.array(EVERY_VIEW), information @ growth, information), mask, None
+    )
+    if rim is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert found.rim is not None
+        assert found.rim.diameter_mm == pytest.approx(26.0, rel=0.02)
+        assert found.rim.shift == pytest.approx(-2.0, rel=0.1)

@@ -26,7 +26,7 @@ BESIDE_UM = 300.0
 GEOMETRY = (
     "lens_um", "mask_um", "pitch_um", "cell_um", "aperture_cell_um", "views", "offset_um",
     "rotation_rad", "blur_um", "tilt", "glass_um", "astray_um", "diffraction", "behind_um",
-    "behind_cell_um", "pupil_um", "pupil_at_um",
+    "behind_cell_um", "pupil_um", "pupil_at_um", "rim_um", "rim_shift",
 )  # fmt: skip
 LAMPS = {
     "white": (1.0, 1.0, 1.0),
@@ -48,8 +48,8 @@ class Piece(NamedTuple):
 
     cell: tuple[int, int]
     """(v, u)."""
-    at_um: tuple[float, float]
-    """Its middle, y and x."""
+    at_um: tuple[Any, Any]
+    """Its middle, y and x; as every pixel sees it, (y, x), where a rim cuts the piece."""
     sides_um: tuple[float, float]
     """In y and x."""
 
@@ -74,7 +74,8 @@ class Optics:
     x to y; plate_at_um: (x, y) of its middle. diffraction: behind the mask's edges, by the angular
     spectrum of plane waves. behind_um, behind_cell_um: distance and cells of a second mask, whose
     middle is on the axis, where the bench has one. pupil_um, pupil_at_um: diameter and middle, x
-    and y, of the round pupil; 0: the aperture's cells are open to their edges.
+    and y, of the round pupil; 0: the aperture's cells are open to their edges. rim_um, rim_shift:
+    diameter of a rim before it, 0: none, and by which its middle moves for each um of the pixel.
     """
 
     lens_um: float = 50_000.0
@@ -110,6 +111,8 @@ class Optics:
     behind_cell_um: float = 20.0
     pupil_um: float = 0.0
     pupil_at_um: tuple[float, float] = (0.0, 0.0)
+    rim_um: float = 0.0
+    rim_shift: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -239,8 +242,8 @@ class Bench:
         slope2 = (down + across) / optics.lens_um**2
         power = optics.falloff + optics.colour_falloff * (1 - self.colour)
         share = (1 + slope2) ** (-power / 2) * self.passed[:, :, None, None]
-        opened = np.reshape([self._opened(piece) for piece, _ in self._views()], optics.views)
-        return share / (share * opened[:, :, None, None]).sum((0, 1))
+        opened = [self._opened(piece) * np.ones((1, 1)) for piece, _ in self._views()]
+        return share / (share * np.reshape(opened, (*optics.views, *opened[0].shape))).sum((0, 1))
 
     def shadow(self, mask_x: float = 0.0, mask_y: float = 0.0, colour: int | None = None) -> Array:
         """Return what the mask passes of every view to every pixel, (v, u, y, x).
@@ -258,8 +261,9 @@ class Bench:
         key = piece, round(mask_x, 6), round(mask_y, 6), now.lens_um, now.blur_um, colour
         if key not in self.known:
             self.known[key] = sum(
-                (share * self._traced(part, mask_x, mask_y, now, colour)
-                for part, share in self._open_parts(piece)), np.zeros(self.size),
+                (share * behind * self._traced(seen, mask_x, mask_y, now, colour)
+                for part, share in self._open_parts(piece)
+                for seen, behind in [self._within_rim(part)]), np.zeros(self.size),
             )  # fmt: skip
         return self.known[key]
 
@@ -401,23 +405,71 @@ class Bench:
                 found.append((Piece((j, i), middle, sides), sides[0] * sides[1] / side**2))
         return found
 
-    def _opened(self, piece: Piece) -> float:
-        """Return the share of a piece of the aperture that the pupil leaves open."""
-        return sum(share for _, share in self._open_parts(piece))
+    def _opened(self, piece: Piece) -> Any:
+        """Return the share of a piece of the aperture that pupil and rim leave open.
+
+        Behind a rim of every pixel, (y, x).
+        """
+        if piece not in self.known:
+            nothing = np.zeros(self.size) if self.optics.rim_um else 0.0
+            self.known[piece] = sum(
+                (share * self._within_rim(part)[1] for part, share in self._open_parts(piece)),
+                nothing,
+            )
+        return self.known[piece]
+
+    def _within_rim(self, piece: Piece, points: int = 8) -> tuple[Piece, Any]:
+        """Return a piece of the aperture about its middle through the rim, and the share of it.
+
+        Both as every pixel sees them, (y, x), where the rim cuts the piece.
+        """
+        optics = self.optics
+        if self._rim_passes(piece):
+            return piece, 1.0
+        y, x = (optics.rim_shift * place for place in self._pixels())
+        beside = (np.arange(points) + 0.5) / points - 0.5
+        inside, from_v, from_u = np.zeros((3, *self.size))
+        for down in piece.sides_um[0] * beside:
+            for right in piece.sides_um[1] * beside:
+                away = (piece.at_um[0] + down - y) ** 2 + (piece.at_um[1] + right - x) ** 2
+                within = away < (optics.rim_um / 2) ** 2
+                inside, from_v, from_u = (
+                    inside + within,
+                    from_v + down * within,
+                    from_u + right * within,
+                )
+        seen = np.maximum(inside, 1)
+        at_um = piece.at_um[0] + from_v / seen, piece.at_um[1] + from_u / seen
+        return piece._replace(at_um=at_um), inside / points**2
+
+    def _rim_passes(self, piece: Piece) -> bool:
+        """Return whether the rim cuts a piece of the aperture for no pixel.
+
+        The piece is within a disk if its corners are, for every pixel if it is for the outermost.
+        """
+        optics = self.optics
+        y, x = (optics.rim_shift * place.ravel()[[0, -1]] for place in self._pixels())
+        (at_v, at_u), (side_v, side_u) = piece.at_um, piece.sides_um
+        far_v = np.abs(at_v + side_v * np.array([[-0.5, 0.5]]) - y[:, None]).max()
+        far_u = np.abs(at_u + side_u * np.array([[-0.5, 0.5]]) - x[:, None]).max()
+        return not optics.rim_um or bool(np.hypot(far_v, far_u) < optics.rim_um / 2)
 
     def _open_parts(self, piece: Piece, splits: int | None = None) -> list[tuple[Piece, float]]:
         """Return the parts of a piece of the aperture in the pupil, and their shares of it.
 
-        Pieces on the pupil's edge are split in four, so often that the shadows of the last are
-        below PART_UM; the last lie about the middle of their open part.
+        Pieces on the edge of pupil or rim are split in four, so often that the shadows of the last
+        are below PART_UM; the last lie about the middle of their part in the pupil.
         """
         optics, points = self.optics, (np.arange(32) + 0.5) / 32 - 0.5
         y = (piece.at_um[0] + piece.sides_um[0] * points)[:, None]
         x = (piece.at_um[1] + piece.sides_um[1] * points)[None, :]
         at_x, at_y = optics.pupil_at_um
         disk = 1.0 * ((x - at_x) ** 2 + (y - at_y) ** 2 < (optics.pupil_um / 2) ** 2)
-        if not optics.pupil_um or disk.all():
+        uncut = not optics.pupil_um or bool(disk.all())
+        if uncut and self._rim_passes(piece):
             return [(piece, 1.0)]
+        if uncut:
+            disk = np.ones(disk.shape)
         if splits is None:
             shadow_um = optics.mask_um / optics.lens_um * max(piece.sides_um)
             splits = max(int(np.ceil(np.log2(shadow_um / PART_UM))), 0)
@@ -511,8 +563,8 @@ class Bench:
         sides = piece.sides_um[0] / parts, piece.sides_um[1] / parts
         beside = np.arange(parts) - (parts - 1) / 2
         passed = np.zeros(self.size)
-        for at_v in piece.at_um[0] + sides[0] * beside:
-            for at_u in piece.at_um[1] + sides[1] * beside:
+        for at_v in [piece.at_um[0] + side for side in sides[0] * beside]:
+            for at_u in [piece.at_um[1] + side for side in sides[1] * beside]:
                 for dy in within:
                     for dx in within:
                         ray = x + dx, y + dy, at_u, at_v
