@@ -958,7 +958,7 @@ def fit_placement(
     if not isinstance(start, Fit) and (pupil is None or pupil.rim is None):
         point = _with_rim_seen(mask, descent.point, whole, prior, settings)
         if point is not descent.point:
-            # About the rim as fitted: it has the knots that its move needs.
+            # The rim as fitted decides how many knots there are.
             at = point.state.placement
             held = dict.fromkeys(PUPIL_PARAMETERS, 0.0)
             at = replace(at, pupil=at.fitted_pupil(), **held)
@@ -1088,7 +1088,7 @@ def _likelier(
     settings: FitSettings,
     pupil: Pupil,
 ) -> _Point:
-    """Return the point fitted behind another pupil, as it is where that is not clearly likelier."""
+    """Return the point fitted behind another pupil where it is clearly likelier, else the point."""
     # The weights were of views open as before.
     even = tuple((1.0,) * mask.views[1] for _ in range(mask.views[0]))
     at = point.state.placement

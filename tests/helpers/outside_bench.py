@@ -74,8 +74,8 @@ class Optics:
     x to y; plate_at_um: (x, y) of its middle. diffraction: behind the mask's edges, by the angular
     spectrum of plane waves. behind_um, behind_cell_um: distance and cells of a second mask, whose
     middle is on the axis, where the bench has one. pupil_um, pupil_at_um: diameter and middle, x
-    and y, of the round pupil; 0: the aperture's cells are open to their edges. rim_um, rim_shift:
-    diameter of a rim before it, 0: none, and by which its middle moves for each um of the pixel.
+    and y, of the round pupil; 0: the aperture's cells are open to their edges. rim_um: diameter
+    of a rim before it; 0: none. rim_shift: its middle's move, um for each um of the pixel.
     """
 
     lens_um: float = 50_000.0
@@ -411,11 +411,8 @@ class Bench:
         Behind a rim of every pixel, (y, x).
         """
         if piece not in self.known:
-            nothing = np.zeros(self.size) if self.optics.rim_um else 0.0
-            self.known[piece] = sum(
-                (share * self._within_rim(part)[1] for part, share in self._open_parts(piece)),
-                nothing,
-            )
+            shares = [share * self._within_rim(part)[1] for part, share in self._open_parts(piece)]
+            self.known[piece] = sum(shares, np.zeros(self.size if self.optics.rim_um else ()))
         return self.known[piece]
 
     def _within_rim(self, piece: Piece, points: int = 8) -> tuple[Piece, Any]:
