@@ -16,7 +16,7 @@ from emmc_rig.formats.format import Export
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.files import write_text
 from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
-from emmc_rig.reconstruction.verdict.rules import NOISE, UNEXPLAINED
+from emmc_rig.reconstruction.verdict.rules import NOISE
 from emmc_rig.report.display import (
     PART_PIXELS,
     DisplayCurve,
@@ -39,8 +39,8 @@ from emmc_rig.report.viewer import poster, viewer_data
 from emmc_rig.store.results import stated_words
 
 Array = NDArray[np.floating]
-EXPLAINED = 1 - UNEXPLAINED.doubt
-"""Share of the detail of validation readings below which the verdict is doubt."""
+EXPLAINED = 0.25
+"""Share of the detail of validation readings below which the card is red."""
 FRAME_PIXELS = 1_500_000
 """Of all frames together, and of the error map; larger ones are shown smaller."""
 

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from emmc_rig.reconstruction.verdict.evidence import Evidence
-from emmc_rig.reconstruction.verdict.rules import LEVELS, Limits, Reason, Verdict, verdict_from
+from emmc_rig.reconstruction.verdict.rules import LEVELS, Level, Reason, Verdict, verdict_from
 
 Combine = Callable[[Sequence[float], Sequence[float]], float]
-DOUBTED_SHARE = Limits(0.25, 1.0)
+DOUBTED_SHARE = 0.25
 """Share of the blocks that are doubted alone, beyond which the whole is: each is judged by fewer
 readings than the whole, so that a few of them are doubted by chance."""
-REFUSED_SHARE = Limits(0.0, 0.5)
-"""Share of blocks with the verdict do not use: one is a place to look at, half of them the
-capture."""
+REFUSED_SHARE = 0.5
+"""Share of the blocks with the verdict do not use, beyond which the whole is not to be used; a
+single block is a place to look at."""
 
 
 @dataclass(frozen=True)
@@ -140,11 +140,14 @@ def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:
     """
     whole = verdict_from(combined(blocks))
     reasons = list(whole.reasons)
-    for level, limits in (("do not use", REFUSED_SHARE), ("doubt", DOUBTED_SHARE)):
+    levels: tuple[Level, ...] = ("do not use", "doubt")
+    for level in levels:
         bad = [block for block in blocks if _rank(block.verdict.level) >= _rank(level)]
         share = len(bad) / len(blocks)
-        level_of_share = limits.level(share)
-        if level_of_share == "trust" or _rank(level) <= _rank(whole.level) or len(blocks) == 1:
+        if share <= (DOUBTED_SHARE if level == "doubt" else 0) or len(blocks) == 1:
+            continue
+        level_of_share = level if share > REFUSED_SHARE else "doubt"
+        if _rank(level) <= _rank(whole.level):
             continue
         worst = max(bad, key=lambda block: _rank(block.verdict.level))
         reason = worst.verdict.reasons[0]

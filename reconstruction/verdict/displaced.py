@@ -91,7 +91,7 @@ class _Design:
     changes: dict[str, Array]
 
 
-def _moved(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camera:
+def moved_masks(camera: Camera, dy_um: float, dx_um: float, distance: float) -> Camera:
     """Return the camera with the masks near its sensor moved, and further by a factor."""
     near = near_masks(camera)
     shots = []
@@ -161,14 +161,14 @@ def _design(psi: ImagingMatrix, relief: Relief) -> _Design | None:
     pixel_um = camera.sensor.sample_pitch_um * psi.binning
 
     def drawn(dy_px: float, dx_px: float, distance: float = 1.0) -> Array:
-        moved = _moved(camera, dy_px * pixel_um, dx_px * pixel_um, distance)
+        moved = moved_masks(camera, dy_px * pixel_um, dx_px * pixel_um, distance)
         plates = draw_plates(moved, psi.size) if distance != 1 else roomy
         return predicted_relief(psi, seen_of_white(moved, psi.size, plates), relief.picture)[1]
 
     try:
         # Masks with room for all moves are drawn once.
         step_um = STEP_PX * pixel_um
-        roomy = draw_plates(_moved(camera, step_um, step_um, 1), psi.size)
+        roomy = draw_plates(moved_masks(camera, step_um, step_um, 1), psi.size)
         own = drawn(0, 0)
         up, down = drawn(STEP_PX, 0), drawn(-STEP_PX, 0)
         right, left = drawn(0, STEP_PX), drawn(0, -STEP_PX)

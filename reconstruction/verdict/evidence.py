@@ -18,10 +18,10 @@ from emmc_rig.reconstruction.colour import unseen_colour
 from emmc_rig.reconstruction.result import SCALE, Reconstruction
 from emmc_rig.reconstruction.verdict.displaced import displaced
 from emmc_rig.reconstruction.verdict.kept import compare_held_out, over_baselines
-from emmc_rig.reconstruction.verdict.orientation import seen_masks
+from emmc_rig.reconstruction.verdict.orientation import WEAK, seen_masks
 from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
 from emmc_rig.reconstruction.verdict.shadow import Relief, measured_relief, shadow
-from emmc_rig.reconstruction.verdict.shots import LEAST_STRENGTH, Motion, compared
+from emmc_rig.reconstruction.verdict.shots import Motion, compared
 
 Array = NDArray[np.floating]
 CLIPPED = 0.5
@@ -150,7 +150,7 @@ def gathered(
     if relief is None:
         relief = measured_relief(psi, frames, noise_sigma, usable)
     masks = shadow(relief)
-    seen = seen_masks(psi, relief) if np.nanmin([1, *masks.strength]) < LEAST_STRENGTH else None
+    seen = seen_masks(psi, relief) if np.nanmin([1, *masks.strength]) < WEAK else None
     residual = frames - psi.forward(result.light_field)
     with ThreadPoolExecutor(1) as beside:  # the two that take long
         given = psi, frames, residual, noise_sigma, usable, fitted.kept

@@ -28,100 +28,87 @@ CONSISTENT = "consistent with frames, Psi and noise"
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of a figure: above `doubt` the verdict is doubt, above `refuse` it is do not use."""
+class Limit:
+    """A limit of a figure: above it the verdict is doubt, above REFUSED times it do not use."""
 
     doubt: float
-    refuse: float
 
     def level(self, figure: float) -> Level:
         """Return the verdict that a figure alone leads to; larger is worse."""
-        if figure > self.refuse:
+        if figure > REFUSED * self.doubt:
             return "do not use"
         return "doubt" if figure > self.doubt else "trust"
 
-    def times(self, factor: float) -> Limits:
-        """Return the limits scaled."""
-        return Limits(self.doubt * factor, self.refuse * factor)
+    def times(self, factor: float) -> Limit:
+        """Return the limit scaled."""
+        return Limit(self.doubt * factor)
 
 
-DISPLACED_PX = Limits(0.28, 0.6)
-"""Of the masks' shadow. 2x flags two broken results fewer of 13, 0.5x none more."""
-STRENGTH_LOST = Limits(0.19, 0.35)
+REFUSED = 2.5
+DISPLACED_PX = Limit(0.28)
+"""Of the masks' shadow."""
+STRENGTH_LOST = Limit(0.19)
 """Contrast of the masks' shadow that is missing, as a share of what Psi predicts."""
-VIGNETTING = Limits(0.2, 0.5)
+VIGNETTING = Limit(0.2)
 """Light that the outermost rays lose beyond what Psi says, as a share."""
-FLICKER = Limits(0.05, 0.15)
+FLICKER = Limit(0.05)
 """Difference of a shot's brightness from the shots' mean, over that."""
-MOTION = Limits(1.0, 5.0)
+MOTION = Limit(1.0)
 """Ratio by which shots saw different scenes; refused only where the shots in question are unknown,
-as nothing mends that. Motion that costs 7 dB or more has ratios of 2 to 13 (built-in scenes, 64x80,
-two and three shots, `tv`)."""
-OFF = Limits(0.0215, 0.05)
-"""Share of readings that differ from all their neighbours. In clean frames of fine soil and leaves
-it is up to 2 %."""
-BAD = Limits(0.02, 0.1)
+as nothing mends that. Motion that costs 7 dB or more has ratios of 2 to 13
+(built-in scenes, 64x80, two and three shots, `tv`)."""
+BAD = Limit(0.01)
 """Share of pixels that the clean-up calls bad. Above it further bad pixels are overlooked."""
-SATURATED = Limits(0.14, 0.35)
-SHORT = Limits(0.02, 0.35)
+SATURATED = Limit(0.14)
+SHORT = Limit(0.02)
 """Share of the readings."""
-UNUSABLE = Limits(0.35, 0.85)
+UNUSABLE = Limit(0.35)
 """Share of the readings. At 40 % one shot loses 1 to 4 dB (group A, 64x80; the fish 0.8)."""
-BLIND = Limits(0.05, 0.25)
-NOISE_SHARE = Limits(0.5, 0.9)
-LEAST_NOISE = 0.13
-"""Noise over the mean reading below which NOISE_SHARE is not applied: in a featureless scene the
-residual is noise alone, which does no harm."""
-NOISE = Limits(0.3, 0.8)
+BLIND = Limit(0.05)
+NOISE = Limit(0.3)
 """Standard deviation of the readings over their mean."""
-UNEXPLAINED = Limits(0.75, 1.1)
-"""One minus the explained share; above 1 the smooth picture alone predicts the readings better."""
-UNDECIDED = Limits(0.75, 1.0)
+UNDECIDED = 0.75
+"""Share of the textured patches: above it depth is not known."""
 NOISY, LEFT_OPEN = 0.08, 0.35
 """Noise over the mean reading, and share of undecided patches, that together cost 3 dB. In six
 scenes of group A (64x80) 500 electrons do: 0.08 to 0.21, and 39 to 77 %. No scene that loses 1 dB
 at most has both."""
-SLIGHT_LOSS, SLIGHT_PX, UNLIKE_SURFACES = 0.05, 0.09, 0.5
-"""An error of Psi too small for the limits above: strength that is missing, displacement in pixels;
-and the mean square residual of surfaces over total variation's from which on it does harm. Clean
-captures of group A and the built-in scenes, by the RGBW masks of the shipped cameras, miss 0.026 at
-most and lie 0.08 px off at most. Harm differs by scene: cells that stand 10 % too far cost
-antinous 11.7 dB and buttercup 0.5, and this share is 0.7 and 0.3."""
-HARM, HARM_STATED, LEAST_EFFECT = 0.8, 0.38, 0.02
+SLIGHT_PX, UNLIKE_SURFACES = 0.09, 0.5
+"""A displacement too small for the limit above; and the mean square residual of surfaces over total
+variation's from which on it does harm. Clean captures of group A and the built-in scenes, by the
+RGBW masks of the shipped cameras, lie 0.08 px off at most."""
+HARM_STATED, LEAST_EFFECT = 0.38, 0.02
 """Relative change of the masks' modulation, above which a cause does harm: over the relative error
-of held-out readings, or over that which the method states for the light field, and alone. In one
-shot whose black level is wrong by 3 or 6 % of the mean (96x96), six scenes of group A and two built
-in by adaptive-fast, it is 0.38 to 0.65 of what is stated where 3 dB are lost, 0.37 at most where 1
-dB at most is; in four scenes by tv 0.85 and 1.8 of the held-out error, and elsewhere 0.6."""
+that the method states for the light field, and alone. In one shot whose black level is wrong by 3
+or 6 % of the mean (96x96), six scenes of group A and two built in by adaptive-fast, it is 0.38 to
+0.65 of what is stated where 3 dB are lost, 0.37 at most where 1 dB at most is."""
 NAMED_LOST = 0.1
-"""Relative change of the masks' modulation by a cause that is named, above which it is doubted by
-tv. Edges blurred by 0.4 pixels change 0.09 to 0.1, and cost 0.5 to 14 dB in eight scenes by
+"""Relative change of the masks' modulation by blur or distance, above which it is doubted whatever
+is stated. Edges blurred by 0.4 pixels change 0.09 to 0.1, and cost 0.5 to 14 dB in eight scenes by
 adaptive-fast, 3 in four; a distance wrong by 10 % changes 0.07 to 0.08, and costs 0.4 to 14, 3 in
 five."""
-GAMMA = Limits(0.05, 0.3)
+GAMMA = Limit(0.05)
 """Of the power of the light that readings follow, less 1. It is wrong brightness, whatever else."""
 AS_LIKELY = 0.9
 """Of the likeliest cause's gain, from which on vignetting is likely as well: under 30 % it is 0.96
 at least in eight scenes, under a black level that is wrong 0.29 at most."""
 SURE = 3
 """Deviations by which a cause must differ from none to be named."""
-BLOCKINESS = Limits(0.44, 1.0)
+BLOCKINESS = Limit(0.44)
 """See `blockiness`. In group A at 96x96 0.08 at most as they were read; by JPEG of quality 95, at a
 loss of 0.1 to 2.3 dB, 0.12 to 0.41; of quality 85, at 2.1 to 15 dB, 0.47 to 1.2."""
-STEPS, STEPS_SHARE = 2.0, 0.7
-"""Noise by quantisation over the noise stated, and over the error of held-out readings."""
-AT_END = Limits(0.01, 1.0)
-MISFIT = Limits(8.0, float("inf"))
-"""Residual of the readings over their noise. In one clean shot of the scene fish, almost without
-noise (0.0005), it is 4."""
+STEPS_SHARE = 0.7
+"""Noise by quantisation over the error of held-out readings."""
+AT_END = 0.01
+"""Share of the patches that fit best at the limit of what is searched."""
+MISFIT = 12.0
+"""Residual of the readings over their noise, at the worst place. In clean shots of 10^6 electrons
+it is 11 at most (16 scenes, 64x80)."""
 COLOUR_ERROR = 0.1
 """Root mean square. One shot of `scenario-iii-mono`: 0.08 to 0.16, of `rgbw-mono` 0.04 to 0.13
 (64x80, three scenes of group A, two built in)."""
 LEAST_PARALLAX = 0.005
 """Root mean square by which the views differ, over the middle one's."""
-LEFT_OUT = Limits(0.4, 1.0)
-LEFT_OUT_OF_ONE = Limits(0.7, 1.0)
-"""For methods that lose little with one shot."""
 DARK = 0.3
 """Brightness over the shots' mean below which a shot is called dark."""
 DRIFT = "calibrate the drift of the masks since then, or calibrate again"
@@ -219,11 +206,12 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         return
     kept = [shot for shot in range(len(e.brightness)) if shot not in e.left_out]
     bright = [(b or 0.0) if shot in kept else 1.0 for shot, b in enumerate(e.brightness)]
-    yield from _left_out(e)
     spoilt = [*_dark(bright), *_confused(e, kept)]
     if spoilt:
         yield spoilt[0]
         return
+    # Another scene is of another brightness, but not the other way about.
+    yield from _motion(e)
     yield from _evened(e, kept)
     apart = [abs(brightness - 1) for brightness in bright]
     worst = apart.index(max(apart))
@@ -232,24 +220,6 @@ def _shots(e: Evidence) -> Iterator[Reason]:
         apart[worst],
         "let the lamp warm up, or divide the frames by a reference",
         FLICKER.level(apart[worst]),
-    )
-    yield from _motion(e)
-
-
-def _left_out(e: Evidence) -> Iterator[Reason]:
-    """Shots that screening excluded; methods that need one shot suffer less."""
-    if not e.left_out:
-        return
-    count = len(e.brightness)
-    share = len(e.left_out) / count
-    limits = LEFT_OUT_OF_ONE if _sensitivity(e).one_shot else LEFT_OUT
-    shots = ", ".join(str(shot + 1) for shot in e.left_out)
-    yield Reason(
-        f"{len(e.left_out)} of {count} shots are excluded, as dark or as the same as another: "
-        f"{shots}",
-        share,
-        "check lamp and stage, and capture them again",
-        limits.level(share),
     )
 
 
@@ -295,27 +265,20 @@ def _motion(e: Evidence) -> Iterator[Reason]:
 
 
 def _evened(e: Evidence, kept: Sequence[int]) -> Iterator[Reason]:
-    """What evening the shots' brightness leaves open; kept: shots that were not left out.
+    """Whether it is open which of two shots has the right brightness.
 
-    Where most shots have one brightness, nothing is open: screening scaled the rest to it.
+    kept: shots that were not left out. More are scaled to each other, which costs nothing.
     """
-    gains = {shot: e.gains[shot] for shot in kept if e.gains}
-    alike = sum(abs(gain - 1) <= FLICKER.doubt for gain in gains.values())
-    if len(gains) < 2 or (len(gains) > 2 and alike > len(gains) / 2):
-        return
-    worst = max(gains, key=lambda shot: abs(np.log(max(gains[shot], 1e-6))))
-    apart = abs(gains[worst] - 1)
-    darker = f"{apart:.1%} {'darker' if gains[worst] < 1 else 'brighter'}"
-    words = f"shot {worst + 1} is {darker} than the others, and was scaled to them"
+    gains = [e.gains[shot] for shot in kept if e.gains]
     if len(gains) == 2:
-        words = f"the two shots differ in brightness by {np.ptp(list(gains.values())):.1%}: which "
-        words += "is right is not known, and the light field has their mean brightness"
-    yield Reason(
-        words,
-        apart,
-        "let the lamp warm up, or divide the frames by a reference",
-        "doubt" if apart > FLICKER.doubt else "trust",
-    )
+        apart = float(np.ptp(gains))
+        yield Reason(
+            f"the two shots differ in brightness by {apart:.1%}: which is right is not known, and "
+            "the light field has their mean brightness",
+            apart,
+            "let the lamp warm up, or divide the frames by a reference",
+            "doubt" if apart / 2 > FLICKER.doubt else "trust",
+        )
 
 
 class Strength(NamedTuple):
@@ -433,7 +396,7 @@ def _masks(e: Evidence) -> Iterator[Reason]:
         yield Reason(what, strength, remedy, weak)
     elif cause.name == "gamma" and GAMMA.level(cause.surely) != "trust":
         yield Reason(what, cause.value, remedy, GAMMA.level(cause.surely))
-    elif _changes_too_much(e, cause) or (surfaces_fail and lost > SLIGHT_LOSS):
+    elif _changes_too_much(e, cause):
         yield Reason(what, strength, remedy, "doubt")
     elif surfaces_fail and moved > SLIGHT_PX:
         yield Reason(shift, moved, DRIFT, "doubt")
@@ -457,10 +420,7 @@ def _changes_too_much(e: Evidence, cause: Cause) -> bool:
     changed = _causes(e).get("contrast", NO_CAUSE).surely
     if cause.name in ("blur", "distance") and changed > NAMED_LOST * _psi_tolerance(e, 0.85):
         return True
-    if not e.noise_share:
-        return False
-    limit = HARM * e.noise / e.noise_share**0.5 if e.stated is None else HARM_STATED * e.stated
-    return changed > max(limit, LEAST_EFFECT)
+    return e.stated is not None and changed > max(HARM_STATED * e.stated, LEAST_EFFECT)
 
 
 def _causes(e: Evidence) -> dict[str, Cause]:
@@ -496,7 +456,7 @@ def _in_words(cause: Cause, strength: float) -> tuple[str, str]:
     return {
         "offset": (
             f"the black level seems {size:.1%} of the mean reading too {'low' if more else 'high'}",
-            "capture darks; where these agree, look for stray light",
+            "look for stray light; without darks, capture them",
         ),
         "gamma": (
             f"the readings follow the light to the power of {1 + cause.value:.2f}",
@@ -530,7 +490,7 @@ def _compression(e: Evidence) -> Iterator[Reason]:
             BLOCKINESS.level(e.blockiness),
         )
     steps, share = e.steps or 0.0, e.noise_share or 0.0
-    if steps > STEPS and steps * share**0.5 > STEPS_SHARE:
+    if steps * share**0.5 > STEPS_SHARE:
         yield Reason(
             f"the readings are quantised: steps add {steps:.1f} times the sensor's noise",
             steps,
@@ -541,15 +501,6 @@ def _compression(e: Evidence) -> Iterator[Reason]:
 
 def _pixels(e: Evidence) -> Iterator[Reason]:
     """Shares of readings that are wrong or missing: several shots make up for each other's."""
-    # A shadow elsewhere makes readings differ from their neighbours, too.
-    weakest = _weakest(e)
-    if weakest is None or weakest.value > 1 - STRENGTH_LOST.doubt / 2 or e.off > OFF.refuse:
-        yield Reason(
-            f"{e.off:.1%} of the readings differ from all their neighbours",
-            e.off,
-            "mask dead and hot pixels (a dark and a reference frame show them), or expose less",
-            OFF.level(e.off),
-        )
     shots = len(e.strengths)
     bad = BAD.times(shots**0.75 * _sensitivity(e).bad_pixels)
     yield Reason(
@@ -570,7 +521,9 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
         "expose less, or bracket the exposure",
         SHORT.level(e.short),
     )
-    listed = e.unusable - e.saturated
+    # What is excluded with its shot is no fault of the pixels.
+    of_shots = len(e.left_out) / shots
+    listed = max(e.unusable - e.saturated - of_shots, 0.0) / max(1 - of_shots, 1 / shots)
     yield Reason(
         f"{listed:.0%} of the readings are of pixels that cannot be used",
         listed,
@@ -587,19 +540,13 @@ def _pixels(e: Evidence) -> Iterator[Reason]:
 
 
 def _noise(e: Evidence) -> Iterator[Reason]:
-    """Whether noise hides the scene: in the readings, or in the residual of held-out ones."""
-    light = "add light, expose longer or capture more shots"
-    if NOISE.level(e.noise) != "trust":
-        yield Reason(
-            f"noise is {e.noise:.0%} of the mean reading", e.noise, light, NOISE.level(e.noise)
-        )
-    elif e.noise_share is not None and e.noise > LEAST_NOISE:
-        yield Reason(
-            f"noise is {e.noise_share:.0%} of the residual of the validation readings",
-            e.noise_share,
-            light,
-            NOISE_SHARE.level(e.noise_share),
-        )
+    """Whether noise hides the scene."""
+    yield Reason(
+        f"noise is {e.noise:.0%} of the mean reading",
+        e.noise,
+        "add light, expose longer or capture more shots",
+        NOISE.level(e.noise),
+    )
 
 
 def _search(e: Evidence) -> Iterator[Reason]:
@@ -614,9 +561,9 @@ def _search(e: Evidence) -> Iterator[Reason]:
             f"{searched} fit alike",
             decided,
             f"use a mask that differs from {picture} to {picture}, or capture more shots",
-            UNDECIDED.level(1 - decided),
+            "cannot tell" if 1 - decided > UNDECIDED else "trust",
         )
-        if e.noise > NOISY and UNDECIDED.doubt > 1 - decided > LEFT_OPEN:
+        if e.noise > NOISY and 1 - decided > LEFT_OPEN:
             yield Reason(
                 f"noise is {e.noise:.0%} of the mean reading, and in {1 - decided:.0%} of the "
                 f"textured patches several {searched} fit",
@@ -628,7 +575,7 @@ def _search(e: Evidence) -> Iterator[Reason]:
         f"{at_end:.0%} of the patches fit best at the limit of the {searched} searched",
         at_end,
         "raise furthest_px" + (", or focus nearer to the scene" if parallax else ""),
-        AT_END.level(at_end),
+        "doubt" if at_end > AT_END else "trust",
     )
 
 
@@ -641,7 +588,7 @@ def _misfit(e: Evidence) -> Iterator[Reason]:
         f"{column:.0f}",
         times,
         "check Psi and the noise model, or capture more shots",
-        MISFIT.level(times),
+        "doubt" if times > MISFIT else "trust",
     )
 
 
@@ -653,14 +600,6 @@ def _fit(e: Evidence) -> Iterator[Reason]:
             e.parallax,
             "if the scene has depth, focus nearer or farther, or capture more shots",
             "cannot tell",
-        )
-    if e.explained is not None and e.noise_share is not None and e.noise_share < NOISE_SHARE.doubt:
-        yield Reason(
-            f"the light field explains {max(e.explained, 0):.0%} of the detail in the validation "
-            "readings, beyond a smooth picture",
-            e.explained,
-            "use another method, or capture more shots",
-            UNEXPLAINED.level(1 - e.explained),
         )
     for over, what in (
         (e.over_flat, f"one picture for all {picture_name(e.view_axes)}s"),

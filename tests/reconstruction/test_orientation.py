@@ -1,5 +1,7 @@
 """Masks that stand otherwise than in Psi are named, on a bench of no code in common."""
 
+import re
+
 import numpy as np
 import pytest
 from outside_bench import Bench, Optics
@@ -28,9 +30,9 @@ def cells():
     return bench_of(CAMERA, SIZE).cells
 
 
-def verdict_on(psi, cells, moved_um=(0.0, 0.0), scene="deep-occlusions"):
+def verdict_on(psi, cells, moved_um=(0.0, 0.0), scene="deep-occlusions", **optics):
     """Return the verdict on a frame through these cells, the mask moved by (x, y)."""
-    bench = Bench(cells, SIZE, seed=0)
+    bench = Bench(cells, SIZE, optics=Optics(**optics), seed=0)
     seen = np.take_along_axis(
         emmc.scene(scene, size=SIZE, views=CAMERA.views).light_field,
         bench.colour[None, None, :, :, None],
@@ -60,6 +62,21 @@ def test_a_mask_far_off_its_place_is_named_with_the_displacement(psi, cells):
     pitch_um = CAMERA.sensor.sample_pitch_um
     verdict = verdict_on(psi, cells, (6 * pitch_um, -4 * pitch_um))
     assert verdict.reasons[0].what == "against Psi the masks are (+6, -4) pixels off in x and y"
+
+
+@pytest.mark.parametrize(
+    ("optics", "words"),
+    [
+        ({"mask_um": 1_250.0}, r"the masks are about 25% further from the sensor"),
+        ({"mask_um": 600.0}, r"the masks are about (36|49)% nearer to the sensor"),
+        ({"rotation_rad": 0.105}, r"the masks are turned by about \+6 degrees from x to y"),
+        ({"cell_um": 21.5}, r"the masks' cells are about 7\.5% larger"),
+    ],
+)
+def test_masks_far_from_psi_are_named_with_how_far(psi, cells, optics, words):
+    verdict = verdict_on(psi, cells, **optics)
+    assert verdict.level == "do not use"
+    assert re.fullmatch("against Psi " + words, verdict.reasons[0].what)
 
 
 def test_another_mask_is_none_of_them(psi, cells):

@@ -355,12 +355,15 @@ def judged_trial(
         ("mask-shift", 0.5, "shadow is about"),
         ("mask-shift", 4, "as with other masks"),
         ("edge-blur", 0.75, "blurred"),
+        ("edge-blur", 2, "blurred by about 2 pixels"),
+        ("mask-distance-error", 200, "further from"),
+        ("mask-rotation", 8, "turned by about +8 degrees from x to y"),
+        ("mask-scale", 10, "cells are about 10.0% larger"),
         ("vignetting", 80, "outermost rays"),
         ("flicker", 20, "brightness"),
         ("repeated-shot", 1, "shot 3 shows the masks of shot 2"),
         ("missing-shot", 1, "shot 3 is dark"),
         ("camera-motion", 2, " saw "),
-        ("bad-pixels", 10, "differ from all their neighbours"),
         ("saturation", 60, "saturated"),
         ("masked-pixels", 90, "largest hole"),
         ("exposure", 50, "noise"),
@@ -374,25 +377,15 @@ def test_a_fault_is_reported_with_its_reason_and_a_remedy(fault, strength, reaso
     assert reported[0].remedy
 
 
-def test_many_shots_that_screening_left_out_are_reported_and_few_are_not():
-    verdict = judged_trial("missing-shot", 2)
-    assert verdict.level == "doubt"
-    assert "2 of 3 shots are excluded, as dark or as the same as another: 2, 3" in verdict.words
-    assert judged_trial("missing-shot", 1).reasons[0].what.startswith(CONSISTENT)
-
-
 @pytest.mark.parametrize("share", [0.7, 0.9])
-def test_a_shot_under_another_light_takes_the_level_of_the_others_and_is_named(three, share):
+def test_a_shot_under_another_light_takes_the_level_of_the_others(three, share):
     scene = np.asarray(open_scene("near-planar", size=SIZE)).astype(np.float32)
     frames = three.forward(scene)
     frames[1] *= share
     result, verdict = judged(three, frames + noise_of(three))
-    # Two of three shots agree: nothing is left open, and the result's notes say what was done.
-    assert not any("darker" in reason.what for reason in verdict.reasons)
+    # Nothing is left open, and the result's notes say what was done.
+    assert not any("brightness" in reason.what for reason in verdict.reasons)
     assert any("brightness" in note for note in result.screening)
-    flickering = verdict_from(dataclasses.replace(verdict.evidence, gains=(0.7, 1.0, 1.4)))
-    assert flickering.level == "doubt"
-    assert "shot 1 is 30.0% darker than the others, and was scaled to them" in flickering.words
     assert result.light_field.mean() == pytest.approx(scene.mean(), rel=0.02)
     two = dataclasses.replace(verdict.evidence, gains=(0.9, 1.1, 1.0), left_out=(2,))
     assert "which is right is not known" in verdict_from(two).words
@@ -436,7 +429,7 @@ def test_evidence_survives_json(clean):
 
 def test_the_gravest_reason_comes_first_and_makes_the_verdict(clean):
     assert verdict_from(clean).level == "trust"
-    verdict = verdict_from(dataclasses.replace(clean, off=0.03, displaced_px=2.0))
+    verdict = verdict_from(dataclasses.replace(clean, short=0.03, displaced_px=2.0))
     assert verdict.level == "do not use"
     assert [LEVELS.index(reason.level) for reason in verdict.reasons] == [3, 2]
 
@@ -460,8 +453,8 @@ def undecided(noise, decided):
         ({"over_flat": 1.2}, "doubt", "one picture for all views predicts the validation readings"),
         ({"over_neighbours": 1.2}, "doubt", "the mean of neighbouring readings predicts"),
         ({"parallax": 1e-4}, "cannot tell", "treated as flat: the frames show no parallax"),
-        (missed(4.0), "trust", ""),
-        (missed(9.0), "doubt", "9.0 sigma, largest near row 12, column 30"),
+        (missed(9.0), "trust", ""),
+        (missed(13.0), "doubt", "13.0 sigma, largest near row 12, column 30"),
         # Where masks hardly show, a wrong Psi does not, either; what is wrong beside is graver.
         (shown(0.01), "trust", ""),
         (shown(0.06), "cannot tell", "a wrong Psi may go unnoticed"),
@@ -469,9 +462,12 @@ def undecided(noise, decided):
         ({**shown(None), "noise": 0.5}, "doubt", "noise is 50%"),
         (undecided(0.1, 0.5), "doubt", "several disparities fit"),
         (undecided(0.1, 0.9), "trust", ""),
+        (undecided(0.01, 0.1), "cannot tell", "depth cannot be determined in 90%"),
         (undecided(0.03, 0.5), "trust", ""),
         ({"unusable": 0.5}, "doubt", "50% of the readings are of pixels that cannot be used"),
         ({"unusable": 0.05}, "trust", ""),
+        # What two shots of three lack that screening left out is no fault of pixels.
+        ({"unusable": 0.68, "left_out": (1, 2)}, "trust", ""),
         ({"short": 0.05}, "doubt", "5.0% of the readings are saturated where no other"),
         ({"short": 0.005}, "trust", ""),
     ],
@@ -498,14 +494,13 @@ MOVED = {"moved_at": (1, 5, 5), "moved_px": (9, 9)}
 @pytest.mark.parametrize(
     ("figures", "by_tv", "by_adaptive"),
     [
-        ({"bad": 0.06}, "trust", "doubt"),
-        ({"left_out": (1, 2)}, "doubt", "trust"),
-        ({"bad": 0.03}, "trust", "trust"),
+        ({"bad": 0.03}, "trust", "doubt"),
+        ({"bad": 0.01}, "trust", "trust"),
         ({**MOVED, "motion": 0.9}, "trust", "trust"),
         ({**MOVED, "motion": 1.1}, "doubt", "doubt"),
         ({**MOVED, "motion": 9.0}, "doubt", "doubt"),
         ({**MOVED, "moved_at": (None, 5, 5), "motion": 9.0}, "do not use", "do not use"),
-        ({"bad": 0.1}, "doubt", "doubt"),
+        ({"bad": 0.1}, "doubt", "do not use"),
     ],
 )
 def test_a_fault_that_misleads_a_method_may_leave_another_unharmed(
@@ -519,9 +514,6 @@ def test_a_fault_that_misleads_a_method_may_leave_another_unharmed(
 @pytest.mark.parametrize(
     ("figures", "over_plain", "level"),
     [
-        ({"strengths": (0.93,)}, 0.8, "doubt"),
-        ({"strengths": (0.93,)}, 0.3, "trust"),
-        ({"strengths": (0.97,)}, 0.8, "trust"),
         ({"displaced_px": 0.12}, 0.8, "doubt"),
         ({"displaced_px": 0.12}, 0.3, "trust"),
         ({"displaced_px": 0.06}, 0.8, "trust"),
@@ -540,8 +532,8 @@ def test_a_slight_error_of_psi_counts_where_surfaces_hardly_explain_the_readings
 
 
 CAUSES = (
-    ("offset", 0.06, "black level seems 6.0% of the mean reading too low", "capture darks"),
-    ("offset", -0.06, "black level seems 6.0% of the mean reading too high", "capture darks"),
+    ("offset", 0.06, "black level seems 6.0% of the mean reading too low", "stray light"),
+    ("offset", -0.06, "black level seems 6.0% of the mean reading too high", "stray light"),
     ("gamma", -0.1, "to the power of 0.90", "without gamma"),
     ("blur", 0.81, "blurred by 0.9 pixels more", "calibrate"),
     ("blur", -0.81, "sharper by 0.9 pixels", "calibrate"),
@@ -561,21 +553,19 @@ def test_causes_are_named_with_size_and_remedy_where_they_do_harm(
         strengths=(0.95,) * 3,
         noise=0.01,
         changes=changes,
-        noise_share=0.25,
-        explained=None,
-        stated=None,
+        stated=0.05,
     )
     verdict = verdict_from(found)
     assert verdict.level == "doubt"
     assert words in verdict.reasons[0].what
     assert remedy in verdict.reasons[0].remedy
     # Where the light field errs by far more, it is no matter; gamma is, as it is wrong brightness.
-    harmless = verdict_from(dataclasses.replace(found, noise_share=0.01))
-    assert harmless.level == ("cannot tell" if cause not in ("gamma", "vignetting") else "doubt")
+    harmless = verdict_from(dataclasses.replace(found, stated=0.2))
+    assert harmless.level == ("trust" if cause not in ("gamma", "vignetting") else "doubt")
     # So is a blur or a distance that changes much of the masks' modulation.
     much = dict(changes, contrast=(0.05, 0.001, 0.5)) if cause != "contrast" else changes
-    strong = verdict_from(dataclasses.replace(found, changes=much, noise_share=0.01))
-    assert strong.level == ("cannot tell" if cause in ("offset", "contrast") else "doubt")
+    strong = verdict_from(dataclasses.replace(found, changes=much, stated=0.2))
+    assert strong.level == ("trust" if cause in ("offset", "contrast") else "doubt")
 
 
 @pytest.mark.slow
