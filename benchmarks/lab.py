@@ -6,6 +6,7 @@ import argparse
 import csv
 import datetime
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,7 +32,8 @@ GROUP_B = (
 """Real light fields in the folder EMMC_LIGHTFIELDS: tune on A, report on B."""
 SMALLEST, QUICKEST = (32, 40), ("tv",)
 RUNS = "runs.csv"
-"""Of every CSV beside it: when its rows were measured, by which version and command."""
+"""Of every CSV beside it: when its rows were measured, by which version, commit and command."""
+RUN_COLUMNS = "file", "date", "version", "commit", "command"
 
 
 def arguments(
@@ -141,12 +143,21 @@ def note_run(folder: Path, name: str) -> None:
         "file": f"{name}.csv",
         "date": datetime.date.today().isoformat(),
         "version": emmc_rig.__version__,
+        "commit": _commit(),
         "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words]),
     }
     with path.open("w", newline="", encoding="utf-8") as opened:
-        writer = csv.DictWriter(opened, ["file", "date", "version", "command"], lineterminator="\n")
+        writer = csv.DictWriter(opened, RUN_COLUMNS, lineterminator="\n", restval="")
         writer.writeheader()
         writer.writerows(known[file] for file in sorted(known))
+
+
+def _commit() -> str:
+    """Return the commit of the code, with a + where files differ from it; "" without git."""
+    asked = ["git", "describe", "--always", "--exclude=*", "--dirty=+"]
+    folder = Path(__file__).parent
+    found = subprocess.run(asked, cwd=folder, capture_output=True, text=True, check=False)
+    return found.stdout.strip()
 
 
 def _row(measure: Callable[..., dict], point: dict) -> dict:

@@ -377,14 +377,14 @@ LOST_DB = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 100.0)
 
 def verdicts() -> Section:
     """Whether results that a fault broke are flagged."""
-    rows = [row for row in rows_of("verdicts-real") if row["kind"] in ("broken", "good", "between")]
+    rows = [row for row in rows_of("verdicts") if row["kind"] in ("broken", "good", "between")]
     groups = {
         "group A (sets the limits)": [row for row in rows if row["scene"] in GROUP_A],
         "group B": [row for row in rows if row["scene"] not in GROUP_A],
     }
 
     def flagged(row: Row) -> bool:
-        return row["verdict"] != "trust"
+        return row["flagged"] == "True"
 
     faults = len({row["fault"] for row in rows} - {"none"})
     series = {}
@@ -403,14 +403,21 @@ def verdicts() -> Section:
     ):
         counts[kind] = [share(where(of, kind=kind), flagged) for of in groups.values()]
         table.append((words, *counts[kind]))
+    named = [
+        [row for row in where(of, kind="broken", flagged="True") if row["right"]]
+        for of in groups.values()
+    ]
+    right = [share(of, lambda row: row["right"] == "True") for of in named]
+    table.append(("first reason names the fault, of those flagged that have a name", *right))
     return Section(
         "Is a broken result flagged?",
         f"In group B, {counts['broken'][1]} results that lost 3 dB or more to a fault are flagged; "
-        f"among good results, {counts['good'][1]} are false alarms.",
-        f"{faults} faults in steps, one shot, `adaptive-fast`. The line should be at 0 % on the "
-        "left, where a fault costs nothing, and at 100 % from 3 dB on. Any verdict but *trust* "
-        "counts as flagged.",
-        ("verdicts-real",),
+        f"among good results, {counts['good'][1]} are false alarms. The first reason names the "
+        f"fault in {right[1]}.",
+        f"{faults} faults in steps, one shot, `adaptive-fast`. The line should be at "
+        "0 % on the left, where a fault costs nothing, and at 100 % from 3 dB on. *Doubt* and *do "
+        "not use* count as flagged.",
+        ("verdicts",),
         {
             "verdicts": svg_charts.lines(
                 "The more a fault costs, the surer it is flagged",
@@ -712,10 +719,11 @@ def table_text(rows: Sequence[Sequence[str]]) -> str:
 
 
 def run_text(file: str, runs: Mapping[str, Row]) -> str:
-    """Return a link to a CSV, with date, version and command of its measurement."""
+    """Return a link to a CSV, with date, version, commit and command of its measurement."""
     run = runs[f"{file}.csv"]
+    commit = f", commit {run['commit']}" if run.get("commit") else ""
     return (
-        f"[{file}.csv](results/{file}.csv): {run['date']}, version {run['version']}, "
+        f"[{file}.csv](results/{file}.csv): {run['date']}, version {run['version']}{commit}, "
         f"`{run['command']}`"
     )
 

@@ -92,7 +92,7 @@ def _worst_motion(blocks: Sequence[JudgedBlock]) -> dict[str, Any]:
     e = worst.evidence
     at = None if e.moved_at is None else (e.moved_at[0], *worst.in_whole(e.moved_at[1:]))
     return {
-        "motion": e.motion, "motion_effect": e.motion_effect, "moved_px": e.moved_px,
+        "motion": e.motion, "moved_px": e.moved_px,
         "moved_at": at,
     }  # fmt: skip
 

@@ -47,7 +47,6 @@ class Evidence:
     displaced_px: float | None  #: root mean square displacement of the shadow
     changes: dict[str, tuple[float | None, ...]]  #: fields of `displaced.Change`, by cause
     brightness: tuple[float | None, ...]  #: of each shot, over the shots' mean
-    off: float  #: share far off all around, where neighbours agree
     bad: float  #: share of the pixels that screening left out
     unusable: float
     saturated: float
@@ -62,7 +61,6 @@ class Evidence:
     parameters: dict[str, float]  #: REPORTED_PARAMETERS of the result
     colour_error: float | None = None  #: rms by colours that frames do not show, over brightness
     motion: float | None = None  #: ratio of `Motion`, above 1 where shots saw different scenes
-    motion_effect: float | None = None
     moved_at: tuple[int | None, int, int] | None = None  #: shot (None: any), row, column
     moved_px: tuple[int, int] | None = None  #: rows and columns of that place
     moved: float = 0.0  #: share left out for motion
@@ -173,7 +171,7 @@ def gathered(
         brightness=_plain(shots.brightness),
         **({} if moved is None else moved.figures()),
         bad=fitted.bad,
-        **pixel_figures(psi, fitted.excluded, relief, noise_sigma, usable),
+        **pixel_figures(fitted.excluded, relief, usable),
         **compare_held_out(frames, residual, noise_sigma, fitted.kept & usable, relief),
         colour_error=_colour_error(psi, frames, usable, relief),
         parameters={

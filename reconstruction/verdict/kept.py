@@ -130,7 +130,7 @@ def _off_neighbours(
     step = 1 if psi.colour is None or psi.binning > 1 else 2
     return np.stack(
         [
-            frame - neighbours(frame, of_shot, step).values.mean(axis=0)
+            frame - neighbours(frame, of_shot, step).mean(axis=0)
             for frame, of_shot in zip(frames, good, strict=True)
         ]
     )

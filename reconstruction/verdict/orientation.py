@@ -71,7 +71,7 @@ IN_PLACE_PX = 1
 CLEARLY = 1.7
 """Least ratio of the largest gain to the next largest: below it nothing is named."""
 WEAK = 0.85
-"""Strength of the masks as Psi has them, below which they are looked for elsewhere."""
+"""Of the strength that Psi predicts: below it the masks are compared with `SIZES`, ORIENTATIONS."""
 LEAST_STRENGTH = 0.3
 """Of the masks as found: 1 where every cell is where it is drawn."""
 

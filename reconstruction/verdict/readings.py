@@ -6,26 +6,17 @@ coefficients are next to nothing. A quantised reading is a multiple of one step.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
 BLIND_PX = 1.9
 """A pixel is blind at this distance from the nearest pixel with a usable reading."""
-SMOOTH = 0.5
-"""Largest spread of the neighbours with which a pixel is compared, over their typical value."""
-DIMMEST = 0.2
-"""Of the light expected without masks: pixels behind dark cells are not compared."""
-ENOUGH = 6
-"""Neighbours, of eight, that must be usable."""
-SPREADS, LEAST, DEVIATIONS = 2.0, 0.3, 6.0
-"""Times the neighbours' spread, their typical value, and the noise, that a pixel is off by."""
 BLOCK_PX = 8
 MOST_PX = 256
 """Side of the middle that is transformed."""
@@ -37,42 +28,16 @@ REPEATED = 4
 
 
 def pixel_figures(
-    psi: ImagingMatrix,
     excluded: Array,
     relief: Relief,
-    noise_sigma: float,
     usable: NDArray[np.bool_],
 ) -> dict[str, Any]:
-    """Return figures of `Evidence` on single pixels. excluded: the readings of unusable pixels.
-
-    A pixel is far off where all about it is smooth, and its light (reading over what the masks
-    pass) lies outside the neighbours' range by more than SPREADS of it, LEAST of the light, and
-    DEVIATIONS of the noise.
-    """
-    step = 1 if psi.colour is None else 2
-    off, compared = 0, 0
-    for shot in range(psi.shots):
-        passed = 1 + relief.masks[shot]
-        detail = (1 + relief.read[shot]) / np.maximum(passed, DIMMEST)
-        good = relief.good[shot] & (passed > DIMMEST)
-        around = neighbours(detail, good, step)
-        # Without the least and the largest, which may be bad themselves; the median of eight.
-        low, high = around.values[1], around.values[-2]
-        typical = np.abs(around.values[3:5].mean(axis=0))
-        spread = high - low
-        smooth = good & (around.good >= ENOUGH) & (spread < SMOOTH * typical)
-        apart = np.where(detail > high, detail - high, np.maximum(low - detail, 0))
-        light = relief.level[shot] * passed
-        wild = (apart > SPREADS * spread) & (apart * light > DEVIATIONS * noise_sigma)
-        wild &= apart > LEAST * typical
-        off += int((wild & smooth).sum())
-        compared += int(smooth.sum())
+    """Return figures of `Evidence` on single pixels. excluded: the readings of unusable pixels."""
     seen = usable.any(axis=0)
     unseen = np.asarray(~seen, dtype=np.uint8)
     radius = cv2.distanceTransform(unseen, cv2.DIST_L2, 3)
     hole = np.unravel_index(int(radius.argmax()), radius.shape)
     return {
-        "off": off / max(compared, 1),
         "unusable": float(1 - usable.mean()),
         "saturated": _saturated(excluded, relief, usable),
         "blind": float((radius >= BLIND_PX).mean()),
@@ -92,29 +57,20 @@ def _saturated(excluded: Array, relief: Relief, usable: NDArray[np.bool_]) -> fl
     return above / usable.size
 
 
-class Neighbours(NamedTuple):
-    """The eight neighbours of each pixel.
+def neighbours(values: Array, good: NDArray[np.bool_], step: int) -> NDArray[np.float32]:
+    """Return the eight neighbours of each pixel, (8, y, x).
 
-    values: in ascending order, (8, y, x); those that are not good have the others' mean. good: how
-    many are good, (y, x).
+    Those that are not good have the others' mean. step: 1, or 2 to the next pixel of a Bayer
+    colour.
     """
-
-    values: NDArray[np.float32]
-    good: NDArray[np.int64]
-
-
-def neighbours(values: Array, good: NDArray[np.bool_], step: int) -> Neighbours:
-    """Return the eight neighbours at a step, 1, or 2 to the next pixel of a Bayer colour."""
     rows, columns = values.shape
     padded = np.pad(np.where(good, values, np.nan), step, mode="reflect")
     places = [(i, j) for i in (0, step, 2 * step) for j in (0, step, 2 * step)]
     places.remove((step, step))
     beside = np.stack([padded[i : i + rows, j : j + columns] for i, j in places])
     known = np.isfinite(beside)
-    count = known.sum(axis=0)
-    mean = np.where(known, beside, 0).sum(axis=0) / np.maximum(count, 1)
-    in_order = np.sort(np.where(known, beside, mean), axis=0)
-    return Neighbours(in_order.astype(np.float32), count)
+    mean = np.where(known, beside, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(known, beside, mean).astype(np.float32)
 
 
 def _cosines() -> NDArray[np.float64]:

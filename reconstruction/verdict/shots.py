@@ -39,14 +39,12 @@ LEAST_STRENGTH = 0.65
 class Motion:
     """The place where shots differ most in what they saw.
 
-    ratio: difference between shots over its limit; above 1 something moved. effect: root mean
-    square change of the readings there, over the mean reading. place, size: middle and extent (y,
-    x), pixels. shot: the number of a single differing shot, else None. moved: readings (shot,
-    pixel_y, pixel_x) of all such places, where the shot is known.
+    ratio: difference between shots over its limit; above 1 something moved. place, size: middle and
+    extent (y, x), pixels. shot: the number of a single differing shot, else None. moved: readings
+    (shot, pixel_y, pixel_x) of all such places, where the shot is known.
     """
 
     ratio: float
-    effect: float
     place: tuple[int, int]
     size: tuple[int, int]
     shot: int | None
@@ -56,7 +54,6 @@ class Motion:
         """Return those of `Evidence`."""
         return {
             "motion": self.ratio,
-            "motion_effect": self.effect,
             "moved_at": (self.shot, *self.place),
             "moved_px": self.size,
             "moved": float(self.moved.mean()),
@@ -123,10 +120,8 @@ def motion(relief: Relief, residual: Array, noise_sigma: float) -> Motion | None
             moved[differs[area]] |= inside
     area = int(areas[peak[1:]])
     x, y, width, height = (int(n) for n in boxes[area][:4])
-    mean = float(np.mean((relief.level * (1 + relief.masks))[relief.good]))
     return Motion(
         ratio=float(ratio.max()),
-        effect=float(np.sqrt(_windows(apart, side)[peak])) / max(mean, 1e-12),
         place=(y + height // 2, x + width // 2),
         size=(max(height - len(reach) + 1, side), max(width - len(reach) + 1, side)),
         shot=differs[area],

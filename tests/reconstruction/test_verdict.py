@@ -258,23 +258,11 @@ def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
     assert swapped.masks[0].argmax() == 0
 
 
-def test_pixels_far_off_are_counted(three):
-    frames, chosen = grey(three), np.zeros(three.frames_shape, bool)
-    chosen[:, 5::9, 7::9] = True
-    frames = np.where(chosen, 0.02 * frames, frames)
-    found = pixel_figures(three, frames, relief_in(three, frames), 1e-4, everywhere(three))
-    assert found["off"] == pytest.approx(chosen.mean(), rel=0.2)
-    clean = pixel_figures(
-        three, grey(three), relief_in(three, grey(three)), 1e-4, everywhere(three)
-    )
-    assert clean["off"] == 0
-
-
 def test_holes_are_measured_and_placed(three):
     usable = everywhere(three)
     usable[:, 20:31, 40:51] = False
     frames = grey(three)
-    found = pixel_figures(three, frames, relief_in(three, frames, usable=usable), 1e-4, usable)
+    found = pixel_figures(frames, relief_in(three, frames, usable=usable), usable)
     assert found["unusable"] == pytest.approx(121 / np.prod(SIZE))
     # The middle of 11 pixels lies 6 from the nearest that is seen; the outermost ring but 1.
     assert found["hole_px"] == pytest.approx(6, abs=0.5)
@@ -283,7 +271,7 @@ def test_holes_are_measured_and_placed(three):
     # The excluded pixels read no more than the others: none is saturated.
     assert found["saturated"] < 0.01
     frames[~usable] = 1
-    assert pixel_figures(three, frames, relief_in(three, frames, usable=usable), 1e-4, usable)[
+    assert pixel_figures(frames, relief_in(three, frames, usable=usable), usable)[
         "saturated"
     ] == pytest.approx(121 / np.prod(SIZE))
 
