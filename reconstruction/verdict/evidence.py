@@ -16,6 +16,7 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.reconstruction.colour import unseen_colour
 from emmc_rig.reconstruction.result import SCALE, Reconstruction
+from emmc_rig.reconstruction.verdict.bands import mask_shift_px
 from emmc_rig.reconstruction.verdict.displaced import displaced
 from emmc_rig.reconstruction.verdict.kept import compare_held_out, over_baselines
 from emmc_rig.reconstruction.verdict.orientation import WEAK, seen_masks
@@ -73,6 +74,8 @@ class Evidence:
     steps: float | None = None  #: noise by quantisation, over the noise stated
     stated: float | None = None  #: deviation by held-out readings, rms, over the light field's mean
     view_axes: ViewAxes = ANGLES
+    #: from band to band: of the light field, and of Psi's masks, without a sign
+    shifts_px: tuple[float, float] | None = None
     #: fields of `orientation.Seen`, where the masks stand clearly otherwise than in Psi
     masks_seen: tuple[Any, ...] | None = None
 
@@ -185,8 +188,17 @@ def gathered(
         steps=None if step is None else step / np.sqrt(12) / max(noise_sigma, 1e-12),
         stated=_stated(result),
         view_axes=psi.view_axes,
+        shifts_px=_shifts_px(psi, result),
         masks_seen=None if seen is None else tuple(seen),
     )
+
+
+def _shifts_px(psi: ImagingMatrix, result: Reconstruction) -> tuple[float, float] | None:
+    """Return `Evidence.shifts_px`."""
+    if "band" not in psi.view_axes or "shift" not in result.maps:
+        return None
+    of_masks = mask_shift_px(psi)
+    return None if of_masks is None else (abs(float(np.median(result.maps["shift"]))), of_masks)
 
 
 def _colour_error(

@@ -24,6 +24,8 @@ from emmc_rig.process.captures import opened_capture
 from emmc_rig.process.reconstructing import reconstruct_undrawn
 from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.reconstruction.preview import Preview
+from emmc_rig.reconstruction.verdict.bands import mask_shift_px
+from emmc_rig.reconstruction.verdict.rules import verdict_from
 from emmc_rig.report.page import light_field_head
 from emmc_rig.report.report import ReportContent, render
 from emmc_rig.report.result_figure import draw_results
@@ -402,3 +404,36 @@ def test_blocks_of_a_capture_of_bands_are_kept_as_bands(tmp_path):
         assert "shift" in maps
         assert "disparity" not in maps
     assert open_export(str(tmp_path / "out")).view_axes == BANDS
+
+
+@pytest.mark.parametrize("along", [0, 1])
+@pytest.mark.parametrize("shift_px", [0, 2, 3])
+def test_psi_says_how_far_bands_lie_apart_behind_a_prism(shift_px, along):
+    bands, size, rng = 5, (60, 80), np.random.default_rng(0)
+    code = rng.integers(0, 2, (size[0] + 20, size[1] + 20)).astype(np.float32)
+    code = cv2.GaussianBlur(code, (0, 0), 0.7)
+    rows = [code[: size[0], 20 - shift_px * k : 20 - shift_px * k + size[1]] for k in range(bands)]
+    columns = [
+        code[20 - shift_px * k : 20 - shift_px * k + size[0], : size[1]] for k in range(bands)
+    ]
+    weights = np.stack(rows if along else columns)
+    views = (1, bands) if along else (bands, 1)
+    axes = ("angle", "band") if along else ("band", "angle")
+    weights = weights.reshape(1, *views, size[0], 1, size[1])
+    psi = ImagingMatrix(weights, np.zeros((1, *size), np.uint8), view_axes=axes)
+    assert mask_shift_px(psi) == pytest.approx(shift_px, abs=0.02)
+    # Codes of their own are no shift.
+    assert mask_shift_px(psi_of((1, 5), BANDS, size=size)) is None
+
+
+@pytest.mark.parametrize(
+    ("shifts_px", "level"),
+    [((1.98, 2.0), "trust"), ((0.25, 2.0), "doubt"), ((5.2, 2.0), "doubt"), ((0.01, 2.0), "trust")],
+)
+def test_bands_that_lie_elsewhere_than_the_masks_are_doubted(shifts_px, level):
+    psi = emmc.camera("rgbw-bayer-1shot").psi((48, 64))
+    verdict = emmc.reconstruct(psi, psi @ emmc.scene("near-planar", size=(48, 64)), "tv").verdict
+    found = replace(verdict.evidence, stated=0.02, view_axes=BANDS, shifts_px=shifts_px)
+    judged = verdict_from(found)
+    assert judged.level == level, judged.words
+    assert (level == "trust") == ("the bands lie" not in judged.words)
