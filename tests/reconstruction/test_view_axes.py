@@ -416,7 +416,7 @@ def test_psi_says_how_far_bands_lie_apart_behind_a_prism(shift_px, along):
     columns = [
         code[20 - shift_px * k : 20 - shift_px * k + size[0], : size[1]] for k in range(bands)
     ]
-    weights = np.stack(rows if along else columns)
+    weights = np.stack(rows if along else columns).astype(np.float32)
     views = (1, bands) if along else (bands, 1)
     axes = ("angle", "band") if along else ("band", "angle")
     weights = weights.reshape(1, *views, size[0], 1, size[1])
