@@ -150,11 +150,13 @@ class Geometry:
         """Return the open share of a hole behind the pupil, and its middle from the view's, um."""
         assert self.pupil is not None
         x_mm, y_mm = np.array(self.pupil.centre_mm) - np.asarray(off_um) / 1e3
-        seen = self.pupil.model_copy(update={"centre_mm": (float(x_mm), float(y_mm))})
         rim = self.pupil.rim
-        # What moves the rim as a moved hole would.
-        pixel_um = (0.0, 0.0) if rim is None else tuple(-np.asarray(off_um) / rim.shift)
-        opened = cell_openings(seen, self.views, self.cell_um, pixel_um=pixel_um)
+        # Seen from a hole that is off, pupil and rim are off the other way, as by a shift of -1.
+        moved = None if rim is None else rim.model_copy(update={"shift": -1.0})
+        centre_mm = float(x_mm), float(y_mm)
+        seen = self.pupil.model_copy(update={"centre_mm": centre_mm, "rim": moved})
+        at_um = float(off_um[0]), float(off_um[1])
+        opened = cell_openings(seen, self.views, self.cell_um, pixel_um=at_um)
         boxes = opened.of_view(*view)
         shares = opened.share[boxes]
         total = max(float(shares.sum()), 1e-9)

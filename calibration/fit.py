@@ -949,14 +949,18 @@ def fit_placement(
             # A pupil that is not known leads the fit astray: it is looked for after a few steps.
             few = settings.model_copy(update={"max_steps": STEPS_TO_PUPIL})
             point = _descend(mask, point, samples, prior, few, FIRST_GAIN).point
-            point = _with_pupil_seen(mask, point, samples, prior, settings)
+            seen = likeliest_pupil(_view_light(mask, point, prior), mask)
+            point = _likelier(mask, point, samples, prior, settings, seen)
             bench = _bench_prior(boards, camera, mask, point.state.placement)
             prior = bench.with_widths(widths)
         descent = _descend(mask, point, samples, prior, settings, FIRST_GAIN)
         state, steps = descent.point.state, steps + descent.steps
     pupil = descent.point.state.placement.pupil
     if not isinstance(start, Fit) and (pupil is None or pupil.rim is None):
-        point = _with_rim_seen(mask, descent.point, whole, prior, settings)
+        growth = _light_growth(mask, descent.point, whole, prior)
+        light = _view_light(mask, descent.point, prior)
+        seen = likeliest_rim(light, growth, mask, descent.point.state.placement.fitted_pupil())
+        point = _likelier(mask, descent.point, whole, prior, settings, seen)
         if point is not descent.point:
             # The rim as fitted decides how many knots there are.
             at = point.state.placement
@@ -1036,38 +1040,6 @@ def _registered(boards: Sequence[Board], camera: Camera, mask: ShadowMask) -> Pl
     return register(max(boards, key=_contrast), mask, soft).placement
 
 
-def _with_pupil_seen(
-    mask: ShadowMask,
-    point: _Point,
-    samples: Sequence[Sample],
-    prior: _Prior,
-    settings: FitSettings,
-) -> _Point:
-    """Return the point with the round pupil that the views' light shows, as it is without one.
-
-    The pupil is taken where the readings become clearly likelier.
-    """
-    pupil = likeliest_pupil(_view_light(mask, point, prior), mask)
-    return point if pupil is None else _likelier(mask, point, samples, prior, settings, pupil)
-
-
-def _with_rim_seen(
-    mask: ShadowMask,
-    point: _Point,
-    samples: Sequence[Sample],
-    prior: _Prior,
-    settings: FitSettings,
-) -> _Point:
-    """Return the point with the rim that the views' light shows, as it is without one.
-
-    The rim is taken where the readings become clearly likelier.
-    """
-    growth = _light_growth(mask, point, samples, prior)
-    seen = _view_light(mask, point, prior)
-    pupil = likeliest_rim(seen, growth, mask, point.state.placement.fitted_pupil())
-    return point if pupil is None else _likelier(mask, point, samples, prior, settings, pupil)
-
-
 def _view_light(mask: ShadowMask, point: _Point, prior: _Prior) -> ViewLight:
     """Return the views' shares of the light, without a prior of the aperture's weights."""
     state, normal = point.state, point.normal
@@ -1086,9 +1058,14 @@ def _likelier(
     samples: Sequence[Sample],
     prior: _Prior,
     settings: FitSettings,
-    pupil: Pupil,
+    pupil: Pupil | None,
 ) -> _Point:
-    """Return the point fitted behind another pupil where it is clearly likelier, else the point."""
+    """Return the point fitted behind another pupil where it is clearly likelier, else the point.
+
+    pupil: None where the views' light shows no other.
+    """
+    if pupil is None:
+        return point
     # The weights were of views open as before.
     even = tuple((1.0,) * mask.views[1] for _ in range(mask.views[0]))
     at = point.state.placement

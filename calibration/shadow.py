@@ -882,15 +882,19 @@ class Shadow:
         knots = field_knots(placement.pupil, mask.aperture_cell_um, pixels_um)
         self._parts = [self._part(knot) for knot in knots]
 
-    def _part(self, knot: Knot, *, slopes: bool = False) -> _Part:
-        """Return boxes and light of the views as a knot sees them; slopes: by the pupil as well."""
-        place = knot.x_um, knot.y_um
-        found = openings(self.mask, self.placement, pixel_um=place)
-        by_pupil = np.zeros((0, len(PUPIL_PARAMETERS), len(OF_BOX)))
-        if slopes:
-            by_pupil = _pupil_slopes(self.mask, self.placement, found, place)
-        boxes = _boxes_of(found, self.mask, self._widths, by_pupil)
-        return _Part(knot, found, boxes, self._light(found, by_pupil))
+    def _part(self, knot: Knot) -> _Part:
+        """Return boxes and light of the views as a knot sees them."""
+        found = openings(self.mask, self.placement, pixel_um=(knot.x_um, knot.y_um))
+        none = np.zeros((0, len(PUPIL_PARAMETERS), len(OF_BOX)))
+        boxes = _boxes_of(found, self.mask, self._widths, none)
+        return _Part(knot, found, boxes, self._light(found, none))
+
+    def _with_slopes(self, part: _Part) -> _Part:
+        """Return a part with slopes by the pupil's parameters."""
+        place, found = (part.knot.x_um, part.knot.y_um), part.openings
+        slopes = _pupil_slopes(self.mask, self.placement, found, place)
+        boxes = _boxes_of(found, self.mask, self._widths, slopes)
+        return replace(part, boxes=boxes, weights=self._light(found, slopes))
 
     def _light(self, found: Openings, slopes: NDArray[np.float64]) -> _Weights:
         """Return the light of the views; slopes: see `_Boxes`."""
@@ -1076,7 +1080,7 @@ class Shadow:
         """Return the readings and what is asked for; by_view needs slopes; narrower: `_sized`."""
         if slopes and narrower is None and len(self._tables) == 1:
             self._tables = share_tables(self.mask, self.placement, KINDS, self._widths)[0]
-            self._parts = [self._part(part.knot, slopes=True) for part in self._parts]
+            self._parts = [self._with_slopes(part) for part in self._parts]
         views = self.mask.views[0] * self.mask.views[1]
 
         def rows(count: int) -> _Seen:

@@ -1,7 +1,7 @@
 """The rules: figures beyond a limit become reasons, each with its remedy, and reasons a verdict.
 
 The limits are tuned, not derived: `benchmarks/verdicts.py` measures how many broken results and how
-many good ones they flag, over 22 faults. Other rules are for faults that the script does not have.
+many good ones they flag, over 22 faults. The rules of further faults were not judged by it.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ import pytest
 from outside_bench import Optics, Sensor
 from outside_boards import Photographer, agreement, bench_of, camera_of
 
+from emmc_rig.calibration.causes import Geometry
 from emmc_rig.calibration.pupil_shape import (
     LightGrowth,
     ViewLight,
@@ -171,3 +172,18 @@ def test_growing_light_shows_the_rim_alone_that_makes_it_grow(rim):
         assert found.rim is not None
         assert found.rim.diameter_mm == pytest.approx(26.0, rel=0.02)
         assert found.rim.shift == pytest.approx(-2.0, rel=0.1)
+
+
+@pytest.mark.parametrize("shift", [-1.0, 0.0])
+def test_a_rim_cuts_a_displaced_hole_as_a_pupil_of_its_size_would(shift):
+    rim = {"diameter_mm": 25.0, "shift": shift}
+    behind = Pupil.model_validate({"diameter_mm": 40.0, "rim": rim})
+    hole = np.array([300.0, -200.0, 0.02])
+    for view in ((0, 0), (2, 4)):
+        found, expected = (
+            Geometry(0.005, 5_000.0, VIEWS, pupil).light(view, hole)
+            for pupil in (behind, Pupil(diameter_mm=25.0))
+        )
+        assert found.share == pytest.approx(expected.share)
+        assert found.middle_um == pytest.approx(expected.middle_um)
+        assert found.sides == pytest.approx(expected.sides)
