@@ -34,7 +34,14 @@ from emmc_rig.process.cost import peak_memory_mib, task_bytes
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.dictionary import Dictionary, open_dictionary
 from emmc_rig.reconstruction.methods import MethodSettings, find_method
-from emmc_rig.reconstruction.result import Reconstruction, Status, stated_figures
+from emmc_rig.reconstruction.result import (
+    Reconstruction,
+    Status,
+    WorstPlace,
+    square_deviation,
+    stated_figures,
+    worst_place,
+)
 from emmc_rig.reconstruction.tiles import (
     AXES,
     ArrayType,
@@ -188,20 +195,24 @@ def block_task(task: BlockTask) -> Generator[tuple[str, None], None, None]:
                 key: getattr(result, key) for key in ("status", "advice", "steps", "parameters")
             },
             "evidence": None if solved.verdict is None else solved.verdict.evidence.as_dict(),
-            "variance": _variance(task, solved.arrays),
+            **_deviation(task, solved.arrays),
             "peak_mib": peak_memory_mib(),
         },
     )
     yield task.block.name, None
 
 
-def _variance(task: BlockTask, arrays: Mapping[str, NDArray]) -> float | None:
-    """Return the sum of the measured views' variance over a block's inner part; None without."""
+def _deviation(task: BlockTask, arrays: Mapping[str, NDArray]) -> dict[str, Any]:
+    """Return `variance` and `worst` of a `DoneBlock`."""
     if "sigma" not in arrays:
-        return None
+        return {"variance": None, "worst": None}
     block = task.block
-    inner = arrays["sigma"][:, :, *within(block.inner, block.part)][measured_views(task.job.psi)]
-    return float(np.sum(np.square(inner, dtype=np.float64)))
+    inner = arrays["sigma"][:, :, *within(block.inner, block.part)]
+    views = measured_views(task.job.psi)
+    square = square_deviation(inner, views)
+    worst, (rows, columns) = worst_place(square), block.inner
+    place = worst._replace(row=worst.row + rows.start, column=worst.column + columns.start)
+    return {"variance": float(square.sum() * views.sum()), "worst": place}
 
 
 def _solved(task: BlockTask) -> SolvedBlock:
@@ -215,11 +226,16 @@ def _solved(task: BlockTask) -> SolvedBlock:
 
 @dataclass(frozen=True)
 class DoneBlock:
-    """What a block says of itself, without its arrays; variance: see `_variance`."""
+    """What a block says of itself, without its arrays.
+
+    variance: of its inner part, summed over measured views and places; worst: the place where it is
+    largest. None for methods without a deviation.
+    """
 
     result: Reconstruction
     verdict: Verdict | None
     variance: float | None
+    worst: WorstPlace | None
     peak_mib: float
 
 
@@ -246,7 +262,9 @@ class BlockFiles(Store[None, DoneBlock]):
         )
         evidence = kept["evidence"]
         verdict = None if evidence is None else verdict_from(Evidence.from_dict(evidence))
-        return DoneBlock(result, verdict, kept["variance"], kept["peak_mib"])
+        at = kept.get("worst")  # Earlier versions did not write it.
+        worst = None if at is None else WorstPlace(*at)
+        return DoneBlock(result, verdict, kept["variance"], worst, kept["peak_mib"])
 
     def add(self, name: str, result: None) -> DoneBlock:
         """Return a block that a worker wrote; raises AppError where it cannot be read here."""
@@ -307,7 +325,7 @@ class Blocks:
         """
         return {
             "blocks": list(self.grid.shape),
-            **stated_figures(self.variance, self.result().parameters),
+            **stated_figures(self.variance, self.result().parameters, self.worst),
             "workers": self.workers,
             "peak_gib": max(block.peak_mib for block in self.done) / 2**10,
             "program_peak_gib": peak_memory_mib() / 2**10,
@@ -321,6 +339,11 @@ class Blocks:
             return None
         samples = measured_views(self.job.psi).sum() * np.prod(self.grid.size)
         return float(sum(v for v in variances if v is not None) / samples)
+
+    @property
+    def worst(self) -> WorstPlace | None:
+        """The place of all blocks with the largest deviation; None where none has any."""
+        return max((block.worst for block in self.done if block.worst), default=None)
 
     def result(self) -> Reconstruction:
         """Return the figures of all blocks together, without arrays."""

@@ -229,10 +229,12 @@ def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cos
             "tv", light_field, Status.CONVERGED, "", 1, (), 1.0, parameters or {}, maps
         )
 
-    assert stated_psnr_db(result_with(sigma=np.full((2, 2), 0.1))) == pytest.approx(20)
-    few = result_with({"stated_tails_db": 1.5, "stated_within_db": 2.0}, sigma=np.full((2, 2), 0.1))
+    even = np.full((3, 3, 8, 8), 0.1)
+    assert stated_psnr_db(result_with(sigma=even)) == pytest.approx(20)
+    few = result_with({"stated_tails_db": 1.5, "stated_within_db": 2.0}, sigma=even)
     assert stated_psnr_db(few) == pytest.approx(18.5)
     assert few.stated["stated_interval_db"] == pytest.approx([16.5, 20.5])
+    assert few.stated["stated_worst_db"] == pytest.approx(18.5)
     assert result_with().stated == {"stated_db": None, "stated_interval_db": None}
     with pytest.raises(AppError, match="estimates no accuracy"):
         stated_psnr_db(result_with())

@@ -109,6 +109,10 @@ def test_blocks_state_the_psnr_that_their_deviations_stand_for(place):
     low, high = metrics["stated_interval_db"]
     assert (high - low) / 2 == pytest.approx(within)
     assert within > 1
+    row, column = metrics["stated_worst_at"]
+    around = np.square(sigma[:, :, row - 12 : row + 12, column - 12 : column + 12]).mean()
+    assert metrics["stated_worst_db"] == pytest.approx(-10 * np.log10(around) - tails, abs=0.3)
+    assert metrics["stated_worst_db"] < metrics["stated_db"]
     assert (high + low) / 2 == pytest.approx(metrics["stated_db"])
     assert json.loads((place / "alone/metrics.json").read_text())["stated_db"] is None
 

@@ -826,3 +826,22 @@ def test_with_several_shots_the_default_is_as_good_as_surfaces_and_as_patches():
 
     others = level_db("adaptive", surfaces), level_db("tv-dict", surfaces)
     assert level_db("adaptive", both) > max(others) - 0.2
+
+
+@pytest.mark.parametrize("camera", ["rgbw-bayer-1shot", "rgbw-bayer-2shots"])
+def test_a_mirror_is_the_least_accurate_place_and_named(camera):
+    psi = build_imaging_matrix(find_camera(camera), (64, 80))
+    truth = open_scene("dark", (64, 80), (5, 5), seed=1).light_field.copy()
+    mirrored = open_scene("toy-table", (64, 80), (5, 5), seed=1).light_field[::-1, ::-1]
+    box = np.s_[:, :, 24:54, 36:70]
+    truth[box] = mirrored[box]
+    noise = 0.003 * np.random.default_rng(0).standard_normal(psi.frames_shape)
+    readings = (psi.forward(truth) + noise).astype(np.float32)
+    result, _ = reconstruct_judged("adaptive-fast", psi, even_frames(readings, 0.003, None))
+    missed = np.square(result.light_field - truth, dtype=np.float64).mean(axis=(0, 1, 4))
+    row, column = result.stated["stated_worst_at"]
+    assert 24 <= row < 54
+    assert 36 <= column < 70
+    there = -10 * np.log10(missed[row - 12 : row + 12, column - 12 : column + 12].mean())
+    assert result.stated["stated_worst_db"] == pytest.approx(there, abs=4)
+    assert there < -10 * np.log10(missed.mean()) - 2

@@ -57,8 +57,16 @@ def test_every_level_of_a_verdict_is_a_sentence_of_a_head():
             {"stated_db": 31.24, "stated_interval_db": [29.81, 33.02]},
             "; estimated accuracy 31.2 dB (29.8 to 33.0 in 9 of 10 captures)",
         ),
+        (
+            {"stated_db": 31.24, "stated_worst_db": 24.13, "stated_worst_at": [40, 66]},
+            "; estimated accuracy 31.2 dB; least, 24.1 dB, about row 40, column 66",
+        ),
+        (
+            {"stated_db": 31.24, "stated_worst_db": 29.0, "stated_worst_at": [40, 66]},
+            "; estimated accuracy 31.2 dB",
+        ),
     ],
-    ids=["none by an earlier version", "no method's", "no interval", "interval"],
+    ids=["none by an earlier version", "no method's", "no interval", "interval", "worst", "even"],
 )
 def test_the_head_says_the_stated_psnr_with_its_interval(stated, words):
     head = light_field_head({"verdict": {"level": "trust", "reasons": []}, **stated})
