@@ -346,7 +346,7 @@ def noise_and_shots() -> Section:
 
 
 WITHIN_ONE, ABOUT = 0.6827, 0.08
-"""Share of the errors that should lie within one deviation, and by how much it may differ."""
+"""Share of errors within one deviation, if they are Gaussian, and its tolerance."""
 
 
 def stated() -> Section:
@@ -365,8 +365,8 @@ def stated() -> Section:
 
     table = [(
         "trusted captures", "number", "estimate is right, in 9 of 10, to",
-        "truth within interval", "its median width", "60 to 76 % of the errors within the deviation",
-        "worst place is right, in 9 of 10, to",
+        "truth within interval", "its median width",
+        "60 to 76 % of the errors within the deviation", "worst place is right, in 9 of 10, to",
     )]  # fmt: skip
     group_b = [row for row in trusted if row["scene"] not in GROUP_A]
     shots = {"1": ("1shot", "cfa"), "2": ("2shots",), "3": ("3shots",)}
