@@ -1,9 +1,10 @@
 """Rules of Windows for `emmc_rig`, in every Python process that has this folder on PYTHONPATH.
 
 Modules of `emmc_rig` import an `os`, `sys`, `signal` and `psutil` as Windows has them, and no POSIX
-module. All other modules import what this computer has, because the standard library and other
-packages chose their code for it; for this reason `sys.platform` differs in `emmc_rig` alone. Rules of Windows' file systems hold for paths below the folder in EMMC_WINDOWS, for
-every library: names, open files that can be neither removed nor renamed, bytes of text files.
+module. The standard library and other packages import those of this computer, because they chose
+their code by `sys.platform`; `sys.platform` is "win32" in `emmc_rig` alone. Rules of Windows' file
+systems hold for paths below the folder in EMMC_WINDOWS, for every library: names, open files that
+can be neither removed nor renamed, line ends of text files.
 """
 
 import builtins
