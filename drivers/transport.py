@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import sys
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -29,13 +30,12 @@ from emmc_rig.drivers.ports import (
     usb_serial_number,
 )
 
-try:
-    from termios import error as _TermiosError  # noqa: N812
-except ImportError:  # Windows
-    _TermiosError = OSError
+_PORT_FAILURES: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+"""What pyserial lets through when the port breaks."""
+if sys.platform != "win32":
+    import termios
 
-_PORT_FAILURES = (serial.SerialException, OSError, _TermiosError)
-"""What pyserial lets through when the port breaks; the terminal's own error is no OSError."""
+    _PORT_FAILURES += (termios.error,)  # it is no OSError
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ECONNREFUSED, errno.EHOSTUNREACH)
 IN_USE = b"Port already in use"

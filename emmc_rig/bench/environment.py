@@ -11,11 +11,10 @@ A source is read again and again; a source that fails or is late does not delay 
 from __future__ import annotations
 
 import math
-import os
 import re
 import shlex
-import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -133,7 +132,9 @@ def _asking(config: SourceConfig) -> Iterator[Callable[[], str]]:
     if config.file is not None:
         yield partial(_read_file, Path(config.file))
     elif config.command is not None:
-        yield partial(_run, shlex.split(config.command), config.limit_s)
+        # On Windows a program is started by a line, in which a backslash divides folders.
+        words = config.command if sys.platform == "win32" else shlex.split(config.command)
+        yield partial(_run, words, config.limit_s)
     else:
         port = _Port(config)
         try:
@@ -147,21 +148,27 @@ def _read_file(path: Path) -> str:
         return file.read(MOST_BYTES)
 
 
-def _run(words: list[str], limit_s: float) -> str:
+def _run(words: str | list[str], limit_s: float) -> str:
+    import psutil
+
     with subprocess.Popen(
         words,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        text=True,
+        encoding="utf-8",
         errors="replace",
-        start_new_session=True,  # Ctrl-C is the capture's; what it started ends with it
+        # Ctrl-C is the capture's: in a session of its own (POSIX), or a group (Windows).
+        start_new_session=True,
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
     ) as process:
         try:
             text, _ = process.communicate(timeout=limit_s)
         except subprocess.TimeoutExpired as fault:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+            with suppress(psutil.NoSuchProcess):
+                for started in psutil.Process(process.pid).children(recursive=True):
+                    started.kill()
+            process.kill()
             raise TimeoutError(f"gave no answer within {limit_s:g} s") from fault
     if process.returncode:
         raise ValueError(f"exit code {process.returncode}: {one_line(text) or 'no output'}")

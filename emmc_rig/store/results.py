@@ -175,7 +175,9 @@ def _commit() -> str:
     git = ("git", "--no-optional-locks", "-C", str(root))
     asked = (*git, "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty")
     try:
-        return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            asked, capture_output=True, encoding="utf-8", check=True
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return ""
 
