@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BeforeValidator,
@@ -18,10 +18,11 @@ from pydantic import (
 )
 
 from emmc_rig.errors import AppError
-from emmc_rig.formats.cameras import find_camera
-from emmc_rig.model.camera import Camera, Shot
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
+
+if TYPE_CHECKING:
+    from emmc_rig.model.camera import Camera, Shot
 
 METERING_EXPOSURE_S = 0.01
 
@@ -295,7 +296,9 @@ class Plan(Settings):
 
 
 def load_plan(path: Path) -> Plan:
-    """Read a plan; raises AppError with one line naming the nearest valid key."""
+    """Read a plan; raises AppError for a missing file, or naming the nearest valid key."""
+    if not path.exists():
+        raise AppError(f"{path}: no such file; write a plan", "new-plan")
     return validated(Plan, read_yaml(path, AppError), str(path), AppError)
 
 
@@ -304,6 +307,8 @@ def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
 
     beside: the folder that a camera file is looked for in first. Raises AppError or CameraError.
     """
+    from emmc_rig.formats.cameras import find_camera  # takes a second to load
+
     spec = plan.camera
     if beside is not None and (beside / spec).is_file():
         spec = str(beside / spec)

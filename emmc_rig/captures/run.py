@@ -121,11 +121,11 @@ def asked_for(
         camera = validated(Camera, session.camera, str(path), CameraError)
         text, rig = session.plan_yaml, rig or session.rig
     else:
+        plan = load_plan(path)
         if rig is None and is_session(folder):
             rig = Session(folder).rig
         if rig is None:
             raise AppError("say which rig: simulated, or a YAML file of devices", "name-rig")
-        plan = load_plan(path)
         camera = planned_camera(plan, path.parent)
         text = path.read_text(encoding="utf-8")
     return CaptureRequest(path, plan, text, camera, folder, rig, until_db, other_devices)
@@ -349,8 +349,6 @@ def capture_session(
     See `asked_for` and `run_capture`. Raises StoppedError when somebody stopped it: what was
     captured is kept, and the same call goes on.
     """
-    if not plan.exists():
-        raise AppError(f"{plan}: no such file; write a plan", "new-plan")
     folder = asked_folder(plan, out)
     with held(folder):
         request = asked_for(plan, folder, rig, until_db, other_devices)
