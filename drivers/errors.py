@@ -447,6 +447,10 @@ class FolderCameraError(DriverError):
         self.reason = reason
 
 
+class LightError(DriverError):
+    """The lights did not confirm the colour that was sent to them."""
+
+
 class MicroManagerError(DriverError):
     """Micro-Manager's core, or a device behind it, said no."""
 

@@ -43,10 +43,14 @@ def identity_of(stage: Stage, axis: str) -> StageIdentity:
 
 @dataclass
 class Sent:
-    """What was last sent to the devices; empty: nothing is known."""
+    """What was last sent to the devices; empty: nothing is known.
+
+    lamp_read: what the lights confirmed.
+    """
 
     bench: tuple | None = None
     lamp: str | None = None
+    lamp_read: str = ""
     offsets_um: dict[str, float] = field(default_factory=dict)
     exposure_s: float | None = None
     gain: float | None = None
@@ -111,6 +115,8 @@ class Devices:
             with suppress(DriverError):
                 self.camera.close()
             self.camera = self._rig.reopen_camera()
+        if what.reconnect_lights and self._rig.lights is not None:
+            self._rig.lights.reconnect()
         if what.reconnect_stage:
             self._rig.stage.reconnect()
         if what.home:
@@ -146,7 +152,7 @@ class Devices:
         """Switch the lamp, unless it is so."""
         if self.sent.lamp != lamp:
             self.sent.lamp = None
-            self._rig.attendant.set_lamp(lamp)
+            self.sent.lamp_read = self._rig.set_lamp(lamp)
             self.sent.lamp = lamp
 
     def move(self, planned: PlannedFrame) -> bool:
@@ -259,7 +265,7 @@ class Devices:
 
     def facts(self) -> dict[str, Any]:
         """Return what the journal says of the devices of a run."""
-        stage, camera = self._rig.stage, self.camera
+        stage, camera, lights = self._rig.stage, self.camera, self._rig.lights
         settings = {}
         with suppress(DriverError):
             # Other values, such as the battery's, a camera may not report.
@@ -267,6 +273,9 @@ class Devices:
         return {
             "camera": {**asdict(camera.identity), "shape": list(camera.shape), "cfa": camera.cfa},
             "camera_settings": settings,
+            "lights": {}
+            if lights is None
+            else {"name": lights.name, "colours": list(lights.colours)},
             "stage": {
                 axis: {
                     "identity": asdict(identity_of(stage, axis)),

@@ -149,6 +149,7 @@ class Engine:
             run=self._recorder.run,
             plan=self._session.amendments,
             lamp=planned.bench.lamp,
+            lamp_read=self.devices.sent.lamp_read,
             commanded_um=dict(planned.bench.offsets_um),
             figures=found,
             wall=self.devices.asked.wall,

@@ -145,7 +145,9 @@ def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session 
     if is_session(request.out):
         session = Session(request.out, disk)
         asked = json.loads(json.dumps(dict(request.rig)))
-        if session.stored and asked != AnyRig.under_new_names(session.rig):
+        begun = AnyRig.under_new_names(session.rig)
+        # How the lights are switched shows in no frame, and may be corrected.
+        if session.stored and asked | {"lights": None} != begun | {"lights": None}:
             raise AppError(
                 f"session {session.folder.name} was begun with another rig: "
                 f"{json.dumps(session.rig)}; name no rig, or begin another session"

@@ -188,7 +188,7 @@ def _devices_of_rig(
     opened = stack.enter_context(opened_rig(rig_description(rig, imaged), design, _nobody))
     place, targets = None, ()
     if isinstance(opened, SimulatedRig):
-        opened.attendant.set_lamp("white")
+        opened.set_lamp("white")
         open_um = {"aperture_x": opened.window_um, "aperture_y": 0.0}
         by_hand = {axis: um for axis, um in open_um.items() if axis not in opened.stage.axes}
         opened.attendant.move(by_hand)
