@@ -251,8 +251,7 @@ class MicroManagerLights(Lights):
         return ", ".join(found)
 
     def _reconnect(self) -> None:
-        """Load the configuration again."""
-        self._loaded.reopen()
+        """Do nothing: to load the configuration again would restart its stage, too."""
 
     def close(self) -> None:
         """Release the core."""

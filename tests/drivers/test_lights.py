@@ -165,8 +165,6 @@ def test_micromanager_sets_and_reads_back_shutters_and_state_devices():
         # A frame that is exposed opens no shutter.
         assert not core.getAutoShutter()
         assert lights.set("off") == "Closed, closed"
-        lights.reconnect()
-        assert not core.getAutoShutter()
         with pytest.raises(LightError, match="no device 'Lamp': name one of"):
             open_lights({**config, "shutter": "Lamp"})
     with closing(open_lights({**config, "shutter": "White Light Shutter"})) as lights:
