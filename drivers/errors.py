@@ -325,6 +325,10 @@ class CaptureError(_WordedError, says="no frame, {}", advice="capture it again")
     """The camera was released but gave no usable frame; the next may be taken."""
 
 
+class NoFrameError(CaptureError, advice="check the trigger and the cable"):
+    """No frame began within its time."""
+
+
 class ExposureStoppedError(
     _WordedError, says="{}: the exposure was broken off; take the frame again"
 ):

@@ -1,5 +1,6 @@
 """A lamp on an Arduino, which restarts when its port is opened, and answers late."""
 
+import math
 from collections import deque
 from collections.abc import Callable
 
@@ -11,6 +12,8 @@ BOOT_S = 1.6
 """An Uno's bootloader listens so long after the DTR line has reset it, and loses other bytes."""
 ANSWER_S = 0.4
 """From a command to its answer: the sketch fades the lamp before it confirms."""
+STROBE_S, PULSE_S = 0.1, 0.01
+"""Period and length of the pulses on the trigger output, which runs as long as the sketch does."""
 READY = "lamp ready"
 LAMP_EXCHANGES = {
     colour: {"send": f"{colour}\n", "expect": f"ok {colour}"}
@@ -23,13 +26,13 @@ class ArduinoLamp(SimulatedController):
     """The sketch: a line with a colour sets the lamp, then comes `ok COLOUR`, or `error LINE`.
 
     on_change: gets the colour whenever the lamp changes. The lamp is off after a restart. Faults:
-    those of the wire.
+    those of the wire, and `lost_pulse`, of the trigger output.
     """
 
     def __init__(
         self, clock: Clock, on_change: Callable[[str], None] = lambda colour: None
     ) -> None:
-        super().__init__(clock)
+        super().__init__(clock, ("lost_pulse",))
         self._on_change = on_change
         self.restart()
 
@@ -45,6 +48,14 @@ class ArduinoLamp(SimulatedController):
             self._commands: deque[tuple[float, str]] = deque()
             self._outbox.clear()
             self._on_change("off")
+
+    def next_edge_s(self, after_s: float, rising: bool = True) -> float:
+        """Return when, at or after a time, the trigger output next rises, or falls."""
+        later_s = 0.0 if rising else PULSE_S
+        edge_s = math.ceil((after_s - later_s) / STROBE_S - 1e-6) * STROBE_S + later_s
+        while self.faults.strikes("lost_pulse", edge_s):
+            edge_s += STROBE_S
+        return edge_s
 
     def power_cycle(self) -> None:
         """Switch off and on."""

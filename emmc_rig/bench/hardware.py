@@ -374,6 +374,8 @@ def simulated_rig(
         bench.rng = np.random.default_rng(int.from_bytes(digest))
 
     lamp = ArduinoLamp(clock, bench.set_lamp) if fitted.lights else None
+    if lamp is not None and isinstance(simulator, U3vCameraSimulator):
+        simulator.lines["Line1"] = lamp.next_edge_s
     rig = SimulatedRig(
         stage,
         opened(),

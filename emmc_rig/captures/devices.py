@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import count
 from typing import Any, NamedTuple
 
-from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
+from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig, RigType
 from emmc_rig.captures.faults import FrameRefusedError, Mending
 from emmc_rig.captures.focus import FocusFound, focused, sharpness
 from emmc_rig.captures.metering import METERABLE_LEVELS, METERING_TRIES
 from emmc_rig.captures.plan import Plan
-from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.camera import Camera as CameraDevice
+from emmc_rig.drivers.errors import CameraSettingError, DriverError
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.drivers.stage import Stage, StageIdentity
 from emmc_rig.errors import AppError
@@ -39,6 +40,35 @@ def identity_of(stage: Stage, axis: str) -> StageIdentity:
         return getattr(stage, "identity", lambda axis: StageIdentity())(axis)
     except DriverError:
         return StageIdentity()
+
+
+def with_trigger(rig: RigType, plan: Plan) -> RigType:
+    """Return the rig, the lines of its camera set as a plan says, also when it is opened again.
+
+    Raises AppError with one line if the camera lacks a line.
+    """
+    trigger, output, reopen = plan.trigger, plan.exposure_output, rig.reopen_camera
+    wanted: list[tuple[str, str, tuple]] = []
+    if trigger is not None:
+        wanted.append(("trigger", "set_trigger", (trigger.source, trigger.edge, trigger.limit_s)))
+    if output is not None:
+        wanted.append(("exposure_output", "set_exposure_output", (output,)))
+
+    def set_lines(camera: CameraDevice) -> CameraDevice:
+        for key, method, arguments in wanted:
+            try:
+                if not hasattr(camera, method):
+                    raise CameraSettingError(key, "does not exist, its driver knows no lines")
+                getattr(camera, method)(*arguments)
+            except CameraSettingError as fault:
+                remedy = f"change {key} in the plan, or leave it out"
+                raise AppError(f"{key}: {fault}: {remedy}") from fault
+        return camera
+
+    if not wanted:
+        return rig
+    set_lines(rig.camera)
+    return replace(rig, reopen_camera=None if reopen is None else lambda: set_lines(reopen()))
 
 
 @dataclass
