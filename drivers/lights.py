@@ -60,8 +60,12 @@ class Lights(ABC):
     def _lost(self, what: str, fault: DriverError) -> LightError:
         """Return a fault as one of the lights; a port's own advice is to home a stage."""
         text = f"the lights ({self.name}) cannot {what}, {fault.what}"
-        of_port = isinstance(fault, PortError)
-        return LightError(text, "check their cable and power" if of_port else fault.advice)
+        advice = fault.advice
+        if isinstance(fault, PortError):
+            advice = "check their cable and power"
+        if isinstance(fault, TransportTimeoutError):
+            advice = "check their power and baud rate, or raise limit_s in the rig's file"
+        return LightError(text, advice)
 
     @abstractmethod
     def _switch(self, colour: str) -> str:

@@ -76,7 +76,7 @@ def test_a_late_answer_to_another_colour_confirms_nothing():
 def test_silence_another_answer_and_another_colour_are_one_line_each():
     bench = Bench()
     bench.lamp.faults.inject("drop_command", math.inf)
-    with pytest.raises(LightError, match=r"answered nothing within 3 s: check power, baud rate"):
+    with pytest.raises(LightError, match=r"answered nothing within 3 s: check their power"):
         bench.lights.set("white")
     bench.lamp.faults.clear()
     wrong = EXCHANGES | {"white": Exchange("light\n", "ok white")}
