@@ -325,6 +325,10 @@ class CaptureError(_WordedError, says="no frame, {}", advice="capture it again")
     """The camera was released but gave no usable frame; the next may be taken."""
 
 
+class NoFrameError(CaptureError, advice="check the trigger and the cable"):
+    """No frame began within its time."""
+
+
 class ExposureStoppedError(
     _WordedError, says="{}: the exposure was broken off; take the frame again"
 ):
@@ -445,6 +449,10 @@ class FolderCameraError(DriverError):
     def __init__(self, folder: str, reason: str) -> None:
         super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
         self.reason = reason
+
+
+class LightError(DriverError):
+    """The lights did not confirm the colour that was sent to them."""
 
 
 class MicroManagerError(DriverError):

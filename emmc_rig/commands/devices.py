@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="devices",
     no_args_is_help=True,
-    help="List, test and move stages and cameras.",
+    help="List, test and move stages, cameras and lights.",
 )
 
 RigOption = Annotated[
@@ -169,11 +169,13 @@ def check(
         axes = opened.stage.axes
         hands = not isinstance(opened.attendant, NoAttendant)
         identity = opened.camera.identity
+        lights = "by hand" if opened.lights is None else ", ".join(opened.lights.colours)
         show_table(
             ("part", rig),
             [
                 ("stage axes", ", ".join(axes) or "none"),
                 ("camera", f"{identity.maker} {identity.model} {identity.serial}".strip()),
+                ("lights", lights if hands or opened.lights else "nothing (by_hand: false)"),
                 ("moved by hand", "what no axis moves" if hands else "nothing (by_hand: false)"),
             ],
         )
@@ -239,6 +241,34 @@ def _show_cameras(found: Sequence[Ability], axes: Sequence[str]) -> None:
         for fit in found
     ]
     show_table(heads, rows)
+
+
+@app.command()
+def lights(
+    colour: Annotated[
+        str | None, typer.Argument(help="off, white, red, green or blue (default: list them)")
+    ] = None,
+    rig: Annotated[str, typer.Option("--rig", help="simulated, or the YAML file of a rig")] = "",
+) -> None:
+    """List a rig's lights, or switch them by hand; nothing moves."""
+    from emmc_rig.bench.hardware import SIMULATED, open_lights
+    from emmc_rig.bench.rig_config import ImagedRig, rig_description
+
+    if not rig:
+        raise typer.BadParameter("name the YAML file of a rig, or --rig simulated")
+    spec: Any = SIMULATED
+    if rig != SIMULATED:
+        spec = rig_description(rig, ImagedRig(scene="deep-occlusions")).get("lights")
+    if spec is None:
+        raise AppError(f"{rig}: has no lights: part, so that a person switches them: add one")
+    with shown_progress("lights"), closing(open_lights(spec)) as opened:
+        answer = "" if colour is None else opened.set(colour)
+        name, colours = opened.name, opened.colours
+    if colour is None:
+        show_table(("lights", "colours"), [(name, ", ".join(colours))])
+    else:
+        tell(f"{name}: {colour}, confirmed by {answer!r}")
+    give_result(lights=name, colours=list(colours), colour=colour, answer=answer)
 
 
 @app.command()
