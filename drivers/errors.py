@@ -237,6 +237,23 @@ class LimitSwitchError(AxisFaultError):
     usual_advice = "check the limits and what is in the way, then home the axis"
 
 
+class PressedSwitchError(LimitSwitchError):
+    """The axis stands on a limit switch: homing could drive it deeper, and was not begun.
+
+    away: "up" or "down", the direction that leads off the switch; "" where it is unknown.
+    """
+
+    def __init__(self, axis: str, away: str = "", reply: str = "") -> None:
+        way = f"{away}wards" if away else "away from the end of the travel at which it stands"
+        super().__init__(
+            axis,
+            "it stands on its limit switch",
+            f"move it off the switch, {way}, before it is homed",
+        )
+        self.away = away
+        self.reply = reply
+
+
 class LostPositionError(AxisFaultError):
     """The axis no longer knows where it is."""
 
