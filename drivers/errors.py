@@ -3,6 +3,8 @@
 from typing import Self
 
 SHOWN_BYTES = 48
+ALL_AXES = "every axis"
+"""The `axis` of an error of a controller as a whole."""
 
 
 def _shown(raw: bytes) -> str:
@@ -15,7 +17,8 @@ def _shown(raw: bytes) -> str:
 class DriverError(Exception):
     """Root of the drivers' errors; shown to the user as one line.
 
-    `axis`, `command` and `reply` are what the error is about, "" where unknown.
+    `axis`, `command` and `reply` are what the error is about, `stage` how the stage was named when
+    it was opened; "" where unknown.
     `loses_position`: the axis no longer knows where it is.
     """
 
@@ -30,9 +33,11 @@ class DriverError(Exception):
         self.axis = axis
         self.command = command
         self.reply = reply
+        self.stage = ""
 
-    def about(self, *, axis: str = "", command: str = "", reply: str = "") -> Self:
+    def about(self, *, axis: str = "", command: str = "", reply: str = "", stage: str = "") -> Self:
         """Fill in what was unknown where the error arose; returns the same error."""
+        self.stage = self.stage or stage
         self.axis = self.axis or axis
         self.command = self.command or command
         self.reply = self.reply or reply

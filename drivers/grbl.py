@@ -9,6 +9,7 @@ from functools import partial
 from emmc_rig.drivers import grbl_codec as codec
 from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
 from emmc_rig.drivers.errors import (
+    ALL_AXES,
     AxisFaultError,
     CommandRefusedError,
     DriverError,
@@ -54,7 +55,6 @@ FACTORY_STEPS_PER_MM = 250.0
 """What `$100` to `$105` hold before anybody has set them (Grbl's defaults.h, generic)."""
 SCALES_AGREE = 1e-3
 """Relative; Grbl shows three decimals of steps per millimetre."""
-ALL_AXES = "every axis"
 SINGLE_AXIS_HOMING = "H"
 """Among the options of `$I`; a compile-time option, off by default (Grbl's config.h)."""
 REFUSAL_ADVICE = {
@@ -82,8 +82,8 @@ class GrblStage(HostStage):
     The travel lies below zero, as Grbl has it, and ends short of the homing switches. Grbl does
     not report whether it was homed, and is idle as well after `$X`, so every axis must be homed
     after connecting. Firmware without option H in `$I`, as it is shipped, homes all axes together.
-    From a pressed limit switch no homing is begun: Grbl takes the switch for the one that it looks
-    for, and its pull-off leads deeper from the other end of the travel (limits.c, `limits_go_home`).
+    From a pressed limit switch no homing is begun: Grbl takes every pressed switch for the home
+    switch, and from the far end of the travel its pull-off leads deeper (limits.c, limits_go_home).
     The scale is the controller's `$100` and following; `steps_per_mm`, by name of an axis, states
     the expected scale, without which the firmware's default counts as never set. Construction
     waits up to BOOT_S for the controller to start; it moves nothing. Raises `ScaleError`, or
@@ -140,8 +140,8 @@ class GrblStage(HostStage):
         """Return the axes on a limit switch, each with the direction that leads off it.
 
         None where the direction is unknown: Grbl does not report at which end an axis stands, so
-        that only a move of this object which ended on the switch shows it. An axis of the
-        controller that is none of this stage has its letter as name. A controller in alarm, which
+        that only a move of this object which ended on the switch shows it. A letter of
+        the controller without a name on this stage stands for itself. A controller in alarm, which
         may report nothing, is reset; it stands.
         """
         self._controller.leave_alarm()

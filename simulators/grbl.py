@@ -2,9 +2,10 @@
 
 Simplified: every move of the queue starts and ends at rest; homing takes all its axes to their
 switches together, pulls off, touches the switch again slowly and pulls off; the receive buffer is
-never full. Both ends of an axis's travel have a switch, on one input, and stop the axis: homing from
-the switch at the far end fails, and drives no deeper. What is not modelled (arcs, probing, work offsets, spindle, check mode, ...) is refused
-as an unsupported command, and logged. The axes have no encoders: a stall loses steps unnoticed.
+never full. Both ends of an axis's travel have a switch, on one input, and stop the axis: homing
+from the switch at the far end fails, and drives no deeper. What is not modelled (arcs, probing,
+work offsets, spindle, check mode, ...) is refused as an unsupported command, and logged. The axes
+have no encoders: a stall loses steps unnoticed.
 Source of the messages: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Realtime
 commands"; the order of a report's fields and its counters from report.c.
 """

@@ -235,7 +235,7 @@ def test_a_pressed_switch_keeps_the_axes_from_homing_that_would_move_it_and_no_o
     stage = Bench(axes=axes).stage()
     with pytest.raises(PressedSwitchError) as refused:
         stage.home()
-    # The stage has no name for it, but Grbl as it is shipped homes it, too.
+    # The stage names X and Y alone; Grbl as it is shipped homes Z as well.
     assert refused.value.axis == "Z"
     assert stage.move_off_switch("Z", Direction.UP, 500.0)
     stage.home()
