@@ -210,6 +210,17 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
     return stage_of(data | dict(overrides or {}), shown)
 
 
+def stages_of_rig(spec: str) -> list[Any] | None:
+    """Return the stages that a rig's YAML file names; None where `spec` is no such file."""
+    if not spec.endswith((".yaml", ".yml")):
+        return None
+    read = read_yaml(Path(spec), AppError)
+    if not isinstance(read, dict) or "protocol" in read or "stage" not in read:
+        return None
+    named = read["stage"]
+    return named if isinstance(named, list) else [named]
+
+
 def _require_actuators(axes: Any, source: str) -> None:
     """Raise AppError for an axis without an actuator: no controller reports what is plugged in."""
     known = ", ".join(ACTUATORS)

@@ -39,6 +39,7 @@ from emmc_rig.bench.device_config import (
     plug_ins,
     settings_of,
     stage_of,
+    stages_of_rig,
 )
 from emmc_rig.bench.environment import Source
 from emmc_rig.bench.hands import Attendant
@@ -419,10 +420,13 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
     spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
     `emmc_rig.bench.device_config`, or what such a file says;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
-    once. settings: single settings that replace those of the file.
-    Raises AppError or a `DriverError`.
+    once; or a rig's YAML file, for its stages. settings: single settings that replace those of the
+    file. Raises AppError or a `DriverError`.
     """
     if isinstance(spec, str):
+        named = stages_of_rig(spec)
+        if named is not None:
+            return open_stages(named)
         name, _, protocol = spec.partition(":")
         if name == SIMULATED:
             return open_simulated(protocol or "zaber", settings)[0]
