@@ -21,6 +21,7 @@ from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.lights import COLOURS
 from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import fine_scene
+from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.journal import RetryEntry, RunEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
@@ -66,12 +67,8 @@ def test_every_frame_is_lit_as_planned_and_the_journal_has_the_lights_answer():
 
 def test_frames_are_those_of_a_bench_whose_lamp_a_hand_switches():
     by_lights, by_hand = (captured(lit_rig(lights)[0]) for lights in (True, False))
-    for planned in by_hand.frames:
-        mosaics = [
-            np.frombuffer(session.read(planned.id)[-2 * SIZE[0] * SIZE[1] :], np.uint8)
-            for session in (by_lights, by_hand)
-        ]
-        assert np.array_equal(*mosaics), planned.id
+    for lit, unlit in zip(*(decoded(s, s.frames) for s in (by_lights, by_hand)), strict=True):
+        assert np.array_equal(lit.mosaic, unlit.mosaic)
     assert {entry.lamp_read for entry in by_hand.stored.values()} == {""}
 
 
