@@ -47,11 +47,13 @@ INNER_SHARE = 0.5
 DEPENDENT = 1e-3
 """An atom adds nothing if chosen atoms explain all but this share of its norm."""
 SEEN_WEAKLY = 0.7
-"""Ridge of OMP's choice, over the square of the median norm of sensed atoms. An atom of prior
-variance s^2 raises the likelihood of a residual r by (a_j . r)^2 / (|a_j|^2 + noise^2 / s^2): without
-the ridge OMP takes atoms that the masks hardly show, with weights that nothing bounds. Without it
-middles of group A (64x80) lose 3.2 dB with one shot of a Bayer camera, 1.2 with three; with 0.5 and 1
-they lose 0.2 at most. The peers of the lab, which do not norm sensed atoms, have an endless ridge."""
+"""Ridge of OMP's choice, over the square of the median norm of sensed atoms.
+
+An atom of prior variance s^2 raises the likelihood of a residual r by
+(a_j . r)^2 / (|a_j|^2 + noise^2 / s^2). Without the ridge OMP takes atoms that the masks hardly
+show: middles of group A (64x80) lose 3.2 dB with one shot of a Bayer camera, 1.2 with three. With
+0.5 and 1 they lose 0.2 at most.
+"""
 FRESH = 0.7
 """LARS: when the level has fallen to this share, correlations are computed anew (32-bit sums)."""
 DARKEST = 1e-6
