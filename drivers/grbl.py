@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 
 from emmc_rig.drivers import grbl_codec as codec
@@ -44,6 +44,7 @@ BOOT_S = 4.0
 REPORTS_UNTIL_OFFSET = 40
 """Grbl reports the work offset in every 30th report at the latest ("Interface", WCO)."""
 POLL_S = 0.05
+RESETS = 2
 OFF_SWITCH_SPEED_UM_S = 1000.0
 """Of a step off a limit switch: half a millimetre takes half a second, in which a hand is at the
 power switch."""
@@ -405,6 +406,8 @@ class _Controller:
                     if isinstance(status, codec.Status):
                         break
                     self._note(status)
+                    if self._waits_for_reset() and isinstance(status, codec.Feedback):
+                        self.raise_alarm()  # it said "Reset to continue", and reports no more
                 else:
                     raise GarbledReplyError(b"", "no report among what came")
         except (TransportTimeoutError, GarbledReplyError) as error:
@@ -502,12 +505,11 @@ class _Controller:
     def leave_alarm(self) -> None:
         """Reset a controller that waits for it, or is held; it stands, so nothing is lost."""
         self.homing_lines.clear()
-        try:
-            state = self.status().state
-        except (TransportTimeoutError, AxisFaultError):
-            state = ""
-        waits = self._alarm is not None and self._alarm.code in ALARMS_UNTIL_RESET
-        if waits or state not in ("Idle", "Alarm"):
+        state = ""
+        if not self._waits_for_reset():
+            with suppress(TransportTimeoutError, AxisFaultError):
+                state = self.status().state
+        if state not in ("Idle", "Alarm"):
             self._reset()
         self._alarm, self._restarted = None, False
 
@@ -538,6 +540,9 @@ class _Controller:
             self._on_lost(alarm.meaning)
         raise error.about(reply=f"ALARM:{alarm.code}")
 
+    def _waits_for_reset(self) -> bool:
+        return self._alarm is not None and self._alarm.code in ALARMS_UNTIL_RESET
+
     def _raise_restart(self) -> None:
         if self._restarted:
             self._restarted = False
@@ -560,9 +565,17 @@ class _Controller:
                     raise
 
     def _reset(self) -> None:
+        """Reset until it says that it has started: in an alarm Grbl drops a reset that came early.
+
+        Source: protocol.c, `protocol_exec_rt_system`.
+        """
         with self._transport.lock:
-            self._transport.write(codec.SOFT_RESET)
-            self._drain()
+            for _ in range(RESETS):
+                self._restarted = False
+                self._transport.write(codec.SOFT_RESET)
+                self._drain()
+                if self._restarted:
+                    break
         self._alarm, self._restarted = None, False
 
     def _drain(self) -> None:
