@@ -17,6 +17,7 @@ from emmc_rig.drivers.errors import (
     GarbledReplyError,
     LimitSwitchError,
     LostPositionError,
+    MoveTimeoutError,
     PositionMismatchError,
     PressedSwitchError,
     ScaleError,
@@ -75,6 +76,10 @@ FAULTS_BY_ALARM: Mapping[int, type[AxisFaultError]] = {
 ALARMS_UNTIL_RESET = {1, 2}
 """After these Grbl answers nothing but a reset ("Interface", Alarm message)."""
 POSITION_KEPT = 2
+ALARM_ADVICE = {
+    9: "see that nothing is in the way, and that every axis that Grbl homes has a switch: as it is "
+    "shipped Z, too (config.h, HOMING_CYCLE_0); then home the axes",
+}
 
 
 class GrblStage(HostStage):
@@ -172,8 +177,8 @@ class GrblStage(HostStage):
                 try:
                     self._controller.command(line, axis)
                     self._wait_until_idle(limits_s, self._clock.now_s(), self._is_moving)
-                except LimitSwitchError as release:
-                    _log.debug("on the way off the switch: %s", release)
+                except (LimitSwitchError, MoveTimeoutError) as fault:
+                    _log.debug("on the way off the switch, the position decides: %s", fault)
                 pressed = self.pressed_switches()
                 if newly := sorted(pressed.keys() - before.keys()):
                     raise PressedSwitchError(newly[0])
@@ -534,7 +539,8 @@ class _Controller:
         self.homing_lines.clear()
         alarm = self._alarm
         fault = FAULTS_BY_ALARM.get(alarm.code, AxisFaultError)
-        error = fault(ALL_AXES, f"alarm {alarm.code} ({alarm.meaning})")
+        advice = ALARM_ADVICE.get(alarm.code, "")
+        error = fault(ALL_AXES, f"alarm {alarm.code} ({alarm.meaning})", advice)
         error.loses_position = alarm.code != POSITION_KEPT
         if error.loses_position:
             self._on_lost(alarm.meaning)
@@ -565,7 +571,7 @@ class _Controller:
                     raise
 
     def _reset(self) -> None:
-        """Reset until it says that it has started: in an alarm Grbl drops a reset that came early.
+        """Reset the controller, again without its banner: an alarm drops a reset that comes early.
 
         Source: protocol.c, `protocol_exec_rt_system`.
         """

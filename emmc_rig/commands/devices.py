@@ -364,7 +364,7 @@ def pressed_switches(stage: Stage) -> dict[str, Direction | None]:
 def _asked_direction(axis: str, named: str, yes: bool) -> Direction:
     """Return the direction that leads off a switch, from a person; raises AppError without one.
 
-    named: the stage, as it was named. yes: nobody is there to be asked.
+    named: the stage, as it was named. yes: no question may be asked.
     """
     unknown = (
         f"{axis} stands on a limit switch, and the controller does not report at which end of the "

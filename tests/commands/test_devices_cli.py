@@ -74,6 +74,12 @@ def test_a_number_that_begins_with_a_minus_is_no_option(run, number):
     assert (code, "No such option" in err) == (2, True)
 
 
+@pytest.mark.parametrize("place", [("-6000",), ("--", "-6000"), ("-6e3",)])
+def test_a_negative_position_is_no_option_either(run, place):
+    out = done(run("jog", "--rig", "simulated:grbl", "--home", "--to", "x", *place))
+    assert float(out.split()[2]) == pytest.approx(-6000, abs=2.6)
+
+
 def test_an_axis_that_is_not_homed_is_told_a_command_that_succeeds(run):
     code, _, err = run("jog", "--rig", "simulated:grbl", "x", -1000)
     assert code == 1
