@@ -200,7 +200,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
 
 
 def stages_of_rig(spec: str) -> list[Any] | None:
-    """Return the stages that a rig's YAML file names; None for any other text or file."""
+    """Return the stages that a rig's YAML file names, or None where `spec` names no rig."""
     if not spec.endswith((".yaml", ".yml")):
         return None
     read = read_yaml(Path(spec), AppError)

@@ -265,9 +265,8 @@ def test_every_advice_from_a_pressed_switch_leads_off_it_within_three_commands(
     stage = f"grbl:{controller.port}"
     (free,) = advised(refused(run("devices", "jog", "--stage", stage, "x", -100)))
     assert free == ["devices", "free", "x", "--stage", stage]
-    ways = advised(refused(run(*free, "--yes")))
-    (chosen,) = [words for words in ways if away in words]
-    out = done(run(*chosen, "--yes"))
+    assert f"--direction {away}" in refused(run(*free, "--yes"))
+    out = done(run(*free, "--yes", "--direction", away))
     places_mm = [x for x, _, _ in controller.places_mm()]
     deepest_mm = min(places_mm) if away == "up" else max(places_mm)
     assert deepest_mm == pytest.approx(at_mm, abs=NEAR_MM)
@@ -282,8 +281,8 @@ def test_a_switch_that_is_stuck_is_named_and_nothing_moves_far(run, controller):
     stage = f"grbl:{controller.port}"
     assert "y reports a fault, it stands" in refused(run("devices", "home", "--stage", stage))
     free = ("devices", "free", "y", "--direction", "down", "--yes", "--stage", stage)
-    assert "still pressed after -5 mm" in refused(run(*free))
-    assert controller.true_mm()[1] == pytest.approx(-20.0, abs=NEAR_MM)
+    assert "still pressed after -3 mm" in refused(run(*free))
+    assert controller.true_mm()[1] == pytest.approx(-18.0, abs=NEAR_MM)
 
 
 def capture(run, controller, places_um):
